@@ -1,0 +1,118 @@
+"""Recorded commands on the simulator's clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from rfdropo_bayes.errors import InputError
+
+
+class Commands(NamedTuple):
+    """A command sequence on a simulator's clock, and when it is observed.
+
+    Attributes:
+        initial: command in force before the first step, to which the initial state belongs [m or rad].
+        step: command reached at the end of each time step [m or rad].
+        sample_step: last step that ends at or before each observation; 0 is the initial state.
+        sample_fraction: how far into the following step the observation lies, in [0, 1).
+    """
+
+    initial: Float[Array, "*batch channel"]
+    step: Float[Array, "*batch step channel"]
+    sample_step: Int[Array, "*batch time"]
+    sample_fraction: Float[Array, "*batch time"]
+
+
+def commands_on_grid(
+    time: Float[np.ndarray, " command"],
+    value: Float[np.ndarray, "command channel"],
+    initial: Float[np.ndarray, " channel"],
+    observation_time: Float[np.ndarray, " time"],
+    *,
+    time_step: float,
+    ramp: float = 0.0,
+    lag_steps: int = 0,
+) -> Commands:
+    """Sample a piecewise-constant command on steps of ``time_step``.
+
+    ``value[k]`` is in force from ``time[k]`` on; a change is carried out linearly over ``ramp`` seconds (a moving
+    average of the piecewise-constant signal, so that overlapping changes add up), ``lag_steps`` steps late. The clock
+    starts at the first observation.
+
+    Args:
+        time: when each command was given [s], increasing.
+        value: commands, cumulative [m or rad].
+        initial: command in force before ``time[0]``.
+        observation_time: when the state was observed [s], increasing; the first is the initial state.
+
+    Raises:
+        InputError: times do not increase, or shapes do not fit.
+    """
+    time, value = np.asarray(time, float), np.asarray(value, float)
+    observation_time = np.asarray(observation_time, float)
+    if len(time) != len(value):
+        raise InputError(f"{len(time)} command times for {len(value)} commands", remedy="give one time per command")
+    for name, clock in (("command", time), ("observation", observation_time)):
+        if np.any(np.diff(clock) < 0):
+            raise InputError(f"{name} times decrease at row {int(np.argmax(np.diff(clock) < 0)) + 1}")
+    elapsed = (observation_time - observation_time[0]) / time_step
+    # Observation clocks jitter by microseconds: an observation within 1e-6 of a step's end belongs to that step.
+    sample_step = np.floor(elapsed + 1e-6).astype(np.int32)
+    fraction = np.clip(elapsed - sample_step, 0.0, None)
+    fraction[fraction < 1e-6] = 0.0
+    n_steps = int(sample_step[-1]) + int(fraction[-1] > 0)
+    end = observation_time[0] + time_step * (np.arange(1, n_steps + 1) - lag_steps)
+    return Commands(np.asarray(initial, float), _ramped(time, value, initial, end, ramp), sample_step, fraction)
+
+
+def _ramped(time, value, initial, at, ramp: float) -> np.ndarray:
+    """The piecewise-constant command averaged over the last ``ramp`` seconds before each of ``at``."""
+    if len(time) == 0:
+        return np.broadcast_to(np.asarray(initial, float), (len(at), len(initial))).copy()
+    if ramp <= 0.0:
+        # A command given at the start of a step acts during it; rounding must not postpone it to the next.
+        index = np.searchsorted(time, at - 1e-9 * max(1.0, float(np.abs(at).max(initial=0.0))), side="left") - 1
+        padded = np.vstack([initial, value])
+        return padded[index + 1]
+    first = min(time[0], float(np.min(at, initial=time[0])) - ramp) - 1.0
+    knots = np.concatenate([[first], time, [max(time[-1], float(np.max(at, initial=time[-1]))) + 1.0]])
+    held = np.vstack([initial, value])
+    integral = np.concatenate([np.zeros((1, held.shape[1])), np.cumsum(held * np.diff(knots)[:, None], axis=0)])
+    columns = [
+        (np.interp(at, knots, integral[:, j]) - np.interp(at - ramp, knots, integral[:, j])) / ramp
+        for j in range(held.shape[1])
+    ]
+    return np.stack(columns, axis=1)
+
+
+def stack_commands(sequences: Sequence[Commands]) -> Commands:
+    """Pad command sequences to one length and stack them along a leading axis.
+
+    A shorter sequence holds its last command; the padded observations repeat its last one, and the caller masks them.
+    """
+    steps = max(len(item.step) for item in sequences)
+    rows = max(len(item.sample_step) for item in sequences)
+    return Commands(
+        np.stack([item.initial for item in sequences]),
+        np.stack([_pad(item.step if len(item.step) else item.initial[None], steps) for item in sequences]),
+        np.stack([_pad(item.sample_step, rows) for item in sequences]),
+        np.stack([_pad(item.sample_fraction, rows) for item in sequences]),
+    )
+
+
+def _pad(array: np.ndarray, length: int) -> np.ndarray:
+    return np.concatenate([array, np.repeat(array[-1:], length - len(array), axis=0)])
+
+
+def sample(series: Float[Array, "steps ..."], commands: Commands) -> Float[Array, "time ..."]:
+    """Read a per-step series (row 0 = initial state) at the observation times, linearly within a step."""
+    import jax.numpy as jnp
+
+    before = series[commands.sample_step]
+    after = series[jnp.minimum(commands.sample_step + 1, series.shape[0] - 1)]
+    weight = commands.sample_fraction.reshape((-1,) + (1,) * (series.ndim - 1))
+    return before + weight * (after - before)

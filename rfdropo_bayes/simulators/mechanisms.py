@@ -1,0 +1,80 @@
+"""The places where a model extension may act on a rollout; a simulator calls only what these protocols name.
+
+A mechanism is nested: at its null value (the nominal value of its parameters) the extended simulator is the base
+simulator exactly. The library of mechanisms lives one room above.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol, runtime_checkable
+
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+Values = Mapping[str, Float[Array, ""]]
+
+STAGES = ("actuation", "body", "contact", "sensing")
+
+
+class Mechanism(Protocol):
+    """A named physical effect on top of a base simulator.
+
+    Attributes:
+        name: registry name.
+        stage: one of `STAGES`, in the order in which they act on a rollout.
+        parameters: its parameters; the nominal value of each is its null value.
+        cause: one line on the physical cause.
+        remedy: one line on what a lab would do about it.
+    """
+
+    name: str
+    stage: str
+    parameters: tuple[ParameterSpec, ...]
+    cause: str
+    remedy: str
+
+
+@runtime_checkable
+class ActuationMechanism(Mechanism, Protocol):
+    """Acts on the command before it becomes a cable displacement."""
+
+    def actuate(
+        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
+    ) -> Float[Array, "step channel"]:
+        """Return the command that reaches the cables at the end of each step, given the one that was sent."""
+
+
+@runtime_checkable
+class BodyMechanism(Mechanism, Protocol):
+    """Acts on the body's material, masses and gravity."""
+
+    def embody(self, values: Values, material: Any, body: Any) -> Any:
+        """Return the material (`fem.Material`) of the extended body (`fem.LayeredBody`), given that of the base."""
+
+
+@runtime_checkable
+class SensingMechanism(Mechanism, Protocol):
+    """Acts on what is measured of the body's motion."""
+
+    def sense(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
+        """Return the measured marker positions [m], given the true ones."""
+
+
+def check_mechanisms(mechanisms: Iterable[Mechanism]) -> tuple[Mechanism, ...]:
+    """Return the mechanisms as a tuple; InputError if one stands twice or two share a parameter."""
+    chosen = tuple(mechanisms)
+    owner: dict[str, str] = {}
+    for mechanism in chosen:
+        if mechanism.stage not in STAGES:
+            raise InputError(f"mechanism {mechanism.name!r} has stage {mechanism.stage!r}", remedy=f"use one of {STAGES}")
+        for spec in mechanism.parameters:
+            if spec.name in owner:
+                raise InputError(
+                    f"mechanisms {owner[spec.name]!r} and {mechanism.name!r} share the parameter {spec.name!r}",
+                    remedy="list each mechanism once",
+                )
+            owner[spec.name] = mechanism.name
+    return chosen

@@ -1,0 +1,56 @@
+"""What a simulator says of each of its parameters: name, unit, hard bounds, nominal value, default prior."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+from rfdropo_bayes.errors import InputError
+
+
+class ParameterSpec(NamedTuple):
+    """One physical parameter of a simulator, of a mechanism or of a noise model.
+
+    Attributes:
+        name: as used in experiment files, posteriors and reports.
+        unit: SI unit, "-" if it has none.
+        low, high: hard bounds, outside which the model has no meaning.
+        nominal: value used where the parameter is not inferred; a mechanism's null value.
+        prior: default prior as a table, e.g. ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``.
+        description: one line on its physical meaning.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    nominal: float
+    prior: Mapping[str, Any]
+    description: str
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A remedy for a mistyped name: the closest known one, or the list of all."""
+    known = sorted(known)
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
+
+
+def check_names(names: Iterable[str], specs: Iterable[ParameterSpec], *, where: str) -> None:
+    """Raise InputError for a name that no specification carries."""
+    known = {spec.name for spec in specs}
+    for name in names:
+        if name not in known:
+            raise InputError(f"unknown parameter {name!r}", where=where, remedy=nearest(name, known))
+
+
+def check_value(spec: ParameterSpec, value: float, *, where: str) -> float:
+    """Return ``value`` if it lies within the hard bounds of ``spec``; raise InputError otherwise."""
+    if not spec.low <= value <= spec.high:
+        raise InputError(
+            f"{spec.name} = {value:g} {spec.unit} is outside its hard bounds [{spec.low:g}, {spec.high:g}]",
+            where=where,
+            remedy="give a value inside them",
+        )
+    return float(value)

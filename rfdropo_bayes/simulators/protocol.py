@@ -1,0 +1,83 @@
+"""The one call shape every simulator has: parameters and commands in, an observation and a result code out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from jaxtyping import Array, Float, Int
+
+from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+
+class Result(IntEnum):
+    """How a rollout ended. Everything but OK is counted and reported, and gets no weight in any inference."""
+
+    OK = 0
+    DIVERGED = 1
+    CABLE_LIMIT = 2
+    CONTACT_NOT_CONVERGED = 3
+    NOT_IN_EQUILIBRIUM = 4
+
+    @property
+    def remedy(self) -> str:
+        """What a user can do about it."""
+        return _REMEDIES[self]
+
+
+_REMEDIES = {
+    Result.OK: "",
+    Result.DIVERGED: "shorten the time step or narrow the priors of stiffness, mass and damping",
+    Result.CABLE_LIMIT: "the cables could not reach their commanded lengths: check limits and initial displacements",
+    Result.CONTACT_NOT_CONVERGED: "raise the number of contact iterations or shorten the time step",
+    Result.NOT_IN_EQUILIBRIUM: "the initial pose was not found: check gravity, stiffness and initial displacements",
+}
+
+
+class Observation(NamedTuple):
+    """What a rollout shows at the observation times, in the frame of the robot's base.
+
+    Attributes:
+        position: marker positions [m].
+        tension: cable tensions [N].
+        object_pose: position [m] and unit quaternion (x, y, z, w) of the object; None if the scene has none.
+        status: a `Result` value.
+    """
+
+    position: Float[Array, "time marker 3"]
+    tension: Float[Array, "time cable"]
+    object_pose: Float[Array, "time 7"] | None
+    status: Int[Array, ""]
+
+
+@runtime_checkable
+class Simulator(Protocol):
+    """Anything that turns named parameters and commands into an observation.
+
+    ``rollout`` replays the whole command sequence from the initial state, without resets (RF-DROPO, eq. 2). A batch of
+    rollouts is ``jax.vmap`` over the parameters.
+    """
+
+    @property
+    def parameters(self) -> tuple[ParameterSpec, ...]:
+        """Every parameter that may be given to ``rollout``; those left out take their nominal value."""
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Names of the markers, in the order of ``Observation.position``."""
+
+    @property
+    def cable_names(self) -> tuple[str, ...]:
+        """Names of the cables, in the order of ``Observation.tension``."""
+
+    @property
+    def description(self) -> dict[str, object]:
+        """Engine, precision and discretisation, for the record."""
+
+    def commands(self, time, value, initial, observation_time) -> Commands:
+        """Bring a recorded command sequence onto the simulator's own clock (see `commands_on_grid`)."""
+
+    def rollout(self, parameters: Mapping[str, Float[Array, ""]], commands: Commands) -> Observation:
+        """Simulate from the initial state to the last observation."""

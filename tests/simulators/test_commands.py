@@ -1,0 +1,66 @@
+"""Commands on the simulator's clock: holds, ramps, lags, and the times of observation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.commands import commands_on_grid, sample, stack_commands
+
+
+def grid(time, value, observed, **options):
+    return commands_on_grid(np.array(time), np.array(value)[:, None], np.zeros(1), np.array(observed), **options)
+
+
+def test_a_held_command_acts_in_the_step_that_starts_with_it():
+    commands = grid([0.0, 0.02], [1.0, 3.0], [0.0, 0.04], time_step=0.01)
+    np.testing.assert_array_equal(commands.step[:, 0], [1.0, 1.0, 3.0, 3.0])
+
+
+def test_a_ramp_spreads_a_change_over_its_duration():
+    """SOFA's trunk: an action of 5 mm is carried out as 1 mm over each of 5 updates."""
+    commands = grid([0.0, 0.05], [5.0, 10.0], [0.0, 0.1], time_step=0.01, ramp=0.05)
+    np.testing.assert_allclose(commands.step[:, 0], np.arange(1.0, 11.0), atol=1e-12)
+
+
+def test_a_lag_postpones_everything_by_whole_steps():
+    prompt = grid([0.0, 0.05], [5.0, 10.0], [0.0, 0.1], time_step=0.01, ramp=0.05)
+    late = grid([0.0, 0.05], [5.0, 10.0], [0.0, 0.1], time_step=0.01, ramp=0.05, lag_steps=1)
+    np.testing.assert_allclose(late.step[1:, 0], prompt.step[:-1, 0], atol=1e-12)
+    assert late.step[0, 0] == 0.0
+
+
+@given(
+    st.lists(st.floats(-5.0, 5.0), min_size=1, max_size=8),
+    st.floats(0.005, 0.3),
+)
+@settings(deadline=None, max_examples=50)
+def test_every_ramp_ends_at_the_last_command(values, ramp):
+    """Whatever the ramp, the command that was sent last is reached once the ramp has passed."""
+    time = 0.05 * np.arange(len(values))
+    end = time[-1] + ramp + 0.05
+    commands = grid(time, values, [0.0, end], time_step=0.01, ramp=ramp)
+    np.testing.assert_allclose(commands.step[-1, 0], values[-1], atol=1e-9)
+
+
+def test_observations_between_steps_are_interpolated():
+    commands = grid([0.0], [0.0], [0.0, 0.015, 0.02], time_step=0.01)
+    series = np.array([[0.0], [1.0], [4.0]])
+    np.testing.assert_allclose(sample(series, commands)[:, 0], [0.0, 2.5, 4.0])
+
+
+def test_stacking_pads_with_the_last_command():
+    stacked = stack_commands([
+        grid([0.0], [1.0], [0.0, 0.01], time_step=0.01),
+        grid([0.0, 0.01], [1.0, 2.0], [0.0, 0.01, 0.02], time_step=0.01),
+    ])
+    np.testing.assert_array_equal(stacked.step[:, :, 0], [[1.0, 1.0], [1.0, 2.0]])
+    np.testing.assert_array_equal(stacked.sample_step, [[0, 1, 1], [0, 1, 2]])
+
+
+def test_decreasing_times_are_refused():
+    with pytest.raises(InputError, match="command times decrease at row 1"):
+        grid([0.1, 0.0], [1.0, 2.0], [0.0, 0.1], time_step=0.01)
