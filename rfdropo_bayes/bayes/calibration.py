@@ -1,0 +1,143 @@
+"""A `TrajectoryModel` as the problem that the inference methods see: named parameters in, log likelihoods out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from rfdropo_bayes.bayes.model import TrajectoryModel
+from rfdropo_bayes.bayes.noise import draw_noise, whiten
+
+Batch = Mapping[str, Float[Array, " n"]]
+
+
+class CalibrationProblem:
+    """Posterior over the parameters of a `TrajectoryModel`, evaluated in batches of a fixed size.
+
+    Rows are time steps: horizon ``h`` means the first ``h`` rows of every recording (eq. 3 of RF-DROPO). A batch is
+    cut into chunks of ``chunk`` parameter sets, the last one padded, so that one compilation serves every batch size,
+    and the number of simulated steps is a run-time argument, so that it serves every horizon.
+    """
+
+    def __init__(self, model: TrajectoryModel, *, chunk: int = 32) -> None:
+        self.model = model
+        self.chunk = chunk
+        self.names = model.space.names
+        self.units = {p.name: p.spec.unit for p in model.space.parameters}
+        self.bounds = {p.name: (p.spec.low, p.spec.high) for p in model.space.parameters}
+        self.n_rows = model.recordings.time.shape[1]
+        self.n_recordings = len(model.recordings.names)
+
+    def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
+        """Independent prior draws."""
+        return self.model.space.sample(key, n)
+
+    def to_unconstrained(self, values: Batch) -> Float[Array, "n d"]:
+        """Values as points of the unconstrained space, columns in the order of ``names``."""
+        return self.model.space.to_unconstrained(values)
+
+    def from_unconstrained(self, u: Float[Array, "n d"]) -> dict[str, Float[Array, " n"]]:
+        """Inverse of `to_unconstrained`."""
+        return self.model.space.from_unconstrained(u)
+
+    def log_prior(self, u: Float[Array, "n d"]) -> Float[Array, " n"]:
+        """Log prior density in the unconstrained space."""
+        return self.model.space.log_prior_unconstrained(u)
+
+    def steps_for(self, horizon: int) -> int:
+        """Time steps to simulate so that the first ``horizon`` rows of every recording are there."""
+        commands = self.model.recordings.commands
+        row = np.minimum(horizon, self.model.recordings.rows) - 1
+        index = np.arange(self.n_recordings), row
+        last = commands.sample_step[index] + (commands.sample_fraction[index] > 0)
+        return int(np.max(last))
+
+    def row_log_likelihood(
+        self, values: Batch, horizon: int
+    ) -> tuple[Float[np.ndarray, "n horizon"], Int[np.ndarray, " n"]]:
+        """Log density of each of the first ``horizon`` rows given those before it, summed over recordings.
+
+        Returns:
+            rows, minus infinity throughout where the rollout did not end well, and the `Result` code of each set.
+        """
+        rows, status = self._chunked(self._rows, values, horizon)
+        rows = rows[:, :horizon]
+        finite = np.isfinite(rows).all(axis=1)
+        status = np.where((status == 0) & ~finite, 1, status)
+        return np.where((status == 0)[:, None], rows, -np.inf), status
+
+    def rollouts(
+        self, values: Batch, horizon: int
+    ) -> tuple[Float[np.ndarray, "n horizon feature"], Int[np.ndarray, " n"]]:
+        """Simulated marker coordinates [m] of all recordings side by side, without observation noise."""
+        position, status = self._chunked(self._positions, values, horizon)
+        position = np.moveaxis(position, 1, 2)[:, :horizon]
+        return position.reshape(len(position), horizon, -1), status
+
+    @cached_property
+    def observed(self) -> Float[np.ndarray, "n_rows feature"]:
+        """Measured marker coordinates [m], laid out like `rollouts`."""
+        return np.moveaxis(self.model.recordings.position, 0, 1).reshape(self.n_rows, -1)
+
+    @cached_property
+    def observed_mask(self) -> np.ndarray:
+        """True where ``observed`` may be used."""
+        valid = np.moveaxis(self.model.recordings.line.valid, 0, 1)
+        return np.repeat(valid[..., None], 3, axis=-1).reshape(self.n_rows, -1)
+
+    def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " residual"]:
+        """Whitened residuals of the first ``horizon`` rows (zero where masked); traceable, for one set of values."""
+        recordings = self.model.recordings
+        observation = self.model.simulate(values, jnp.asarray(self.steps_for(horizon)))
+        sigma, tau = self.model.noise_of(values)
+        white = jax.vmap(lambda r, line: whiten(r, sigma, tau, line)[0])(
+            recordings.position - observation.position, recordings.line
+        )
+        return white[:, :horizon].reshape(-1)
+
+    def predict(self, values: Batch) -> tuple[Float[np.ndarray, "n recording time marker 3"], Int[np.ndarray, " n"]]:
+        """Simulated marker positions [m] of every recording, without observation noise."""
+        return self._chunked(self._positions, values, self.n_rows)
+
+    def predict_noisy(self, key: PRNGKeyArray, values: Batch) -> tuple[np.ndarray, np.ndarray]:
+        """Posterior-predictive positions: a rollout and a noise realisation for every set of values."""
+        position, status = self.predict(values)
+        time = self.model.recordings.time
+        markers = position.shape[3]
+
+        def noise(key: PRNGKeyArray, values: Batch) -> Array:
+            sigma, tau = self.model.noise_of(values)
+            keys = jax.random.split(key, self.n_recordings)
+            return jax.vmap(lambda k, t: draw_noise(k, t, markers, sigma, tau))(keys, time)
+
+        inferred = {name: jnp.asarray(values[name]) for name in self.names}
+        return position + np.asarray(jax.vmap(noise)(jax.random.split(key, len(position)), inferred)), status
+
+    @cached_property
+    def _rows(self) -> Callable:
+        return jax.jit(jax.vmap(self.model.row_log_likelihood, in_axes=(0, None)))
+
+    @cached_property
+    def _positions(self) -> Callable:
+        def positions(values: Batch, steps: Int[Array, ""]) -> tuple[Array, Array]:
+            observation = self.model.simulate(values, steps)
+            return observation.position, jnp.max(observation.status)
+
+        return jax.jit(jax.vmap(positions, in_axes=(0, None)))
+
+    def _chunked(self, evaluate: Callable, values: Batch, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+        """Evaluate a batch chunk by chunk; the padding of the last chunk repeats its last set and is dropped."""
+        steps = jnp.asarray(self.steps_for(horizon))
+        columns = {name: np.asarray(values[name], dtype=float) for name in self.names}
+        n = len(next(iter(columns.values())))
+        parts = []
+        for start in range(0, n, self.chunk):
+            index = np.minimum(np.arange(start, start + self.chunk), n - 1)
+            parts.append(jax.device_get(evaluate({name: column[index] for name, column in columns.items()}, steps)))
+        first, second = (np.concatenate([part[i] for part in parts])[:n] for i in range(2))
+        return first, second

@@ -1,0 +1,195 @@
+"""A simulator, its inferred parameters, a noise model and recordings, joined into one numpyro model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from rfdropo_bayes.bayes.noise import Timeline, draw_noise, row_log_density, timeline
+from rfdropo_bayes.bayes.space import ParameterSpace
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.commands import Commands, stack_commands
+from rfdropo_bayes.simulators.protocol import Observation, Simulator
+
+Values = Mapping[str, Float[Array, "..."]]
+
+
+class TrajectoryNoise(dist.Distribution):
+    """Measured marker positions of one recording, given the simulated ones; `noise.row_log_density` over all rows."""
+
+    support = dist.constraints.independent(dist.constraints.real, 3)
+
+    def __init__(self, position, sigma, tau, time, line: Timeline, *, validate_args: bool | None = None) -> None:
+        self.position, self.sigma, self.tau, self.time, self.line = position, sigma, tau, time, line
+        super().__init__((), position.shape, validate_args=validate_args)
+
+    def sample(self, key: PRNGKeyArray | None, sample_shape: tuple[int, ...] = ()) -> Array:
+        """Simulated positions plus one realisation of the noise."""
+        count = int(np.prod(sample_shape))
+        draw = partial(draw_noise, time=self.time, markers=self.position.shape[1], sigma=self.sigma, tau=self.tau)
+        noise = jax.vmap(draw)(jax.random.split(key, count)).reshape(sample_shape + self.position.shape)
+        return self.position + noise
+
+    def log_prob(self, value: Float[Array, "time marker 3"]) -> Float[Array, ""]:
+        """Log density of all valid rows."""
+        return jnp.sum(row_log_density(value - self.position, self.sigma, self.tau, self.line))
+
+
+@dataclass(frozen=True)
+class RecordingSet:
+    """Recordings as the arrays a likelihood needs, padded to a common length (padding is not valid).
+
+    Attributes:
+        names: one per recording.
+        time: observation times, from zero [s].
+        rows: number of rows of each recording.
+        position: measured marker positions [m]; zero where masked.
+        commands: commands on the simulator's clock.
+    """
+
+    names: tuple[str, ...]
+    time: Float[np.ndarray, "recording time"]
+    rows: Int[np.ndarray, " recording"]
+    position: Float[np.ndarray, "recording time marker 3"]
+    line: Timeline
+    commands: Commands
+
+
+def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) -> RecordingSet:
+    """Bring trajectories onto the simulator's clock and markers.
+
+    Raises:
+        InputError: no trajectory, two of one name, or markers or cables that the simulator has not.
+    """
+    if not trajectories:
+        raise InputError("no recordings", where="[data] fit", remedy="name at least one recording")
+    names = tuple(trajectory.name for trajectory in trajectories)
+    if len(set(names)) < len(names):
+        raise InputError(f"two recordings share a name: {', '.join(names)}", where="[data]", remedy="list each once")
+    length = max(len(trajectory.time) for trajectory in trajectories)
+    times, positions, valid, commands = [], [], [], []
+    for trajectory in trajectories:
+        chosen = _marker_columns(simulator, trajectory)
+        mask = np.asarray(trajectory.position_mask)[:, chosen]
+        position = np.where(mask[:, :, None], np.asarray(trajectory.position)[:, chosen], 0.0)
+        missing = length - len(trajectory.time)
+        tail = trajectory.time[-1] + trajectory.dataset.attrs["sample_time"] * np.arange(1, missing + 1)
+        times.append(np.concatenate([trajectory.time, tail]) - trajectory.time[0])
+        positions.append(np.pad(position, ((0, missing), (0, 0), (0, 0))))
+        valid.append(np.pad(mask, ((0, missing), (0, 0))))
+        commands.append(_commands(simulator, trajectory))
+    lines = [timeline(time, ok) for time, ok in zip(times, valid, strict=True)]
+    return RecordingSet(
+        names,
+        np.stack(times),
+        np.array([len(trajectory.time) for trajectory in trajectories]),
+        np.stack(positions),
+        Timeline(*(np.stack(part) for part in zip(*lines, strict=True))),
+        stack_commands(commands),
+    )
+
+
+def _marker_columns(simulator: Simulator, trajectory: Trajectory) -> list[int]:
+    known = list(trajectory.marker_names)
+    missing = [name for name in simulator.marker_names if name not in known]
+    if missing:
+        raise InputError(
+            f"the robot's markers {', '.join(missing)} are not in the recording",
+            where=trajectory.name,
+            remedy=f"the recording has {', '.join(known)}: use the robot that was recorded",
+        )
+    return [known.index(name) for name in simulator.marker_names]
+
+
+def _commands(simulator: Simulator, trajectory: Trajectory) -> Commands:
+    value = np.asarray(trajectory.command)
+    if value.shape[1] != len(simulator.channel_names):
+        raise InputError(
+            f"the recording has {value.shape[1]} command channels, the robot {len(simulator.channel_names)}",
+            where=trajectory.name,
+            remedy="use the robot that was recorded",
+        )
+    return simulator.commands(trajectory.command_time, value, trajectory.initial_command, trajectory.time)
+
+
+@dataclass(frozen=True)
+class TrajectoryModel:
+    """The probabilistic program: priors, rollouts of the simulator, observation noise.
+
+    Attributes:
+        simulator: anything that satisfies `Simulator`, mechanisms included.
+        space: inferred parameters, those of the noise among them.
+        fixed: values of parameters that are not inferred and differ from their nominal value.
+        noise: ``"white"`` or ``"ar1"``.
+        recordings: data.
+    """
+
+    simulator: Simulator
+    space: ParameterSpace
+    fixed: Mapping[str, float]
+    noise: str
+    recordings: RecordingSet
+
+    def noise_of(self, values: Values) -> tuple[Any, Any]:
+        """Standard deviation [m] and correlation time [s] (None for white noise) among a set of values."""
+        known = {**self.fixed, **values}
+        return known["observation_noise"], known["noise_correlation_time"] if self.noise == "ar1" else None
+
+    @cached_property
+    def _physical(self) -> frozenset[str]:
+        return frozenset(spec.name for spec in self.simulator.parameters)
+
+    def rollout_values(self, values: Values, recording: str) -> dict[str, Array]:
+        """What the simulator is given for one recording: fixed and inferred physical parameters."""
+        chosen = {**self.fixed, **self.space.for_recording(values, recording)}
+        return {name: jnp.asarray(value) for name, value in chosen.items() if name in self._physical}
+
+    def simulate(self, values: Values, steps: Int[Array, ""] | None = None) -> Observation:
+        """Roll out every recording under one set of values.
+
+        Args:
+            values: inferred parameters, scalars.
+            steps: simulate only this many time steps (rows beyond hold no meaning); None for all, differentiable in
+                reverse mode.
+
+        Returns:
+            observations with a leading axis over recordings.
+        """
+        per_recording = [self.rollout_values(values, name) for name in self.recordings.names]
+        stacked = {name: jnp.stack([row[name] for row in per_recording]) for name in per_recording[0]}
+        return jax.vmap(lambda v, c: self.simulator.rollout(v, c, steps))(stacked, self.recordings.commands)
+
+    def row_log_likelihood(
+        self, values: Values, steps: Int[Array, ""] | None = None
+    ) -> tuple[Float[Array, " time"], Int[Array, ""]]:
+        """Log density of each row given those before it, summed over recordings, and the worst result code."""
+        observation = self.simulate(values, steps)
+        sigma, tau = self.noise_of(values)
+        residual = self.recordings.position - observation.position
+        density = jax.vmap(lambda r, line: row_log_density(r, sigma, tau, line))(residual, self.recordings.line)
+        return jnp.sum(density, axis=0), jnp.max(observation.status)
+
+    def __call__(self, observe: Bool | bool = True) -> None:
+        """The numpyro model; ``observe=False`` leaves the positions free, for predictive draws."""
+        values = {p.name: numpyro.sample(p.name, p.prior) for p in self.space.parameters}
+        observation = self.simulate(values)
+        sigma, tau = self.noise_of(values)
+        numpyro.deterministic("status", observation.status)
+        for index, name in enumerate(self.recordings.names):
+            rows = int(self.recordings.rows[index])
+            line = Timeline(*(part[index, :rows] for part in self.recordings.line))
+            noise = TrajectoryNoise(
+                observation.position[index, :rows], sigma, tau, self.recordings.time[index, :rows], line
+            )
+            measured = self.recordings.position[index, :rows] if observe else None
+            numpyro.sample(f"position@{name}", noise, obs=measured)

@@ -1,0 +1,110 @@
+"""Prior distributions from the tables of an experiment file, confined to a parameter's hard bounds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpyro.distributions as dist
+from scipy import stats
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
+
+
+def _normal(spec: ParameterSpec, loc: float, scale: float) -> dist.Distribution:
+    return dist.TruncatedNormal(loc, scale, low=_open(spec.low), high=_open(spec.high))
+
+
+def _half_normal(spec: ParameterSpec, scale: float) -> dist.Distribution:
+    return dist.TruncatedNormal(0.0, scale, low=max(0.0, spec.low), high=_open(spec.high))
+
+
+def _log_normal(spec: ParameterSpec, median: float, sigma: float) -> dist.Distribution:
+    low = math.log(spec.low) if spec.low > 0 else None
+    high = math.log(spec.high) if math.isfinite(spec.high) else None
+    base = dist.TruncatedNormal(math.log(median), sigma, low=low, high=high)
+    return dist.TransformedDistribution(base, dist.transforms.ExpTransform())
+
+
+def _uniform(spec: ParameterSpec, low: float, high: float) -> dist.Distribution:
+    return dist.Uniform(low, high)
+
+
+def _log_uniform(spec: ParameterSpec, low: float, high: float) -> dist.Distribution:
+    return dist.LogUniform(low, high)
+
+
+def _open(bound: float) -> float | None:
+    return bound if math.isfinite(bound) else None
+
+
+_FAMILIES: dict[str, tuple[Callable[..., dist.Distribution], tuple[str, ...]]] = {
+    "Normal": (_normal, ("loc", "scale")),
+    "TruncatedNormal": (_normal, ("loc", "scale")),
+    "HalfNormal": (_half_normal, ("scale",)),
+    "LogNormal": (_log_normal, ("median", "sigma")),
+    "Uniform": (_uniform, ("low", "high")),
+    "LogUniform": (_log_uniform, ("low", "high")),
+}
+
+
+def prior_from_table(spec: ParameterSpec, table: Mapping[str, Any], *, where: str) -> dist.Distribution:
+    """Build the prior of one parameter.
+
+    Normal, HalfNormal and LogNormal priors are truncated to the hard bounds; Uniform and LogUniform ranges must lie
+    inside them.
+
+    Args:
+        spec: the parameter, with its unit and bounds.
+        table: ``distribution`` and its arguments in the parameter's unit; LogNormal takes ``median`` and ``sigma``
+            (standard deviation of the logarithm).
+
+    Raises:
+        InputError: unknown distribution or argument, a scale that is not positive, or a prior outside the bounds.
+    """
+    arguments = dict(table)
+    family = arguments.pop("distribution", None)
+    if family not in _FAMILIES:
+        raise InputError(f"unknown distribution {family!r}", where=where, remedy=nearest(str(family), _FAMILIES))
+    build, names = _FAMILIES[family]
+    for name in arguments:
+        if name not in names:
+            raise InputError(f"{family} takes no argument {name!r}", where=where, remedy=nearest(name, names))
+    missing = [name for name in names if name not in arguments]
+    if missing:
+        raise InputError(f"{family} lacks {', '.join(missing)}", where=where, remedy=f"it takes {', '.join(names)}")
+    numbers = {name: _number(name, arguments[name], where) for name in names}
+    _check_inside(spec, family, numbers, where)
+    return build(spec, **numbers)
+
+
+def _number(name: str, value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{name} = {value!r} is not a finite number", where=where, remedy="give a number")
+    if name in ("scale", "sigma", "median") and value <= 0:
+        raise InputError(f"{name} = {value:g} is not positive", where=where, remedy="give a positive number")
+    return float(value)
+
+
+def _check_inside(spec: ParameterSpec, family: str, numbers: Mapping[str, float], where: str) -> None:
+    """A range must lie inside the hard bounds; a bell must have at least half of its mass there."""
+    bounds = f"the hard bounds of {spec.name} are [{spec.low:g}, {spec.high:g}] {spec.unit}"
+    if family in ("Uniform", "LogUniform"):
+        low, high = numbers["low"], numbers["high"]
+        if low >= high:
+            raise InputError(f"low = {low:g} is not below high = {high:g}", where=where, remedy="swap them")
+        if low < spec.low or high > spec.high or (family == "LogUniform" and low <= 0):
+            raise InputError(f"the prior [{low:g}, {high:g}] reaches outside the bounds", where=where, remedy=bounds)
+        return
+    if family == "HalfNormal":
+        inside = 2 * (stats.norm.cdf(spec.high / numbers["scale"]) - stats.norm.cdf(max(0.0, spec.low) / numbers["scale"]))
+    elif family == "LogNormal":
+        bell = stats.lognorm(numbers["sigma"], scale=numbers["median"])
+        inside = bell.cdf(spec.high) - bell.cdf(max(spec.low, 0.0))
+    else:
+        bell = stats.norm(numbers["loc"], numbers["scale"])
+        inside = bell.cdf(spec.high) - bell.cdf(spec.low)
+    if inside < 0.5:
+        raise InputError(f"only {100 * inside:.0f} % of the prior lies within the bounds", where=where, remedy=bounds)

@@ -1,0 +1,132 @@
+"""The parameters that are inferred: each with its name, unit, bounds, prior, and the recordings it belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpyro.distributions as dist
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from rfdropo_bayes.bayes.priors import prior_from_table
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
+
+SEPARATOR = "@"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One inferred parameter.
+
+    Attributes:
+        spec: name, unit, hard bounds and meaning of the physical parameter.
+        prior: numpyro distribution, in the parameter's unit, within its hard bounds.
+        recording: name of the only recording it belongs to; empty if all share it.
+        table: the prior as it was written, for the record.
+    """
+
+    spec: ParameterSpec
+    prior: dist.Distribution
+    recording: str = ""
+    table: Mapping[str, Any] | None = None
+
+    @property
+    def name(self) -> str:
+        """Name in posteriors: ``young_modulus``, or ``offset_x@AKLWI_1`` for a parameter of one recording."""
+        return f"{self.spec.name}{SEPARATOR}{self.recording}" if self.recording else self.spec.name
+
+    @cached_property
+    def transform(self) -> dist.transforms.Transform:
+        """Bijection from the real line to the support of the prior."""
+        return dist.biject_to(self.prior.support)
+
+
+@dataclass(frozen=True)
+class ParameterSpace:
+    """The inferred parameters, and how a set of their values becomes the parameters of one recording's rollout."""
+
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names, in sampling order."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    def __getitem__(self, name: str) -> Parameter:
+        return self.parameters[self.names.index(name)]
+
+    def for_recording(self, values: Mapping[str, Float[Array, "..."]], recording: str) -> dict[str, Float[Array, "..."]]:
+        """The physical parameters that hold for one recording, under their physical names."""
+        chosen = {p.spec.name: values[p.name] for p in self.parameters if not p.recording}
+        chosen |= {p.spec.name: values[p.name] for p in self.parameters if p.recording == recording}
+        return chosen
+
+    def sample(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
+        """Independent draws from the prior, one array of length n per parameter."""
+        keys = jax.random.split(key, len(self.parameters))
+        return {p.name: p.prior.sample(k, (n,)) for p, k in zip(self.parameters, keys, strict=True)}
+
+    def log_prior(self, values: Mapping[str, Float[Array, "..."]]) -> Float[Array, "..."]:
+        """Log density of the prior in physical units."""
+        return sum(p.prior.log_prob(values[p.name]) for p in self.parameters)
+
+    def to_unconstrained(self, values: Mapping[str, Float[Array, "..."]]) -> Float[Array, "... d"]:
+        """Map values to the real line, parameter by parameter in the order of ``names``."""
+        return jnp.stack([p.transform.inv(jnp.asarray(values[p.name])) for p in self.parameters], axis=-1)
+
+    def from_unconstrained(self, u: Float[Array, "... d"]) -> dict[str, Float[Array, "..."]]:
+        """Inverse of `to_unconstrained`."""
+        return {p.name: p.transform(u[..., i]) for i, p in enumerate(self.parameters)}
+
+    def log_prior_unconstrained(self, u: Float[Array, "... d"]) -> Float[Array, "..."]:
+        """Log density of the prior in unconstrained coordinates, with the Jacobian."""
+        total = jnp.zeros(u.shape[:-1])
+        for i, p in enumerate(self.parameters):
+            value = p.transform(u[..., i])
+            total += p.prior.log_prob(value) + p.transform.log_abs_det_jacobian(u[..., i], value)
+        return total
+
+
+def build_space(
+    specs: Sequence[ParameterSpec],
+    priors: Mapping[str, Any],
+    per_recording: Mapping[str, Sequence[str]],
+    recordings: Sequence[str],
+    *,
+    where: str = "[model.priors]",
+) -> ParameterSpace:
+    """Join specifications and prior tables.
+
+    Args:
+        specs: every parameter of the model.
+        priors: which are inferred, and their prior tables; a number instead of a table fixes nothing here (the caller
+            has taken fixed values out), ``{}`` asks for the default prior.
+        per_recording: parameters that are free in the named recordings only.
+        recordings: names of all recordings.
+
+    Raises:
+        InputError: an unknown name, an unusable prior, or nothing to infer.
+    """
+    by_name = {spec.name: spec for spec in specs}
+    check_names(list(priors) + list(per_recording), specs, where=where)
+    parameters: list[Parameter] = []
+    for name, table in priors.items():
+        spec = by_name[name]
+        chosen = dict(table) if table else dict(spec.prior)
+        prior = prior_from_table(spec, chosen, where=f"{where} {name}")
+        for recording in per_recording.get(name, ("",)):
+            if recording and recording not in recordings:
+                raise InputError(
+                    f"{name} is per recording, but no recording is called {recording!r}",
+                    where="[model.per_recording]",
+                    remedy=f"recordings: {', '.join(recordings)}",
+                )
+            parameters.append(Parameter(spec, prior, recording, chosen))
+    if not parameters:
+        raise InputError("no parameter has a prior", where=where, remedy="give at least one")
+    return ParameterSpace(tuple(parameters))
