@@ -1,0 +1,169 @@
+"""The experiment file: one TOML that names robot, data, priors, mechanisms, method, budget and seed."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from rfdropo_bayes.data import DataSpec
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.tables import parse_table
+
+
+class Table(BaseModel):
+    """A table of the experiment file: unknown keys are errors, values do not change once read."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ModelTable(Table):
+    """[model]: what is added to the robot's base simulator, and what is inferred.
+
+    ``priors`` maps parameter names to prior tables (``{}`` asks for the default prior); ``fixed`` sets the values of
+    parameters that are not inferred; ``per_recording`` frees a parameter in the named recordings (``"all"``, or names
+    with wildcards) instead of sharing it.
+    """
+
+    mechanisms: list[str] = Field(default_factory=list)
+    noise: Literal["white", "ar1"] = "white"
+    priors: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    fixed: dict[str, float] = Field(default_factory=dict)
+    per_recording: dict[str, str | list[str]] = Field(default_factory=dict)
+
+
+class SimulatorTable(Table):
+    """[simulator]: engine and discretisation; what is left out is the robot's own."""
+
+    engine: Literal["auto", "jax", "numba"] = "auto"
+    precision: Literal["float64", "float32"] = "float64"
+    time_step: float | None = Field(default=None, gt=0.0, le=0.1)
+    nodes_across: Literal[2, 3] = 2
+    refine: int = Field(default=1, ge=1, le=16)
+    threads: int | None = Field(default=None, ge=1)
+
+
+class InferenceTable(BaseModel):
+    """[inference]: method and budget; the method's own options are checked by the method."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    method: str = "smc"
+    rollouts: int = Field(default=20000, ge=1)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of the method, without the name and the budget."""
+        return dict(self.model_extra or {})
+
+
+class CommandsTable(Table):
+    """[commands]: a random command sequence to simulate, where no recording is replayed.
+
+    Every ``interval`` seconds one channel, chosen at random, moves by ``step`` (in the robot's command unit) up or
+    down, within ``[low, high]``; the state is observed every ``sample_time`` seconds.
+    """
+
+    duration: float = Field(gt=0.0)
+    interval: float = Field(gt=0.0)
+    step: float = Field(gt=0.0)
+    low: float
+    high: float
+    sample_time: float = Field(gt=0.0)
+    recordings: list[str] = Field(min_length=1)
+
+
+class NoiseTable(Table):
+    """[noise]: added to simulated marker positions; ``standard_deviation`` in metres per coordinate."""
+
+    standard_deviation: float = Field(ge=0.0)
+    correlation_time: float | None = Field(default=None, gt=0.0)
+
+
+class Experiment(Table):
+    """An experiment as read from its file; see `load_experiment`."""
+
+    robot: str
+    seed: int = 0
+    title: str = ""
+    data: DataSpec | None = None
+    commands: CommandsTable | None = None
+    noise: NoiseTable | None = None
+    model: ModelTable = Field(default_factory=ModelTable)
+    simulator: SimulatorTable = Field(default_factory=SimulatorTable)
+    inference: InferenceTable = Field(default_factory=InferenceTable)
+
+
+def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experiment, dict[str, Any]]:
+    """Read an experiment file.
+
+    Args:
+        path: the TOML file.
+        overrides: assignments ``table.key=value`` (value in TOML syntax) that replace entries of the file.
+
+    Returns:
+        the experiment, and its tables as they were read with the overrides in place, for the record.
+
+    Raises:
+        InputError: no such file, not TOML, an unknown key or a value of the wrong type.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not text"
+        raise InputError(f"cannot read the experiment file: {reason}", where=str(path), remedy="check the path") from None
+    try:
+        tables = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"not valid TOML: {error}", where=str(path), remedy="mend the syntax there") from None
+    for assignment in overrides:
+        override(tables, assignment)
+    return parse_table(Experiment, tables, where=str(path)), tables
+
+
+def override(tables: dict[str, Any], assignment: str) -> None:
+    """Apply one ``table.key=value`` to nested tables in place."""
+    name, equals, text = assignment.partition("=")
+    keys = [key.strip() for key in name.split(".")]
+    if not equals or not all(keys):
+        raise InputError(f"{assignment!r} is not of the form table.key=value", where="--set", remedy="e.g. seed=1")
+    table: Any = tables
+    for key in keys[:-1]:
+        table = table.setdefault(key, {})
+        if not isinstance(table, dict):
+            raise InputError(f"{key!r} in {name!r} is not a table", where="--set", remedy="check the key")
+    table[keys[-1]] = _toml_value(text.strip())
+
+
+def _toml_value(text: str) -> Any:
+    """A value in TOML syntax; a bare word is taken as a string, so that names need no quotes on a command line."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def matching(names: Sequence[str], patterns: str | Sequence[str], *, where: str) -> list[str]:
+    """Recordings that ``"all"``, a name or a wildcard pattern stand for; InputError if one stands for none."""
+    from fnmatch import fnmatchcase
+
+    if patterns == "all":
+        return list(names)
+    chosen: list[str] = []
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        found = [name for name in names if fnmatchcase(name, pattern)]
+        if not found:
+            raise InputError(f"no recording matches {pattern!r}", where=where, remedy=f"recordings: {', '.join(names)}")
+        chosen += [name for name in found if name not in chosen]
+    return chosen
+
+
+def describe(tables: Mapping[str, Any]) -> str:
+    """The tables as TOML text, for config.toml in the run folder."""
+    import tomli_w
+
+    return tomli_w.dumps(dict(tables))
