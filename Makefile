@@ -1,0 +1,59 @@
+# Every target sets up what it needs, once, in $(VENV). Needs Python 3.11 or newer and make, nothing else.
+
+VENV   ?= .venv
+# The first interpreter found that is new enough; say `make PYTHON=/path/to/python3.11` to choose another.
+PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3 python; do \
+	"$$name" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$name" && break; done)
+BIN     = $(VENV)/bin
+PIP     = $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+PYTEST  = $(BIN)/python -m pytest
+CORE    = $(VENV)/core.stamp
+DEV     = $(VENV)/dev.stamp
+
+# Two BLAS threads that fight over small blocks make a solve fifty times slower.
+export OPENBLAS_NUM_THREADS = 1
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-all lint format notebooks clean
+
+help: ## this list
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-16s%s\n", $$1, $$2 }'
+
+demo: $(CORE) ## calibrate the bundled example and write its report (minutes)
+	$(BIN)/rfdropo calibrate experiments/demo.toml --out reports/demo
+	@echo "The report: reports/demo/report.html"
+
+test: $(DEV) ## the tests that are not slow
+	$(PYTEST) -n 2 -m "not slow and not notebook"
+
+test-all: $(DEV) ## every test, the slow ones and the notebooks too
+	$(PYTEST) -n 2
+
+lint: $(DEV) ## ruff, its formatter, and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(DEV) ## let ruff mend what it can
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+notebooks: $(DEV) ## run every notebook from top to bottom
+	$(PYTEST) -m notebook
+
+clean: ## remove the environment and what the tools cached; reports stay
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	find rfdropo_bayes tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@test -n "$(PYTHON)" || { echo "rfdropo_bayes needs Python 3.11 or newer; none found. Install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 2; }
+	@echo "Setting up $(VENV) with $$($(PYTHON) --version) (once; a few minutes)"
+	$(PYTHON) -m venv $(VENV)
+
+$(CORE): pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) --editable .
+	@touch $@
+
+$(DEV): $(CORE)
+	$(PIP) --editable '.[dev]'
+	@touch $@

@@ -1,0 +1,151 @@
+"""The house rules that a machine can check: who imports whom, and how long a module or a function may be."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+PACKAGE = REPOSITORY / "rfdropo_bayes"
+
+FOUNDATION = {"errors", "runtime", "tables"}  # modules at the bottom, open to every room
+
+# From the ground up; docs/architecture.md says why. A room may import these, the foundation and the standard library.
+MAY_IMPORT: dict[str, set[str]] = {
+    "data": set(),
+    "posteriors": set(),
+    "robots": set(),
+    "fem": set(),
+    "simulators": {"robots", "fem"},
+    "mechanisms": {"robots", "fem", "simulators"},
+    "bayes": {"data", "posteriors", "robots", "simulators", "mechanisms"},
+    "inference": {"posteriors", "bayes"},
+    "audit": {"data", "posteriors", "simulators", "mechanisms", "bayes", "inference"},
+    "report": {"data", "posteriors", "bayes", "inference", "audit"},
+    "envs": {"posteriors", "robots", "simulators", "mechanisms"},
+    "training": {"posteriors", "envs"},
+    "deployment": {"data", "robots"},
+}
+MAY_IMPORT["workflow"] = set(MAY_IMPORT) - {"envs", "training", "deployment"}
+MAY_IMPORT["cli"] = set(MAY_IMPORT)
+
+WITHOUT_JAX = {"data", "posteriors", "robots", "deployment"}  # read recordings and drive motors on a small computer
+JAX_FAMILY = {"jax", "jaxlib", "numpyro", "blackjax"}
+
+MODULE_LINES, FUNCTION_LINES = 400, 60
+MODULE_LINES_EVER, FUNCTION_LINES_EVER = 450, 80
+# Longer than the rule, for the reason given: "room/module.py" or "room/module.py:function".
+LONGER_FOR_A_REASON: dict[str, str] = {}
+NAMELESS = re.compile(r"(^|_)(utils?|utilities|helpers?|managers?|magic|misc|common|stuff)(_|$)")
+
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+def relative(path: Path) -> str:
+    return path.relative_to(PACKAGE).as_posix()
+
+
+def room_of(path: Path) -> str:
+    """First part of a module's path inside the package: a room, or a module of the foundation."""
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def imported_modules(source: str, package: list[str]) -> set[str]:
+    """Dotted names a module imports, wherever the statement stands; relative imports are resolved in ``package``."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            origin = ".".join([*base, *([node.module] if node.module else [])])
+            if origin == "rfdropo_bayes":  # `from rfdropo_bayes import fem` imports the room fem
+                names.update(f"{origin}.{alias.name}" for alias in node.names)
+            else:
+                names.add(origin)
+    return names
+
+
+def imports_of(path: Path) -> set[str]:
+    package = ["rfdropo_bayes", *path.relative_to(PACKAGE).parts[:-1]]
+    return imported_modules(path.read_text(), package)
+
+
+def forbidden_rooms(room: str, imported: set[str]) -> set[str]:
+    """Rooms among the imported modules that ``room`` may not know."""
+    rooms = {name.split(".")[1] for name in imported if name.startswith("rfdropo_bayes.")}
+    return rooms - MAY_IMPORT.get(room, set()) - FOUNDATION - {room, "__version__"}
+
+
+def test_the_table_goes_downwards_only() -> None:
+    """Every room's permissions are rooms listed before it, so the imports cannot form a circle."""
+    seen: set[str] = set()
+    for room, allowed in MAY_IMPORT.items():
+        assert allowed <= seen, f"{room} may import {sorted(allowed - seen)}, which come after it"
+        seen.add(room)
+
+
+def test_every_room_is_in_the_table() -> None:
+    known = set(MAY_IMPORT) | FOUNDATION | {"__init__", "__main__"}
+    assert {room_of(path) for path in MODULES} <= known
+
+
+def test_the_parser_sees_every_way_to_import() -> None:
+    source = (
+        "import rfdropo_bayes.fem.layered\nfrom rfdropo_bayes import audit\nfrom . import cables\n"
+        "from ..data import Trajectory\nfrom .. import report\ndef late():\n    from rfdropo_bayes.cli import main\n"
+    )
+    imported = imported_modules(source, ["rfdropo_bayes", "robots"])
+    assert forbidden_rooms("robots", imported) == {"fem", "audit", "data", "report", "cli"}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=relative)
+def test_imports_go_downwards(path: Path) -> None:
+    above = forbidden_rooms(room_of(path), imports_of(path))
+    assert not above, f"{relative(path)} imports {sorted(above)}; see the table in docs/architecture.md"
+
+
+@pytest.mark.parametrize("path", [path for path in MODULES if room_of(path) in WITHOUT_JAX], ids=relative)
+def test_rooms_that_touch_hardware_and_files_do_not_import_jax(path: Path) -> None:
+    assert not {name.split(".")[0] for name in imports_of(path)} & JAX_FAMILY
+
+
+@pytest.mark.parametrize("room", sorted(WITHOUT_JAX & {room_of(path) for path in MODULES}))
+def test_nothing_they_import_loads_jax(room: str) -> None:
+    program = f"import sys, rfdropo_bayes.{room}; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], cwd=REPOSITORY, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("path", [path for path in MODULES if room_of(path) != "posteriors"], ids=relative)
+def test_one_room_knows_arviz(path: Path) -> None:
+    """ArviZ is being rewritten: what depends on its version stays behind `posteriors`."""
+    assert "arviz" not in {name.split(".")[0] for name in imports_of(path)}
+
+
+def lengths(path: Path) -> dict[str, int]:
+    """Lines of a module and of each of its functions, docstrings included, by the names of LONGER_FOR_A_REASON."""
+    text = path.read_text()
+    found = {relative(path): text.count("\n")}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            found[f"{relative(path)}:{node.name}"] = (node.end_lineno or node.lineno) - node.lineno + 1
+    return found
+
+
+@pytest.mark.parametrize("path", MODULES, ids=relative)
+def test_modules_and_functions_are_short(path: Path) -> None:
+    for name, lines in lengths(path).items():
+        rule, ever = (FUNCTION_LINES, FUNCTION_LINES_EVER) if ":" in name else (MODULE_LINES, MODULE_LINES_EVER)
+        limit = ever if name in LONGER_FOR_A_REASON else rule
+        assert lines <= limit, f"{name}: {lines} lines, at most {limit}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=relative)
+def test_module_names_are_nouns_of_the_field(path: Path) -> None:
+    for part in path.relative_to(PACKAGE).with_suffix("").parts:
+        assert not NAMELESS.search(part), f"{relative(path)}: name it after what it holds"
