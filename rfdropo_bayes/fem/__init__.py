@@ -1,0 +1,2 @@
+from rfdropo_bayes.runtime import configure_jax
+configure_jax()

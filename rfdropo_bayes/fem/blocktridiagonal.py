@@ -1,0 +1,99 @@
+"""Symmetric positive definite block-tridiagonal systems: factor once, solve for many right-hand sides.
+
+Block elimination along the axis. The pivot blocks are inverted explicitly by symmetric sweeps over their 3 x 3 diagonal blocks,
+which are plain array operations over a batch; a LAPACK call for each small block would cost more than its arithmetic.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.fem.hexahedron import cofactor
+
+
+class BlockTridiagonal(NamedTuple):
+    """Symmetric matrix with blocks on the diagonal and below it; ``lower[i]`` couples row i + 1 to column i."""
+
+    diagonal: Float[Array, "stations b b"]
+    lower: Float[Array, "stations_1 b b"]
+
+
+class BlockFactor(NamedTuple):
+    """Inverse pivots D^-1 and multipliers L of A = (1 + L) D (1 + L)'; ``multiplier[0]`` is zero."""
+
+    inverse: Float[Array, "stations b b"]
+    multiplier: Float[Array, "stations b b"]
+
+
+def multiply(matrix: BlockTridiagonal, vector: Float[Array, "stations b k"]) -> Float[Array, "stations b k"]:
+    """Matrix times k vectors."""
+    result = matrix.diagonal @ vector
+    result = result.at[1:].add(matrix.lower @ vector[:-1])
+    return result.at[:-1].add(jnp.swapaxes(matrix.lower, -1, -2) @ vector[1:])
+
+
+def invert(block: Float[Array, "b b"]) -> Float[Array, "b b"]:
+    """Inverse of a symmetric positive definite block whose size is a multiple of three (Gauss-Jordan by 3 x 3 pivots)."""
+    size = block.shape[-1]
+    for first in range(0, size, 3):
+        rows = slice(first, first + 3)
+        pivot = block[rows, rows]
+        adjugate = cofactor(pivot).T
+        inverse = adjugate / jnp.dot(pivot[0], adjugate[:, 0])
+        row = (inverse @ block[rows, :]).at[:, rows].set(inverse)
+        column = block[:, rows].at[rows].set(0.0)
+        block = (block.at[:, rows].set(0.0) - column @ row).at[rows, :].set(row)
+    return block
+
+
+def factor(matrix: BlockTridiagonal) -> BlockFactor:
+    """Eliminate from the first station to the last."""
+
+    def eliminate(previous_inverse, blocks):
+        diagonal, lower = blocks
+        multiplier = lower @ previous_inverse
+        inverse = invert(diagonal - multiplier @ lower.T)
+        return inverse, (inverse, multiplier)
+
+    lower = jnp.concatenate([jnp.zeros_like(matrix.diagonal[:1]), matrix.lower])
+    _, (inverse, multiplier) = lax.scan(eliminate, jnp.zeros_like(lower[0]), (matrix.diagonal, lower))
+    return BlockFactor(inverse, multiplier)
+
+
+def substitute(factored: BlockFactor, right: Float[Array, "stations b k"]) -> Float[Array, "stations b k"]:
+    """Solve with a factor for k right-hand sides."""
+
+    def forward(previous, blocks):
+        multiplier, values = blocks
+        values = values - multiplier @ previous
+        return values, values
+
+    def backward(following, blocks):
+        multiplier, values = blocks
+        values = values - following
+        return multiplier.T @ values, values
+
+    start = jnp.zeros_like(right[0])
+    _, reduced = lax.scan(forward, start, (factored.multiplier, right))
+    _, solution = lax.scan(backward, start, (factored.multiplier, factored.inverse @ reduced), reverse=True)
+    return solution
+
+
+def solve(matrix: BlockTridiagonal, right: Float[Array, "stations b k"]) -> Float[Array, "stations b k"]:
+    """Solution X of A X = B for k right-hand sides.
+
+    Derivatives go through the solution and not through the elimination: a tangent or a cotangent costs one substitution with
+    the factor that is there already.
+    """
+    factored = factor(jax.tree.map(lax.stop_gradient, matrix))
+    return lax.custom_linear_solve(
+        lambda vector: multiply(matrix, vector),
+        right,
+        solve=lambda _, values: substitute(factored, values),
+        symmetric=True,
+    )

@@ -1,0 +1,168 @@
+"""Cholesky factorisation of symmetric 3 x 3-block matrices of one static pattern, many matrices side by side in SIMD lanes.
+
+The pattern is analysed once: fill-reducing order (multiple minimum degree, from SuperLU through SciPy), elimination tree, fill, and for
+every block of the factor the list of products it receives. The factorisation then runs over these lists, column by column
+("left-looking": George and Liu 1981, Computer Solution of Large Sparse Positive Definite Systems, ch. 5).
+
+Right-hand sides ride along as dense rows below the matrix. The factorisation turns each row b' into (L^-1 b)', which is the forward
+substitution; products of these rows are b_i' A^-1 b_j, the condensed matrix that cables and contacts need.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Bool, Int
+from scipy.sparse.linalg import splu
+
+from rfdropo_bayes.fem.native.simd import fill, load, square_root, store
+
+
+class BlockPattern(NamedTuple):
+    """Static structure of a factor with ``n`` columns and ``border`` dense block rows below them.
+
+    Column j holds the blocks ``first[j]:first[j + 1]``: rows in increasing order, the border rows last. Block t is row
+    ``row[t]``; it receives the products ``source[k, 0] source[k, 1]'`` for k in ``product[t]:product[t + 1]``. The pivot of
+    column j receives ``own[k] own[k]'`` for k in ``own_first[j]:own_first[j + 1]``.
+    """
+
+    first: Int[np.ndarray, " n_1"]
+    row: Int[np.ndarray, " blocks"]
+    product: Int[np.ndarray, " blocks_1"]
+    source: Int[np.ndarray, "products 2"]
+    own_first: Int[np.ndarray, " n_1"]
+    own: Int[np.ndarray, " own_products"]
+    border: int
+
+
+def elimination_order(adjacency: sparse.csr_matrix) -> Int[np.ndarray, " n"]:
+    """Order that keeps the fill small: minimum degree, then a postorder, which keeps what is used together close in memory."""
+    count = adjacency.shape[0]
+    degree = np.asarray(np.abs(adjacency).sum(axis=1)).ravel()
+    dominant = (sparse.diags(degree + 1.0) - adjacency).tocsc()
+    order = np.argsort(splu(dominant, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).perm_c, kind="stable")
+    parent = _parents(_columns(adjacency[order][:, order].tocsr()))
+    children: list[list[int]] = [[] for _ in range(count + 1)]
+    for node, above in enumerate(parent):
+        children[above].append(node)
+    postorder, stack = [], [count]
+    while stack:  # preorder with children reversed, read backwards, is a postorder
+        node = stack.pop()
+        postorder.append(node)
+        stack.extend(children[node])
+    return order[np.array(postorder[:0:-1], dtype=int)]
+
+
+def _columns(matrix: sparse.csr_matrix) -> list[set[int]]:
+    """Rows of the factor below the diagonal, column by column: fill passes from a column to its parent."""
+    columns = [
+        {int(row) for row in matrix.indices[matrix.indptr[j] : matrix.indptr[j + 1]] if row > j} for j in range(matrix.shape[0])
+    ]
+    for rows in columns:
+        if rows:
+            above = min(rows)
+            columns[above] |= rows - {above}
+    return columns
+
+
+def _parents(columns: list[set[int]]) -> list[int]:
+    """Elimination tree; the root's parent is the number of columns."""
+    return [min(rows) if rows else len(columns) for rows in columns]
+
+
+def analyse(adjacency: sparse.csr_matrix, border: int) -> BlockPattern:
+    """Pattern of the factor of a matrix that is already in elimination order, with ``border`` dense block rows."""
+    count = adjacency.shape[0]
+    rows = [sorted(column) + list(range(count, count + border)) for column in _columns(adjacency.tocsr())]
+    first = np.concatenate([[0], np.cumsum([len(column) for column in rows])]).astype(np.int32)
+    place = [{row: int(first[j]) + k for k, row in enumerate(column)} for j, column in enumerate(rows)]
+    products: list[list[tuple[int, int]]] = [[] for _ in range(first[-1])]
+    own: list[list[int]] = [[] for _ in range(count)]
+    for k, column in enumerate(rows):
+        for b, lower in enumerate(column):
+            if lower >= count:
+                break  # products of border rows form the condensed matrix, which is summed apart
+            own[lower].append(int(first[k]) + b)
+            for a in range(b + 1, len(column)):
+                products[place[lower][column[a]]].append((int(first[k]) + a, int(first[k]) + b))
+    return BlockPattern(
+        first,
+        np.concatenate([np.array(column, dtype=np.int32) for column in rows]),
+        np.concatenate([[0], np.cumsum([len(items) for items in products])]).astype(np.int32),
+        np.array([pair for items in products for pair in items], dtype=np.int32).reshape(-1, 2),
+        np.concatenate([[0], np.cumsum([len(items) for items in own])]).astype(np.int32),
+        np.array([item for items in own for item in items], dtype=np.int32),
+        border,
+    )
+
+
+def block_slot(pattern: BlockPattern, row: int, column: int) -> int:
+    """Index of the block (row, column), row > column."""
+    first, last = pattern.first[column], pattern.first[column + 1]
+    return int(first + np.searchsorted(pattern.row[first:last], row))
+
+
+@numba.njit(inline="always")
+def _invert_pivot(pivot, j, token):
+    """Replace the lower triangle (00, 10, 11, 20, 21, 22) of a pivot by the inverse of its Cholesky factor, and return it."""
+    one = fill(1.0, pivot, token)
+    i00 = one / square_root(load(pivot, j, token))
+    l10 = load(pivot, j + 1, token) * i00
+    l20 = load(pivot, j + 3, token) * i00
+    i11 = one / square_root(load(pivot, j + 2, token) - l10 * l10)
+    l21 = (load(pivot, j + 4, token) - l20 * l10) * i11
+    i22 = one / square_root(load(pivot, j + 5, token) - l20 * l20 - l21 * l21)
+    i10 = -(l10 * i00 * i11)
+    i21 = -(l21 * i11 * i22)
+    i20 = -((l20 * i00 + l21 * i10) * i22)
+    store(pivot, j, i00)
+    store(pivot, j + 1, i10)
+    store(pivot, j + 2, i11)
+    store(pivot, j + 3, i20)
+    store(pivot, j + 4, i21)
+    store(pivot, j + 5, i22)
+    return i00, i10, i11, i20, i21, i22
+
+
+@numba.njit(inline="always")
+def _update_pivot(pivot, j, lower, pattern, column, token):
+    """Subtract from a pivot the products of the blocks to its left."""
+    p00, p10, p11 = load(pivot, j, token), load(pivot, j + 1, token), load(pivot, j + 2, token)
+    p20, p21, p22 = load(pivot, j + 3, token), load(pivot, j + 4, token), load(pivot, j + 5, token)
+    for k in range(pattern.own_first[column], pattern.own_first[column + 1]):
+        block = 9 * pattern.own[k]
+        for m in range(3):
+            a, b, c = load(lower, block + m, token), load(lower, block + 3 + m, token), load(lower, block + 6 + m, token)
+            p00 = p00 - a * a
+            p10 = p10 - b * a
+            p11 = p11 - b * b
+            p20 = p20 - c * a
+            p21 = p21 - c * b
+            p22 = p22 - c * c
+    store(pivot, j, p00)
+    store(pivot, j + 1, p10)
+    store(pivot, j + 2, p11)
+    store(pivot, j + 3, p20)
+    store(pivot, j + 4, p21)
+    store(pivot, j + 5, p22)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def factor(pattern, pivot, lower, token):
+    """Factorise in place: ``lower`` (9 blocks, lanes) becomes L, ``pivot`` (6 n, lanes) the inverses of its diagonal blocks."""
+    for column in range(len(pattern.first) - 1):
+        _update_pivot(pivot, 6 * column, lower, pattern, column, token)
+        i00, i10, i11, i20, i21, i22 = _invert_pivot(pivot, 6 * column, token)
+        for block in range(pattern.first[column], pattern.first[column + 1]):
+            t = 9 * block
+            a00, a01, a02 = load(lower, t, token), load(lower, t + 1, token), load(lower, t + 2, token)
+            a10, a11, a12 = load(lower, t + 3, token), load(lower, t + 4, token), load(lower, t + 5, token)
+            a20, a21, a22 = load(lower, t + 6, token), load(lower, t + 7, token), load(lower, t + 8, token)
+            for k in range(pattern.product[block], pattern.product[block + 1]):
+                left, right = 9 * pattern.source[k, 0], 9 * pattern.source[k, 1]
+                for m in range(3):
+                    x, y, z = load(right, m, token), load(right, m, token), load(right, m, token)
+            store(lower, t, a00)

@@ -1,0 +1,221 @@
+"""A vector of lanes as a value inside compiled kernels: one lane is one sample, and lanes never mix.
+
+A `Simd` value is an LLVM vector of 32- or 64-bit floats. The arithmetic operators act lane by lane; a plain number met on the way
+fills all lanes. Multiplications and additions may contract to fused multiply-add, nothing else is reordered, so that a lane's
+result does not depend on its neighbours or on its place.
+
+Kernels keep their data in C-contiguous arrays ``(n, lanes)`` and move rows with `load` and `store`. How many lanes there are must be
+known to the compiler: kernels take it as the tuple made by `lane_token`, whose length is part of its type.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import llvmlite.binding as llvm
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import (
+    intrinsic,
+    lower_builtin,
+    lower_cast,
+    models,
+    register_model,
+)
+
+ALIGNMENT = 64
+"""Bytes to which work arrays are aligned: one cache line, and the widest vector register."""
+CONTRACT = ("contract",)
+"""Fast-math flags of every operation: contraction to fused multiply-add only."""
+
+
+class SimdType(types.Type):
+    """Numba type of ``lanes`` floats of one width."""
+
+    def __init__(self, dtype: types.Float, lanes: int) -> None:
+        self.dtype, self.lanes = dtype, lanes
+        super().__init__(name=f"Simd({dtype}, {lanes})")
+
+
+@register_model(SimdType)
+class SimdModel(models.PrimitiveModel):
+    """A `SimdType` is held in one LLVM vector."""
+
+    def __init__(self, data_model_manager, front_type: SimdType) -> None:
+        super().__init__(data_model_manager, front_type, vector_type(front_type))
+
+
+def vector_type(simd: SimdType) -> ir.VectorType:
+    """LLVM type of a `SimdType`."""
+    return ir.VectorType(ir.DoubleType() if simd.dtype.bitwidth == 64 else ir.FloatType(), simd.lanes)
+
+
+def native_lanes(dtype: Any) -> int:
+    """Lanes of ``dtype`` in this machine's widest vector register (at least 16 bytes, as on any 64-bit machine)."""
+    features = llvm.get_host_cpu_features()
+    width = 64 if features.get("avx512f") else 32 if features.get("avx") else 16
+    return width // np.dtype(dtype).itemsize
+
+
+def lane_token(lanes: int) -> tuple[int, ...]:
+    """The argument that tells a kernel its number of lanes at compile time."""
+    return (0,) * lanes
+
+
+def aligned_zeros(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """Zeros whose first element lies on a boundary of `ALIGNMENT` bytes."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    raw = np.zeros(size + ALIGNMENT, dtype=np.uint8)
+    first = -raw.ctypes.data % ALIGNMENT
+    return raw[first : first + size].view(dtype).reshape(shape)
+
+
+def _pointer(context, builder, array_type, array, row, simd: SimdType):
+    """Address of row ``row`` of an array ``(n, lanes)``."""
+    data = context.make_array(array_type)(context, builder, array).data
+    offset = builder.mul(row, ir.Constant(row.type, simd.lanes))
+    return builder.bitcast(builder.gep(data, [offset]), vector_type(simd).as_pointer())
+
+
+@intrinsic
+def load(typing_context, array, row, token):
+    """Row ``row`` of an array ``(n, lanes)`` as a `Simd` value."""
+    simd = SimdType(array.dtype, len(token))
+
+    def generate(context, builder, sig, arguments):
+        index = context.cast(builder, arguments[1], sig.args[1], types.intp)
+        pointer = _pointer(context, builder, sig.args[0], arguments[0], index, simd)
+        return builder.load(pointer, align=simd.dtype.bitwidth // 8)
+
+    return simd(array, row, token), generate
+
+
+@intrinsic
+def store(typing_context, array, row, value):
+    """Write a `Simd` value to row ``row`` of an array ``(n, lanes)``."""
+    if not isinstance(value, SimdType):
+        return None
+
+    def generate(context, builder, sig, arguments):
+        index = context.cast(builder, arguments[1], sig.args[1], types.intp)
+        pointer = _pointer(context, builder, sig.args[0], arguments[0], index, sig.args[2])
+        builder.store(arguments[2], pointer, align=value.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, row, value), generate
+
+
+def _splat(context, builder, number, number_type, simd: SimdType):
+    scalar = context.cast(builder, number, number_type, simd.dtype)
+    empty = ir.Constant(vector_type(simd), ir.Undefined)
+    first = builder.insert_element(empty, scalar, ir.Constant(ir.IntType(32), 0))
+    mask = ir.Constant(ir.VectorType(ir.IntType(32), simd.lanes), [0] * simd.lanes)
+    return builder.shuffle_vector(first, empty, mask)
+
+
+@intrinsic
+def fill(typing_context, number, array, token):
+    """A number in all lanes, in the precision of ``array``."""
+    simd = SimdType(array.dtype, len(token))
+
+    def generate(context, builder, sig, arguments):
+        return _splat(context, builder, arguments[0], sig.args[0], simd)
+
+    return simd(number, array, token), generate
+
+
+def _binary(name: str) -> Callable:
+    def generate(context, builder, sig, arguments):
+        simd = sig.return_type
+        left, right = (
+            value if isinstance(kind, SimdType) else _splat(context, builder, value, kind, simd)
+            for value, kind in zip(arguments, sig.args, strict=True)
+        )
+        return getattr(builder, name)(left, right, flags=CONTRACT)
+
+    return generate
+
+
+for _operator, _name in (
+    (operator.add, "fadd"),
+    (operator.sub, "fsub"),
+    (operator.mul, "fmul"),
+    (operator.truediv, "fdiv"),
+):
+    for _left, _right in ((SimdType, SimdType), (SimdType, types.Number), (types.Number, SimdType)):
+        lower_builtin(_operator, _left, _right)(_binary(_name))
+
+    @infer_global(_operator)
+    class _BinaryTemplate(AbstractTemplate):
+        """Lane-wise arithmetic of two vectors, or of a vector and a number."""
+
+        def generic(self, args, kws):
+            left, right = args
+            if isinstance(left, SimdType) and (left == right or isinstance(right, types.Number)):
+                return signature(left, left, right)
+            if isinstance(right, SimdType) and isinstance(left, types.Number):
+                return signature(right, left, right)
+            return None
+
+
+@lower_builtin(operator.neg, SimdType)
+def _negate(context, builder, sig, arguments):
+    return builder.fneg(arguments[0])
+
+
+@infer_global(operator.neg)
+class _NegateTemplate(AbstractTemplate):
+    """Sign change of every lane."""
+
+    def generic(self, args, kws):
+        return signature(args[0], args[0]) if isinstance(args[0], SimdType) else None
+
+
+@lower_cast(SimdType, SimdType)
+def _cast_same(context, builder, from_type, to_type, value):
+    return value
+
+
+@intrinsic
+def square_root(typing_context, value):
+    """Square root of every lane."""
+    if not isinstance(value, SimdType):
+        return None
+
+    def generate(context, builder, sig, arguments):
+        kind = vector_type(sig.args[0])
+        name = f"llvm.sqrt.v{value.lanes}f{value.dtype.bitwidth}"
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind]), name)
+        return builder.call(function, arguments)
+
+    return value(value), generate
+
+
+@intrinsic
+def where_greater(typing_context, left, right, first, second):
+    """``first`` in the lanes where left > right, ``second`` elsewhere (and where either is not a number)."""
+    if not all(isinstance(kind, SimdType) for kind in (left, right, first, second)):
+        return None
+
+    def generate(context, builder, sig, arguments):
+        return builder.select(builder.fcmp_ordered(">", arguments[0], arguments[1]), arguments[2], arguments[3])
+
+    return first(left, right, first, second), generate
+
+
+@intrinsic
+def any_greater(typing_context, left, right):
+    """True if left > right in any lane."""
+    if not (isinstance(left, SimdType) and left == right):
+        return None
+
+    def generate(context, builder, sig, arguments):
+        bits = builder.fcmp_ordered(">", *arguments)
+        return builder.icmp_unsigned("!=", builder.bitcast(bits, ir.IntType(left.lanes)), ir.Constant(ir.IntType(left.lanes), 0))
+
+    return types.boolean(left, right), generate
