@@ -1,0 +1,21 @@
+"""Robot descriptions: geometry, section profile, cables, markers and parameters, read from TOML and validated."""
+
+from rfdropo_bayes.robots.body import Body, PointMass
+from rfdropo_bayes.robots.cable import Cable, Channels
+from rfdropo_bayes.robots.catalogue import known_robots, load_robot
+from rfdropo_bayes.robots.parameter import Parameter
+from rfdropo_bayes.robots.robot import Command, Marker, PushScene, Robot
+
+__all__ = [
+    "Body",
+    "Cable",
+    "Channels",
+    "Command",
+    "Marker",
+    "Parameter",
+    "PointMass",
+    "PushScene",
+    "Robot",
+    "known_robots",
+    "load_robot",
+]

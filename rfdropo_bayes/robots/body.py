@@ -1,0 +1,98 @@
+"""Geometry of a slender body along z, and the effective section of each of its layers."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, model_validator
+
+from rfdropo_bayes.robots.table import Name, Pair, Positive, Table
+
+
+class PointMass(Table):
+    """A rigid part fixed to the body: its mass [kg] is the parameter of that name; it sits at a station."""
+
+    parameter: Name
+    z_m: float
+
+
+class Body(Table):
+    """A body layered along z, from the clamp (first station) to the tip.
+
+    A layer's section is effective: the profile is what makes the layer's ends move as those of the real body do under
+    unit moments, force and torque, whatever its true shape in between.
+
+    Attributes:
+        station_m: axial coordinates of the S stations; the first is clamped.
+        half_width_m: half widths in x and y at each station of the square that carries the nodes: the outer size of
+            the body, which encloses the cable guides.
+        nodes_across: nodes along a side of that square.
+        axial_area_m2: EA / E of the S - 1 layers.
+        bending_moment_area_m4: EI / E: [integral of x^2, integral of y^2]; the first resists bending in the x-z plane.
+        torsion_constant_m4: GJ / G.
+        mass_area_m2: volume per length.
+        mass_moment_area_m4: rotary inertia per density and length, ordered like ``bending_moment_area_m4``.
+        volume_m3: volume of the whole body, clamped part included: what the trunk mass is divided by.
+        point_masses: rigid parts on top of the body's own mass.
+    """
+
+    station_m: tuple[float, ...] = Field(min_length=2)
+    half_width_m: tuple[Pair, ...]
+    nodes_across: Literal[2, 3] = 2
+    axial_area_m2: tuple[Positive, ...]
+    bending_moment_area_m4: tuple[tuple[Positive, Positive], ...]
+    torsion_constant_m4: tuple[Positive, ...]
+    mass_area_m2: tuple[Positive, ...]
+    mass_moment_area_m4: tuple[tuple[Positive, Positive], ...]
+    volume_m3: Positive
+    point_masses: tuple[PointMass, ...] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Body:
+        layers = len(self.station_m) - 1
+        if np.any(np.diff(self.station_m) <= 0):
+            raise ValueError("station_m does not increase")
+        if len(self.half_width_m) != layers + 1 or np.min(self.half_width_m) <= 0:
+            raise ValueError(f"half_width_m needs one positive pair for each of the {layers + 1} stations")
+        for key in (
+            "axial_area_m2",
+            "bending_moment_area_m4",
+            "torsion_constant_m4",
+            "mass_area_m2",
+            "mass_moment_area_m4",
+        ):
+            if len(getattr(self, key)) != layers:
+                raise ValueError(f"{key} has {len(getattr(self, key))} entries for {layers} layers")
+        for mass in self.point_masses:
+            if np.min(np.abs(np.array(self.station_m) - mass.z_m)) > 1e-6:
+                raise ValueError(f"the point mass {mass.parameter} at z = {mass.z_m:g} m is not at a station")
+        if self.layer_volume() > self.volume_m3 * (1 + 1e-9):
+            raise ValueError(f"volume_m3 = {self.volume_m3:g} is less than the sum of its layers")
+        return self
+
+    def layer_volume(self) -> float:
+        """Volume of all layers [m3]; the rest of ``volume_m3`` is held by the clamp."""
+        return float(np.sum(np.diff(self.station_m) * np.array(self.mass_area_m2)))
+
+    def arrays(self) -> dict[str, np.ndarray | int]:
+        """The fields of a layered body for the finite-element engine, in SI units."""
+        return {
+            "station": np.array(self.station_m),
+            "half_width": np.array(self.half_width_m),
+            "nodes_across": self.nodes_across,
+            "axial_area": np.array(self.axial_area_m2),
+            "bending_moment_area": np.array(self.bending_moment_area_m4),
+            "torsion_constant": np.array(self.torsion_constant_m4),
+            "mass_area": np.array(self.mass_area_m2),
+            "mass_moment_area": np.array(self.mass_moment_area_m4),
+        }
+
+    def point_mass_placement(self) -> tuple[tuple[str, ...], Float[np.ndarray, "station mass"]]:
+        """Names of the point-mass parameters, and the matrix that lumps their values [kg] at the stations."""
+        station = np.array(self.station_m)
+        placement = np.zeros((len(station), len(self.point_masses)))
+        for column, mass in enumerate(self.point_masses):
+            placement[int(np.argmin(np.abs(station - mass.z_m))), column] = 1.0
+        return tuple(mass.parameter for mass in self.point_masses), placement

@@ -1,0 +1,81 @@
+"""Cables through guide points, and the channels that command them."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, model_validator
+
+from rfdropo_bayes.robots.table import Name, Pair, Positive, Table
+
+
+class Cable(Table):
+    """A cable that runs at one azimuth, parallel to the axis or tapering towards it.
+
+    It starts at the anchor, a point fixed to the base, and passes the guides on to the last one, where it ends.
+
+    Attributes:
+        name: unique among the robot's cables.
+        azimuth_deg: from +x towards +y.
+        anchor_z_m, anchor_radius_m: axial coordinate of the anchor, and its distance from the axis.
+        guide_z_m: axial coordinates of the guides.
+        guide_radius_m: distance of each guide from the axis.
+        displacement_limit_m: least and greatest displacement, pull > 0; commands beyond are held at the limit.
+    """
+
+    name: Name
+    azimuth_deg: float
+    anchor_z_m: float
+    anchor_radius_m: Positive
+    guide_z_m: tuple[float, ...] = Field(min_length=1)
+    guide_radius_m: tuple[Positive, ...]
+    displacement_limit_m: Pair
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Cable:
+        if len(self.guide_radius_m) != len(self.guide_z_m):
+            raise ValueError(f"{len(self.guide_radius_m)} guide radii for {len(self.guide_z_m)} guides of {self.name}")
+        if np.any(np.diff(np.r_[self.anchor_z_m, self.guide_z_m]) <= 0):
+            raise ValueError(f"anchor and guides of {self.name} do not follow each other along z")
+        low, high = self.displacement_limit_m
+        if not low <= 0.0 <= high or low == high:
+            raise ValueError(f"displacement_limit_m of {self.name} does not enclose zero")
+        return self
+
+    def anchor(self) -> Float[np.ndarray, "3"]:
+        """Where the cable leaves the base [m]."""
+        return self._points(self.anchor_radius_m, self.anchor_z_m)[0]
+
+    def guides(self) -> Float[np.ndarray, "guide 3"]:
+        """Guide points in the undeformed body [m], the last is where the cable ends."""
+        return self._points(self.guide_radius_m, self.guide_z_m)
+
+    def _points(self, radius: float | tuple[float, ...], z: float | tuple[float, ...]) -> np.ndarray:
+        angle = np.deg2rad(self.azimuth_deg)
+        radius, z = np.atleast_1d(radius), np.atleast_1d(z)
+        return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+
+
+class Channels(Table):
+    """How commands become cable displacements: ``displacement = gain @ (radius * command)``.
+
+    Attributes:
+        names: the channels, in the order of the columns of ``gain``.
+        gain: one row per cable, one column per channel; pull > 0.
+        radius_parameter: for each channel the parameter [m] that turns its angle [rad] into a length; absent where
+            commands are lengths.
+    """
+
+    names: tuple[Name, ...] = Field(min_length=1)
+    gain: tuple[tuple[float, ...], ...]
+    radius_parameter: tuple[Name, ...] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Channels:
+        if any(len(row) != len(self.names) for row in self.gain):
+            raise ValueError(f"a row of gain does not have one entry for each of the {len(self.names)} channels")
+        if self.radius_parameter is not None and len(self.radius_parameter) != len(self.names):
+            raise ValueError(f"radius_parameter does not name one parameter for each of the {len(self.names)} channels")
+        if np.any(np.all(np.array(self.gain) == 0, axis=0)):
+            raise ValueError("a channel moves no cable")
+        return self

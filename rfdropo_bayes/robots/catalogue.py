@@ -1,0 +1,52 @@
+"""Robot files by name: those that come with the package, or any path."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots.robot import Robot
+from rfdropo_bayes.tables import parse_table
+
+PACKAGE = Path(__file__).resolve().parents[1]
+FOLDERS = (PACKAGE / "models" / "robots", PACKAGE.parent / "models" / "robots")
+"""Where robot files lie: inside an installed package, and beside it in a clone."""
+
+
+def known_robots() -> dict[str, Path]:
+    """The robots that come with the package: name -> file."""
+    return {path.stem: path for folder in reversed(FOLDERS) for path in sorted(folder.glob("*.toml"))}
+
+
+def load_robot(name_or_path: str | Path) -> Robot:
+    """Read and validate a robot description.
+
+    Args:
+        name_or_path: name of a robot that comes with the package, or path of a TOML file.
+
+    Raises:
+        InputError: an unknown robot (the known ones are listed), an unreadable file, or a description that does not
+            hold together.
+    """
+    path = _find(name_or_path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot be read: {error}", where=str(path), remedy="give a readable TOML file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"is not valid TOML: {error}", where=str(path), remedy="mend the file") from None
+    return parse_table(Robot, table, where=str(path))
+
+
+def _find(name_or_path: str | Path) -> Path:
+    known = known_robots()
+    if str(name_or_path) in known:
+        return known[str(name_or_path)]
+    path = Path(name_or_path)
+    if path.suffix == ".toml" and path.is_file():
+        return path
+    raise InputError(
+        f"unknown robot {str(name_or_path)!r}",
+        remedy=f"known: {', '.join(sorted(known)) or 'none'}; or give the path of a .toml file",
+    )

@@ -1,0 +1,71 @@
+"""Physical parameters of a robot: unit, nominal value, hard bounds and a default prior."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from rfdropo_bayes.robots.table import Table
+
+ARGUMENTS = {
+    "Normal": ("loc", "scale"),
+    "TruncatedNormal": ("loc", "scale"),
+    "HalfNormal": ("scale",),
+    "LogNormal": ("median", "sigma"),
+    "Uniform": ("low", "high"),
+    "LogUniform": ("low", "high"),
+}
+"""Prior distributions (names of numpyro) and their arguments; LogNormal's ``sigma`` is that of the logarithm."""
+
+
+class Parameter(Table):
+    """A physical parameter.
+
+    Attributes:
+        unit: SI unit, "-" if it has none.
+        nominal: value used where the parameter is not inferred.
+        low, high: hard bounds, outside which the model has no meaning.
+        prior: default prior, ``{distribution = "LogNormal", median = 4.5e6, sigma = 0.5}``.
+        description: one line on its physical meaning.
+        each: "cable" stands for one parameter per cable, named ``<name>_<cable>``.
+    """
+
+    unit: str
+    nominal: float
+    low: float
+    high: float
+    prior: dict[str, Any]
+    description: str = Field(min_length=1)
+    each: Literal["cable"] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Parameter:
+        if not self.low < self.high:
+            raise ValueError(f"low = {self.low:g} is not below high = {self.high:g}")
+        if not self.low <= self.nominal <= self.high:
+            raise ValueError(f"nominal = {self.nominal:g} is outside its bounds [{self.low:g}, {self.high:g}]")
+        _check_prior(self.prior, self.low, self.high)
+        return self
+
+
+def _check_prior(prior: dict[str, Any], low: float, high: float) -> None:
+    family = prior.get("distribution")
+    if family not in ARGUMENTS:
+        raise ValueError(f"unknown distribution {family!r}; known: {', '.join(ARGUMENTS)}")
+    names = ARGUMENTS[family]
+    if set(prior) - {"distribution"} != set(names):
+        raise ValueError(f"{family} takes exactly {', '.join(names)}")
+    for name in names:
+        value = prior[name]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f"{name} of the prior is not a number")
+        if name in ("scale", "sigma", "median") and value <= 0:
+            raise ValueError(f"{name} of the prior is not positive")
+    if family in ("Uniform", "LogUniform"):
+        inside = low <= prior["low"] < prior["high"] <= high
+    else:
+        centre = prior.get("loc", prior.get("median", max(low, 0.0)))
+        inside = low <= centre <= high
+    if not inside:
+        raise ValueError(f"the prior lies outside the bounds [{low:g}, {high:g}]")
