@@ -1,11 +1,13 @@
 # Every target sets up what it needs, once, in $(VENV). Needs Python 3.11 or newer and make, nothing else.
 
-VENV   ?= .venv
+VENV    ?= .venv
+WORKERS ?= 2
 # The first interpreter found that is new enough; say `make PYTHON=/path/to/python3.11` to choose another.
-PYTHON ?= $(shell for name in python3.11 python3.12 python3.13 python3 python; do \
+PYTHON  ?= $(shell for name in python3.11 python3.12 python3.13 python3 python; do \
 	"$$name" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo "$$name" && break; done)
 BIN     = $(VENV)/bin
-PIP     = $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# --no-compile: Python compiles the few modules that are used when it first meets them, which halves the set-up.
+PIP     = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 PYTEST  = $(BIN)/python -m pytest
 CORE    = $(VENV)/core.stamp
 DEV     = $(VENV)/dev.stamp
@@ -24,10 +26,10 @@ demo: $(CORE) ## calibrate the bundled example and write its report (minutes)
 	@echo "The report: reports/demo/report.html"
 
 test: $(DEV) ## the tests that are not slow
-	$(PYTEST) -n 2 -m "not slow and not notebook"
+	$(PYTEST) -n $(WORKERS) -m "not slow and not notebook"
 
 test-all: $(DEV) ## every test, the slow ones and the notebooks too
-	$(PYTEST) -n 2
+	$(PYTEST) -n $(WORKERS)
 
 lint: $(DEV) ## ruff, its formatter, and mypy
 	$(BIN)/ruff check .
