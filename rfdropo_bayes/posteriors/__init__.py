@@ -1,0 +1,17 @@
+"""Draws and predictions on disk: the one room that knows ArviZ and its version."""
+
+from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
+from rfdropo_bayes.posteriors.inference_data import load_posterior, save_posterior, summarise, to_inference_data
+from rfdropo_bayes.posteriors.record import ParameterInfo, PosteriorRecord, RecordingPrediction
+
+__all__ = [
+    "ParameterInfo",
+    "PosteriorRecord",
+    "ProductOfPowers",
+    "RecordingPrediction",
+    "evaluate_products",
+    "load_posterior",
+    "save_posterior",
+    "summarise",
+    "to_inference_data",
+]

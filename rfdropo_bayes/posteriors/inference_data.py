@@ -1,0 +1,171 @@
+"""InferenceData in NetCDF: groups, units, bounds and priors; every call that depends on ArviZ's version is here."""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+
+from rfdropo_bayes.errors import InputError
+
+with warnings.catch_warnings():  # 0.23 announces its successor on import; pyproject.toml keeps us on the old one
+    warnings.simplefilter("ignore", FutureWarning)
+    import arviz
+
+SCHEMA = "rfdropo_bayes.posterior/1"
+GROUPS = ("posterior", "prior", "posterior_predictive", "prior_predictive", "observed_data", "sample_stats")
+
+Draws = Mapping[str, Float[np.ndarray, "chain draw"]]
+
+
+def to_inference_data(
+    posterior: Draws,
+    *,
+    prior: Mapping[str, Float[np.ndarray, " draw"]] | None = None,
+    posterior_predictive: xr.Dataset | None = None,
+    prior_predictive: xr.Dataset | None = None,
+    observed_data: xr.Dataset | None = None,
+    sample_stats: xr.Dataset | None = None,
+    log_likelihood: Float[np.ndarray, "chain draw row"] | None = None,
+    units: Mapping[str, str] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, Mapping[str, Any]] | None = None,
+    descriptions: Mapping[str, str] | None = None,
+    attrs: Mapping[str, Any] | None = None,
+) -> arviz.InferenceData:
+    """Put draws and what belongs to them into ArviZ's layout.
+
+    Args:
+        posterior: draws of each parameter, physical (SI) units.
+        prior: prior draws of each parameter.
+        posterior_predictive, prior_predictive, observed_data, sample_stats: groups as they shall be stored.
+        log_likelihood: of every data row at every draw.
+        units, bounds, priors, descriptions: kept as attributes of the variable; a prior is its table.
+        attrs: attributes of the whole, numbers, strings or JSON-able objects (data hash, seed, versions, ...).
+
+    Raises:
+        InputError: draws that are not (chain, draw), differ in shape, or are not finite.
+    """
+    shapes = {name: np.shape(values) for name, values in posterior.items()}
+    if not shapes or len(set(shapes.values())) != 1 or len(next(iter(shapes.values()))) != 2:
+        raise InputError(f"draws must all have one shape (chain, draw), got {shapes}", where="posterior")
+    for name, values in posterior.items():
+        if not np.isfinite(values).all():
+            raise InputError(f"draws of {name} are not finite", where="posterior", remedy="report this as an error")
+
+    def described(values: Mapping[str, np.ndarray]) -> xr.Dataset:
+        dataset = _draws_dataset(values)
+        for name in values:
+            low, high = (bounds or {}).get(name, (-np.inf, np.inf))
+            dataset[variable_key(name)].attrs = {
+                "name": name,
+                "unit": (units or {}).get(name, ""),
+                "low": float(low),
+                "high": float(high),
+                "prior": json.dumps(dict((priors or {}).get(name, {})), sort_keys=True),
+                "description": (descriptions or {}).get(name, ""),
+            }
+        return dataset
+
+    groups = {
+        "posterior": described(posterior),
+        "prior": described({name: np.asarray(v)[None] for name, v in prior.items()}) if prior else None,
+        "posterior_predictive": posterior_predictive,
+        "prior_predictive": prior_predictive,
+        "observed_data": observed_data,
+        "sample_stats": sample_stats,
+        "log_likelihood": None,
+    }
+    if log_likelihood is not None:
+        groups["log_likelihood"] = xr.Dataset({"row": (("chain", "draw", "row_index"), np.asarray(log_likelihood))})
+    stored = {"schema": SCHEMA, **{key: _attribute(value) for key, value in (attrs or {}).items()}}
+    return arviz.InferenceData(attrs=stored, **{name: group for name, group in groups.items() if group is not None})
+
+
+def variable_key(name: str) -> str:
+    """Name of a NetCDF variable for a parameter: a slash would open a group."""
+    return name.replace("/", "|")
+
+
+def _draws_dataset(values: Mapping[str, np.ndarray]) -> xr.Dataset:
+    chains, draws = np.shape(next(iter(values.values())))
+    data = {variable_key(name): (("chain", "draw"), np.asarray(v, dtype=float)) for name, v in values.items()}
+    return xr.Dataset(data, coords={"chain": np.arange(chains), "draw": np.arange(draws)})
+
+
+def _attribute(value: Any) -> str | int | float:
+    return value if isinstance(value, str | int | float) and not isinstance(value, bool) else json.dumps(value)
+
+
+def save_posterior(data: arviz.InferenceData, path: Path) -> None:
+    """Write NetCDF; an interrupted call leaves what was there before.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        data.to_netcdf(str(partial), engine="h5netcdf", compress=True)
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise InputError(
+            f"cannot be written ({error.strerror or error})", where=str(path), remedy="choose a writable folder"
+        ) from None
+
+
+def load_posterior(path: Path) -> arviz.InferenceData:
+    """Read what `save_posterior` wrote, all of it into memory.
+
+    Raises:
+        InputError: if the file is missing, damaged, or not a posterior of ours.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError("no such file", where=str(path), remedy="give the folder of a finished calibration")
+    try:
+        with arviz.rc_context({"data.load": "eager"}):
+            data = arviz.from_netcdf(str(path), engine="h5netcdf")
+    except Exception as error:  # the HDF5 stack raises many types on damaged files, none of them ours
+        raise InputError(
+            f"is not a readable NetCDF file ({type(error).__name__})", where=str(path), remedy="calibrate again"
+        ) from None
+    if data.attrs.get("schema") != SCHEMA or "posterior" not in data.groups():
+        raise InputError(
+            f"is a NetCDF file, but not a posterior of ours (attribute schema = {SCHEMA!r} is missing)",
+            where=str(path),
+            remedy="give posterior.nc of a calibration",
+        )
+    return data
+
+
+def summarise(posterior: Draws) -> dict[str, dict[str, float]]:
+    """ArviZ's summary of each parameter: bulk and tail effective sample size, Monte-Carlo error of the mean, R-hat.
+
+    ``r_hat`` (rank-normalised, split) needs chains and is NaN where there is one only. Chains that never moved give NaN
+    throughout.
+    """
+    data = arviz.InferenceData(posterior=_draws_dataset(posterior))
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        bulk, tail = arviz.ess(data, method="bulk"), arviz.ess(data, method="tail")
+        error = arviz.mcse(data, method="mean")
+        several = next(iter(posterior.values())).shape[0] > 1
+        r_hat = arviz.rhat(data) if several else None
+    return {
+        name: {
+            "ess_bulk": float(bulk[variable_key(name)]),
+            "ess_tail": float(tail[variable_key(name)]),
+            "mcse_mean": float(error[variable_key(name)]),
+            "r_hat": float(r_hat[variable_key(name)]) if r_hat is not None else float("nan"),
+        }
+        for name in posterior
+    }

@@ -1,0 +1,303 @@
+"""A posterior and its predictions as plain arrays: what a report reads, free of ArviZ."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Bool, Float
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
+from rfdropo_bayes.posteriors.inference_data import (
+    load_posterior,
+    save_posterior,
+    to_inference_data,
+    variable_key,
+)
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class ParameterInfo:
+    """What is known of a parameter beside its draws.
+
+    Attributes:
+        name: as in the experiment file; ``name@recording`` for one that belongs to a recording.
+        unit: SI unit, "-" if it has none.
+        low, high: hard bounds, infinite where there is none.
+        prior: table of its prior, ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``; empty if derived.
+        description: one line on its physical meaning.
+    """
+
+    name: str
+    unit: str
+    low: float = -np.inf
+    high: float = np.inf
+    prior: Mapping[str, Any] = field(default_factory=dict)
+    description: str = ""
+
+    @property
+    def logarithmic(self) -> bool:
+        """True where the prior is one of the logarithm."""
+        return str(self.prior.get("distribution", "")).startswith("Log")
+
+
+@dataclass(frozen=True)
+class RecordingPrediction:
+    """One recording, measured and predicted, in the robot's base frame.
+
+    Attributes:
+        name: of the recording.
+        split: "fit" if the parameters were inferred from it, "test" if no fit ever saw it.
+        time: [s].
+        marker_names: base to tip; the last one is the headline.
+        observed: measured positions [m]; anything finite where masked.
+        mask: True where ``observed`` may be used.
+        predicted: draws of what would be measured [m], observation noise included.
+        mean: predictive mean without noise [m]; the mean of ``predicted`` if None.
+        prior_predicted: the same as ``predicted`` under the prior, or None.
+        repeat_group: equal numbers mark repeats of the same commands; -1 marks none.
+    """
+
+    name: str
+    split: str
+    time: Float[np.ndarray, " time"]
+    marker_names: tuple[str, ...]
+    observed: Float[np.ndarray, "time marker 3"]
+    mask: Bool[np.ndarray, "time marker"]
+    predicted: Float[np.ndarray, "draw time marker 3"]
+    mean: Float[np.ndarray, "time marker 3"] | None = None
+    prior_predicted: Float[np.ndarray, "draw time marker 3"] | None = None
+    repeat_group: int = -1
+
+    def __post_init__(self) -> None:
+        shape = (len(self.time), len(self.marker_names), 3)
+        fits = np.shape(self.observed) == shape and np.shape(self.mask) == shape[:2]
+        fits = fits and np.shape(self.predicted)[1:] == shape and np.shape(self.central) == shape
+        if not fits or (self.prior_predicted is not None and np.shape(self.prior_predicted)[1:] != shape):
+            raise InputError("measured and predicted positions do not fit together", where=self.name)
+        if self.split not in ("fit", "test"):
+            raise InputError(f"split is {self.split!r}", where=self.name, remedy='it must be "fit" or "test"')
+
+    @cached_property
+    def central(self) -> Float[np.ndarray, "time marker 3"]:
+        """The point prediction [m]."""
+        return np.mean(self.predicted, axis=0, dtype=float) if self.mean is None else np.asarray(self.mean)
+
+
+@dataclass(frozen=True)
+class PosteriorRecord:
+    """Everything that `posterior.nc` holds.
+
+    Attributes:
+        parameters: one entry per variable of ``posterior``, derived quantities included.
+        posterior: draws of equal weight, physical units.
+        prior: prior draws, physical units; may be empty.
+        recordings: predictions; may be empty.
+        derived: definitions of the variables that are functions of others.
+        trace: numbers of the sampler, one dictionary per stage.
+        block_scores: per block ``first_row``, ``last_row`` (1-based, inclusive), ``log_score`` = log p(block | rows
+            before it), ``sd``.
+        log_likelihood: of each data row at each draw, or None.
+        attrs: data hash, seed, versions and the like.
+    """
+
+    parameters: tuple[ParameterInfo, ...]
+    posterior: Mapping[str, Float[np.ndarray, "chain draw"]]
+    prior: Mapping[str, Float[np.ndarray, " draw"]] = field(default_factory=dict)
+    recordings: tuple[RecordingPrediction, ...] = ()
+    derived: tuple[ProductOfPowers, ...] = ()
+    trace: Sequence[Mapping[str, float]] = ()
+    block_scores: Sequence[Mapping[str, float]] = ()
+    log_likelihood: Float[np.ndarray, "chain draw row"] | None = None
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if tuple(info.name for info in self.parameters) != tuple(self.posterior):
+            raise InputError("parameters and draws do not list the same names in the same order", where="posterior")
+
+    @property
+    def free(self) -> tuple[ParameterInfo, ...]:
+        """The inferred parameters, without the derived quantities."""
+        names = {product.name for product in self.derived}
+        return tuple(info for info in self.parameters if info.name not in names)
+
+    def flat(self, name: str) -> Float[np.ndarray, " n"]:
+        """Draws of one variable, chains joined."""
+        return np.asarray(self.posterior[name]).reshape(-1)
+
+    def with_derived(self, products: Sequence[ProductOfPowers]) -> PosteriorRecord:
+        """The same record with quantities added that are functions of its parameters, in posterior and prior.
+
+        Raises:
+            InputError: see `evaluate_products`.
+        """
+        infos = tuple(ParameterInfo(p.name, p.unit, 0.0, np.inf, {}, p.description) for p in products)
+        prior = {**self.prior, **evaluate_products(self.prior, products)} if self.prior else {}
+        return PosteriorRecord(
+            self.parameters + infos,
+            {**self.posterior, **evaluate_products(self.posterior, products)},
+            prior,
+            self.recordings,
+            self.derived + tuple(products),
+            self.trace,
+            self.block_scores,
+            self.log_likelihood,
+            self.attrs,
+        )
+
+    def save(self, path: Path) -> None:
+        """Write `posterior.nc`.
+
+        Raises:
+            InputError: if the file cannot be written.
+        """
+        infos = {info.name: info for info in self.parameters}
+        products = [
+            {"name": p.name, "unit": p.unit, "powers": dict(p.powers), "description": p.description}
+            for p in self.derived
+        ]
+        data = to_inference_data(
+            self.posterior,
+            prior=self.prior,
+            posterior_predictive=_predictions(self.recordings),
+            prior_predictive=_prior_predictions(self.recordings),
+            observed_data=_observations(self.recordings),
+            sample_stats=_stages(self.trace, self.block_scores),
+            log_likelihood=self.log_likelihood,
+            units={name: info.unit for name, info in infos.items()},
+            bounds={name: (info.low, info.high) for name, info in infos.items()},
+            priors={name: info.prior for name, info in infos.items()},
+            descriptions={name: info.description for name, info in infos.items()},
+            attrs={"attributes": dict(self.attrs), "derived": products, "names": list(self.posterior)},
+        )
+        save_posterior(data, path)
+
+    @classmethod
+    def load(cls, path: Path) -> PosteriorRecord:
+        """Read `posterior.nc`.
+
+        Raises:
+            InputError: if the file is missing, damaged, or not one of ours.
+        """
+        data = load_posterior(path)
+        try:
+            return _from_groups(data)
+        except (KeyError, AttributeError, json.JSONDecodeError) as error:
+            raise InputError(
+                f"lacks part of a posterior of ours ({error})", where=str(path), remedy="calibrate again"
+            ) from None
+
+
+def _from_groups(data: Any) -> PosteriorRecord:
+    names = json.loads(data.attrs["names"])
+    variables = [data.posterior[variable_key(name)] for name in names]
+    parameters = tuple(
+        ParameterInfo(
+            name,
+            v.attrs["unit"],
+            float(v.attrs["low"]),
+            float(v.attrs["high"]),
+            json.loads(v.attrs["prior"]),
+            v.attrs["description"],
+        )
+        for name, v in zip(names, variables, strict=True)
+    )
+    groups = data.groups()
+    prior = data.prior if "prior" in groups else xr.Dataset()
+    stats = data.sample_stats if "sample_stats" in groups else xr.Dataset()
+    return PosteriorRecord(
+        parameters,
+        {name: v.values for name, v in zip(names, variables, strict=True)},
+        {name: prior[variable_key(name)].values[0] for name in names if variable_key(name) in prior},
+        _recordings(data) if "observed_data" in groups else (),
+        tuple(ProductOfPowers(**product) for product in json.loads(data.attrs["derived"])),
+        _rows(stats, "stage"),
+        _rows(stats, "block"),
+        data.log_likelihood["row"].values if "log_likelihood" in groups else None,
+        json.loads(data.attrs["attributes"]),
+    )
+
+
+def _predictions(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
+    """Recordings differ in length and may differ in draws: each has variables and dimensions of its own."""
+    data: dict[str, Any] = {}
+    for i, r in enumerate(recordings):
+        dims = (f"time_{i}", f"marker_{i}", "axis")
+        data[f"position_{i}"] = (("chain", f"draw_{i}", *dims), np.asarray(r.predicted, dtype=np.float32)[None])
+        data[f"mean_{i}"] = (dims, r.central)
+    return xr.Dataset(data, coords={"axis": list(AXES)}) if data else None
+
+
+def _prior_predictions(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
+    data = {
+        f"position_{i}": (
+            ("chain", f"draw_{i}", f"time_{i}", f"marker_{i}", "axis"),
+            np.asarray(r.prior_predicted, dtype=np.float32)[None],
+        )
+        for i, r in enumerate(recordings)
+        if r.prior_predicted is not None
+    }
+    return xr.Dataset(data, coords={"axis": list(AXES)}) if data else None
+
+
+def _observations(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
+    data: dict[str, Any] = {}
+    coords: dict[str, Any] = {"axis": list(AXES)}
+    for i, r in enumerate(recordings):
+        attrs = {"name": r.name, "split": r.split, "repeat_group": int(r.repeat_group), "unit": "m"}
+        data[f"position_{i}"] = ((f"time_{i}", f"marker_{i}", "axis"), np.asarray(r.observed, dtype=float), attrs)
+        data[f"mask_{i}"] = ((f"time_{i}", f"marker_{i}"), np.asarray(r.mask, dtype=np.int8))
+        coords |= {f"time_{i}": np.asarray(r.time, dtype=float), f"marker_{i}": list(r.marker_names)}
+    return xr.Dataset(data, coords=coords, attrs={"recordings": len(recordings)}) if recordings else None
+
+
+def _recordings(data: Any) -> tuple[RecordingPrediction, ...]:
+    observed, predicted = data.observed_data, data.posterior_predictive
+    before = data.prior_predictive if "prior_predictive" in data.groups() else xr.Dataset()
+    return tuple(
+        RecordingPrediction(
+            observed[f"position_{i}"].attrs["name"],
+            observed[f"position_{i}"].attrs["split"],
+            observed[f"time_{i}"].values,
+            tuple(str(name) for name in observed[f"marker_{i}"].values),
+            observed[f"position_{i}"].values,
+            observed[f"mask_{i}"].values.astype(bool),
+            predicted[f"position_{i}"].values[0],
+            predicted[f"mean_{i}"].values,
+            before[f"position_{i}"].values[0] if f"position_{i}" in before else None,
+            int(observed[f"position_{i}"].attrs["repeat_group"]),
+        )
+        for i in range(int(observed.attrs["recordings"]))
+    )
+
+
+def _stages(trace: Sequence[Mapping[str, Any]], blocks: Sequence[Mapping[str, Any]]) -> xr.Dataset | None:
+    data = {}
+    for dim, rows in (("stage", trace), ("block", blocks)):
+        for key in dict.fromkeys(key for row in rows for key in row):
+            column = [_number(row.get(key)) for row in rows]
+            if not all(value is None for value in column):
+                data[f"{dim}_{key}"] = (dim, np.array([np.nan if v is None else v for v in column], dtype=float))
+    return xr.Dataset(data) if data else None
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if isinstance(value, bool | int | float | np.number | np.bool_) else None
+
+
+def _rows(stats: xr.Dataset, dim: str) -> tuple[dict[str, float], ...]:
+    """One dictionary per stage or block; what was not recorded there is left out."""
+    columns = {str(key).removeprefix(f"{dim}_"): v.values for key, v in stats.items() if v.dims == (dim,)}
+    return tuple(
+        {key: float(column[i]) for key, column in columns.items() if not np.isnan(column[i])}
+        for i in range(stats.sizes.get(dim, 0))
+    )
