@@ -1,0 +1,37 @@
+"""Recordings: the Trajectory type, importers, validation, fault masking, repeats, registration."""
+
+from rfdropo_bayes.data.asl_csv import read_asl_csv, read_motor_step
+from rfdropo_bayes.data.faults import Faults, find_faults
+from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
+from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
+from rfdropo_bayes.data.registration import Registration, clock_offset, register, shift_commands, to_base_frame
+from rfdropo_bayes.data.repeats import PureError, group_repeats, noise_floor, pure_error
+from rfdropo_bayes.data.sofa_csv import read_sofa_csv
+from rfdropo_bayes.data.spec import DATA_VARIABLE, DataSpec, RecordingEntry, explain, load_recordings
+from rfdropo_bayes.data.trajectory import Trajectory
+
+__all__ = [
+    "DATA_VARIABLE",
+    "CsvColumns",
+    "DataSpec",
+    "Faults",
+    "PureError",
+    "RecordingEntry",
+    "Registration",
+    "Trajectory",
+    "clock_offset",
+    "explain",
+    "find_faults",
+    "group_repeats",
+    "load_recordings",
+    "noise_floor",
+    "pure_error",
+    "read_asl_csv",
+    "read_motor_step",
+    "read_optitrack_csv",
+    "read_plain_csv",
+    "read_sofa_csv",
+    "register",
+    "shift_commands",
+    "to_base_frame",
+]

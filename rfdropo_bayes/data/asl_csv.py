@@ -1,0 +1,187 @@
+"""Recordings of the ASL trunk: motion capture of three disks, and six motor commands, in two files.
+
+Timing. Both files run at 100 Hz. Row k of the observations is the state just before command row k is sent, so command
+row k is in force from ``time[k]`` until ``time[k + 1]``, and the observations have one row more than the commands. What
+was in force before row 0 is not recorded: ``initial_command`` repeats command row 0 (recordings start smoothly).
+
+Frame. Motion capture has y up and the trunk hangs. Base frame: x = mocap x, y = mocap z, z = -mocap y (down, along the
+axis); right-handed. No origin is subtracted: the mocap origin is arbitrary and moved by a centimetre between days, so a
+rest offset per recording is a parameter of the model.
+
+Settled poses. An observation file whose ID is the number of its command row holds, for each command in turn, the motion
+to its settled pose and some rest. Its trajectory has one row per command: the median of the last 0.2 s, at its end;
+command row k + 1 is in force from the first row of its own block, command 0 from the start.
+
+Motor angles are in radians. In files of before June 2025 they are a 20 Hz zero-order hold; for settled poses they are
+stale and left out.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rfdropo_bayes.data.csv_table import CsvTable
+from rfdropo_bayes.data.faults import Faults, fill_missing, find_faults
+from rfdropo_bayes.data.trajectory import Trajectory
+from rfdropo_bayes.errors import InputError
+
+FORMAT = "asl-csv"
+RATE = 100.0  # [Hz]
+MOTORS = 6
+NO_COMMANDS = "none"
+FRAME = "robot base: x = mocap x, y = mocap z, z = -mocap y (down, along the axis); mocap origin"
+MOCAP_TO_BASE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+_DISKS = [f"{axis}{disk}" for disk in (1, 2, 3) for axis in "xyz"]
+_COMMANDS = [f"u{motor}" for motor in range(1, MOTORS + 1)]
+_ANGLES = [f"phi{motor}" for motor in range(1, MOTORS + 1)]
+_SETTLED_ROWS = 20
+
+
+class _Recording(NamedTuple):
+    table: CsvTable
+    identity: Int[np.ndarray, " rows"]
+    time: Float[np.ndarray, " rows"]
+    position: Float[np.ndarray, "rows disk 3"]
+    faults: Faults
+
+
+def read_asl_csv(observations: Path, commands: Path | None, *, mask_missing: bool = False) -> Trajectory:
+    """One recording: disks disk1 (base) ... disk3 (tip), motors motor1 ... motor6 [rad], pull as the file has it.
+
+    Args:
+        observations: file of observations.
+        commands: file of commands; None for a recording at zero command.
+        mask_missing: mask lost marker positions instead of rejecting the file.
+
+    Raises:
+        InputError: on a damaged file (see ``CsvTable``), missing rows, or two files that do not fit together.
+    """
+    table = CsvTable(observations, ["ID", *_DISKS])
+    identity = table.numbers(["ID"])[:, 0].astype(int)
+    position = table.points(_DISKS, allow_missing=mask_missing) @ MOCAP_TO_BASE.T
+    time = np.arange(len(table)) / RATE
+    recording = _Recording(table, identity, time, position, find_faults(time, position))
+    command = _read_commands(commands) if commands is not None else np.zeros((len(table) - 1, MOTORS))
+    content = (_settled_poses if len(set(identity)) < len(identity) else _motion)(recording, command, commands)
+    settings: dict[str, Any] = {"faults": recording.faults.counts} | content.pop("settings")
+    payload = re.search(r"_(\d+)g$", _stem(observations))
+    settings["payload_mass"] = 1e-3 * float(payload.group(1)) if payload else 0.0
+    return Trajectory.build(
+        name=_stem(observations),
+        robot="asl_trunk",
+        format=FORMAT,
+        marker_names=["disk1", "disk2", "disk3"],
+        cable_names=[f"motor{motor}" for motor in range(1, MOTORS + 1)],
+        command_unit="rad",
+        frame=FRAME,
+        provenance=f"{observations.name}, commands {commands.name if commands else NO_COMMANDS}: ASL Trunk",
+        settings=settings,
+        **content,
+    )
+
+
+def read_motor_step(values: Path, times: Path) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows 6"]]:
+    """Times [s] after the command and motor angles [rad] of the 30-degree step on motor 1 (files without a header).
+
+    Raises:
+        InputError: if a file cannot be read as numbers or the two do not fit together.
+    """
+    tables = []
+    for path in (values, times):
+        try:
+            tables.append(np.loadtxt(path, delimiter=",", ndmin=2))
+        except (OSError, ValueError) as error:
+            raise InputError(f"cannot be read ({error})", where=str(path), remedy="fetch it again") from None
+    angle, time = np.deg2rad(tables[0]), tables[1].ravel()
+    if angle.shape != (len(time), MOTORS):
+        raise InputError(
+            f"holds {angle.shape[0]} rows of {angle.shape[1]} angles, but there are {len(time)} times",
+            where=str(values),
+            remedy=f"give {MOTORS} angles per time",
+        )
+    return time, angle
+
+
+def _motion(recording: _Recording, command: np.ndarray, commands: Path | None) -> dict[str, Any]:
+    rows = len(recording.time)
+    _check_consecutive(recording.identity, str(recording.table.path))
+    if rows != len(command) + 1:
+        raise InputError(
+            f"{rows} observations do not fit {len(command)} commands: there must be one observation more",
+            where=f"{recording.table.path} with {commands}",
+            remedy="pair the files that were recorded together; use rows = [first, last] to cut both",
+        )
+    angle = None
+    hold = 0.0
+    if all(name in recording.table for name in _ANGLES):
+        angle = np.deg2rad(recording.table.numbers(_ANGLES))
+        changes = np.flatnonzero((np.diff(angle, axis=0) != 0.0).any(axis=1))
+        hold = float(np.median(np.diff(changes))) / RATE if changes.size > 2 else 0.0
+    return {
+        "time": recording.time,
+        "position": fill_missing(recording.time, recording.position),
+        "position_mask": recording.faults.mask,
+        "command_time": recording.time[:-1],
+        "command": command,
+        "initial_command": command[0],
+        "motor_angle": angle,
+        "settings": {} if angle is None else {"motor_angle_hold": hold},
+    }
+
+
+def _settled_poses(recording: _Recording, command: np.ndarray, commands: Path | None) -> dict[str, Any]:
+    numbers, first = np.unique(recording.identity, return_index=True)
+    where = f"{recording.table.path} with {commands}"
+    if np.any(np.diff(recording.identity) < 0):
+        raise InputError("its rows are not in the order of their ID", where=where, remedy="sort them")
+    if commands is None or len(numbers) != len(command) or not np.array_equal(numbers, np.arange(len(command))):
+        found = "no" if commands is None else str(len(command))
+        raise InputError(
+            f"poses with ID {numbers[0]} to {numbers[-1]} ({len(numbers)}) do not fit {found} commands",
+            where=where,
+            remedy="pair the files that were recorded together",
+        )
+    end = np.append(first[1:], len(recording.time)) - 1
+    pose = np.zeros((len(numbers), *recording.position.shape[1:]))
+    mask = np.zeros(pose.shape[:2], dtype=bool)
+    for row, (start, stop) in enumerate(zip(first, end, strict=True)):
+        window = slice(max(start, stop + 1 - _SETTLED_ROWS), stop + 1)
+        for disk in range(pose.shape[1]):
+            good = recording.faults.mask[window, disk]
+            mask[row, disk] = good.any()
+            pose[row, disk] = np.median(recording.position[window, disk][good if good.any() else slice(None)], axis=0)
+    return {
+        "time": recording.time[end],
+        "position": fill_missing(recording.time[end], pose),
+        "position_mask": mask,
+        "command_time": recording.time[first[1:]],
+        "command": command[1:],
+        "initial_command": command[0],
+        "settings": {"settled_poses": True, "motor_angle": "stale, left out"},
+    }
+
+
+def _read_commands(path: Path) -> Float[np.ndarray, "rows 6"]:
+    table = CsvTable(path, ["ID", *_COMMANDS])
+    _check_consecutive(table.numbers(["ID"])[:, 0].astype(int), str(path))
+    return np.deg2rad(table.numbers(_COMMANDS))
+
+
+def _check_consecutive(identity: np.ndarray, where: str) -> None:
+    wrong = np.flatnonzero(identity != np.arange(len(identity)))
+    if wrong.size:
+        row = int(wrong[0])
+        raise InputError(
+            f"ID {identity[row]} where {row} is due: rows are missing or out of order",
+            where=f"{where}, row {row}, column 'ID'",
+            remedy="fetch it again, or use rows = [first, last] on a whole recording to leave rows out",
+        )
+
+
+def _stem(path: Path) -> str:
+    return path.name.removesuffix(".gz").removesuffix(".csv")

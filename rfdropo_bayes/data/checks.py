@@ -1,0 +1,120 @@
+"""What every trajectory must satisfy, whichever file it came from."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from rfdropo_bayes.errors import InputError
+
+DIMS: dict[str, tuple[str, ...]] = {
+    "position": ("time", "marker", "axis"),
+    "position_mask": ("time", "marker"),
+    "command": ("command_time", "cable"),
+    "initial_command": ("cable",),
+    "tension": ("time", "cable"),
+    "motor_angle": ("time", "cable"),
+    "object_pose": ("time", "pose"),
+}
+_LARGEST_EXTENT = 5.0  # [m]: no soft robot on a bench sweeps more; millimetres taken for metres always do
+_SMALLEST_EXTENT = 1e-3  # [m]: several markers on one robot are never this close; metres taken for millimetres are
+_LARGEST_COMMAND = {"m": 5.0, "rad": 20.0}  # unclipped cumulative commands stay below; other units exceed it
+_LARGEST_COMMAND_STEP = {"m": 0.5, "rad": 20.0}
+
+
+def check_dataset(dataset: xr.Dataset) -> None:
+    """Raise an InputError on wrong shapes, times, values that are not finite, or implausible units."""
+    name = str(dataset.attrs.get("name", "recording"))
+    for key, dims in DIMS.items():
+        if key in dataset and dataset[key].dims != dims:
+            raise InputError(f"{key} has dimensions {dataset[key].dims}, not {dims}", where=name)
+    if dataset.sizes["axis"] != 3:
+        raise InputError(f"positions have {dataset.sizes['axis']} coordinates", where=name, remedy="give x, y and z")
+    if dataset.sizes["time"] < 2 or dataset.sizes["command_time"] < 1:
+        raise InputError(
+            f"has {dataset.sizes['time']} observation and {dataset.sizes['command_time']} command rows",
+            where=name,
+            remedy="at least 2 and 1 are needed",
+        )
+    for key in ("marker", "cable"):
+        names = [str(value) for value in dataset[key].values]
+        if len(set(names)) != len(names):
+            raise InputError(f"{key} names are not unique: {', '.join(names)}", where=name, remedy="rename them")
+    _check_times(dataset, name)
+    _check_finite(dataset, name)
+    _check_lengths(dataset, name)
+    _check_commands(dataset, name)
+    if "object_pose" in dataset:
+        norm = np.linalg.norm(dataset["object_pose"].values[:, 3:], axis=1)
+        if np.any(np.abs(norm - 1.0) > 1e-2):
+            row = int(np.argmax(np.abs(norm - 1.0)))
+            raise InputError(
+                f"the quaternion of the object has norm {norm[row]:.3g}",
+                where=f"{name}, row {row}",
+                remedy="give a unit quaternion as x, y, z, w",
+            )
+
+
+def _check_times(dataset: xr.Dataset, name: str) -> None:
+    for key in ("time", "command_time"):
+        values = dataset[key].values
+        if not np.all(np.isfinite(values)):
+            row = int(np.argmax(~np.isfinite(values)))
+            raise InputError(f"{key} is not a number", where=f"{name}, row {row}", remedy="repair the time column")
+        stuck = np.flatnonzero(np.diff(values) <= 0.0)
+        if stuck.size:
+            raise InputError(
+                f"{key} does not increase ({stuck.size} times)",
+                where=f"{name}, row {int(stuck[0]) + 1}",
+                remedy="sort the rows or remove duplicates",
+            )
+
+
+def _check_finite(dataset: xr.Dataset, name: str) -> None:
+    for key in DIMS:
+        if key in dataset:
+            bad = ~np.isfinite(dataset[key].values.astype(float))
+            if bad.any():
+                index = np.argwhere(bad)[0]
+                place = ", ".join(f"{dim} {dataset[dim].values[i]}" for dim, i in zip(DIMS[key], index, strict=True))
+                raise InputError(
+                    f"{key} is NaN or infinite ({int(bad.sum())} values)",
+                    where=f"{name}, {place}",
+                    remedy="repair the recording",
+                )
+
+
+def _check_lengths(dataset: xr.Dataset, name: str) -> None:
+    position = dataset["position"].values[dataset["position_mask"].values.astype(bool)]
+    if position.size == 0:
+        raise InputError("every position is masked", where=name, remedy="use another recording")
+    extent = float(np.ptp(position, axis=0).max())
+    if extent > _LARGEST_EXTENT:
+        raise InputError(
+            f"the positions span {extent:.4g} m",
+            where=name,
+            remedy="they look like millimetres given as metres: state the unit the file is in",
+        )
+    size = extent if dataset.sizes["marker"] > 1 else float(np.abs(position).max())
+    if size < _SMALLEST_EXTENT:
+        raise InputError(
+            f"the positions span {extent * 1e3:.3g} mm in all",
+            where=name,
+            remedy="they look like metres given as millimetres: state the unit the file is in",
+        )
+
+
+def _check_commands(dataset: xr.Dataset, name: str) -> None:
+    unit = dataset["command"].attrs.get("unit")
+    if unit not in _LARGEST_COMMAND:
+        raise InputError(f"command unit {unit!r} is unknown", where=name, remedy="use 'm' or 'rad'")
+    command = np.concatenate([dataset["initial_command"].values[None], dataset["command"].values])
+    largest = float(np.abs(command).max())
+    step = float(np.abs(np.diff(command, axis=0)).max())
+    if largest > _LARGEST_COMMAND[unit] or step > _LARGEST_COMMAND_STEP[unit]:
+        other = "millimetres given as metres" if unit == "m" else "degrees given as radians"
+        raise InputError(
+            f"commands reach {largest:.4g} {unit} with steps of {step:.4g} {unit}",
+            where=name,
+            remedy=f"they look like {other}: state the unit the file is in",
+        )

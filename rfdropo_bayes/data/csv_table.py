@@ -1,0 +1,150 @@
+"""Reading a numeric CSV file strictly: a recording that was cut short must not pass for a shorter recording."""
+
+from __future__ import annotations
+
+import difflib
+import gzip
+import io
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from rfdropo_bayes.errors import InputError
+
+
+def closest(name: str, known: Sequence[str]) -> str:
+    """Hint that names the known entry nearest to ``name``, or lists them if none is near."""
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    if near:
+        return f"did you mean {near[0]!r}?"
+    shown = ", ".join(known[:12]) + (", ..." if len(known) > 12 else "")
+    return f"there is: {shown}"
+
+
+def read_text(path: Path) -> str:
+    """Text of a plain or gzipped file.
+
+    Raises:
+        InputError: the file is missing, unreadable, a damaged gzip archive or not text.
+    """
+    try:
+        raw = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError("no such file", where=str(path), remedy="correct the path") from None
+    except OSError as error:
+        raise InputError(
+            f"cannot be read ({error.strerror})", where=str(path), remedy="check its permissions"
+        ) from None
+    try:
+        if raw[:2] == b"\x1f\x8b":
+            raw = gzip.decompress(raw)
+        return raw.decode("utf-8-sig")
+    except (EOFError, OSError, zlib.error):
+        raise InputError("the gzip archive is cut short or damaged", where=str(path), remedy="fetch it again") from None
+    except UnicodeDecodeError:
+        raise InputError("is not a text file", where=str(path), remedy="give a CSV file, plain or gzipped") from None
+
+
+class CsvTable:
+    """A rectangular table of numbers with named columns.
+
+    Args:
+        path: the file, plain or gzipped.
+        required: columns that must be there.
+        machine_written: the format's own writer ends every line with a newline, so a last line without one was cut.
+
+    Raises:
+        InputError: empty file, header without rows, ragged or cut rows, a missing, renamed or repeated column.
+    """
+
+    def __init__(self, path: Path, required: Sequence[str], *, machine_written: bool = True) -> None:
+        self.path = path
+        text = read_text(path)
+        lines = text.splitlines()
+        while lines and not lines[-1].strip():
+            lines.pop()
+        if not lines:
+            raise InputError("the file is empty", where=str(path), remedy="give a CSV with a header and rows")
+        if len(lines) == 1:
+            raise InputError("has a header but no rows", where=str(path), remedy="record or export it again")
+        _check_rectangular(path, lines)
+        if machine_written and not text.endswith("\n"):
+            raise InputError(
+                "the last line does not end: the file is cut short",
+                where=f"{path}, row {len(lines) - 2}",
+                remedy="fetch it again, or drop that row, or end it with a newline if it is whole",
+            )
+        self.frame = pd.read_csv(io.StringIO("\n".join(lines)), skipinitialspace=True, low_memory=False)
+        self.frame.columns = [str(name).strip() for name in self.frame.columns]
+        self.require(required)
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.frame.columns
+
+    def require(self, names: Sequence[str]) -> None:
+        """Raise an InputError that names the first of ``names`` that is not a column, and the nearest that is."""
+        columns = list(self.frame.columns)
+        for name in names:
+            if name not in columns:
+                spare = [column for column in columns if column not in names] or columns
+                raise InputError(
+                    f"column {name!r} is missing; {closest(name, spare)}",
+                    where=str(self.path),
+                    remedy="rename the column, or use format = 'csv' with a [data.columns] mapping",
+                )
+
+    def numbers(self, names: Sequence[str], *, allow_missing: bool = False) -> Float[np.ndarray, "rows columns"]:
+        """Columns as float64; rows are counted from 0 after the header in every message.
+
+        Raises:
+            InputError: a cell that is not a number; an empty, NaN or infinite cell unless ``allow_missing``
+                (then it comes back as NaN).
+        """
+        self.require(names)
+        cells = self.frame[list(names)]
+        values = np.array(cells.apply(pd.to_numeric, errors="coerce"), dtype=np.float64)
+        text = np.isnan(values) & cells.notna().to_numpy()
+        if text.any():
+            row, column = np.argwhere(text)[0]
+            raise InputError(
+                f"{str(cells.iat[row, column])!r} is not a number",
+                where=f"{self.path}, row {row}, column {names[column]!r}",
+                remedy="correct the cell",
+            )
+        values[np.isinf(values)] = np.nan
+        if not allow_missing and np.isnan(values).any():
+            row, column = np.argwhere(np.isnan(values))[0]
+            raise InputError(
+                f"NaN or empty cell ({int(np.isnan(values).sum())} of them in all)",
+                where=f"{self.path}, row {row}, column {names[column]!r}",
+                remedy="repair the recording; lost markers alone may be masked with missing = 'mask' in [data]",
+            )
+        return values
+
+    def points(self, names: Sequence[str], *, allow_missing: bool = False) -> Float[np.ndarray, "rows points 3"]:
+        """Columns x, y, z of several points, in the order of ``names``."""
+        return self.numbers(names, allow_missing=allow_missing).reshape(len(self), -1, 3)
+
+
+def _check_rectangular(path: Path, lines: Sequence[str]) -> None:
+    fields = lines[0].count(",") + 1
+    header = [name.strip() for name in lines[0].split(",")]
+    repeated = sorted({name for name in header if header.count(name) > 1})
+    if repeated:
+        raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy="rename one of them")
+    for row, line in enumerate(lines[1:]):
+        found = line.count(",") + 1
+        if found != fields:
+            last = row == len(lines) - 2
+            raise InputError(
+                f"has {found} values where the header names {fields}" + (": the file is cut short" if last else ""),
+                where=f"{path}, row {row}",
+                remedy="fetch the file again or drop the row" if last else "repair the row",
+            )

@@ -1,0 +1,154 @@
+"""Any CSV, plain or gzipped, through a mapping of its columns: the way in for one's own robot.
+
+Timing. The command in row k is in force from the time of row k until that of row k + 1, as a loop that measures, then
+commands, writes it; before row 0 the command of row 0 was in force. Commands may stand in a file of their own, with as
+many rows as the observations or one fewer.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from rfdropo_bayes.data.csv_table import CsvTable
+from rfdropo_bayes.data.faults import fill_missing, find_faults
+from rfdropo_bayes.data.registration import rotate_pose
+from rfdropo_bayes.data.trajectory import Trajectory
+from rfdropo_bayes.errors import InputError
+
+FORMAT = "csv"
+_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_COMMANDS = {name: ("m", factor) for name, factor in _METRES.items()} | {
+    "rad": ("rad", 1.0),
+    "deg": ("rad", np.pi / 180.0),
+}
+
+
+def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
+    matrix = axes_matrix(axes)
+    if not np.isclose(np.linalg.det(matrix), 1.0):
+        raise ValueError("axes must name x, y and z once each, with signs that make a right-handed frame")
+    return axes
+
+
+class CsvColumns(BaseModel):
+    """The table [data.columns]: which column is what, in which unit.
+
+    ``axes`` says which file axis the base frame's x, y, z are, e.g. ["x", "z", "-y"] for a trunk that hangs in a y-up
+    motion-capture frame. Times come from the column ``time`` or from a constant ``sample_time`` [s].
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    time: str | None = None
+    time_unit: Literal["s", "ms"] = "s"
+    sample_time: Annotated[float, Field(gt=0)] | None = None
+    commands: Annotated[list[str], Field(min_length=1)]
+    command_unit: Literal["m", "cm", "mm", "rad", "deg"]
+    positions: Annotated[list[tuple[str, str, str]], Field(min_length=1)]
+    position_unit: Literal["m", "cm", "mm"]
+    axes: Annotated[tuple[str, str, str], AfterValidator(_right_handed)] = ("x", "y", "z")
+    markers: list[str] | None = None
+    cables: list[str] | None = None
+    tensions: list[str] | None = None
+    motor_angles: list[str] | None = None
+    motor_angle_unit: Literal["rad", "deg"] = "rad"
+    object_pose: Annotated[list[str], Field(min_length=7, max_length=7)] | None = None
+    robot: str = ""
+
+    @model_validator(mode="after")
+    def _fits(self) -> CsvColumns:
+        if (self.time is None) == (self.sample_time is None):
+            raise ValueError("give either time (a column) or sample_time (seconds)")
+        for key, names, count in (
+            ("markers", self.markers, len(self.positions)),
+            ("cables", self.cables, len(self.commands)),
+            ("tensions", self.tensions, len(self.commands)),
+            ("motor_angles", self.motor_angles, len(self.commands)),
+        ):
+            if names is not None and len(names) != count:
+                raise ValueError(f"{key} has {len(names)} entries where {count} are needed")
+        return self
+
+
+def axes_matrix(axes: tuple[str, str, str]) -> Float[np.ndarray, "3 3"]:
+    """Rotation from the file's frame to the base frame, from names such as ("x", "z", "-y")."""
+    matrix = np.zeros((3, 3))
+    for row, name in enumerate(axes):
+        sign, letter = (-1.0, name[1:]) if name.startswith("-") else (1.0, name.lstrip("+"))
+        if letter in ("x", "y", "z"):
+            matrix[row, "xyz".index(letter)] = sign
+    return matrix
+
+
+def read_plain_csv(
+    path: Path, columns: CsvColumns, commands: Path | None = None, *, mask_missing: bool = False
+) -> Trajectory:
+    """One recording.
+
+    Args:
+        path: file with the observations, and the commands unless they have a file of their own.
+        columns: what each column is.
+        commands: file of the commands.
+        mask_missing: mask lost marker positions instead of rejecting the file.
+
+    Raises:
+        InputError: on a damaged file (see ``CsvTable``), a column that is not there, or files that do not fit together.
+    """
+    coordinates = [name for point in columns.positions for name in point]
+    table = CsvTable(path, coordinates, machine_written=False)
+    rotation, metres = axes_matrix(columns.axes), _METRES[columns.position_unit]
+    position = metres * table.points(coordinates, allow_missing=mask_missing) @ rotation.T
+    time = _times(table, columns)
+    faults = find_faults(time, position)
+    command = _commands(table, commands, columns)
+    angle_scale = np.pi / 180.0 if columns.motor_angle_unit == "deg" else 1.0
+    return Trajectory.build(
+        name=path.name.removesuffix(".gz").removesuffix(".csv"),
+        robot=columns.robot,
+        format=FORMAT,
+        time=time,
+        position=fill_missing(time, position),
+        position_mask=faults.mask,
+        marker_names=columns.markers or [f"m{marker}" for marker in range(1, len(columns.positions) + 1)],
+        command_time=time[: len(command)],
+        command=command,
+        command_unit=_COMMANDS[columns.command_unit][0],
+        initial_command=command[0],
+        cable_names=columns.cables or columns.commands,
+        tension=None if columns.tensions is None else table.numbers(columns.tensions),
+        motor_angle=None if columns.motor_angles is None else angle_scale * table.numbers(columns.motor_angles),
+        object_pose=_pose(table, columns),
+        provenance=path.name,
+        settings={"faults": faults.counts},
+    )
+
+
+def _times(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " rows"]:
+    if columns.time is None:
+        return float(columns.sample_time or 0.0) * np.arange(len(table))
+    time = table.numbers([columns.time])[:, 0] * (1e-3 if columns.time_unit == "ms" else 1.0)
+    return time - time[0]
+
+
+def _commands(table: CsvTable, path: Path | None, columns: CsvColumns) -> Float[np.ndarray, "rows cable"]:
+    source = table if path is None else CsvTable(path, columns.commands, machine_written=False)
+    values = _COMMANDS[columns.command_unit][1] * source.numbers(columns.commands)
+    if len(values) not in (len(table), len(table) - 1):
+        raise InputError(
+            f"{len(table)} observations do not fit {len(values)} commands: give as many, or one fewer",
+            where=f"{table.path} with {path}",
+            remedy="pair the files that were recorded together",
+        )
+    return values
+
+
+def _pose(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows 7"] | None:
+    if columns.object_pose is None:
+        return None
+    pose = table.numbers(columns.object_pose) * np.array([_METRES[columns.position_unit]] * 3 + [1.0] * 4)
+    return rotate_pose(pose, axes_matrix(columns.axes), np.zeros(3))

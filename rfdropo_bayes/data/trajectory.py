@@ -1,0 +1,370 @@
+"""The one type of measured or simulated motion that the rest of the program sees."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from rfdropo_bayes.data import checks
+from rfdropo_bayes.errors import InputError
+
+AXES = ("x", "y", "z")
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+SCHEMA = "rfdropo_bayes.trajectory/1"
+_HASHED = ("time", "command_time", "position", "position_mask", "command", "initial_command")
+_OPTIONAL = ("tension", "motor_angle", "object_pose")
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One recording: what was commanded, what was observed, and when.
+
+    ``dataset`` holds, in SI units and in the robot's base frame (x, y across, z along the axis, away from the base):
+
+    - ``position(time, marker, axis)`` [m] and ``position_mask(time, marker)``: False where the position is a
+      recording fault; the value there is a finite placeholder that no likelihood may use;
+    - ``command(command_time, cable)``, unit in its attribute ("m" or "rad"): cumulative command, pull > 0, unclipped,
+      piecewise constant. Row k is in force from ``command_time[k]`` until the next row's time, the last one for ever;
+    - ``initial_command(cable)``: in force before ``command_time[0]``, hence the state the recording starts from;
+    - optionally ``tension(time, cable)`` [N], ``motor_angle(time, cable)`` [rad] and ``object_pose(time, pose)``
+      (x y z [m], unit quaternion x y z w).
+
+    ``time`` is in seconds from the first observation row. ``command_time`` shares that clock.
+
+    Raises:
+        InputError: on shapes that do not fit, times that do not increase, values that are not finite, or lengths that
+            cannot be in metres.
+    """
+
+    dataset: xr.Dataset
+
+    def __post_init__(self) -> None:
+        checks.check_dataset(self.dataset)
+        object.__setattr__(self, "dataset", self.dataset.assign_attrs(sha256=_digest(self.dataset)))
+
+    @classmethod
+    def build(
+        cls,
+        *,
+        name: str,
+        robot: str,
+        format: str,
+        time: Float[np.ndarray, " time"],
+        position: Float[np.ndarray, "time marker 3"],
+        command_time: Float[np.ndarray, " command_time"],
+        command: Float[np.ndarray, "command_time cable"],
+        command_unit: str,
+        marker_names: Sequence[str],
+        cable_names: Sequence[str],
+        initial_command: Float[np.ndarray, " cable"] | None = None,
+        position_mask: Bool[np.ndarray, "time marker"] | None = None,
+        tension: Float[np.ndarray, "time cable"] | None = None,
+        motor_angle: Float[np.ndarray, "time cable"] | None = None,
+        object_pose: Float[np.ndarray, "time 7"] | None = None,
+        synthetic: bool = False,
+        provenance: str = "",
+        frame: str = "robot base: x, y across, z along the axis away from the base",
+        settings: Mapping[str, Any] | None = None,
+    ) -> Trajectory:
+        """Assemble and check a recording; every array is in SI units, see the class for meanings and shapes.
+
+        ``initial_command`` defaults to zero; ``position_mask`` to all True. Times are shifted so that the first
+        observation is at 0. ``settings`` are facts about the recording that a model may need (JSON).
+        """
+        origin = time[0] if len(time) else 0.0
+        coords = {
+            "time": np.asarray(time, dtype=float) - origin,
+            "command_time": np.asarray(command_time, dtype=float) - origin,
+            "marker": list(marker_names),
+            "cable": list(cable_names),
+            "axis": list(AXES),
+        } | ({} if object_pose is None else {"pose": list(POSE)})
+        arrays = {
+            "position": position,
+            "position_mask": np.ones(np.shape(position)[:2], dtype=bool) if position_mask is None else position_mask,
+            "command": command,
+            "initial_command": np.zeros(len(cable_names)) if initial_command is None else initial_command,
+            "tension": tension,
+            "motor_angle": motor_angle,
+            "object_pose": None if object_pose is None else continuous_quaternions(object_pose),
+        }
+        try:
+            data = {key: (checks.DIMS[key], np.array(value)) for key, value in arrays.items() if value is not None}
+            dataset = xr.Dataset(data, coords=coords)
+        except ValueError as error:
+            raise InputError(
+                f"recording and commands do not fit together ({error})", where=name, remedy="check their lengths"
+            ) from None
+        dataset["command"].attrs["unit"] = command_unit
+        dataset.attrs = {
+            "schema": SCHEMA,
+            "name": name,
+            "robot": robot,
+            "format": format,
+            "provenance": provenance,
+            "frame": frame,
+            "sample_time": float(np.median(np.diff(time))) if len(time) > 1 else 0.0,
+            "synthetic": int(synthetic),
+            "settings": json.dumps(dict(settings or {}), sort_keys=True),
+        }
+        return cls(dataset)
+
+    @property
+    def name(self) -> str:
+        """What the report calls this recording."""
+        return str(self.dataset.attrs["name"])
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot description it was recorded on; empty if the file did not say."""
+        return str(self.dataset.attrs["robot"])
+
+    @property
+    def time(self) -> Float[np.ndarray, " time"]:
+        """Times of the observations [s], the first is 0."""
+        return self._array("time")
+
+    @property
+    def command_time(self) -> Float[np.ndarray, " command_time"]:
+        """Times from which each command row is in force [s], same clock as ``time``."""
+        return self._array("command_time")
+
+    @property
+    def command(self) -> Float[np.ndarray, "command_time cable"]:
+        """Cumulative command, pull > 0, unclipped, in ``command_unit``."""
+        return self._array("command")
+
+    @property
+    def initial_command(self) -> Float[np.ndarray, " cable"]:
+        """Command in force before ``command_time[0]``: the recording starts in its equilibrium."""
+        return self._array("initial_command")
+
+    @property
+    def command_unit(self) -> str:
+        """``"m"`` (cable displacement) or ``"rad"`` (motor angle)."""
+        return str(self.dataset["command"].attrs["unit"])
+
+    @property
+    def position(self) -> Float[np.ndarray, "time marker 3"]:
+        """Marker positions in the base frame [m]."""
+        return self._array("position")
+
+    @property
+    def position_mask(self) -> Bool[np.ndarray, "time marker"]:
+        """True where the position may be used."""
+        return self._array("position_mask")
+
+    @property
+    def tension(self) -> Float[np.ndarray, "time cable"] | None:
+        """Cable tensions [N], if measured."""
+        return self._array("tension") if "tension" in self.dataset else None
+
+    @property
+    def motor_angle(self) -> Float[np.ndarray, "time cable"] | None:
+        """Measured motor angles [rad], if measured; ``settings`` says how stale they are."""
+        return self._array("motor_angle") if "motor_angle" in self.dataset else None
+
+    @property
+    def object_pose(self) -> Float[np.ndarray, "time 7"] | None:
+        """Pose of the manipulated object (x y z [m], quaternion x y z w), if there is one."""
+        return self._array("object_pose") if "object_pose" in self.dataset else None
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Names of the markers, base to tip."""
+        return tuple(str(name) for name in self.dataset["marker"].values)
+
+    @property
+    def cable_names(self) -> tuple[str, ...]:
+        """Names of the command channels."""
+        return tuple(str(name) for name in self.dataset["cable"].values)
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the content (numbers and names, not provenance)."""
+        return str(self.dataset.attrs["sha256"])
+
+    @property
+    def synthetic(self) -> bool:
+        """True if a simulator made it."""
+        return bool(self.dataset.attrs["synthetic"])
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Facts about the recording, as the importer knew them."""
+        return dict(json.loads(str(self.dataset.attrs["settings"])))
+
+    def _array(self, name: str) -> np.ndarray:
+        values = self.dataset[name].values.view()
+        values.flags.writeable = False
+        return values
+
+    def command_at(self, time: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n cable"]:
+        """Command in force at each time [s], a new row counting from its own instant on (zero-order hold)."""
+        row = np.searchsorted(self.command_time, np.asarray(time) + _INSTANT, side="right") - 1
+        return np.concatenate([self.initial_command[None], self.command])[row + 1]
+
+    def with_attributes(self, **attributes: Any) -> Trajectory:
+        """Same content under other attributes (``name``, ``provenance``, ...); ``settings`` are merged."""
+        settings = self.settings | attributes.pop("settings", {})
+        return Trajectory(self.dataset.assign_attrs(settings=json.dumps(settings, sort_keys=True), **attributes))
+
+    def slice_rows(self, first: int, last: int) -> Trajectory:
+        """Observation rows ``first`` to ``last``, both included, with the clock set back to 0 at ``first``.
+
+        The commands kept are those that begin in [time[first], time[last]); ``initial_command`` becomes the one in
+        force just before ``first``.
+
+        Raises:
+            InputError: if there are no such rows.
+        """
+        rows = self.time.size
+        if not 0 <= first < last < rows:
+            raise InputError(
+                f"rows [{first}, {last}] are out of range",
+                where=self.name,
+                remedy=f"choose 0 <= first < last <= {rows - 1} (rows of the observations, both included)",
+            )
+        start, end = self.time[first], self.time[last]
+        before = self.command_time < start - _INSTANT
+        kept = ~before & (self.command_time < end - _INSTANT)
+        history = np.concatenate([self.initial_command[None], self.command[before]])
+        dataset = self.dataset.isel(time=slice(first, last + 1))
+        if kept.any():
+            dataset = dataset.isel(command_time=np.flatnonzero(kept))
+        else:
+            dataset = dataset.isel(command_time=[0])
+            dataset["command"] = dataset["command"].copy(data=history[-1:])
+            dataset = dataset.assign_coords(command_time=[start])
+        dataset["initial_command"] = dataset["initial_command"].copy(data=history[-1])
+        dataset = dataset.assign_coords(time=dataset.time - start, command_time=dataset.command_time - start)
+        return Trajectory(dataset.assign_attrs(name=f"{self.name}[{first}:{last}]"))
+
+    def resample(self, sample_time: float) -> Trajectory:
+        """Observations on the grid 0, sample_time, 2 sample_time, ... [s] by linear interpolation (quaternions: slerp).
+
+        Commands are events and stay as they are. A resampled position is masked if a row it draws on is masked.
+        Nothing is filtered: resampling to a coarser grid picks rows, and their noise stays independent.
+
+        Raises:
+            InputError: if the sample time is not positive or longer than the recording.
+        """
+        duration = float(self.time[-1])
+        if not (np.isfinite(sample_time) and 0.0 < sample_time <= duration):
+            raise InputError(
+                f"cannot resample to every {sample_time} s",
+                where=self.name,
+                remedy=f"choose 0 < resample <= {duration:g} s, the length of the recording",
+            )
+        grid = sample_time * np.arange(int(np.floor(duration / sample_time + 1e-9)) + 1)
+        left, weight = _brackets(self.time, grid)
+        right = np.minimum(left + 1, self.time.size - 1)
+        data: dict[str, Any] = {}
+        for key in ("position", "tension", "motor_angle", "object_pose"):
+            if key in self.dataset:
+                values = self.dataset[key].values
+                share = weight.reshape((-1,) + (1,) * (values.ndim - 1))
+                data[key] = (self.dataset[key].dims, (1.0 - share) * values[left] + share * values[right])
+        if "object_pose" in data:
+            data["object_pose"][1][:, 3:] = _slerp(self.dataset["object_pose"].values[:, 3:], left, right, weight)
+        mask = self.position_mask
+        usable = (mask[left] | (weight == 1.0)[:, None]) & (mask[right] | (weight == 0.0)[:, None])
+        data["position_mask"] = (("time", "marker"), usable)
+        dataset = self.dataset.drop_dims("time").assign(data).assign_coords(time=grid)
+        return Trajectory(dataset.assign_attrs(sample_time=float(sample_time)))
+
+    def save(self, path: Path) -> None:
+        """Write our NetCDF.
+
+        Raises:
+            InputError: if the file cannot be written.
+        """
+        try:
+            self.dataset.to_netcdf(path, engine="h5netcdf")
+        except OSError as error:
+            raise InputError(
+                f"cannot be written ({error.strerror or error})", where=str(path), remedy="choose a writable folder"
+            ) from None
+
+    @classmethod
+    def load(cls, path: Path) -> Trajectory:
+        """Read our NetCDF.
+
+        Raises:
+            InputError: if the file is missing, corrupt, written by something else, or its content does not match the
+                hash stored in it.
+        """
+        if not Path(path).is_file():
+            raise InputError("no such file", where=str(path), remedy="correct the path")
+        try:
+            with xr.open_dataset(path, engine="h5netcdf") as opened:
+                dataset = opened.load()
+        except Exception as error:  # the HDF5 stack raises many types on damaged files, none of them ours
+            raise InputError(
+                f"is not a readable NetCDF file ({type(error).__name__})", where=str(path), remedy="fetch it again"
+            ) from None
+        if dataset.attrs.get("schema") != SCHEMA:
+            raise InputError(
+                f"is a NetCDF file, but not a trajectory of ours (attribute schema = {SCHEMA!r} is missing)",
+                where=str(path),
+                remedy="convert it with Trajectory.build(...).save(path)",
+            )
+        missing = [key for key in (*_HASHED, "marker", "cable", "axis") if key not in dataset.variables]
+        if missing:
+            raise InputError(f"lacks the variable {missing[0]!r}", where=str(path), remedy="fetch it again")
+        stored = dataset.attrs.get("sha256")
+        dataset["position_mask"] = dataset["position_mask"].astype(bool)
+        trajectory = cls(dataset)
+        if stored != trajectory.sha256:
+            raise InputError("its content does not match its hash", where=str(path), remedy="fetch it again")
+        return trajectory
+
+
+_INSTANT = 1e-9  # [s]: times that differ by less are the same instant
+
+
+def continuous_quaternions(pose: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time 7"]:
+    """Poses whose quaternion keeps its sign from row to row, the first with w >= 0 (q and -q are the same rotation)."""
+    pose = np.array(pose, dtype=float)
+    turn = np.where((pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0.0, -1.0, 1.0)
+    first = -1.0 if pose.size and pose[0, 6] < 0.0 else 1.0
+    pose[:, 3:] *= first * np.concatenate([[1.0], np.cumprod(turn)])[:, None][: len(pose)]
+    return pose
+
+
+def _brackets(time: Float[np.ndarray, " rows"], grid: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
+    """Row before each grid time and the weight of the row after it; exactly 0 or 1 on a row."""
+    left = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, time.size - 2)
+    weight = (grid - time[left]) / (time[left + 1] - time[left])
+    weight[np.abs(weight) < 1e-6] = 0.0
+    weight[np.abs(weight - 1.0) < 1e-6] = 1.0
+    return left, np.clip(weight, 0.0, 1.0)
+
+
+def _slerp(quaternion: np.ndarray, left: np.ndarray, right: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    start, end = Rotation.from_quat(quaternion[left]), Rotation.from_quat(quaternion[right])
+    turn = (start.inv() * end).as_rotvec()
+    between = (start * Rotation.from_rotvec(weight[:, None] * turn)).as_quat()
+    return continuous_quaternions(np.hstack([np.zeros((len(between), 3)), between]))[:, 3:]
+
+
+def _digest(dataset: xr.Dataset) -> str:
+    digest = hashlib.sha256()
+    for key in (*_HASHED, *_OPTIONAL):
+        if key in dataset.variables:
+            values = np.ascontiguousarray(dataset[key].values)
+            digest.update(f"{key}{values.shape}".encode())
+            digest.update(values.astype("<f8").tobytes())
+    for key in ("marker", "cable"):
+        digest.update("\x1f".join(str(name) for name in dataset[key].values).encode())
+    digest.update(str(dataset["command"].attrs.get("unit", "")).encode())
+    return digest.hexdigest()
