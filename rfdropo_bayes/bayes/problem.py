@@ -1,0 +1,98 @@
+"""What an inference method sees: a posterior given data, in named parameters. Simulators stay hidden behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+Values = Mapping[str, Float[Array, " n"]]
+
+
+@runtime_checkable
+class Problem(Protocol):
+    """A posterior given data.
+
+    A data *row* is one time step of every recording; a *horizon* ``h`` is the prefix of the first ``h`` rows (eq. 3 of
+    RF-DROPO). Values are always named and in physical units; ``u`` is the unconstrained space that samplers move in.
+
+    Attributes:
+        names: scalar parameters, in sampling order.
+        units: unit of each parameter, SI.
+        bounds: hard bounds of each parameter; infinite where there is none.
+        n_rows: rows of data; horizons run from 1 to ``n_rows``.
+
+    A problem may also have
+
+    - ``fingerprint: str``, a digest of its data and model: checkpoints of another problem are then refused;
+    - ``status_names: Mapping[int, str]``, words for its status codes, used when excluded rollouts are counted.
+    """
+
+    names: tuple[str, ...]
+    units: dict[str, str]
+    bounds: dict[str, tuple[float, float]]
+    n_rows: int
+
+    def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
+        """Independent prior draws."""
+        ...
+
+    def to_unconstrained(self, values: Values) -> Float[Array, "n d"]:
+        """Values as points of the unconstrained space."""
+        ...
+
+    def from_unconstrained(self, u: Float[Array, "n d"]) -> dict[str, Float[Array, " n"]]:
+        """Inverse of `to_unconstrained`."""
+        ...
+
+    def log_prior(self, u: Float[Array, "n d"]) -> Float[Array, " n"]:
+        """Normalised log prior density in the UNCONSTRAINED space, that is with the Jacobian of the transform."""
+        ...
+
+    def row_log_likelihood(
+        self, values: Values, horizon: int
+    ) -> tuple[Float[Array, "n horizon"], Int[Array, " n"]]:
+        """Log density of each of the first ``horizon`` rows given those before it, for a batch of values.
+
+        Returns:
+            rows: minus infinity where the likelihood is zero, never NaN.
+            status: 0, or the code of a rollout that did not end well. Such a rollout never gets weight; it is counted.
+        """
+        ...
+
+
+@runtime_checkable
+class ResidualProblem(Problem, Protocol):
+    """A problem whose log likelihood is a sum of squares, as Gauss-Newton wants it."""
+
+    def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " m"]:
+        """Whitened residuals r of the first ``horizon`` rows for ONE set of values.
+
+        ``-0.5 * sum(r**2) + c`` is the log likelihood, where ``c`` depends on noise parameters only. Traceable by JAX
+        where the simulator is; otherwise Jacobians are taken by central differences.
+        """
+        ...
+
+
+@runtime_checkable
+class RolloutProblem(Problem, Protocol):
+    """A problem that can be simulated without a noise model, as RF-DROPO wants it.
+
+    Attributes:
+        observed: measured features, laid out like `rollouts`.
+        observed_mask: True where ``observed`` may be used.
+
+    It may also have ``physical_names: tuple[str, ...]``, the parameters that a rollout depends on (all of ``names`` where
+    it is missing); the others, such as the noise scale, are passed at their prior median.
+    """
+
+    @property
+    def observed(self) -> Float[Array, "n_rows feature"]: ...
+
+    @property
+    def observed_mask(self) -> Bool[Array, "n_rows feature"]: ...
+
+    def rollouts(self, values: Values, horizon: int) -> tuple[Float[Array, "n horizon feature"], Int[Array, " n"]]:
+        """Simulated features of the first ``horizon`` rows, without observation noise, and the status of each."""
+        ...

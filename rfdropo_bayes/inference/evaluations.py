@@ -1,0 +1,63 @@
+"""Calls of a problem's likelihood: cleaned, counted, and charged to a budget of rollouts."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rfdropo_bayes.bayes.problem import Problem
+
+NOT_A_NUMBER = "not_a_number"
+
+
+@dataclass
+class Ledger:
+    """What has been spent on a problem.
+
+    A rollout of horizon h counts as h / n_rows rollouts, because its cost is that of the steps it simulates.
+
+    Attributes:
+        rollouts: full-length equivalents used.
+        evaluations: parameter sets evaluated, at any horizon.
+        excluded: parameter sets that got no weight, counted by status.
+    """
+
+    rollouts: float = 0.0
+    evaluations: int = 0
+    excluded: Counter[str] = field(default_factory=Counter)
+
+    def charge(self, problem: Problem, n: int, horizon: int) -> None:
+        """Count ``n`` rollouts of ``horizon`` rows."""
+        self.rollouts += n * horizon / problem.n_rows
+        self.evaluations += n
+
+    def exclude(self, problem: Problem, status: Int[np.ndarray, " n"], not_a_number: np.ndarray) -> None:
+        """Count what is left out: by its status, or for a likelihood that is not a number."""
+        words = getattr(problem, "status_names", {})
+        for code, count in zip(*np.unique(status[status != 0], return_counts=True), strict=True):
+            self.excluded[words.get(int(code), f"status_{int(code)}")] += int(count)
+        unexplained = int(np.sum(not_a_number & (status == 0)))
+        if unexplained:
+            self.excluded[NOT_A_NUMBER] += unexplained
+
+
+def evaluate_rows(
+    problem: Problem, u: Float[np.ndarray, "n d"], horizon: int, ledger: Ledger
+) -> Float[np.ndarray, "n horizon"]:
+    """Row log likelihoods at unconstrained points; minus infinity throughout for every rollout that is left out."""
+    values = problem.from_unconstrained(u)
+    rows, status = (np.asarray(part) for part in problem.row_log_likelihood(values, horizon))
+    rows = np.asarray(rows, dtype=float)
+    ledger.charge(problem, len(u), horizon)
+    not_a_number = np.any(np.isnan(rows) | (rows == np.inf), axis=1)
+    ledger.exclude(problem, status, not_a_number)
+    return np.where((not_a_number | (status != 0))[:, None], -np.inf, rows)
+
+
+def evaluate_prior(problem: Problem, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+    """Log prior at unconstrained points; minus infinity where it is not a number."""
+    density = np.asarray(problem.log_prior(u), dtype=float)
+    return np.where(np.isnan(density) | (density == np.inf), -np.inf, density)

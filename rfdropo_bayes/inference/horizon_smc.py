@@ -1,0 +1,377 @@
+"""Sequential Monte Carlo whose stages lengthen the horizon: prior, posterior given h1 rows, ..., given all rows.
+
+Inside a block of rows the path is followed row by row, a row being brought in by shares where it says too much at
+once, so that every target is the posterior of a prefix (or nearly), and the evidence of EVERY prefix falls out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+from scipy.special import logsumexp
+
+from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.checkpoints import Checkpoint, open_checkpoint, run_digest
+from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.proposals import KERNELS, initial_scale
+from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains, exclusion_warnings
+from rfdropo_bayes.inference.schedules import SPACINGS, block_boundaries
+from rfdropo_bayes.inference.tempering import Population, StageInfo, Tuning, refresh, stage
+
+PARTICLES_WITHOUT_BUDGET = 1000
+ROLLOUTS_PER_PARTICLE = 20.0
+FEWEST_PARTICLES = 50
+
+
+@dataclass(frozen=True)
+class SmcConfig:
+    """Horizon SMC.
+
+    Attributes:
+        rollouts: budget in full-length rollouts, of all replicates together; None for no limit.
+        particles: per replicate; None takes as many as the budget serves, or 1000 without one.
+        replicates: independent repetitions; they become chains, and their scatter is the evidence's deviation.
+        blocks: number of times the horizon is lengthened.
+        spacing: of the blocks: "geometric", "linear" or "every" (row).
+        target_ess: share of effective particles kept from one target to the next; closer to 1 is slower and more exact.
+        kernel: "crank_nicolson" (adapts between independent draws and small steps) or "random_walk".
+        degrees: degrees of freedom of the Student-t behind "crank_nicolson".
+        acceptance: acceptance rate that the step size is adapted to.
+        correlation: moves of a stage end once no direction is more correlated than this with its start.
+        max_moves: most moves in a stage.
+    """
+
+    rollouts: float | None = None
+    particles: int | None = None
+    replicates: int = 1
+    blocks: int = 6
+    spacing: str = "geometric"
+    target_ess: float = 0.5
+    kernel: str = "crank_nicolson"
+    degrees: float = 8.0
+    acceptance: float = 0.3
+    correlation: float = 0.3
+    max_moves: int = 20
+
+    def __post_init__(self) -> None:
+        where = "[inference]"
+        if self.kernel not in KERNELS:
+            raise InputError(f"unknown kernel {self.kernel!r}", where=where, remedy=f"one of {', '.join(KERNELS)}")
+        if self.spacing not in SPACINGS:
+            raise InputError(f"unknown spacing {self.spacing!r}", where=where, remedy=f"one of {', '.join(SPACINGS)}")
+        for name in ("target_ess", "acceptance", "correlation"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise InputError(f"{name} = {getattr(self, name)} is not between 0 and 1", where=where)
+        for name in ("replicates", "blocks", "max_moves"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} = {getattr(self, name)} is less than 1", where=where)
+        if self.particles is not None and self.particles < 10:
+            raise InputError(f"particles = {self.particles} is less than 10", where=where)
+        if self.degrees <= 0.0 or (self.rollouts is not None and self.rollouts <= 0.0):
+            raise InputError("degrees and rollouts must be positive", where=where)
+
+    @property
+    def tuning(self) -> Tuning:
+        """What a stage needs of this."""
+        return Tuning(
+            self.target_ess, self.kernel, self.degrees, self.acceptance, self.correlation, self.max_moves
+        )
+
+
+class Plan(NamedTuple):
+    """Sizes that are fixed before a replicate starts.
+
+    Attributes:
+        particles: number of particles.
+        horizons: prefix lengths at the ends of the blocks.
+        budget: rollouts of this replicate; infinite for no limit.
+    """
+
+    particles: int
+    horizons: tuple[int, ...]
+    budget: float
+
+
+class SmcState(NamedTuple):
+    """Everything a replicate needs to go on.
+
+    Attributes:
+        population: particles; their rows reach to the end of the present block.
+        block: index of the present block; -1 before the first.
+        stage: number of stages done; random keys derive from it.
+        log_evidence: log p(rows passed).
+        prefix_log_evidence: at every prefix passed, NaN elsewhere.
+        ledger: cost and exclusions.
+        trace: one dictionary per stage.
+        seconds: time spent.
+        finished: the last stage is done.
+    """
+
+    population: Population
+    block: int
+    stage: int
+    log_evidence: float
+    prefix_log_evidence: Float[np.ndarray, " n_rows"]
+    ledger: Ledger
+    trace: list[dict[str, Any]]
+    seconds: float
+    finished: bool
+
+
+def make_plan(problem: Problem, config: SmcConfig) -> Plan:
+    """Fix particles and blocks so that the budget can be kept.
+
+    Raises:
+        InputError: the budget does not even allow every particle one look at every block and one last move.
+    """
+    horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
+    budget = np.inf if config.rollouts is None else config.rollouts / config.replicates
+    looks = sum(horizons) / problem.n_rows
+    if config.particles is not None:
+        particles = config.particles
+    elif config.rollouts is None:
+        particles = PARTICLES_WITHOUT_BUDGET
+    else:
+        particles = int(budget / max(ROLLOUTS_PER_PARTICLE, 2.0 * looks))
+    least = max(particles, FEWEST_PARTICLES if config.particles is None else 1)
+    if least * (looks + 1.0) > budget:
+        raise InputError(
+            f"{config.rollouts:g} rollouts are too few for {least} particles over {len(horizons)} blocks",
+            where="[inference] rollouts",
+            remedy=f"allow at least {config.replicates * least * (looks + 1.0):.0f}, or use fewer particles",
+        )
+    return Plan(least, horizons, budget)
+
+
+def init(key: PRNGKeyArray, problem: Problem, plan: Plan, config: SmcConfig) -> SmcState:
+    """Prior draws, no rollouts yet."""
+    u = np.asarray(problem.to_unconstrained(problem.sample_prior(key, plan.particles)), dtype=float)
+    n = plan.particles
+    population = Population(
+        u,
+        evaluate_prior(problem, u),
+        np.zeros((n, 0)),
+        np.full(n, -np.log(n)),
+        0.0,
+        initial_scale(config.kernel, u.shape[1]),
+    )
+    prefix = np.full(problem.n_rows, np.nan)
+    return SmcState(population, -1, 0, 0.0, prefix, Ledger(), [], 0.0, False)
+
+
+def step(
+    key: PRNGKeyArray, state: SmcState, problem: Problem, plan: Plan, config: SmcConfig
+) -> tuple[SmcState, StageInfo]:
+    """One stage: look further ahead if the block is used up, reweight, resample, move.
+
+    Args:
+        key: key of the whole replicate; the stage's own is derived from it, which makes a resumed run exact.
+        state: of the replicate.
+        problem: to be sampled.
+        plan: sizes.
+        config: settings.
+    """
+    began = time.monotonic()
+    key = jax.random.fold_in(key, state.stage)
+    if state.block < 0 or state.population.progress == plan.horizons[state.block]:
+        state = _extend(state, problem, plan.horizons[state.block + 1])
+    horizon = plan.horizons[state.block]
+    evaluate = partial(_evaluate, problem, horizon, state.ledger)
+    moves = _affordable_moves(state, plan, horizon, problem.n_rows)
+    population, info = stage(key, state.population, float(horizon), evaluate, config.tuning, moves)
+    if not np.isfinite(info.log_evidence_increment):
+        raise _nothing_left(state, horizon)
+    finished = population.progress == problem.n_rows
+    evidence = state.log_evidence + info.log_evidence_increment
+    prefix = state.prefix_log_evidence.copy()
+    prefix[info.passed - 1] = state.log_evidence + info.row_log_evidence
+    facts = {"horizon": horizon, "budget_exhausted": moves == 0, **_facts(info), "log_evidence": evidence}
+    state.trace.append(facts | {"rollouts": state.ledger.rollouts})
+    if finished:
+        moves = max(1, _affordable_moves(state, plan, horizon, problem.n_rows, last=True))
+        last_key = jax.random.fold_in(key, 1)
+        population, done = refresh(last_key, population, info, evaluate, config.tuning, moves)
+        state.trace.append(facts | _facts(done) | {"rollouts": state.ledger.rollouts, "final": True})
+    state = state._replace(
+        population=population,
+        stage=state.stage + 1,
+        log_evidence=evidence,
+        prefix_log_evidence=prefix,
+        seconds=state.seconds + time.monotonic() - began,
+        finished=finished,
+    )
+    return state, info
+
+
+def _extend(state: SmcState, problem: Problem, horizon: int) -> SmcState:
+    """Roll every particle out to the next horizon; the rows it has already are kept as they are."""
+    known = state.population.rows
+    rows = evaluate_rows(problem, state.population.position, horizon, state.ledger)
+    rows = np.concatenate([known, rows[:, known.shape[1] :]], axis=1)
+    return state._replace(population=state.population._replace(rows=rows), block=state.block + 1)
+
+
+def _evaluate(problem: Problem, horizon: int, ledger: Ledger, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return evaluate_prior(problem, u), evaluate_rows(problem, u, horizon, ledger)
+
+
+def _affordable_moves(state: SmcState, plan: Plan, horizon: int, n_rows: int, *, last: bool = False) -> int:
+    """Moves a stage may make. What the rest of the run cannot do without is held back first, and a stage takes at most
+    half of what is then left, so that later stages find something."""
+    if not np.isfinite(plan.budget):
+        return 10**9
+    looks = sum(plan.horizons[state.block + 1 :]) / n_rows
+    left = plan.budget - state.ledger.rollouts - (0.0 if last else plan.particles * (looks + 1.0))
+    cost = plan.particles * horizon / n_rows
+    if left < cost:
+        return 0
+    return max(1, int((left if last else 0.5 * left) / cost + 1e-9))
+
+
+def _facts(info: StageInfo) -> dict[str, float]:
+    kept = ("progress", "log_evidence_increment", "ess", "moves", "acceptance", "scale", "correlation")
+    return {name: getattr(info, name) for name in kept}
+
+
+def _nothing_left(state: SmcState, horizon: int) -> InputError:
+    reasons = ", ".join(f"{name} {count}" for name, count in sorted(state.ledger.excluded.items())) or "no reason given"
+    return InputError(
+        f"the prior excludes the data: no parameter set has a positive likelihood up to row {horizon} ({reasons})",
+        where="[model.priors]",
+        remedy="widen the priors, or look at what the simulator reports for them",
+    )
+
+
+def run(
+    problem: Problem,
+    config: SmcConfig,
+    key: PRNGKeyArray,
+    *,
+    checkpoint_dir: Path | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> InferenceResult:
+    """Sample a problem's posterior with ``config.replicates`` independent replicates.
+
+    Raises:
+        InputError: a budget that is too small, a prior that excludes the data, a checkpoint of another run.
+    """
+    plan = make_plan(problem, config)
+    digest = run_digest(problem, "smc", config, key)
+    states = []
+    for replicate in range(config.replicates):
+        checkpoint = open_checkpoint(checkpoint_dir, f"smc_{replicate}", digest, resume=resume)
+
+        def report(state: SmcState, replicate: int = replicate) -> None:
+            if progress is not None:
+                done = (replicate + state.population.progress / problem.n_rows) / config.replicates
+                progress.stage(done, method="smc", replicate=replicate, stage=state.stage, **state.trace[-1])
+
+        states.append(_replicate(problem, config, plan, jax.random.fold_in(key, replicate), checkpoint, report))
+    return _result(problem, config, plan, states)
+
+
+def _replicate(
+    problem: Problem,
+    config: SmcConfig,
+    plan: Plan,
+    key: PRNGKeyArray,
+    checkpoint: Checkpoint,
+    report: Callable[[SmcState], None],
+) -> SmcState:
+    init_key, stage_key = jax.random.split(key)
+    saved = checkpoint.load()
+    state = init(init_key, problem, plan, config) if saved is None else _unpack(*saved)
+    while not state.finished:
+        state, _ = step(stage_key, state, problem, plan, config)
+        checkpoint.save(*_pack(state))
+        report(state)
+    return state
+
+
+def _pack(state: SmcState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    population = state.population
+    arrays = {name: getattr(population, name) for name in ("position", "base", "rows", "log_weights")}
+    meta = {name: getattr(state, name) for name in ("block", "stage", "log_evidence", "trace", "seconds", "finished")}
+    meta |= {"progress": population.progress, "scale": population.scale, "ledger": asdict(state.ledger)}
+    return arrays | {"prefix_log_evidence": state.prefix_log_evidence}, meta
+
+
+def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SmcState:
+    population = Population(
+        arrays["position"], arrays["base"], arrays["rows"], arrays["log_weights"], meta["progress"], meta["scale"]
+    )
+    ledger = Ledger(meta["ledger"]["rollouts"], meta["ledger"]["evaluations"], Counter(meta["ledger"]["excluded"]))
+    named = {name: meta[name] for name in ("block", "stage", "log_evidence", "trace", "seconds", "finished")}
+    return SmcState(population, prefix_log_evidence=arrays["prefix_log_evidence"], ledger=ledger, **named)
+
+
+def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcState]) -> InferenceResult:
+    draws = chains(problem, [state.population.position for state in states])
+    values = np.array([state.log_evidence for state in states])
+    prefixes = np.stack([state.prefix_log_evidence for state in states])
+    excluded: Counter[str] = sum((state.ledger.excluded for state in states), Counter())
+    evaluations = sum(state.ledger.evaluations for state in states)
+    trace = [{"replicate": index, **row} for index, state in enumerate(states) for row in state.trace]
+    sd = float(values.std(ddof=1)) if len(values) > 1 else float("nan")
+    return InferenceResult(
+        method="smc",
+        draws=draws,
+        log_evidence=(float(np.mean(values)), sd),
+        prefix_log_evidence=prefixes.mean(axis=0),
+        block_scores=_block_scores(plan.horizons, prefixes),
+        log_likelihood=np.stack([state.population.rows for state in states]),
+        trace=trace,
+        rollouts=sum(state.ledger.rollouts for state in states),
+        evaluations=evaluations,
+        excluded=dict(excluded),
+        warnings=[
+            *bound_warnings(draws, problem.bounds),
+            *exclusion_warnings(excluded, evaluations),
+            *_stage_warnings(trace, config),
+        ],
+        seconds=sum(state.seconds for state in states),
+        details={"log_evidence_replicates": values.tolist(), "particles": plan.particles, "horizons": plan.horizons},
+    )
+
+
+def _block_scores(horizons: tuple[int, ...], prefixes: Float[np.ndarray, "r n_rows"]) -> list[dict[str, float]]:
+    scores, first = [], 0
+    for last in horizons:
+        block = prefixes[:, last - 1] - (prefixes[:, first - 1] if first else 0.0)
+        sd = float(block.std(ddof=1)) if len(block) > 1 else float("nan")
+        scores.append({"first_row": first + 1, "last_row": last, "log_score": float(block.mean()), "sd": sd})
+        first = last
+    return scores
+
+
+def _stage_warnings(trace: list[dict[str, Any]], config: SmcConfig) -> list[str]:
+    sentences = []
+    leaps = [row for row in trace if row["budget_exhausted"] and not row.get("final")]
+    if leaps:
+        worst = min(row["ess"] for row in leaps)
+        sentences.append(
+            f"the budget of {config.rollouts:g} rollouts ran out at row {leaps[0]['progress']:g}: the last rows were "
+            f"brought in by reweighting only (effective share {worst:.2%}); allow more rollouts or use fewer particles"
+        )
+    last = [row for row in trace if row.get("final")]
+    stuck = max(row["correlation"] for row in last)
+    if stuck > max(0.7, config.correlation):
+        sentences.append(f"the last moves left the particles {stuck:.2f} correlated with where they were")
+    return sentences
+
+
+def log_mean_evidence(values: Float[np.ndarray, " r"]) -> float:
+    """Logarithm of the mean of replicate evidences, which unlike their mean logarithm is unbiased before the log."""
+    return float(logsumexp(values) - np.log(len(values)))
