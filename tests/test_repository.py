@@ -1,0 +1,147 @@
+"""What the repository says about itself is true: pins, commands, versions, links, and nobody's own paths."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+import tomli_w
+from hatchling.builders.wheel import WheelBuilder
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import rfdropo_bayes
+from rfdropo_bayes.cli.main import app
+from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.workflow.experiment import load_experiment
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+DOCUMENTS = sorted(REPOSITORY.glob("*.md")) + sorted((REPOSITORY / "docs").glob("*.md"))
+
+README = (REPOSITORY / "README.md").read_text()
+
+OWN_PATH = re.compile(r"(?<![\w./~$}])/(?:home|Users|root|work|tmp|mnt|farm)/\w")
+INDEX_OPTION = re.compile(r"--(?:extra-)?index[-]url|--find[-]links|--trusted[-]host")
+
+
+def requirements(extra: str | None) -> list[Requirement]:
+    lines = PROJECT["dependencies"] if extra is None else PROJECT["optional-dependencies"][extra]
+    return [requirement for requirement in map(Requirement, lines) if requirement.name != PROJECT["name"]]
+
+
+def constraints() -> dict[str, str]:
+    lines = (REPOSITORY / "constraints.txt").read_text().splitlines()
+    pairs = [line.split("==") for line in lines if line and not line.startswith("#")]
+    return {canonicalize_name(name): version for name, version in pairs}
+
+
+def make_targets() -> set[str]:
+    return set(re.findall(r"^([a-z][a-z-]*):", (REPOSITORY / "Makefile").read_text(), flags=re.MULTILINE))
+
+
+def code_in(document: Path) -> str:
+    """Text of a Markdown file that is set as code."""
+    return "\n".join(re.findall(r"```.*?```|`[^`\n]+`", document.read_text(), flags=re.DOTALL))
+
+
+def tracked_text() -> list[tuple[str, str]]:
+    """Name and text of every text file in git; empty where this is no checkout."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    found = []
+    for name in filter(None, listed.stdout.split("\0")):
+        try:
+            found.append((name, (REPOSITORY / name).read_text(encoding="utf-8")))
+        except (UnicodeDecodeError, OSError):
+            continue
+    return found
+
+
+@pytest.mark.parametrize("extra", [None, *PROJECT["optional-dependencies"]])
+def test_every_dependency_is_pinned_inside_its_range(extra: str | None) -> None:
+    pins = constraints()
+    for requirement in requirements(extra):
+        name = canonicalize_name(requirement.name)
+        assert name in pins, f"{name} is missing from constraints.txt"
+        assert requirement.specifier.contains(pins[name]), f"{name}=={pins[name]} is outside {requirement.specifier}"
+
+
+def test_no_accelerator_packages_are_pinned() -> None:
+    assert not [name for name in constraints() if re.search(r"nvidia|cuda|triton|rocm", name)]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_documented_make_commands_exist(document: Path) -> None:
+    named = set(re.findall(r"\bmake ([a-z][a-z-]*)", code_in(document)))
+    assert named <= make_targets(), f"{document.name} names {sorted(named - make_targets())}"
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_documented_rfdropo_commands_exist(document: Path) -> None:
+    known = {command.name or command.callback.__name__ for command in app.registered_commands if command.callback}
+    named = set(re.findall(r"\brfdropo +([a-z][a-z-]*)", code_in(document)))
+    assert named <= known, f"{document.name} names {sorted(named - known)}"
+
+
+def test_the_experiment_in_the_readme_is_one(tmp_path: Path) -> None:
+    """The example experiment is valid, and so is its [data] replaced by the example of a plain CSV."""
+    whole, plain = (tomllib.loads(text) for text in re.findall(r"```toml\n(.*?)```", README, flags=re.DOTALL))
+    for name, tables in (("whole", whole), ("plain", whole | plain)):
+        path = tmp_path / f"{name}.toml"
+        path.write_text(tomli_w.dumps(tables))
+        experiment, _ = load_experiment(path)
+        assert set(experiment.model.priors) <= set(load_robot(experiment.robot).parameters)
+
+
+def test_the_two_commands_are_in_the_readme() -> None:
+    assert {"make demo", "make test"} <= set(re.findall(r"make [a-z-]+", code_in(REPOSITORY / "README.md")))
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_links_inside_the_repository_lead_somewhere(document: Path) -> None:
+    targets = re.findall(r"\]\((?!https?://|#)([^)#]+)", document.read_text())
+    assert not [target for target in targets if not (document.parent / target).exists()]
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    version = rfdropo_bayes.__version__
+    assert f"\nversion: {version}\n" in (REPOSITORY / "CITATION.cff").read_text()
+    short = re.escape(version.rsplit(".", 1)[0])
+    assert re.search(rf"^Version {short}\b", README, flags=re.MULTILINE)
+
+
+def test_the_wheel_holds_code_robots_and_experiments(tmp_path: Path) -> None:
+    built = next(WheelBuilder(str(REPOSITORY)).build(directory=str(tmp_path), versions=["standard"]))
+    names = set(zipfile.ZipFile(built).namelist())
+    expected = {path.relative_to(REPOSITORY).as_posix() for path in (REPOSITORY / "rfdropo_bayes").rglob("*.py")}
+    for folder in ("models/robots", "experiments"):
+        expected |= {f"rfdropo_bayes/{folder}/{path.name}" for path in (REPOSITORY / folder).glob("*.toml")}
+    assert expected <= names
+    assert not [name for name in names if name.startswith(("tests/", "shared/", "reports/"))]
+
+
+def test_files_name_no_machine_and_no_package_index() -> None:
+    bad = []
+    for name, text in tracked_text():
+        for number, line in enumerate(text.splitlines(), start=1):
+            if OWN_PATH.search(line) or INDEX_OPTION.search(line):
+                bad.append(f"{name}:{number}: {line.strip()[:100]}")
+    assert not bad, "\n".join(bad)
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ("data = '/home/" + "someone/data.csv'", True),
+        ("open('/tmp/" + "x')", True),
+        ("see ../shared/work/notes", False),
+        ("#!/usr/bin/env bash", False),
+        ("https://example.org/home/page", False),
+    ],
+)
+def test_the_search_for_own_paths_finds_them(line: str, found: bool) -> None:
+    assert bool(OWN_PATH.search(line)) is found
