@@ -18,7 +18,7 @@ import scipy.sparse as sparse
 from jaxtyping import Bool, Int
 from scipy.sparse.linalg import splu
 
-from rfdropo_bayes.fem.native.simd import fill, load, square_root, store
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, load, square_root, store
 
 
 class BlockPattern(NamedTuple):
@@ -112,12 +112,12 @@ def _invert_pivot(pivot, j, token):
     i00 = one / square_root(load(pivot, j, token))
     l10 = load(pivot, j + 1, token) * i00
     l20 = load(pivot, j + 3, token) * i00
-    i11 = one / square_root(load(pivot, j + 2, token) - l10 * l10)
-    l21 = (load(pivot, j + 4, token) - l20 * l10) * i11
-    i22 = one / square_root(load(pivot, j + 5, token) - l20 * l20 - l21 * l21)
+    i11 = one / square_root(fnma(l10, l10, load(pivot, j + 2, token)))
+    l21 = fnma(l20, l10, load(pivot, j + 4, token)) * i11
+    i22 = one / square_root(fnma(l21, l21, fnma(l20, l20, load(pivot, j + 5, token))))
     i10 = -(l10 * i00 * i11)
     i21 = -(l21 * i11 * i22)
-    i20 = -((l20 * i00 + l21 * i10) * i22)
+    i20 = -(fma(l20, i00, l21 * i10) * i22)
     store(pivot, j, i00)
     store(pivot, j + 1, i10)
     store(pivot, j + 2, i11)
@@ -136,12 +136,12 @@ def _update_pivot(pivot, j, lower, pattern, column, token):
         block = 9 * pattern.own[k]
         for m in range(3):
             a, b, c = load(lower, block + m, token), load(lower, block + 3 + m, token), load(lower, block + 6 + m, token)
-            p00 = p00 - a * a
-            p10 = p10 - b * a
-            p11 = p11 - b * b
-            p20 = p20 - c * a
-            p21 = p21 - c * b
-            p22 = p22 - c * c
+            p00 = fnma(a, a, p00)
+            p10 = fnma(b, a, p10)
+            p11 = fnma(b, b, p11)
+            p20 = fnma(c, a, p20)
+            p21 = fnma(c, b, p21)
+            p22 = fnma(c, c, p22)
     store(pivot, j, p00)
     store(pivot, j + 1, p10)
     store(pivot, j + 2, p11)
@@ -164,5 +164,66 @@ def factor(pattern, pivot, lower, token):
             for k in range(pattern.product[block], pattern.product[block + 1]):
                 left, right = 9 * pattern.source[k, 0], 9 * pattern.source[k, 1]
                 for m in range(3):
-                    x, y, z = load(right, m, token), load(right, m, token), load(right, m, token)
-            store(lower, t, a00)
+                    x, y, z = load(lower, right + m, token), load(lower, right + 3 + m, token), load(lower, right + 6 + m, token)
+                    w = load(lower, left + m, token)
+                    a00 = fnma(w, x, a00)
+                    a01 = fnma(w, y, a01)
+                    a02 = fnma(w, z, a02)
+                    w = load(lower, left + 3 + m, token)
+                    a10 = fnma(w, x, a10)
+                    a11 = fnma(w, y, a11)
+                    a12 = fnma(w, z, a12)
+                    w = load(lower, left + 6 + m, token)
+                    a20 = fnma(w, x, a20)
+                    a21 = fnma(w, y, a21)
+                    a22 = fnma(w, z, a22)
+            store(lower, t, a00 * i00)
+            store(lower, t + 1, fma(a00, i10, a01 * i11))
+            store(lower, t + 2, fma(a00, i20, fma(a01, i21, a02 * i22)))
+            store(lower, t + 3, a10 * i00)
+            store(lower, t + 4, fma(a10, i10, a11 * i11))
+            store(lower, t + 5, fma(a10, i20, fma(a11, i21, a12 * i22)))
+            store(lower, t + 6, a20 * i00)
+            store(lower, t + 7, fma(a20, i10, a21 * i11))
+            store(lower, t + 8, fma(a20, i20, fma(a21, i21, a22 * i22)))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def condense(pattern, lower, condensed, token):
+    """Products b_i' A^-1 b_j of all border rows i >= j, after `factor`, into ``condensed`` (rows * rows, lanes), row-major."""
+    rows = 3 * pattern.border
+    for i in range(rows):
+        for j in range(i + 1):
+            total = fill(0.0, lower, token)
+            for column in range(len(pattern.first) - 1):
+                last = pattern.first[column + 1] - pattern.border
+                a, b = 9 * (last + i // 3) + 3 * (i % 3), 9 * (last + j // 3) + 3 * (j % 3)
+                for m in range(3):
+                    total = fma(load(lower, a + m, token), load(lower, b + m, token), total)
+            store(condensed, i * rows + j, total)
+            store(condensed, j * rows + i, total)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def back_substitute(pattern, pivot, lower, weight, solution, token):
+    """Solve A x = sum_i weight_i b_i over the border rows b_i, after `factor`; ``solution`` is (3 n, lanes)."""
+    for column in range(len(pattern.first) - 2, -1, -1):
+        last = pattern.first[column + 1] - pattern.border
+        x, y, z = fill(0.0, lower, token), fill(0.0, lower, token), fill(0.0, lower, token)
+        for i in range(3 * pattern.border):
+            t, factor_i = 9 * (last + i // 3) + 3 * (i % 3), load(weight, i, token)
+            x = fma(factor_i, load(lower, t, token), x)
+            y = fma(factor_i, load(lower, t + 1, token), y)
+            z = fma(factor_i, load(lower, t + 2, token), z)
+        for block in range(pattern.first[column], last):
+            t, row = 9 * block, 3 * pattern.row[block]
+            for m in range(3):
+                value = load(solution, row + m, token)
+                x = fnma(load(lower, t + 3 * m, token), value, x)
+                y = fnma(load(lower, t + 3 * m + 1, token), value, y)
+                z = fnma(load(lower, t + 3 * m + 2, token), value, z)
+        j = 6 * column
+        i20, i21, i22 = load(pivot, j + 3, token), load(pivot, j + 4, token), load(pivot, j + 5, token)
+        store(solution, 3 * column, fma(load(pivot, j, token), x, fma(load(pivot, j + 1, token), y, i20 * z)))
+        store(solution, 3 * column + 1, fma(load(pivot, j + 2, token), y, i21 * z))
+        store(solution, 3 * column + 2, i22 * z)

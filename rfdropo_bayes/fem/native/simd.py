@@ -1,8 +1,8 @@
 """A vector of lanes as a value inside compiled kernels: one lane is one sample, and lanes never mix.
 
 A `Simd` value is an LLVM vector of 32- or 64-bit floats. The arithmetic operators act lane by lane; a plain number met on the way
-fills all lanes. Multiplications and additions may contract to fused multiply-add, nothing else is reordered, so that a lane's
-result does not depend on its neighbours or on its place.
+fills all lanes. Nothing is reordered or contracted behind the kernel's back: fused multiply-add happens where `fma` or `fnma` stands and nowhere else,
+so that a lane's result depends neither on its neighbours nor on what the compiler chose to inline.
 
 Kernels keep their data in C-contiguous arrays ``(n, lanes)`` and move rows with `load` and `store`. How many lanes there are must be
 known to the compiler: kernels take it as the tuple made by `lane_token`, whose length is part of its type.
@@ -23,15 +23,12 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import (
     intrinsic,
     lower_builtin,
-    lower_cast,
     models,
     register_model,
 )
 
 ALIGNMENT = 64
 """Bytes to which work arrays are aligned: one cache line, and the widest vector register."""
-CONTRACT = ("contract",)
-"""Fast-math flags of every operation: contraction to fused multiply-add only."""
 
 
 class SimdType(types.Type):
@@ -136,7 +133,7 @@ def _binary(name: str) -> Callable:
             value if isinstance(kind, SimdType) else _splat(context, builder, value, kind, simd)
             for value, kind in zip(arguments, sig.args, strict=True)
         )
-        return getattr(builder, name)(left, right, flags=CONTRACT)
+        return getattr(builder, name)(left, right)
 
     return generate
 
@@ -176,9 +173,31 @@ class _NegateTemplate(AbstractTemplate):
         return signature(args[0], args[0]) if isinstance(args[0], SimdType) else None
 
 
-@lower_cast(SimdType, SimdType)
-def _cast_same(context, builder, from_type, to_type, value):
-    return value
+def _fused(negative: bool) -> Callable:
+    def generate(context, builder, sig, arguments):
+        simd = sig.return_type
+        first, second, third = (
+            value if isinstance(kind, SimdType) else _splat(context, builder, value, kind, simd)
+            for value, kind in zip(arguments, sig.args, strict=True)
+        )
+        kind = vector_type(simd)
+        name = f"llvm.fma.v{simd.lanes}f{simd.dtype.bitwidth}"
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * 3), name)
+        return builder.call(function, [builder.fneg(first) if negative else first, second, third])
+
+    return generate
+
+
+@intrinsic
+def fma(typing_context, first, second, third):
+    """first * second + third, rounded once; ``second`` may be a number."""
+    return (first(first, second, third), _fused(False)) if isinstance(first, SimdType) else None
+
+
+@intrinsic
+def fnma(typing_context, first, second, third):
+    """third - first * second, rounded once; ``second`` may be a number."""
+    return (first(first, second, third), _fused(True)) if isinstance(first, SimdType) else None
 
 
 @intrinsic

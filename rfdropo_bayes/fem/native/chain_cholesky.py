@@ -1,0 +1,166 @@
+"""Cholesky factorisation of bordered block-tridiagonal matrices, many side by side in SIMD lanes.
+
+The stations of a layered body are eliminated one after the other from the tip to the base. Three arrays hold, for every station, the
+pivot block, the coupling to the next station and the border: rows below the matrix, one for each right-hand side. All are cut into
+3 x 3 tiles and stored panel by panel: rows 3 p to 3 p + 2 of a block with ``size`` columns are panel p, element (3 p + r, c) at
+``(p * size + c) * 3 + r``. One kernel, panel times transposed panel, does nearly all of the work. The factorisation turns a border
+row b' into (L^-1 b)', and products of these rows are b_i' A^-1 b_j.
+"""
+
+from __future__ import annotations
+
+import numba
+
+from rfdropo_bayes.fem.native.simd import fill, load, square_root, store
+
+
+@numba.njit(inline="always")
+def _tile_minus_product(target, t, left, a, right, b, length, token):
+    """The tile at ``t`` less the product of ``length`` columns of two panels; nine values, column by column."""
+    c0, c1, c2 = load(target, t, token), load(target, t + 1, token), load(target, t + 2, token)
+    c3, c4, c5 = load(target, t + 3, token), load(target, t + 4, token), load(target, t + 5, token)
+    c6, c7, c8 = load(target, t + 6, token), load(target, t + 7, token), load(target, t + 8, token)
+    for k in range(length):
+        x, y, z = load(left, a + 3 * k, token), load(left, a + 3 * k + 1, token), load(left, a + 3 * k + 2, token)
+        w = load(right, b + 3 * k, token)
+        c0, c1, c2 = c0 - x * w, c1 - y * w, c2 - z * w
+        w = load(right, b + 3 * k + 1, token)
+        c3, c4, c5 = c3 - x * w, c4 - y * w, c5 - z * w
+        w = load(right, b + 3 * k + 2, token)
+        c6, c7, c8 = c6 - x * w, c7 - y * w, c8 - z * w
+    return c0, c1, c2, c3, c4, c5, c6, c7, c8
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def subtract_product(target, t, left, a, right, b, length, token):
+    """Subtract the product of two panels from a tile."""
+    c0, c1, c2, c3, c4, c5, c6, c7, c8 = _tile_minus_product(target, t, left, a, right, b, length, token)
+    store(target, t, c0)
+    store(target, t + 1, c1)
+    store(target, t + 2, c2)
+    store(target, t + 3, c3)
+    store(target, t + 4, c4)
+    store(target, t + 5, c5)
+    store(target, t + 6, c6)
+    store(target, t + 7, c7)
+    store(target, t + 8, c8)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _pivot_tile(block, row, length, token):
+    """Finish the diagonal tile after ``length`` columns: its Cholesky factor, with the diagonal inverted."""
+    t = row + 3 * length
+    c0, c1, c2, _, c4, c5, _, _, c8 = _tile_minus_product(block, t, block, row, block, row, length, token)
+    one = fill(1.0, block, token)
+    inverse = one / square_root(c0)
+    c1, c2 = c1 * inverse, c2 * inverse
+    store(block, t, inverse)
+    store(block, t + 1, c1)
+    store(block, t + 2, c2)
+    inverse = one / square_root(c4 - c1 * c1)
+    c5 = (c5 - c2 * c1) * inverse
+    store(block, t + 4, inverse)
+    store(block, t + 5, c5)
+    store(block, t + 8, one / square_root(c8 - c2 * c2 - c5 * c5))
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _factor_tile(target, row, block, pivot_row, length, token):
+    """Finish the tile of a panel below the diagonal tile after ``length`` columns."""
+    t, d = row + 3 * length, pivot_row + 3 * length
+    c0, c1, c2, c3, c4, c5, c6, c7, c8 = _tile_minus_product(
+        target, t, target, row, block, pivot_row, length, token
+    )
+    inverse = load(block, d, token)
+    c0, c1, c2 = c0 * inverse, c1 * inverse, c2 * inverse
+    lower, inverse = load(block, d + 1, token), load(block, d + 4, token)
+    c3, c4, c5 = (c3 - c0 * lower) * inverse, (c4 - c1 * lower) * inverse, (c5 - c2 * lower) * inverse
+    lower, last, inverse = load(block, d + 2, token), load(block, d + 5, token), load(block, d + 8, token)
+    store(target, t, c0)
+    store(target, t + 1, c1)
+    store(target, t + 2, c2)
+    store(target, t + 3, c3)
+    store(target, t + 4, c4)
+    store(target, t + 5, c5)
+    store(target, t + 6, (c6 - c0 * lower - c3 * last) * inverse)
+    store(target, t + 7, (c7 - c1 * lower - c4 * last) * inverse)
+    store(target, t + 8, (c8 - c2 * lower - c5 * last) * inverse)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def eliminate(pivot, coupling, border, condensed, station, last, tiles, panels, token):
+    """Factorise one station and carry it over to the next, ``station - 1``, and to the condensed matrix.
+
+    ``tiles`` is the block size in tiles, ``panels`` the height of the border. ``last`` says that no station follows.
+    """
+    size = 3 * tiles
+    panel = 3 * size
+    block, frame = tiles * panel, panels * panel
+    p, b = station * block, station * frame
+    for k in range(tiles):
+        _pivot_tile(pivot, p + k * panel, 3 * k, token)
+        for i in range(k + 1, tiles):
+            _factor_tile(pivot, p + i * panel, pivot, p + k * panel, 3 * k, token)
+        if not last:
+            for i in range(tiles):
+                _factor_tile(coupling, p + i * panel, pivot, p + k * panel, 3 * k, token)
+        for i in range(panels):
+            _factor_tile(border, b + i * panel, pivot, p + k * panel, 3 * k, token)
+    for i in range(panels):
+        for j in range(i + 1):
+            subtract_product(condensed, 9 * (i * panels + j), border, b + i * panel, border, b + j * panel, size, token)
+    if last:
+        return
+    for i in range(tiles):
+        for j in range(i + 1):
+            t = p - block + i * panel + 9 * j
+            subtract_product(pivot, t, coupling, p + i * panel, coupling, p + j * panel, size, token)
+    for i in range(panels):
+        for j in range(tiles):
+            t = b - frame + i * panel + 9 * j
+            subtract_product(border, t, border, b + i * panel, coupling, p + j * panel, size, token)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _back_substitute_block(pivot, p, solution, s, tiles, token):
+    """Solve L' x = y in place for one station."""
+    size = 3 * tiles
+    for k in range(tiles - 1, -1, -1):
+        row = s + 3 * k
+        x, y, z = load(solution, row, token), load(solution, row + 1, token), load(solution, row + 2, token)
+        for i in range(k + 1, tiles):
+            t = p + (i * size + 3 * k) * 3
+            for r in range(3):
+                value = load(solution, s + 3 * i + r, token)
+                x = x - load(pivot, t + r, token) * value
+                y = y - load(pivot, t + 3 + r, token) * value
+                z = z - load(pivot, t + 6 + r, token) * value
+        t = p + (k * size + 3 * k) * 3
+        z = z * load(pivot, t + 8, token)
+        y = (y - load(pivot, t + 5, token) * z) * load(pivot, t + 4, token)
+        x = (x - load(pivot, t + 1, token) * y - load(pivot, t + 2, token) * z) * load(pivot, t, token)
+        store(solution, row, x)
+        store(solution, row + 1, y)
+        store(solution, row + 2, z)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def back_substitute(pivot, coupling, border, weight, rows, solution, first, stations, tiles, panels, token):
+    """Solve A x = sum_i weight_i b_i over the first ``rows`` border rows b_i, after all stations >= ``first`` are eliminated."""
+    size = 3 * tiles
+    block, frame = 3 * tiles * size, 3 * panels * size
+    for station in range(first, stations):
+        s = station * size
+        for k in range(size):
+            value = fill(0.0, pivot, token)
+            for i in range(rows):
+                at = station * frame + (i // 3 * size + k) * 3 + i % 3
+                value = value + load(weight, i, token) * load(border, at, token)
+            if station > first:
+                for i in range(tiles):
+                    t = station * block + (i * size + k) * 3
+                    value = value - load(coupling, t, token) * load(solution, s - size + 3 * i, token)
+                    value = value - load(coupling, t + 1, token) * load(solution, s - size + 3 * i + 1, token)
+                    value = value - load(coupling, t + 2, token) * load(solution, s - size + 3 * i + 2, token)
+            store(solution, s + k, value)
+        _back_substitute_block(pivot, station * block, solution, s, tiles, token)

@@ -1,0 +1,195 @@
+"""The compiled engine for layered bodies: rollouts of a whole batch on CPUs, the same numbers as ``fem.rollouts``.
+
+Samples fill the lanes of vector registers, blocks of lanes are spread over threads. Lanes never mix and a block knows nothing of the
+others: a rollout's result does not depend on its batch, on its place in it or on the number of threads.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
+from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, Storage, compile_rollout, storage
+from rfdropo_bayes.fem.native.section_modes import layered_tables
+from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
+
+Precision = Literal["float64", "float32"]
+# Tolerance of the tension problem and relative compliance added to every cable, as far as the precision resolves them.
+_TENSION_PROBLEM = {"float64": (1e-12, 0.0), "float32": (1e-6, 1e-6)}
+
+
+class NativeRollout(NamedTuple):
+    """Recorded motion of a batch; row 0 is the initial state.
+
+    A diverged rollout stays finite, but its rows from then on mean nothing.
+    """
+
+    position: Float[np.ndarray, "batch rows points 3"]  # [m]
+    tension: Float[np.ndarray, "batch rows cables"]  # [N]
+    diverged: Bool[np.ndarray, " batch"]
+    cables_converged: Bool[np.ndarray, " batch"]
+    residual: Float[np.ndarray, " batch"]  # relative unbalanced force of the initial equilibrium; 0 for a start at rest
+
+
+@cache
+def _kernel() -> Callable:
+    """The rollout kernel. Numba's cache looks at one source file only, hence the digest of all of them."""
+    sources = sorted(Path(__file__).parent.glob("*.py"))
+    return compile_rollout(hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest())
+
+
+def available_threads() -> int:
+    """Processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class NativeLayered:
+    """Rollouts of one layered body with its cables.
+
+    Args:
+        system: body, cables, and how many stations are held.
+        points: the points whose positions are recorded.
+        time_step: of one implicit Euler step [s].
+        precision: of all arithmetic; parameters, commands and results are float64 in any case.
+        threads: lane blocks computed at the same time; None for all processors this process may use.
+        from_equilibrium: start in static equilibrium under the cable displacements ``start``, else undeformed.
+        lanes: samples side by side; None for as many as a vector register holds.
+
+    Raises:
+        InputError: unknown precision, or a number of threads or lanes that makes no sense.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        points: PointMap,
+        time_step: float,
+        *,
+        precision: Precision = "float64",
+        threads: int | None = None,
+        from_equilibrium: bool = False,
+        lanes: int | None = None,
+    ) -> None:
+        if precision not in _TENSION_PROBLEM:
+            raise InputError(f"precision {precision!r}", remedy=f"use one of {', '.join(_TENSION_PROBLEM)}")
+        if threads is not None and threads < 1:
+            raise InputError(f"{threads} threads", remedy="use at least one, or None for all processors")
+        self.system, self.time_step, self.from_equilibrium = system, float(time_step), from_equilibrium
+        self.precision, self.dtype = precision, np.dtype(precision)
+        self.threads = threads or available_threads()
+        self.lanes = lanes or native_lanes(self.dtype)
+        self.points = len(points.node)
+        self._tables = layered_tables(system, points, self.dtype.type)
+        self._token = lane_token(self.lanes)
+        self._local = threading.local()
+
+    def rollout(
+        self,
+        material: Material,
+        displacement: Float[np.ndarray, "*batch steps cables"],
+        *,
+        start: Float[np.ndarray, "*batch cables"] | None = None,
+        steps: int | None = None,
+        stride: int = 1,
+    ) -> NativeRollout:
+        """Roll out a batch.
+
+        Args:
+            material: fields with a leading batch axis, or without one to serve the whole batch.
+            displacement: cable displacements [m] at the end of every step, one sequence for all or one for each rollout.
+            start: cable displacements [m] of the initial equilibrium; None means zero.
+            steps: compute only so many steps.
+            stride: record every so many steps.
+
+        Raises:
+            InputError: shapes that do not fit.
+        """
+        displacement = np.asarray(displacement, dtype=float)
+        cables = len(self.system.cables.anchor)
+        start = np.zeros(cables) if start is None else np.asarray(start, dtype=float)
+        if displacement.ndim not in (2, 3) or displacement.shape[-1] != cables or start.shape[-1:] != (cables,):
+            raise InputError(
+                f"displacement has shape {displacement.shape} and start {start.shape} for {cables} cables", where="rollout"
+            )
+        batch, count = self._batch(material, displacement, start)
+        steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
+        tolerance, regularisation = _TENSION_PROBLEM[self.precision]
+        schedule = Schedule(self.time_step, steps, int(stride), 0, tolerance, regularisation)
+        output = _empty_output(count, 1 + steps // stride, self.points, cables)
+        self._run(batch, schedule, output, count)
+        return NativeRollout(*output)
+
+    def _batch(self, material: Material, displacement: np.ndarray, start: np.ndarray) -> tuple[Batch, int]:
+        """Parameters in the precision of the kernels, and the number of rollouts."""
+        layers = len(self.system.body.station) - 1
+        width = {"gravity": (3,), "stiffness_scale": (layers,), "point_mass": (layers + 1,)}
+        values = {name: np.asarray(value, dtype=float) for name, value in material._asdict().items()}
+        sizes = {len(value) for name, value in values.items() if value.ndim > len(width.get(name, ()))}
+        sizes |= {len(displacement)} if displacement.ndim == 3 else set()
+        sizes |= {len(start)} if start.ndim == 2 else set()
+        count = max(sizes, default=1)
+        if sizes - {1, count}:
+            raise InputError(f"batch axes of lengths {sorted(sizes)}", where="rollout")
+        rows = {}
+        for name, value in values.items():
+            shape = width.get(name, ())
+            if value.shape not in (shape, (1, *shape), (count, *shape)):
+                raise InputError(f"{name} has shape {value.shape}, expected {(count, *shape)}", where="material")
+            rows[name] = np.broadcast_to(value, (count, *shape))
+        modulus, ratio = rows["young_modulus"], np.minimum(rows["poisson_ratio"], POISSON_LIMIT)
+        shear = modulus / (2.0 * (1.0 + ratio))
+        lame = 2.0 * shear * ratio / (1.0 - 2.0 * ratio)
+        arrays = Batch(
+            moduli=np.stack([lame, shear, 2.0 * lame * shear / (lame + 2.0 * shear)], axis=1),
+            density=rows["density"][:, None],
+            damping=np.stack([rows["rayleigh_mass"], rows["rayleigh_stiffness"]], axis=1),
+            gravity=rows["gravity"],
+            layer_scale=rows["stiffness_scale"],
+            point_mass=rows["point_mass"],
+            start=start.reshape(-1, start.shape[-1]),
+            displacement=displacement.reshape(-1, *displacement.shape[-2:]),
+        )
+        return Batch(*(np.ascontiguousarray(array, dtype=self.dtype) for array in arrays)), count
+
+    def _run(self, batch: Batch, schedule: Schedule, output: Output, count: int) -> None:
+        """All lane blocks, in this thread or in several."""
+        kernel, tables, token = _kernel(), self._tables, self._token
+
+        def block(first: int) -> None:
+            kernel(tables, batch, self._storage(), schedule, output, first, token)
+
+        firsts = range(0, count, self.lanes)
+        if min(self.threads, len(firsts)) < 2:
+            for first in firsts:
+                block(first)
+            return
+        with ThreadPoolExecutor(min(self.threads, len(firsts))) as pool:
+            list(pool.map(block, firsts))
+
+    def _storage(self) -> Storage:
+        """Storage of the calling thread."""
+        if not hasattr(self._local, "storage"):
+            self._local.storage = storage(self._tables, self.lanes, self.dtype.type)
+        return self._local.storage
+
+
+def _empty_output(count: int, records: int, points: int, cables: int) -> Output:
+    return Output(
+        np.zeros((count, records, points, 3)),
+        np.zeros((count, records, cables)),
+        np.zeros(count, dtype=bool),
+        np.ones(count, dtype=bool),
+        np.zeros(count),
+    )

@@ -1,0 +1,227 @@
+"""Whole rollouts of a tetrahedral body on a CPU: samples packed into SIMD lanes, lane blocks spread over threads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Bool, Float, Int
+
+from rfdropo_bayes.fem.cables import CableLayout
+from rfdropo_bayes.fem.drives import DriveLimits
+from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.native import tetrahedral as kernels
+from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
+from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
+from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
+
+LOST = 10.0
+"""A point further from its place at rest than this many body sizes means that the rollout has diverged."""
+
+
+class Rollouts(NamedTuple):
+    """Recorded motion of a batch."""
+
+    position: Float[np.ndarray, "samples rows points 3"]  # [m]
+    tension: Float[np.ndarray, "samples rows cables"]  # [N]
+    diverged: Bool[np.ndarray, " samples"]
+    cables_converged: Bool[np.ndarray, " samples"]
+
+
+class TetrahedralEngine:
+    """A body, its cables and its recorded points, prepared for rollouts in one precision.
+
+    Args:
+        dtype: ``numpy.float64`` or ``numpy.float32``.
+        lanes: samples side by side; by default as many as this machine's vector registers hold.
+        threads: lane blocks at a time; results do not depend on it.
+    """
+
+    def __init__(
+        self,
+        body: TetrahedralBody,
+        cables: CableLayout,
+        limits: DriveLimits,
+        points: PointMap,
+        *,
+        dtype: type = np.float64,
+        lanes: int | None = None,
+        threads: int | None = None,
+    ) -> None:
+        self.body, self.dtype, self.points = body, np.dtype(dtype), points
+        self.lanes = lanes or native_lanes(dtype)
+        self.threads = threads or os.cpu_count() or 1
+        self._order, self._number = _numbering(body)
+        self._rest = body.rest[self._order]
+        self._pattern = _pattern(body, self._number, len(cables.anchor))
+        # Elements in the order in which the factorisation needs them: their blocks are then still in cache.
+        self._elements = np.argsort(self._number[body.element].min(axis=1), kind="stable")
+        self._mesh = _mesh(body, self._elements, self._number, self._pattern, self.dtype)
+        self._cables = _cables(cables, limits, body, self._number, self.dtype)
+        self._nodes = np.ascontiguousarray(self._number[points.node], dtype=np.int32)
+        self._weights = np.ascontiguousarray(points.weight, dtype=self.dtype)
+
+    def rollouts(
+        self,
+        parameters: Mapping[str, np.ndarray],
+        commands: Float[np.ndarray, "*samples steps cables"],
+        *,
+        time_step: float,
+        stride: int = 1,
+    ) -> Rollouts:
+        """Rollouts from rest through the commanded displacements [m] of every step, recorded every ``stride`` steps.
+
+        ``parameters`` holds, with a leading axis of samples: ``young_modulus`` [Pa], ``poisson_ratio``, ``node_mass`` (nodes) [kg],
+        ``rayleigh_mass`` [1/s], ``rayleigh_stiffness`` [s], ``gravity`` (3) [m/s2], and optionally ``stiffness_scale``
+        (elements).
+        """
+        samples = len(parameters["young_modulus"])
+        commands = np.broadcast_to(commands, (samples, *commands.shape[-2:]))
+        chunks = [np.arange(first, first + self.lanes) for first in range(0, samples, self.lanes)]
+        rows, points = commands.shape[1] // stride, len(self._nodes)
+        result = Rollouts(
+            np.empty((samples, rows, points, 3)),
+            np.empty((samples, rows, commands.shape[2])),
+            np.zeros(samples, dtype=bool),
+            np.ones(samples, dtype=bool),
+        )
+
+        def run(chunk: Int[np.ndarray, " lanes"]) -> None:
+            self._run(np.minimum(chunk, samples - 1), chunk[chunk < samples], parameters, commands, time_step, stride, result)
+
+        with ThreadPoolExecutor(self.threads) as pool:
+            list(pool.map(run, chunks))
+        return result
+
+    def _run(self, lane, kept, parameters, commands, time_step, stride, result: Rollouts) -> None:
+        """One lane block: samples ``lane`` (the last one repeated to fill the lanes), of which ``kept`` are wanted."""
+        inputs = self._samples({name: np.asarray(value)[lane] for name, value in parameters.items()})
+        displacement = self._lanes_last(commands[lane])
+        work = self._work()
+        rows = displacement.shape[0] // stride
+        seen = aligned_zeros((rows, len(self._nodes), 3, self.lanes), self.dtype)
+        pulls = aligned_zeros((rows, displacement.shape[1], self.lanes), self.dtype)
+        solved = kernels.rollout(
+            self._pattern, self._mesh, self._cables, displacement, inputs, work, self._nodes, self._weights, stride,
+            time_step, 1e-12 if self.dtype.itemsize == 8 else 1e-5, seen, pulls, lane_token(self.lanes),
+        )  # fmt: skip
+        count = len(kept)
+        position, tension = np.moveaxis(seen, 3, 0)[:count], np.moveaxis(pulls, 2, 0)[:count]
+        reach = LOST * np.ptp(self._rest, axis=0).max()
+        last = np.moveaxis(work.position, 1, 0)[:count].reshape(count, -1, 3)
+        result.position[kept], result.tension[kept] = position, tension
+        with np.errstate(invalid="ignore"):
+            result.diverged[kept] = ~(np.abs(last - self._rest).max(axis=(1, 2)) < reach)
+        result.cables_converged[kept] = solved
+
+    def _lanes_last(self, values: np.ndarray) -> np.ndarray:
+        """Aligned copy in the engine's precision with the sample axis last."""
+        moved = np.moveaxis(values, 0, -1)
+        copy = aligned_zeros(moved.shape, self.dtype)
+        copy[...] = moved
+        return copy
+
+    def _samples(self, values: Mapping[str, np.ndarray]) -> kernels.Samples:
+        young, poisson = np.asarray(values["young_modulus"]), np.asarray(values["poisson_ratio"])
+        shear = young / (2.0 * (1.0 + poisson))
+        scale = values.get("stiffness_scale", np.ones((self.lanes, len(self.body.element))))
+        return kernels.Samples(
+            self._lanes_last((2.0 * shear * poisson / (1.0 - 2.0 * poisson))[:, None]),
+            self._lanes_last(shear[:, None]),
+            self._lanes_last(scale[:, self._elements]),
+            self._lanes_last(values["node_mass"][:, self._order]),
+            self._lanes_last(values["rayleigh_mass"][:, None]),
+            self._lanes_last(values["rayleigh_stiffness"][:, None]),
+            self._lanes_last(values["gravity"]),
+        )
+
+    def _work(self) -> kernels.Work:
+        nodes, free, rows = len(self.body.rest), self._mesh.free, 3 * self._pattern.border
+        cables = len(self._cables.rest_length)
+        sizes = {
+            "position": 3 * nodes, "velocity": 3 * nodes, "force": 3 * nodes, "pivot": 6 * nodes,
+            "lower": 9 * len(self._pattern.row) + 9, "solution": 3 * free, "condensed": rows * rows, "weight": rows,
+            "compliance": cables**2, "slack": cables, "active": cables, "tension": cables, "measured": cables,
+            "pivoting": cables * (cables + 1), "axes": 9, "turned": 12,
+        }  # fmt: skip
+        work = kernels.Work(**{name: aligned_zeros((size, self.lanes), self.dtype) for name, size in sizes.items()})
+        work.position[...] = self._rest.reshape(-1, 1)
+        return work
+
+
+def _numbering(body: TetrahedralBody) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, " nodes"]]:
+    """Nodes in elimination order, held ones last, and the place of every node in that order."""
+    free = np.flatnonzero(~body.fixed)
+    order = np.concatenate([free[elimination_order(_adjacency(body)[free][:, free].tocsr())], np.flatnonzero(body.fixed)])
+    number = np.empty(len(order), dtype=np.int64)
+    number[order] = np.arange(len(order))
+    return order, number
+
+
+def _adjacency(body: TetrahedralBody) -> sparse.csr_matrix:
+    """Which nodes share an element."""
+    rows, columns = np.repeat(body.element, 4, axis=1).ravel(), np.tile(body.element, (1, 4)).ravel()
+    matrix = sparse.csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(body.rest),) * 2)
+    matrix.setdiag(0.0)
+    matrix.eliminate_zeros()
+    matrix.data[:] = 1.0
+    return matrix
+
+
+def _pattern(body: TetrahedralBody, number: np.ndarray, cables: int) -> BlockPattern:
+    order = np.argsort(number)
+    free = order[: np.sum(~body.fixed)]
+    return analyse(_adjacency(body)[free][:, free].tocsr(), border=(3 + cables) // 3)
+
+
+def _mesh(
+    body: TetrahedralBody, elements: np.ndarray, number: np.ndarray, pattern: BlockPattern, dtype: np.dtype
+) -> kernels.Mesh:
+    free, dump = int(np.sum(~body.fixed)), len(pattern.row)
+    corner, frame = body.element[elements], body.rest_frame[elements]
+    ascending = np.argsort(number[corner], axis=1)
+    sorted_corner = np.take_along_axis(corner, ascending, axis=1)
+    gradient = np.take_along_axis(body.gradient[elements], ascending[:, :, None], axis=1)
+    edge = body.rest[sorted_corner[:, 1:]] - body.rest[sorted_corner[:, :1]]
+    node = number[sorted_corner]
+    pairs = [(a, b) for b in range(3) for a in range(b + 1, 4)]
+    slot = [[block_slot(pattern, nodes[a], nodes[b]) if nodes[a] < free else dump for a, b in pairs] for nodes in node]
+    return kernels.Mesh(
+        node.astype(np.int32),
+        number[corner[:, :3]].astype(np.int32),
+        np.einsum("eij,eaj->eai", frame, gradient).astype(dtype),
+        np.einsum("eij,eaj->eai", frame, edge).astype(dtype),
+        body.volume[elements].astype(dtype),
+        np.array(slot, dtype=np.int32),
+        free,
+        body.frames == "polar",
+    )
+
+
+def _cables(
+    layout: CableLayout, limits: DriveLimits, body: TetrahedralBody, number: np.ndarray, dtype: np.dtype
+) -> kernels.Cables:
+    first, node, weight, length = [0], [], [], []
+    for cable, used in enumerate(layout.guide_used):
+        guides = layout.guide_node[cable, used], layout.guide_weight[cable, used]
+        node.append(np.concatenate([guides[0][:1] * 0, guides[0]]))
+        weight.append(np.concatenate([guides[1][:1] * 0.0, guides[1]]))
+        first.append(first[-1] + len(node[-1]))
+        place = np.einsum("gk,gki->gi", guides[1], body.rest[guides[0]])
+        route = np.concatenate([layout.anchor[cable : cable + 1], place])
+        length.append(np.linalg.norm(np.diff(route, axis=0), axis=1).sum())
+    width = max([int(np.max(np.nonzero(w)[1])) + 1 for w in weight if np.any(w)], default=1)
+    shape = (0, layout.guide_node.shape[2])
+    return kernels.Cables(
+        np.array(first, dtype=np.int32),
+        np.ascontiguousarray(number[np.concatenate([np.zeros(shape, dtype=int), *node])][:, :width], dtype=np.int32),
+        np.ascontiguousarray(np.concatenate([np.zeros(shape), *weight])[:, :width], dtype=dtype),
+        layout.anchor.astype(dtype),
+        np.array(length, dtype=dtype),
+        np.asarray(limits.displacement, dtype=dtype),
+        float(limits.rate),
+    )

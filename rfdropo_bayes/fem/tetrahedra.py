@@ -1,0 +1,170 @@
+"""Corotational linear tetrahedra: frames, forces and tangents of any tetrahedral mesh.
+
+Each element is linear elastic in a frame that turns with it: f_a = -V Q S(H) g_a with g_a the gradients of the shape functions at
+rest, H = sum_a (Q' x_a - X_a) (x) g_a and S the isotropic law; the tangent is Q K Q', without the geometric terms. Two frames:
+
+- ``"polar"``: rotation of the polar decomposition of the deformation gradient (Mueller and Gross 2004, Graphics Interface);
+- ``"edges"``: from the element's first three nodes, x along the edge 0-1, z normal to the face 0-1-2, as SOFA's
+  TetrahedronFEMForceField does with ``method="large"`` (Nesme, Payan and Faure 2005, Eurographics short papers). It depends
+  on the order of the element's nodes.
+
+Constant-strain tetrahedra are stiff in bending and lock near incompressibility: they are here for fidelity to meshes that others
+simulate, not for accuracy at few unknowns.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.corotational import rotation
+
+FRAMES = ("polar", "edges")
+LARGEST_WEIGHTS = 8
+"""Nodes that `PointMap` and `CableLayout` reserve for each point; a tetrahedron uses the first four."""
+
+
+class TetrahedralBody(NamedTuple):
+    """Mesh and rest geometry; NumPy arrays, fixed for a simulation."""
+
+    rest: Float[np.ndarray, "nodes 3"]  # [m]
+    element: Int[np.ndarray, "elements 4"]
+    fixed: Bool[np.ndarray, " nodes"]  # held at rest in all three directions
+    gradient: Float[np.ndarray, "elements 4 3"]  # of the shape functions at rest [1/m]
+    volume: Float[np.ndarray, " elements"]  # [m3]
+    rest_frame: Float[np.ndarray, "elements 3 3"]  # rows: axes of the element's frame at rest
+    frames: str  # one of FRAMES
+
+
+def tetrahedral_body(
+    rest: Float[np.ndarray, "nodes 3"],
+    element: Int[np.ndarray, "elements 4"],
+    fixed: Bool[np.ndarray, " nodes"],
+    frames: str = "polar",
+) -> TetrahedralBody:
+    """Body from node coordinates [m], tetrahedra of positive volume, and which nodes are held.
+
+    Raises:
+        InputError: an unknown kind of frame, arrays that do not fit together, a flat or inverted element, or no held node.
+    """
+    rest, element, fixed = np.asarray(rest, float), np.asarray(element, int), np.asarray(fixed, bool)
+    if frames not in FRAMES:
+        raise InputError(f"element frames {frames!r}", where="mesh", remedy=f"use one of {FRAMES}")
+    if rest.ndim != 2 or rest.shape[1] != 3 or element.ndim != 2 or element.shape[1] != 4 or fixed.shape != rest.shape[:1]:
+        raise InputError(f"shapes {rest.shape}, {element.shape} and {fixed.shape} do not fit together", where="mesh")
+    if not np.any(fixed):
+        raise InputError("no node is held", where="mesh", remedy="fix the nodes of the clamped end")
+    edges = np.swapaxes(rest[element[:, 1:]] - rest[element[:, :1]], 1, 2)
+    volume = np.linalg.det(edges) / 6.0
+    if not np.all(volume > 0.0):
+        number = int(np.argmin(volume))
+        raise InputError(f"element {number} has volume {volume[number]:.3g} m3", where="mesh", remedy="repair the mesh")
+    others = np.linalg.inv(edges)
+    gradient = np.concatenate([-others.sum(axis=1, keepdims=True), others], axis=1)
+    corners = rest[element]
+    rest_frame = np.asarray(_edge_axes(corners)) if frames == "edges" else np.tile(np.eye(3), (len(element), 1, 1))
+    return TetrahedralBody(rest, element, fixed, gradient, volume, rest_frame, frames)
+
+
+def _edge_axes(corners: Float[Array, "elements 4 3"]) -> Float[Array, "elements 3 3"]:
+    """Rows: unit vectors along edge 0-1, in the face 0-1-2 across it, and normal to that face."""
+    along, across = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    first = along / jnp.linalg.norm(along, axis=1, keepdims=True)
+    normal = jnp.cross(first, across)
+    normal = normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
+    return jnp.stack([first, jnp.cross(normal, first), normal], axis=1)
+
+
+def lame_constants(
+    young_modulus: Float[Array, ""], poisson_ratio: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """First Lame constant and shear modulus [Pa]."""
+    shear = young_modulus / (2.0 * (1.0 + poisson_ratio))
+    return 2.0 * shear * poisson_ratio / (1.0 - 2.0 * poisson_ratio), shear
+
+
+def element_rotations(body: TetrahedralBody, position: Float[Array, "nodes 3"]) -> Float[Array, "elements 3 3"]:
+    """Rotation of every element from rest."""
+    corners = position[body.element]
+    if body.frames == "edges":
+        return jnp.einsum("eki,ekj->eij", _edge_axes(corners), body.rest_frame)
+    return rotation(jnp.einsum("eai,eaj->eij", corners, body.gradient))
+
+
+def nodal_force(
+    body: TetrahedralBody,
+    turn: Float[Array, "elements 3 3"],
+    field: Float[Array, "nodes 3"],
+    rest: Float[Array, "nodes 3"] | float,
+    lame: tuple[Float[Array, "..."], Float[Array, "..."]],
+) -> Float[Array, "nodes 3"]:
+    """Forces -Q K (Q' field - rest) on the nodes [N]: elastic ones from positions; -K v from velocities with ``rest`` zero.
+
+    ``lame`` are the Lame constants [Pa], of the body or of each element.
+    """
+    first, shear = (jnp.broadcast_to(value, body.volume.shape)[:, None, None] for value in lame)
+    corners = field[body.element]
+    local = jnp.einsum("eji,eaj->eai", turn, corners - corners[:, :1])
+    if not isinstance(rest, float):
+        corners = rest[body.element]
+        local = local - (corners - corners[:, :1])
+    slope = jnp.einsum("eai,eaj->eij", local, body.gradient)
+    trace = jnp.trace(slope, axis1=1, axis2=2)[:, None, None]
+    stress = first * trace * jnp.eye(3) + shear * (slope + jnp.swapaxes(slope, 1, 2))
+    force = -jnp.einsum("e,eij,ejk,eak->eai", body.volume, turn, stress, body.gradient)
+    return jnp.zeros_like(body.rest).at[body.element].add(force)
+
+
+def element_tangents(
+    body: TetrahedralBody,
+    turn: Float[Array, "elements 3 3"],
+    lame: tuple[Float[Array, "..."], Float[Array, "..."]],
+) -> Float[Array, "elements 4 4 3 3"]:
+    """Tangent stiffness Q K Q' [N/m] of every element: block (a, b) couples node a's force to node b's displacement."""
+    first, shear = (jnp.broadcast_to(value * 1.0, body.volume.shape) * body.volume for value in lame)
+    gradient = jnp.einsum("eij,eaj->eai", turn, body.gradient)
+    pairs = jnp.einsum("eai,ebj->eabij", gradient, gradient)
+    dots = jnp.einsum("eai,ebi->eab", gradient, gradient)
+    scaled = (slice(None), None, None, None, None)
+    return (
+        first[scaled] * pairs + shear[scaled] * (jnp.swapaxes(pairs, 3, 4) + dots[..., None, None] * jnp.eye(3))
+    )
+
+
+def equal_node_masses(body: TetrahedralBody, mass: Float[Array, ""]) -> Float[Array, " nodes"]:
+    """A total mass [kg] in equal parts on all nodes, held ones included (SOFA's UniformMass)."""
+    return jnp.broadcast_to(mass / len(body.rest), (len(body.rest),))
+
+
+def lumped_masses(body: TetrahedralBody, density: Float[Array, ""]) -> Float[Array, " nodes"]:
+    """A quarter of every element's mass on each of its nodes [kg]."""
+    volume = np.zeros(len(body.rest))
+    np.add.at(volume, body.element, body.volume[:, None] / 4.0)
+    return density * volume
+
+
+def locate(
+    body: TetrahedralBody, points: Float[np.ndarray, "points 3"]
+) -> tuple[Int[np.ndarray, "points 8"], Float[np.ndarray, "points 8"]]:
+    """Nodes and weights (barycentric, padded with zeros) of points of the undeformed body [m].
+
+    A point in no element belongs to the one whose centroid is nearest, and follows it by extrapolation (as SOFA's
+    BarycentricMapping does).
+    """
+    corners = body.rest[body.element]
+    centres = corners.mean(axis=1)
+    points = np.atleast_2d(np.asarray(points, float))
+    node = np.zeros((len(points), LARGEST_WEIGHTS), dtype=int)
+    weight = np.zeros((len(points), LARGEST_WEIGHTS))
+    for index, point in enumerate(points):
+        natural = np.einsum("eai,ei->ea", body.gradient, point - corners[:, 0])
+        natural[:, 0] += 1.0
+        outside = -natural.min(axis=1)
+        rank = np.where(outside > 0.0, np.sum((point - centres) ** 2, axis=1), outside)
+        chosen = int(np.argmin(rank))
+        node[index, :4], weight[index, :4] = body.element[chosen], natural[chosen]
+    return node, weight
