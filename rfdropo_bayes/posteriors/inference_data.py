@@ -20,7 +20,6 @@ with warnings.catch_warnings():  # 0.23 announces its successor on import; pypro
     import arviz
 
 SCHEMA = "rfdropo_bayes.posterior/1"
-GROUPS = ("posterior", "prior", "posterior_predictive", "prior_predictive", "observed_data", "sample_stats")
 
 Draws = Mapping[str, Float[np.ndarray, "chain draw"]]
 
@@ -86,7 +85,8 @@ def to_inference_data(
     if log_likelihood is not None:
         groups["log_likelihood"] = xr.Dataset({"row": (("chain", "draw", "row_index"), np.asarray(log_likelihood))})
     stored = {"schema": SCHEMA, **{key: _attribute(value) for key, value in (attrs or {}).items()}}
-    return arviz.InferenceData(attrs=stored, **{name: group for name, group in groups.items() if group is not None})
+    present: dict[str, Any] = {name: group for name, group in groups.items() if group is not None}
+    return arviz.InferenceData(attrs=stored, **present)
 
 
 def variable_key(name: str) -> str:

@@ -20,7 +20,7 @@ from rfdropo_bayes.posteriors import (
 
 
 def make_record(rng: np.random.Generator) -> PosteriorRecord:
-    """Two parameters on a scale ridge, a per-recording one with a slash in its name, two recordings of unlike length."""
+    """Two parameters on a scale ridge, one of a recording with a slash in its name, two recordings of unlike length."""
     scale = rng.normal(0.0, 0.4, (2, 60))
     posterior = {
         "young_modulus": 4.5e6 * np.exp(scale + 0.01 * rng.normal(size=(2, 60))),
@@ -130,7 +130,7 @@ def test_predictions_must_fit_the_measurements() -> None:
 
 
 def test_diagnostics_tell_mixed_chains_from_stuck_ones() -> None:
-    """False-failure rate below 1e-6 under other seeds: the effective size of 4000 independent draws varies by about 3 %."""
+    """False-failure rate below 1e-6 under other seeds: the effective size of 4000 independent draws varies by 3 %."""
     rng = np.random.default_rng(1)
     good = rng.normal(size=(4, 1000))
     stuck = good + 3.0 * np.arange(4)[:, None]

@@ -1,0 +1,145 @@
+"""The predictors a sceptic would use instead of a simulator: a held pose, a copied mean, a regression on the commands.
+
+None of them knows anything of the robot. A calibrated simulator that does not beat them has not earned its keep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.data import Trajectory, group_repeats
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.report.fir import FirRegression, fit_fir
+from rfdropo_bayes.report.scores import ErrorFigures, measured_paths, score
+
+Predictor = Callable[[Trajectory], Float[np.ndarray, "time marker 3"]]
+
+
+@dataclass(frozen=True)
+class BaselineErrors:
+    """How one predictor fared.
+
+    Attributes:
+        name: key in summary.json.
+        title: name for people.
+        description: how it predicts, in one sentence.
+        fit, test: its errors; None where it has none.
+        reason: why it could not predict; empty if it could.
+    """
+
+    name: str
+    title: str
+    description: str
+    fit: ErrorFigures | None
+    test: ErrorFigures | None
+    reason: str = ""
+
+
+def held_initial_pose(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
+    """The first usable position of each marker, for ever."""
+    first = np.argmax(recording.position_mask, axis=0)
+    pose = recording.position[first, np.arange(recording.position.shape[1])]
+    return np.broadcast_to(pose, recording.position.shape)
+
+
+def mean_pose(fit: Sequence[Trajectory]) -> Predictor:
+    """The mean position of each marker over all rows of the fit recordings, for ever."""
+    weight = np.concatenate([t.position_mask for t in fit]).astype(float)
+    total = np.einsum("tm,tma->ma", weight, np.concatenate([t.position for t in fit]))
+    pose = total / np.maximum(weight.sum(axis=0), 1.0)[:, None]
+    return lambda recording: np.broadcast_to(pose, recording.position.shape)
+
+
+def copied_mean(fit: Sequence[Trajectory]) -> Predictor:
+    """The mean of the fit recordings at the same time after the start, whatever is commanded.
+
+    A fit recording is predicted by the others. The predictor raises InputError where no other lasts as long.
+    """
+
+    def predict(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
+        others = [source for source in fit if source.sha256 != recording.sha256 or source.name != recording.name]
+        total = np.zeros(recording.position.shape)
+        count = np.zeros(recording.position.shape[:2])
+        for source in others:
+            within = recording.time <= source.time[-1] + _tolerance(source)
+            for marker in range(recording.position.shape[1]):
+                usable = source.position_mask[:, marker]
+                if usable.any():
+                    path, time = source.position[usable, marker], source.time[usable]
+                    for axis in range(3):
+                        total[:, marker, axis] += within * np.interp(recording.time, time, path[:, axis])
+                    count[:, marker] += within
+        if not count.all():
+            raise InputError(
+                f"no other fit recording lasts {recording.time[-1]:.4g} s, as long as this one", where=recording.name
+            )
+        return total / count[..., None]
+
+    return predict
+
+
+def _tolerance(recording: Trajectory) -> float:
+    """Repeats end a little apart, with the jitter of their clocks."""
+    return 2.0 * float(np.median(np.diff(recording.time)))
+
+
+def baseline_errors(
+    fit: Sequence[Trajectory], test: Sequence[Trajectory], *, trained_on: str = ""
+) -> dict[str, BaselineErrors]:
+    """Train every predictor on the fit recordings and score it on both roles.
+
+    Args:
+        fit: recordings a fit may see.
+        test: recordings no fit sees; may be empty.
+        trained_on: words for the fit recordings; by default their number and length.
+    """
+    seconds = sum(float(t.time[-1]) for t in fit)
+    trained_on = trained_on or f"{seconds:.4g} s in {len(fit)} recording{'s' if len(fit) != 1 else ''}"
+    groups = [list(group) for group in group_repeats(fit)]
+    linear, cubic = fit_fir(fit, groups, degree=1), fit_fir(fit, groups, degree=3)
+    predictors: dict[str, tuple[str, str, Predictor]] = {
+        "initial_pose": ("initial pose held", "each recording's own first pose, for ever", held_initial_pose),
+        "mean_pose": ("constant mean pose", f"mean pose of the fit recordings ({trained_on})", mean_pose(fit)),
+        "copied_mean": (
+            "fit mean copied",
+            f"mean of the fit recordings ({trained_on}) at the same time, whatever is commanded",
+            copied_mean(fit),
+        ),
+        "fir_linear": ("linear FIR", _describe(linear, trained_on), linear.predict),
+        "fir_cubic": ("cubic FIR", _describe(cubic, trained_on), cubic.predict),
+    }
+    return {
+        name: _scored(name, title, description, predict, fit, test)
+        for name, (title, description, predict) in predictors.items()
+    }
+
+
+def _describe(fir: FirRegression, trained_on: str) -> str:
+    powers = "commands" if fir.degree == 1 else f"commands and their powers up to {fir.degree}"
+    return (
+        f"ridge regression on the {powers} of the last {fir.lags[-1]:.3g} s ({len(fir.lags)} lags), trained on "
+        f"{trained_on}; history length and penalty by cross-validation there"
+    )
+
+
+def _scored(
+    name: str,
+    title: str,
+    description: str,
+    predict: Predictor,
+    fit: Sequence[Trajectory],
+    test: Sequence[Trajectory],
+) -> BaselineErrors:
+    figures: list[ErrorFigures | None] = []
+    reason = ""
+    for recordings in (fit, test):
+        try:
+            figures.append(score({t.name: predict(t) for t in recordings}, measured_paths(recordings)))
+        except InputError as error:
+            figures.append(None)
+            reason = str(error)
+    return BaselineErrors(name, title, description, figures[0], figures[1], reason)
