@@ -86,6 +86,7 @@ class DataSpec(BaseModel):
 class _Source(NamedTuple):
     observations: Path
     commands: Path | None
+    zero_command: bool
     rows: tuple[int, int] | None
 
 
@@ -171,7 +172,7 @@ def _sources(entries: list[RecordingEntry], base: Path) -> Iterator[_Source]:
         else:
             matches = [_existing(root / entry.observations, looked)]
         for match in matches:
-            yield _Source(match, commands, entry.rows)
+            yield _Source(match, commands, entry.commands == NO_COMMANDS, entry.rows)
 
 
 _WHERE_TO_PUT = f"correct the path, or set {DATA_VARIABLE} to the folder that holds the data"
@@ -194,6 +195,12 @@ def _read(spec: DataSpec, source: _Source) -> Trajectory:
     if spec.format == "optitrack-csv":
         return read_optitrack_csv(source.observations, mask_missing=mask_missing)
     if spec.format == "asl-csv":
+        if source.commands is None and not source.zero_command:
+            raise InputError(
+                "has no commands",
+                where=str(source.observations),
+                remedy="give {observations = ..., commands = ...}, with commands = 'none' for a recording at zero command",
+            )
         return read_asl_csv(source.observations, source.commands, mask_missing=mask_missing)
     if spec.format == "csv" and spec.columns is not None:
         return read_plain_csv(source.observations, spec.columns, source.commands, mask_missing=mask_missing)

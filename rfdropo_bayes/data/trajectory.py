@@ -80,14 +80,6 @@ class Trajectory:
         ``initial_command`` defaults to zero; ``position_mask`` to all True. Times are shifted so that the first
         observation is at 0. ``settings`` are facts about the recording that a model may need (JSON).
         """
-        origin = time[0] if len(time) else 0.0
-        coords = {
-            "time": np.asarray(time, dtype=float) - origin,
-            "command_time": np.asarray(command_time, dtype=float) - origin,
-            "marker": list(marker_names),
-            "cable": list(cable_names),
-            "axis": list(AXES),
-        } | ({} if object_pose is None else {"pose": list(POSE)})
         arrays = {
             "position": position,
             "position_mask": np.ones(np.shape(position)[:2], dtype=bool) if position_mask is None else position_mask,
@@ -97,13 +89,7 @@ class Trajectory:
             "motor_angle": motor_angle,
             "object_pose": None if object_pose is None else continuous_quaternions(object_pose),
         }
-        try:
-            data = {key: (checks.DIMS[key], np.array(value)) for key, value in arrays.items() if value is not None}
-            dataset = xr.Dataset(data, coords=coords)
-        except ValueError as error:
-            raise InputError(
-                f"recording and commands do not fit together ({error})", where=name, remedy="check their lengths"
-            ) from None
+        dataset = _assemble(name, arrays, time, command_time, marker_names, cable_names)
         dataset["command"].attrs["unit"] = command_unit
         dataset.attrs = {
             "schema": SCHEMA,
@@ -330,6 +316,31 @@ class Trajectory:
 
 
 _INSTANT = 1e-9  # [s]: times that differ by less are the same instant
+
+
+def _assemble(
+    name: str,
+    arrays: Mapping[str, Any],
+    time: np.ndarray,
+    command_time: np.ndarray,
+    marker_names: Sequence[str],
+    cable_names: Sequence[str],
+) -> xr.Dataset:
+    origin = time[0] if len(time) else 0.0
+    coords = {
+        "time": np.asarray(time, dtype=float) - origin,
+        "command_time": np.asarray(command_time, dtype=float) - origin,
+        "marker": list(marker_names),
+        "cable": list(cable_names),
+        "axis": list(AXES),
+    } | ({} if arrays["object_pose"] is None else {"pose": list(POSE)})
+    try:
+        data = {key: (checks.DIMS[key], np.array(value)) for key, value in arrays.items() if value is not None}
+        return xr.Dataset(data, coords=coords)
+    except ValueError as error:
+        raise InputError(
+            f"recording and commands do not fit together ({error})", where=name, remedy="check their lengths"
+        ) from None
 
 
 def continuous_quaternions(pose: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time 7"]:

@@ -1,0 +1,182 @@
+"""Bad files and tables: one line that says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+import gzip
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.data import CsvColumns, DataSpec, read_asl_csv, read_optitrack_csv, read_plain_csv, read_sofa_csv
+from rfdropo_bayes.data.csv_table import CsvTable
+from rfdropo_bayes.errors import InputError
+
+
+def fails(message: str):
+    return pytest.raises(InputError, match=message)
+
+
+def test_empty_files(tmp_path):
+    path = tmp_path / "empty.csv"
+    path.write_text("")
+    with fails(r"empty\.csv: the file is empty"):
+        read_sofa_csv(path)
+    path.write_text("action,x0\n")
+    with fails("a header but no rows"):
+        read_sofa_csv(path)
+    with fails("no such file"):
+        read_sofa_csv(tmp_path / "absent.csv")
+    path.write_bytes(b"\xff\xfe\x00\x80")
+    with fails("not a text file"):
+        read_sofa_csv(path)
+
+
+def test_a_file_cut_anywhere_in_its_last_row_is_noticed(sofa_table, write, tmp_path):
+    path = write(sofa_table(), tmp_path / "episode.csv")
+    text = path.read_text()
+    last_row = text.rstrip("\n").rfind("\n") + 1
+    for cut in range(last_row + 1, len(text), 7):
+        path.write_text(text[:cut])
+        with fails("row 3: .*the file is cut short"):
+            read_sofa_csv(path)
+    path.write_text(text[:last_row])
+    with fails("row 3: the episode does not end"):
+        read_sofa_csv(path)
+
+
+def test_a_cut_archive_is_noticed(asl_tables, write, tmp_path):
+    observations, commands = asl_tables()
+    path = write(observations, tmp_path / "o.csv.gz")
+    path.write_bytes(path.read_bytes()[:-200])
+    with fails("gzip archive is cut short"):
+        read_asl_csv(path, write(commands, tmp_path / "c.csv"))
+    path.write_bytes(gzip.compress(b"ID,x1\n0,1\n"))
+    with fails("column 'y1' is missing"):
+        read_asl_csv(path, None)
+
+
+def test_ragged_rows_in_the_middle(sofa_table, write, tmp_path):
+    path = write(sofa_table(), tmp_path / "episode.csv")
+    lines = path.read_text().splitlines()
+    lines[2] += ",1.0"
+    path.write_text("\n".join(lines) + "\n")
+    with fails("row 1: has 66 values where the header names 65; repair the row"):
+        read_sofa_csv(path)
+
+
+def test_missing_and_renamed_columns(optitrack_table, write, tmp_path):
+    table = optitrack_table()
+    with fails("column 'timestamp' is missing; did you mean 'time_stamp'"):
+        read_optitrack_csv(write(table.rename(columns={"timestamp": "time_stamp"}), tmp_path / "a.csv"))
+    with fails("column 'z3' is missing"):
+        read_optitrack_csv(write(table.drop(columns="z3"), tmp_path / "b.csv"))
+    (tmp_path / "c.csv").write_text("a,a\n1,2\n")
+    with fails("column 'a' appears twice"):
+        CsvTable(tmp_path / "c.csv", ["a"])
+
+
+def test_nan_and_text_are_placed(optitrack_table, write, tmp_path):
+    table = optitrack_table()
+    table.loc[4, "y2"] = np.nan
+    path = write(table, tmp_path / "run.csv")
+    with fails(r"run\.csv, row 4, column 'y2': NaN or empty cell \(1 of them"):
+        read_optitrack_csv(path)
+    masked = read_optitrack_csv(path, mask_missing=True)
+    assert not masked.position_mask[4, 1]
+    np.testing.assert_allclose(masked.position[4, 1], masked.position[[3, 5], 1].mean(axis=0), atol=2e-5)
+    path.write_text(path.read_text().replace("100.5,", "half past,"))
+    with fails("row 5, column 'timestamp': 'half past' is not a number"):
+        read_optitrack_csv(path)
+
+
+def test_a_nan_command_is_never_masked(optitrack_table, write, tmp_path):
+    table = optitrack_table().astype({"action": float})
+    table.loc[4, "action"] = np.nan
+    with fails("row 4, column 'action'"):
+        read_optitrack_csv(write(table, tmp_path / "run.csv"), mask_missing=True)
+
+
+@pytest.mark.parametrize(("row", "value", "message"), [(0, 3, "not -1"), (2, 16, "16 is not"), (3, 2.5, "2.5 is not")])
+def test_actions_that_do_not_exist(sofa_table, write, tmp_path, row, value, message):
+    table = sofa_table().astype({"action": float})
+    table.loc[row, "action"] = value
+    with fails(message):
+        read_sofa_csv(write(table, tmp_path / "episode.csv"))
+
+
+def test_metres_given_as_millimetres_and_the_reverse(sofa_table, asl_tables, write, tmp_path):
+    table = sofa_table()
+    points = [column for column in table if column[0] in "xyz"]
+    table[points] *= 1e-3
+    with fails("metres given as millimetres"):
+        read_sofa_csv(write(table, tmp_path / "episode.csv"))
+    observations, commands = asl_tables()
+    observations[[column for column in observations if column != "ID"]] *= 1e3
+    with fails("millimetres given as metres"):
+        read_asl_csv(write(observations, tmp_path / "o.csv"), write(commands, tmp_path / "c.csv"))
+
+
+def test_recordings_and_commands_that_do_not_fit(asl_tables, write, tmp_path):
+    observations, commands = asl_tables()
+    path = write(observations, tmp_path / "o.csv")
+    with fails("60 observations do not fit 49 commands: there must be one observation more"):
+        read_asl_csv(path, write(commands.iloc[:49], tmp_path / "c.csv"))
+    observations["ID"] //= 20
+    path = write(observations, tmp_path / "o.csv")
+    with fails(r"poses with ID 0 to 2 \(3\) do not fit 5 commands"):
+        read_asl_csv(path, write(commands.iloc[:5], tmp_path / "c.csv"))
+    with fails("do not fit no commands"):
+        read_asl_csv(path, None)
+
+
+def test_rows_missing_in_the_middle(asl_tables, optitrack_table, write, tmp_path):
+    observations, commands = asl_tables()
+    with fails("row 7, column 'ID': ID 8 where 7 is due"):
+        read_asl_csv(write(observations.drop(index=7), tmp_path / "o.csv"), write(commands, tmp_path / "c.csv"))
+    with fails("row 6, column 'timestamp': 0.2 s pass before this row"):
+        read_optitrack_csv(write(optitrack_table().drop(index=6), tmp_path / "run.csv"))
+
+
+COLUMNS = {
+    "sample_time": 0.1,
+    "commands": ["u"],
+    "command_unit": "mm",
+    "positions": [["x", "y", "z"]],
+    "position_unit": "mm",
+}
+
+
+def test_a_plain_csv_needs_the_columns_its_mapping_names(tmp_path):
+    (tmp_path / "own.csv").write_text("x,y,z,pull\n100,0,0,1\n100,1,0,2\n")
+    with fails("column 'u' is missing; there is: x, y, z, pull"):
+        read_plain_csv(tmp_path / "own.csv", CsvColumns.model_validate(COLUMNS))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fits": []}, r"\[data\]\.fits: unknown key 'fits'; did you mean 'fit'\?"),
+        ({"format": "sofa_csv"}, r"'sofa_csv' is not one of sofa-csv, .*did you mean 'sofa-csv'"),
+        ({"fit": []}, "at least 1 item"),
+        ({"resample": -0.1}, "greater than 0"),
+        (
+            {"fit": [{"observation": "a.csv"}]},
+            "unknown key 'observation'; did you mean 'observations'|'observations' is",
+        ),
+        ({"format": "csv"}, r"needs a \[data.columns\] table"),
+        ({"format": "csv", "columns": COLUMNS | {"tme": "t"}}, "unknown key 'tme'; did you mean 'time'"),
+        ({"format": "csv", "columns": COLUMNS | {"position_unit": "metre"}}, "'metre' is not one of m, cm, mm"),
+        ({"format": "csv", "columns": COLUMNS | {"axes": ["x", "z", "y"]}}, "right-handed"),
+        ({"format": "csv", "columns": COLUMNS | {"time": "t"}}, "either time"),
+        ({"format": "csv", "columns": COLUMNS | {"markers": ["a", "b"]}}, "markers has 2 entries where 1 are needed"),
+    ],
+)
+def test_tables_with_a_mistake(change, message):
+    with fails(message) as caught:
+        DataSpec.parse({"format": "sofa-csv", "fit": ["a.csv"]} | change)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_key_is_named():
+    with fails(r"\[data\]\.fit: the key 'fit' is missing"):
+        DataSpec.parse({"format": "netcdf"})

@@ -1,0 +1,205 @@
+"""Importers, on synthetic files and against rows of the real ones checked by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.data import (
+    CsvColumns,
+    read_asl_csv,
+    read_motor_step,
+    read_optitrack_csv,
+    read_plain_csv,
+    read_sofa_csv,
+)
+from rfdropo_bayes.errors import InputError
+
+
+def test_sofa_commands_accumulate_and_are_in_force_from_the_row_before(sofa_table, write, tmp_path):
+    table = sofa_table()
+    table["action"] = [-1, 2, 2, 10, 15]
+    recording = read_sofa_csv(write(table, tmp_path / "episode.csv"))
+    np.testing.assert_allclose(recording.time, [0.0, 0.05, 0.10, 0.15, 0.20])
+    np.testing.assert_allclose(recording.command_time, recording.time[:-1])
+    np.testing.assert_allclose(recording.command[:, 2], [5e-3, 10e-3, 5e-3, 5e-3])
+    np.testing.assert_allclose(recording.command[:, 7], [0.0, 0.0, 0.0, -5e-3])
+    assert not recording.initial_command.any()
+    assert recording.synthetic
+    assert recording.position_mask.all()
+    np.testing.assert_allclose(recording.position[3, 20], [0.0, -3e-3, 0.18])
+
+
+def test_sofa_file_by_hand(datasets):
+    recording = read_sofa_csv(datasets / "sofa_trunk" / "push_1.csv")
+    assert recording.position.shape == (101, 21, 3)
+    assert recording.marker_names[::10] == ("p00", "p10", "p20")
+    np.testing.assert_allclose(recording.position[1, 20], [0.0075e-3, -12.129e-3, 183.35725e-3], atol=1e-12)
+    np.testing.assert_allclose(recording.object_pose[1, :3], [0.0, -74.681e-3, 0.1], atol=1e-12)
+    # its first actions are 15 15 13 13 7 3 3: cable 7 released twice, cable 5 twice, then 7 pulled and 3 twice
+    np.testing.assert_allclose(recording.command[3], 1e-3 * np.array([0, 0, 0, 0, 0, -10, 0, -10]))
+    np.testing.assert_allclose(recording.command[6], 1e-3 * np.array([0, 0, 0, 10, 0, -10, 0, -5]))
+    assert recording.settings["goal"] == [0.1, -0.1, 0.05]
+
+
+def test_optitrack_timing_and_units(optitrack_table, write, tmp_path):
+    recording = read_optitrack_csv(write(optitrack_table(), tmp_path / "run.csv"))
+    np.testing.assert_allclose(recording.command_time, 0.1 * np.arange(11), atol=1e-9)
+    np.testing.assert_allclose(recording.command[:4, 1], [5e-3, 0.0, 5e-3, 0.0], atol=1e-15)
+    assert recording.position_mask.all()
+    assert recording.object_pose is None
+    np.testing.assert_allclose(recording.position[0, 3], [0.0, -0.03, 0.16], atol=1e-4)
+
+
+def test_optitrack_file_by_hand(datasets):
+    name = "AKLWI_collected_data_20250130-145317.csv"
+    recording = read_optitrack_csv(datasets / "sim2real_trunk" / name)
+    assert recording.position.shape == (101, 4, 3)
+    assert recording.command.shape == (100, 8)
+    np.testing.assert_allclose(
+        recording.position[2, 3], [6.033880170e-3, -66.258259117e-3, 162.961840629e-3], atol=1e-11
+    )
+    np.testing.assert_allclose(recording.time[:3], [0.0, 0.212689, 0.312689], atol=1e-6)
+    # 5, 12, 12, 12: cable 5 pulled once, cable 4 released three times; 82 actions 14 at the end release cable 6
+    np.testing.assert_allclose(recording.command[3], 1e-3 * np.array([0, 0, 0, 0, -15, 5, 0, 0]))
+    assert recording.command[-1, 6] == pytest.approx(-82 * 5e-3)
+    # rows 0 and 1 repeat one frame: action 0 left just before row 1, action 1 at row 1; row 1 is no new measurement
+    np.testing.assert_allclose(recording.command_time[:3], recording.time[[1, 1, 2]] - [1 / 120, 0, 0], atol=1e-9)
+    assert not recording.position_mask[1].any()
+    assert recording.position_mask.sum() == 400
+    np.testing.assert_allclose(np.linalg.norm(recording.object_pose[:, 3:], axis=1), 1.0, atol=1e-6)
+    assert recording.object_pose[0, 6] == pytest.approx(0.99992925)  # the file has the opposite sign: the same rotation
+
+
+def test_asl_frame_units_and_timing(asl_tables, write, tmp_path):
+    observations, commands = asl_tables()
+    observations[["x1", "y1", "z1"]] = [0.11, -0.105, 0.13]
+    recording = read_asl_csv(write(observations, tmp_path / "o.csv"), write(commands, tmp_path / "c.csv.gz"))
+    np.testing.assert_allclose(recording.position[7, 0], [0.11, 0.13, 0.105])
+    np.testing.assert_allclose(recording.command[5], [np.pi / 6, 0, 0, 0, 0, 0])
+    np.testing.assert_allclose(recording.time, 0.01 * np.arange(60))
+    np.testing.assert_allclose(recording.command_time, recording.time[:-1])
+    np.testing.assert_allclose(recording.initial_command, recording.command[0])
+    assert recording.command_unit == "rad"
+
+
+def test_asl_file_by_hand(datasets):
+    folder = datasets / "asl_trunk"
+    recording = read_asl_csv(
+        folder / "observations_controlled_1_100g.csv.gz", folder / "control_inputs_controlled_1.csv.gz"
+    )
+    assert recording.position.shape == (15001, 3, 3)
+    assert recording.command.shape == (15000, 6)
+    np.testing.assert_allclose(recording.position[0, 2], [0.10035146, 0.1065277, 0.31325835], atol=1e-8)
+    np.testing.assert_allclose(recording.command[1, :2], np.deg2rad([-1.9690438733303424, 5.095397942463393]))
+    np.testing.assert_allclose(recording.motor_angle[1, 2], np.deg2rad(-2.9804534912109375))
+    assert recording.settings["payload_mass"] == pytest.approx(0.1)
+    assert recording.settings["motor_angle_hold"] == pytest.approx(0.05)
+    assert recording.time[-1] == pytest.approx(150.0)
+
+
+def test_asl_settled_poses(datasets):
+    folder = datasets / "asl_trunk"
+    recording = read_asl_csv(
+        folder / "observations_adiabatic_global_4.csv.gz", folder / "control_inputs_adiabatic_global_4.csv.gz"
+    )
+    assert recording.position.shape == (30, 3, 3)
+    assert recording.command.shape == (29, 6)
+    np.testing.assert_allclose(np.rad2deg(recording.initial_command[0]), 18.99296397981523)
+    np.testing.assert_allclose(np.rad2deg(recording.command[0, 1]), -63.57886031528356)
+    assert recording.motor_angle is None
+    # command k is in force when pose k is taken, and commands come at the blocks' first rows: 177 rows, then 354
+    held = recording.command_at(recording.time)
+    np.testing.assert_array_equal(held[1:], recording.command)
+    np.testing.assert_allclose(recording.time[1], 3.54)
+    np.testing.assert_allclose(recording.command_time[:2], [0.01, 3.55])
+    # the same command, sent twice in a row, leaves the trunk where it was (rows 17 and 18)
+    np.testing.assert_array_equal(held[17], held[18])
+    assert np.linalg.norm(recording.position[17] - recording.position[18], axis=1).max() < 0.5e-3
+
+
+def test_asl_at_zero_command(datasets):
+    recording = read_asl_csv(datasets / "asl_trunk" / "observations_zeros_0g.csv.gz", None)
+    assert recording.command.shape == (3000, 6)
+    assert not recording.command.any()
+    assert np.std(recording.position, axis=0).max() < 0.1e-3
+
+
+def test_motor_step(datasets, tmp_path):
+    folder = datasets / "asl_trunk"
+    time, angle = read_motor_step(folder / "motor_step_values.csv", folder / "motor_step_times.csv")
+    assert angle.shape == (len(time), 6)
+    np.testing.assert_allclose(np.rad2deg(angle[0, 0]), 3.259765625)
+    (tmp_path / "times.csv").write_text("0.1,0.2\n")
+    with pytest.raises(InputError, match="there are 2 times"):
+        read_motor_step(folder / "motor_step_values.csv", tmp_path / "times.csv")
+
+
+@pytest.fixture
+def plain(tmp_path) -> Path:
+    rows = 40
+    noise = np.random.default_rng(2).normal(0.0, 0.01, (rows, 3))
+    lines = ["t,x,y,z,motor,load"]
+    for row in range(rows):
+        x, y, z = np.array([100.0 + row, -200.0, 30.0]) + noise[row]
+        lines.append(f"{1000 + 20 * row},{x!r},{y!r},{z!r},{row},{row / 10}")
+    path = tmp_path / "own.csv"
+    path.write_text("\n".join(lines))
+    return path
+
+
+MAPPING = {
+    "time": "t",
+    "time_unit": "ms",
+    "commands": ["motor"],
+    "command_unit": "deg",
+    "positions": [["x", "y", "z"]],
+    "position_unit": "mm",
+    "axes": ["x", "z", "-y"],
+    "tensions": ["load"],
+    "robot": "own",
+}
+
+
+def test_plain_csv_converts_through_its_mapping(plain):
+    recording = read_plain_csv(plain, CsvColumns.model_validate(MAPPING))
+    np.testing.assert_allclose(recording.time, 0.02 * np.arange(40), atol=1e-9)
+    np.testing.assert_allclose(recording.position[10, 0], [0.11, 0.03, 0.2], atol=1e-4)
+    np.testing.assert_allclose(recording.command_at(recording.time)[:, 0], np.deg2rad(np.arange(40)))
+    np.testing.assert_allclose(recording.tension[5], [0.5])
+    assert recording.robot == "own"
+    assert recording.cable_names == ("motor",)
+
+
+def test_plain_csv_takes_commands_from_a_file_of_their_own(plain, tmp_path):
+    (tmp_path / "commands.csv").write_text("motor\n" + "\n".join(["7"] * 39))
+    recording = read_plain_csv(plain, CsvColumns.model_validate(MAPPING), tmp_path / "commands.csv")
+    np.testing.assert_allclose(recording.command, np.deg2rad(7.0))
+    (tmp_path / "commands.csv").write_text("motor\n" + "\n".join(["7"] * 38))
+    with pytest.raises(InputError, match="40 observations do not fit 38 commands"):
+        read_plain_csv(plain, CsvColumns.model_validate(MAPPING), tmp_path / "commands.csv")
+
+
+def test_plain_csv_turns_the_object_with_the_frame(tmp_path):
+    text = "x,y,z,u,ox,oy,oz,qx,qy,qz,qw\n"
+    text += "".join(f"{100 + row},0,0,{row},0,0.5,0,0,0.7071068,0,0.7071068\n" for row in range(4))
+    (tmp_path / "object.csv").write_text(text)
+    columns = CsvColumns.model_validate(
+        {
+            "sample_time": 0.1,
+            "commands": ["u"],
+            "command_unit": "mm",
+            "positions": [["x", "y", "z"]],
+            "position_unit": "mm",
+            "axes": ["x", "z", "-y"],
+            "object_pose": ["ox", "oy", "oz", "qx", "qy", "qz", "qw"],
+        }
+    )
+    pose = read_plain_csv(tmp_path / "object.csv", columns).object_pose
+    np.testing.assert_allclose(pose[0, :3], [0.0, 0.0, -0.5e-3], atol=1e-12)
+    # a cube turned by 90 degrees about the file's y: its x axis points to -z there, which is -y in the base frame
+    x, y, z, w = pose[0, 3:]
+    first_axis = [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)]
+    np.testing.assert_allclose(first_axis, [0.0, -1.0, 0.0], atol=1e-6)
