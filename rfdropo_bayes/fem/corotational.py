@@ -7,6 +7,8 @@ Haugen 2005, Comput. Methods Appl. Mech. Engng 194:2285-2335, without the geomet
 
 from __future__ import annotations
 
+import math
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -54,18 +56,24 @@ def internal_force(
     return jnp.concatenate([force[:, :half], none]) + jnp.concatenate([none, force[:, half:]])
 
 
-def tangent(
-    stiffness: Float[Array, "layers dofs dofs"], frame: Float[Array, "layers 3 3"]
-) -> BlockTridiagonal:
-    """Tangent stiffness R K R' [N/m] over all stations; positive semi-definite."""
+def pack(stiffness: Float[Array, "layers dofs dofs"]) -> Float[Array, "layers 9 pairs"]:
+    """Layer stiffness arranged for ``tangent``: the nine component pairs first, then block (lower, upper, coupling) and node pair."""
     layers, size = stiffness.shape[0], stiffness.shape[1] // 2
-    nodes = size // 3
+    blocks = stiffness[:, :size, :size], stiffness[:, size:, size:], stiffness[:, size:, :size]
+    parts = jnp.stack(blocks, axis=1).reshape(layers, 3, size // 3, 3, size // 3, 3)
+    return jnp.transpose(parts, (0, 3, 5, 1, 2, 4)).reshape(layers, 9, size * size // 3)
 
-    def turned(block: Float[Array, "layers b b"]) -> Float[Array, "layers b b"]:
-        parts = block.reshape(layers, nodes, 3, nodes, 3)
-        return jnp.einsum("lij,lnjmk,lhk->lnimh", frame, parts, frame).reshape(layers, size, size)
 
-    below, above = turned(stiffness[:, :size, :size]), turned(stiffness[:, size:, size:])
-    none = jnp.zeros((1, size, size))
-    diagonal = jnp.concatenate([below, none]) + jnp.concatenate([none, above])
-    return BlockTridiagonal(diagonal, turned(stiffness[:, size:, :size]))
+def tangent(packed: Float[Array, "layers 9 pairs"], frame: Float[Array, "layers 3 3"]) -> BlockTridiagonal:
+    """Tangent stiffness R K R' [N/m] over all stations, from ``pack``; positive semi-definite.
+
+    One product with R (x) R turns all node pairs of a layer at once, several times faster than two products per pair.
+    """
+    layers = len(frame)
+    section = math.isqrt(packed.shape[2] // 3)
+    pairs = jnp.einsum("lij,lhk->lihjk", frame, frame).reshape(layers, 9, 9)
+    parts = (pairs @ packed).reshape(layers, 3, 3, 3, section, section)
+    blocks = jnp.transpose(parts, (3, 0, 4, 1, 5, 2)).reshape(3, layers, 3 * section, 3 * section)
+    none = jnp.zeros_like(blocks[0, :1])
+    diagonal = jnp.concatenate([blocks[0], none]) + jnp.concatenate([none, blocks[1]])
+    return BlockTridiagonal(diagonal, blocks[2])

@@ -51,6 +51,7 @@ class Prepared(NamedTuple):
     """What is computed once a rollout."""
 
     stiffness: Float[Array, "layers dofs dofs"]  # of each layer in its own frame [N/m]
+    packed: Float[Array, "layers 9 pairs"]  # the same, arranged for the tangent
     mass: BlockTridiagonal  # scalar: section nodes x section nodes blocks [kg]
     weight: Float[Array, "nodes 3"]  # M g [N]
     gravity: Float[Array, "3"]
@@ -106,7 +107,9 @@ def without_cables() -> CableLayout:
 def prepare(system: System, material: Material) -> Prepared:
     """Stiffness, mass and loads of a body with the given material: once a rollout."""
     body = system.body
-    stiffness = layered.layer_stiffness(body, material.young_modulus, jnp.minimum(material.poisson_ratio, POISSON_LIMIT))
+    poisson_ratio = jnp.minimum(material.poisson_ratio, POISSON_LIMIT)
+    stiffness = layered.layer_stiffness(body, material.young_modulus, poisson_ratio)
+    stiffness = stiffness * material.stiffness_scale[:, None, None]
     section = body.section_nodes
     layer_mass = layered.layer_mass(body) * material.density
     none = jnp.zeros((1, section, section))
@@ -121,7 +124,8 @@ def prepare(system: System, material: Material) -> Prepared:
     guides = guide_matrix(system.cables, body.nodes)
     weight = multiply(mass, jnp.broadcast_to(material.gravity, (len(body.station), section, 3)))
     return Prepared(
-        stiffness=stiffness * material.stiffness_scale[:, None, None],
+        stiffness=stiffness,
+        packed=corotational.pack(stiffness),
         mass=mass,
         weight=weight.reshape(-1, 3),
         gravity=material.gravity,
@@ -210,7 +214,7 @@ def step(
     """
     frame, local = frames_and_displacements(system, prepared, state.position)
     force = corotational.internal_force(prepared.stiffness, frame, local).reshape(-1, 3)
-    tangent = corotational.tangent(prepared.stiffness, frame)
+    tangent = corotational.tangent(prepared.packed, frame)
     stations = len(system.body.station)
     damping = time_step + prepared.rayleigh_stiffness
     strained = multiply(tangent, state.velocity.reshape(stations, -1, 1)).reshape(-1, 3)

@@ -1,0 +1,43 @@
+"""Energies and momentum of a state, for checks and reports."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.fem.dynamics import Prepared, State, System, frames_and_displacements, mass_times
+
+
+class Energies(NamedTuple):
+    """Energies of one state [J]."""
+
+    kinetic: Float[Array, ""]
+    elastic: Float[Array, ""]
+    gravitational: Float[Array, ""]  # zero with every node at the origin
+
+    @property
+    def total(self) -> Float[Array, ""]:
+        """Their sum."""
+        return self.kinetic + self.elastic + self.gravitational
+
+
+def energies(system: System, prepared: Prepared, state: State) -> Energies:
+    """Kinetic energy v'Mv/2, elastic energy d'Kd/2 in the layers' frames, and gravity's -x'Mg."""
+    _, local = frames_and_displacements(system, prepared, state.position)
+    return Energies(
+        kinetic=0.5 * jnp.sum(state.velocity * mass_times(system, prepared, state.velocity)),
+        elastic=0.5 * jnp.einsum("li,lij,lj->", local, prepared.stiffness, local),
+        gravitational=-jnp.sum(prepared.weight * state.position),
+    )
+
+
+def linear_momentum(system: System, prepared: Prepared, state: State) -> Float[Array, "3"]:
+    """Sum of M v over the body [kg m/s]."""
+    return jnp.sum(mass_times(system, prepared, state.velocity), axis=0)
+
+
+def total_mass(prepared: Prepared) -> Float[Array, ""]:
+    """Mass of the body with its point masses [kg]."""
+    return jnp.sum(prepared.mass.diagonal) + 2.0 * jnp.sum(prepared.mass.lower)

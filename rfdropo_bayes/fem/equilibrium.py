@@ -1,0 +1,129 @@
+"""Static equilibrium under gravity, external forces and cables: where a rollout starts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from rfdropo_bayes.fem import corotational
+from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal
+from rfdropo_bayes.fem.cables import lengths_and_jacobian
+from rfdropo_bayes.fem.dynamics import (
+    Prepared,
+    State,
+    System,
+    accept,
+    constrained_increment,
+    frames_and_displacements,
+    state_at_rest,
+)
+
+ITERATIONS = 60
+TOLERANCE = 1e-6
+"""Largest force out of balance, relative to the loads, that counts as equilibrium."""
+LONGEST_STEP = 0.1
+"""No node moves further than this many body lengths in an iteration."""
+SMALLEST_RELAXATION = 0.1
+
+
+class EquilibriumInfo(NamedTuple):
+    """How well the body is in equilibrium."""
+
+    residual: Float[Array, ""]  # largest nodal force out of balance / sum of the loads
+    converged: Bool[Array, ""]  # residual within TOLERANCE, cable problem solved
+    diverged: Bool[Array, ""]
+
+
+class _Iterate(NamedTuple):
+    position: Float[Array, "nodes 3"]
+    tension: Float[Array, " cables"]
+    increment: Float[Array, "nodes 3"]
+    relaxation: Float[Array, ""]
+
+
+def _tension_stiffening(
+    system: System, frame: Float[Array, "layers 3 3"], tension: Float[Array, " layers"]
+) -> BlockTridiagonal:
+    """Geometric stiffness N / L of layers in tension against lateral motion of one face relative to the other.
+
+    The corotational tangent leaves it out; without it the iteration for a soft body that hangs in its cables or its own weight
+    swings about the answer with growing amplitude. Compression is left out: its stiffness would be negative.
+    """
+    nodes = system.body.section_nodes
+    axis = frame[:, :, 2]
+    lateral = jnp.eye(3) - axis[:, :, None] * axis[:, None, :]
+    spring = jnp.maximum(tension, 0.0) / np.diff(system.body.station) / nodes**2
+    block = jax.vmap(lambda part: jnp.kron(jnp.ones((nodes, nodes)), part))(lateral * spring[:, None, None])
+    none = jnp.zeros_like(block[:1])
+    return BlockTridiagonal(jnp.concatenate([block, none]) + jnp.concatenate([none, block]), -block)
+
+
+def _layer_tension(
+    system: System,
+    local_force: Float[Array, "layers dofs"],
+    cable_force: Float[Array, "nodes 3"],
+    frame: Float[Array, "layers 3 3"],
+) -> Float[Array, " layers"]:
+    """Axial force [N] in each section, body and cables together: what a cable compresses, it holds straight as well."""
+    nodes = system.body.section_nodes
+    body = jnp.sum(local_force.reshape(len(frame), 2 * nodes, 3)[:, nodes:, 2], axis=1)
+    beyond = jnp.cumsum(jnp.sum(cable_force.reshape(-1, nodes, 3), axis=1)[::-1], axis=0)[::-1][1:]
+    return body - jnp.einsum("li,li->l", beyond, frame[:, :, 2])
+
+
+def _increment(system: System, prepared: Prepared, iterate: _Iterate, load, displacement):
+    """Newton increment with the corotational tangent; the cables pull to the commanded displacement in one go."""
+    frame, local = frames_and_displacements(system, prepared, iterate.position)
+    force = corotational.internal_force(prepared.stiffness, frame, local).reshape(-1, 3)
+    length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, iterate.position)
+    cable_force = -jnp.einsum("cni,c->ni", jacobian, iterate.tension)
+    local_force = jnp.einsum("lij,lj->li", prepared.stiffness, local)
+    stiffening = _tension_stiffening(system, frame, _layer_tension(system, local_force, cable_force, frame))
+    tangent = jax.tree.map(jnp.add, corotational.tangent(prepared.packed, frame), stiffening)
+    slack = prepared.rest_length - displacement - length
+    found = constrained_increment(system, tangent, force + load, jacobian, slack, iterate.tension)
+    held = system.clamped_stations * system.body.section_nodes
+    unbalanced = jnp.max(jnp.abs((force + load + cable_force)[held:]))
+    return *found, unbalanced
+
+
+def static_equilibrium(
+    system: System,
+    prepared: Prepared,
+    displacement: Float[Array, " cables"],
+    external_force: Float[Array, "nodes 3"] | float = 0.0,
+    iterations: int = ITERATIONS,
+) -> tuple[State, EquilibriumInfo]:
+    """Body at rest under its weight, the external nodal forces [N] and the commanded cable displacements [m].
+
+    Newton's method with the corotational tangent from the undeformed body. The increments are limited in length, and relaxed
+    more whenever two in a row point against each other, which makes soft bodies far from straight converge too. A fixed number
+    of iterations, so that both modes of differentiation work. Needs at least one clamped station.
+    """
+    load = prepared.weight + external_force
+    longest = LONGEST_STEP * (system.body.station[-1] - system.body.station[0])
+
+    def iterate(current: _Iterate, _):
+        increment, tension, converged, _ = _increment(system, prepared, current, load, displacement)
+        now, before = lax.stop_gradient((increment, current.increment))
+        along = jnp.sum(now * before)
+        opposed = along < -0.3 * jnp.sqrt(jnp.sum(now**2) * jnp.sum(before**2))
+        relaxation = jnp.clip(current.relaxation * jnp.where(opposed, 0.6, 1.2), SMALLEST_RELAXATION, 1.0)
+        scale = jnp.minimum(relaxation, longest / jnp.maximum(jnp.max(jnp.abs(now)), 1e-300))
+        return _Iterate(current.position + scale * increment, tension, increment, relaxation), converged
+
+    start = state_at_rest(system)
+    first = _Iterate(start.position, start.tension, jnp.zeros_like(start.position), jnp.array(1.0))
+    last, solved = lax.scan(iterate, first, None, length=iterations)
+    unbalanced = _increment(system, prepared, last, load, displacement)[3]
+    loads = jnp.sum(jnp.abs(load)) + jnp.sum(last.tension)
+    residual = unbalanced / jnp.maximum(loads, 1e-300)
+    moved = State(last.position, jnp.zeros_like(last.position), last.tension)
+    state, info = accept(system, prepared, start, moved, solved[-1])
+    converged = (residual < TOLERANCE) & info.cables_converged & ~info.diverged
+    return state, EquilibriumInfo(residual, converged, info.diverged)
