@@ -83,8 +83,8 @@ class RolloutProblem(Problem, Protocol):
         observed: measured features, laid out like `rollouts`.
         observed_mask: True where ``observed`` may be used.
 
-    It may also have ``physical_names: tuple[str, ...]``, the parameters that a rollout depends on (all of ``names`` where
-    it is missing); the others, such as the noise scale, are passed at their prior median.
+    It may also have ``physical_names: tuple[str, ...]``, the parameters that a rollout depends on (all of ``names``
+    where it is missing); the others, such as the noise scale, are passed at their prior median.
     """
 
     @property

@@ -368,7 +368,10 @@ def _stage_warnings(trace: list[dict[str, Any]], config: SmcConfig) -> list[str]
     last = [row for row in trace if row.get("final")]
     stuck = max(row["correlation"] for row in last)
     if stuck > max(0.7, config.correlation):
-        sentences.append(f"the last moves left the particles {stuck:.2f} correlated with where they were")
+        sentences.append(
+            f"the last moves left the particles {stuck:.2f} correlated with where they were: several modes, or a shape "
+            "that the moves cannot follow; compare replicates"
+        )
     return sentences
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Bool, Float, PRNGKeyArray
+from scipy.linalg import solve_triangular
 
 KERNELS = ("crank_nicolson", "random_walk")
 
@@ -51,20 +50,27 @@ def adapt_scale(kernel: str, scale: float, acceptance: float, target: float) -> 
     return float(np.clip(longer, 1e-4, 1.0 if kernel == "crank_nicolson" else 10.0))
 
 
-@partial(jax.jit, static_argnames=("kernel",))
+def host_generator(key: PRNGKeyArray) -> np.random.Generator:
+    """NumPy generator that is a function of a JAX key.
+
+    Population bookkeeping runs on the host: it is cheap, and its shapes change from run to run, so that compiling it
+    would take longer than running it.
+    """
+    return np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
+
+
 def propose(
-    key: PRNGKeyArray,
-    position: Float[Array, "n d"],
+    generator: np.random.Generator,
+    position: Float[np.ndarray, "n d"],
     reference: Reference,
-    scale: Float[Array, ""],
-    degrees: Float[Array, ""],
-    *,
+    scale: float,
+    degrees: float,
     kernel: str,
-) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
     """Propose for all particles at once.
 
-    ``random_walk``: ``x' = x + scale L z``. ``crank_nicolson``: ``x' = m + sqrt(1 - scale^2) (x - m) + scale sqrt(s) L z``
-    with ``s`` inverse gamma, reversible with respect to a Student-t of the reference's location and spread (the
+    ``random_walk``: ``x' = x + scale L z``.
+    ``crank_nicolson``: ``x' = m + sqrt(1 - scale^2) (x - m) + scale sqrt(s) L z`` with ``s`` inverse gamma, reversible with respect to a Student-t of the reference's location and spread (the
     t-preconditioned Crank-Nicolson proposal of Grumitt, Karamanis and Seljak 2024). At scale 1 it nearly forgets where
     it came from, so that one move decorrelates a population that is close to normal; at small scales it is a random
     walk.
@@ -72,27 +78,21 @@ def propose(
     Returns:
         proposals, and the log of the proposal's part of the acceptance ratio.
     """
-    noise_key, gamma_key = jax.random.split(key)
     n, d = position.shape
-    step = jax.random.normal(noise_key, (n, d)) @ reference.cholesky.T
+    step = generator.standard_normal((n, d)) @ reference.cholesky.T
     if kernel == "random_walk":
-        return position + scale * step, jnp.zeros(n)
+        return position + scale * step, np.zeros(n)
     centred = position - reference.mean
     distance = _squared_distance(reference, centred)
-    spread = 0.5 * (degrees + distance) / jax.random.gamma(gamma_key, 0.5 * (d + degrees), (n,))
-    # sqrt((1 - s)(1 + s)) is exact at s = 1, where 1 - s^2 may be slightly negative.
-    moved = jnp.sqrt((1.0 - scale) * (1.0 + scale)) * centred + scale * jnp.sqrt(spread)[:, None] * step
-    ratio = 0.5 * (d + degrees) * (
-        jnp.log1p(_squared_distance(reference, moved) / degrees) - jnp.log1p(distance / degrees)
-    )
-    return reference.mean + moved, ratio
+    spread = 0.5 * (degrees + distance) / generator.standard_gamma(0.5 * (d + degrees), n)
+    moved = np.sqrt(1.0 - scale**2) * centred + scale * np.sqrt(spread)[:, None] * step
+    change = np.log1p(_squared_distance(reference, moved) / degrees) - np.log1p(distance / degrees)
+    return reference.mean + moved, 0.5 * (d + degrees) * change
 
 
-@jax.jit
-def accept(key: PRNGKeyArray, log_ratio: Float[Array, " n"]) -> Bool[Array, " n"]:
+def accept(generator: np.random.Generator, log_ratio: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     """Metropolis decision for every particle; a ratio that is not a number is a refusal."""
-    uniform = jax.random.uniform(key, log_ratio.shape)
-    return jnp.log(uniform) < jnp.where(jnp.isnan(log_ratio), -jnp.inf, log_ratio)
+    return np.log(generator.uniform(size=log_ratio.shape)) < np.where(np.isnan(log_ratio), -np.inf, log_ratio)
 
 
 def slowest_correlation(
@@ -105,6 +105,5 @@ def slowest_correlation(
     return float(np.max(np.sum(first * second, axis=1) / np.maximum(spread, 1e-300)))
 
 
-def _squared_distance(reference: Reference, centred: Float[Array, "n d"]) -> Float[Array, " n"]:
-    white = jax.scipy.linalg.solve_triangular(reference.cholesky, centred.T, lower=True)
-    return jnp.sum(white**2, axis=0)
+def _squared_distance(reference: Reference, centred: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+    return np.sum(solve_triangular(reference.cholesky, centred.T, lower=True) ** 2, axis=0)

@@ -60,7 +60,11 @@ def chains(problem: Problem, positions: list[np.ndarray]) -> Draws:
 
 
 def bound_warnings(
-    draws: Mapping[str, np.ndarray], bounds: Mapping[str, tuple[float, float]], *, edge: float = 0.01, share: float = 0.1
+    draws: Mapping[str, np.ndarray],
+    bounds: Mapping[str, tuple[float, float]],
+    *,
+    edge: float = 0.01,
+    share: float = 0.1,
 ) -> list[str]:
     """A sentence for every parameter with more than ``share`` of its draws within ``edge`` of its range from a bound.
 
@@ -71,10 +75,12 @@ def bound_warnings(
         low, high = bounds[name]
         if not np.isfinite(high - low):
             continue
-        for side, near in (("lower", values < low + edge * (high - low)), ("upper", values > high - edge * (high - low))):
+        margin = edge * (high - low)
+        for side, bound, near in (("lower", low, values < low + margin), ("upper", high, values > high - margin)):
             if np.mean(near) > share:
-                bound = low if side == "lower" else high
-                sentences.append(f"{name} sits on its {side} bound {bound:g}: {np.mean(near):.0%} of the draws are there")
+                sentences.append(
+                    f"{name} sits on its {side} bound {bound:g}: {np.mean(near):.0%} of the draws are there"
+                )
     return sentences
 
 

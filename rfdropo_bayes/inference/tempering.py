@@ -22,6 +22,7 @@ from rfdropo_bayes.inference.proposals import (
     accept,
     adapt_scale,
     fit_reference,
+    host_generator,
     propose,
     slowest_correlation,
 )
@@ -104,7 +105,9 @@ def path_density(rows: Float[np.ndarray, "n h"], progress: float) -> Float[np.nd
     return total + share * rows[:, whole] if share > 0.0 else total
 
 
-def advance(population: Population, target_ess: float, stop: float, *, leap: bool) -> tuple[Population, StageInfo, bool]:
+def advance(
+    population: Population, target_ess: float, stop: float, *, leap: bool
+) -> tuple[Population, StageInfo, bool]:
     """Reweight to the next target of the path, at most to ``stop``.
 
     Args:
@@ -187,14 +190,13 @@ def move(
     density = population.base + path_density(population.rows, population.progress)
     correlation = 1.0
     for count in range(max(1, min(moves, tuning.max_moves))):
-        propose_key, accept_key = jax.random.split(jax.random.fold_in(key, count))
+        generator = host_generator(jax.random.fold_in(key, count))
         proposal, ratio = propose(
-            propose_key, population.position, reference, scale, tuning.degrees, kernel=tuning.kernel
+            generator, population.position, reference, scale, tuning.degrees, tuning.kernel
         )
-        proposal = np.asarray(proposal)
         base, rows = evaluate(proposal)
         proposed = base + path_density(rows, population.progress)
-        chosen = np.asarray(accept(accept_key, np.asarray(ratio) + proposed - density))
+        chosen = accept(generator, ratio + proposed - density)
         population = population._replace(
             position=np.where(chosen[:, None], proposal, population.position),
             base=np.where(chosen, base, population.base),

@@ -1,0 +1,271 @@
+"""Posterior mode by Levenberg-Marquardt in the unconstrained space, and the Laplace approximation around it.
+
+Observation noise among the parameters. The residuals r are whitened, so the log likelihood is ``-r'r / 2 + c`` where c
+holds the log determinants and depends on noise parameters alone. Noise parameters stay in the vector that is optimised
+(they are not profiled out: their posterior and their correlation with the rest are wanted). They are found by testing
+along which coordinates the log likelihood and ``-r'r / 2`` differ. Along these the gradient is taken from the log
+likelihood itself, by central differences; and since ``J'J`` holds only one half of the information about a scale
+(``m`` instead of ``2 m``), their block of the Hessian at the optimum is taken by second differences of the log
+likelihood. Physical parameters keep the Gauss-Newton block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from rfdropo_bayes.bayes.problem import ResidualProblem
+from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
+
+DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order one
+
+
+class Target(NamedTuple):
+    """A posterior at one horizon, as functions of one unconstrained point (batched where marked).
+
+    Attributes:
+        density: log posterior of a batch (n, d).
+        likelihood: log likelihood of a batch (n, d).
+        prior_gradient, prior_hessian: of the log prior.
+        linearise: residuals (m,) and their Jacobian (m, d).
+        noise: coordinates along which the log determinant changes.
+    """
+
+    density: Callable[[np.ndarray], np.ndarray]
+    likelihood: Callable[[np.ndarray], np.ndarray]
+    prior_gradient: Callable[[np.ndarray], np.ndarray]
+    prior_hessian: Callable[[np.ndarray], np.ndarray]
+    linearise: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    noise: Bool[np.ndarray, " d"]
+
+
+class LevenbergState(NamedTuple):
+    """Where an optimisation stands.
+
+    Attributes:
+        position: unconstrained point.
+        log_density: log posterior there.
+        damping: Levenberg-Marquardt's, relative to the diagonal of the Hessian.
+        converged: the last step promised less than the tolerance.
+    """
+
+    position: Float[np.ndarray, " d"]
+    log_density: float
+    damping: float
+    converged: bool
+
+
+class StepInfo(NamedTuple):
+    """One step: the gain in log posterior, the gain the quadratic model promised, and the tries it took."""
+
+    gain: float
+    promised: float
+    tries: int
+
+
+class Laplace(NamedTuple):
+    """Normal approximation in unconstrained coordinates.
+
+    Attributes:
+        mean: the mode.
+        covariance: inverse of minus the Hessian.
+        log_density: log posterior, unnormalised, at the mode.
+    """
+
+    mean: Float[np.ndarray, " d"]
+    covariance: Float[np.ndarray, "d d"]
+    log_density: float
+
+    @property
+    def log_evidence(self) -> float:
+        """Log of the integral of the unnormalised posterior, were it normal."""
+        d = len(self.mean)
+        return self.log_density + 0.5 * d * np.log(2.0 * np.pi) + 0.5 * float(np.linalg.slogdet(self.covariance)[1])
+
+
+def make_target(
+    problem: ResidualProblem,
+    horizon: int,
+    ledger: Ledger,
+    u: Float[np.ndarray, " d"],
+    jacobian: str = "auto",
+    noise: Bool[np.ndarray, " d"] | None = None,
+) -> Target:
+    """Posterior of the first ``horizon`` rows.
+
+    Args:
+        problem: with residuals.
+        horizon: rows to use.
+        ledger: every rollout is charged to it; a Jacobian in d directions counts as d + 1.
+        u: a point with a finite likelihood, where noise coordinates are looked for.
+        jacobian: "forward" (JAX), "central" differences, or "auto": forward where residuals can be traced.
+        noise: noise coordinates, if known.
+    """
+
+    def likelihood(points: np.ndarray) -> np.ndarray:
+        return evaluate_rows(problem, points, horizon, ledger).sum(axis=1)
+
+    def density(points: np.ndarray) -> np.ndarray:
+        return evaluate_prior(problem, points) + likelihood(points)
+
+    prior = _prior_derivatives(problem)
+    linearise = _make_linearise(problem, horizon, ledger, u, jacobian)
+    if noise is None:
+        residual, slope = linearise(u)
+        noise = _noise_coordinates(likelihood, u, -slope.T @ residual)
+    return Target(density, likelihood, *prior, linearise, noise)
+
+
+def _prior_derivatives(problem: ResidualProblem) -> tuple[Callable, Callable]:
+    def single(u: Array) -> Array:
+        return jnp.asarray(problem.log_prior(u[None]))[0]
+
+    gradient, hessian = jax.jit(jax.grad(single)), jax.jit(jax.hessian(single))
+    return (lambda u: np.asarray(gradient(u))), (lambda u: np.asarray(hessian(u)))
+
+
+def _make_linearise(problem: ResidualProblem, horizon: int, ledger: Ledger, u: np.ndarray, jacobian: str) -> Callable:
+    def residuals(u: Array) -> Array:
+        values = problem.from_unconstrained(u[None])
+        return problem.residuals({name: value[0] for name, value in values.items()}, horizon)
+
+    if jacobian == "auto":
+        jacobian = "forward" if _traceable(residuals, u) else "central"
+    if jacobian == "forward":
+
+        @jax.jit
+        def both(u: Array) -> tuple[Array, Array]:
+            def tangent(direction: Array) -> tuple[Array, Array]:
+                return jax.jvp(residuals, (u,), (direction,))
+
+            value, columns = jax.vmap(tangent, out_axes=(None, 1))(jnp.eye(len(u)))
+            return value, columns
+
+        def linearise(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            ledger.charge(problem, len(u) + 1, horizon)
+            value, columns = both(u)
+            return np.asarray(value), np.asarray(columns)
+
+        return linearise
+
+    def differences(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ledger.charge(problem, 2 * len(u) + 1, horizon)
+        steps = DIFFERENCE * np.eye(len(u))
+        columns = [(np.asarray(residuals(u + e)) - np.asarray(residuals(u - e))) / (2.0 * DIFFERENCE) for e in steps]
+        return np.asarray(residuals(u)), np.stack(columns, axis=1)
+
+    return differences
+
+
+def _traceable(residuals: Callable, u: np.ndarray) -> bool:
+    try:
+        jax.eval_shape(residuals, u)
+    except (jax.errors.JAXTypeError, TypeError):
+        return False
+    return True
+
+
+def _noise_coordinates(likelihood: Callable, u: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Coordinates where the slope of the log likelihood is not that of ``-r'r / 2``: the log determinant's doing."""
+    slope = _slope(likelihood, u, np.ones(len(u), dtype=bool))
+    scale = np.maximum(np.abs(slope), np.abs(gradient))
+    return np.abs(slope - gradient) > 1e-2 * scale + 1e-3
+
+
+def _slope(likelihood: Callable, u: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    steps = DIFFERENCE * np.eye(len(u))[chosen]
+    values = likelihood(np.concatenate([u + steps, u - steps]))
+    upper, lower = values[: len(steps)], values[len(steps) :]
+    return (upper - lower) / (2.0 * DIFFERENCE)
+
+
+def quadratic_model(target: Target, u: Float[np.ndarray, " d"]) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient of the log posterior and a positive definite stand-in for minus its Hessian."""
+    residual, jacobian = target.linearise(u)
+    gradient = -jacobian.T @ residual
+    curvature = jacobian.T @ jacobian
+    if target.noise.any():
+        gradient[target.noise] = _slope(target.likelihood, u, target.noise)
+        # Twice, exact in expectation for a scale: J'J has m where the information is 2 m.
+        curvature[np.ix_(target.noise, target.noise)] *= 2.0
+    return gradient + target.prior_gradient(u), curvature + _positive_part(-target.prior_hessian(u))
+
+
+def init(target: Target, u: Float[np.ndarray, " d"]) -> LevenbergState:
+    """State at a starting point."""
+    return LevenbergState(u, float(target.density(u[None])[0]), 1e-3, False)
+
+
+def step(target: Target, state: LevenbergState, tolerance: float) -> tuple[LevenbergState, StepInfo]:
+    """One Levenberg-Marquardt step; damping grows until the log posterior rises.
+
+    Damping acts on the curvature's diagonal (Marquardt's scaling), so that units do not matter. All dampings of a step
+    are tried in one batch of rollouts.
+    """
+    gradient, curvature = quadratic_model(target, state.position)
+    diagonal = np.diag(np.maximum(np.diag(curvature), 1e-12))
+    dampings = state.damping * 10.0 ** np.arange(-1.0, 5.0)
+    moves = np.stack([np.linalg.solve(curvature + damping * diagonal, gradient) for damping in dampings])
+    # No coordinate moves further than 2: a logistic or a logarithm is beyond any quadratic model there.
+    moves *= np.minimum(1.0, 2.0 / np.maximum(np.abs(moves).max(axis=1, keepdims=True), 1e-300))
+    newton = np.linalg.solve(curvature + 1e-12 * diagonal, gradient)
+    promised = 0.5 * float(gradient @ newton)
+    if promised < tolerance:
+        return state._replace(converged=True), StepInfo(0.0, promised, 0)
+    densities = target.density(state.position + moves)
+    best = int(np.argmax(densities))
+    gain = float(densities[best] - state.log_density)
+    if gain <= 0.0:
+        # The differences left are those of rounding, or the model is useless here: smaller steps next time.
+        stuck = state.damping > 1e8
+        return state._replace(damping=state.damping * 1e5, converged=stuck), StepInfo(0.0, promised, len(dampings))
+    moved = LevenbergState(
+        state.position + moves[best], float(densities[best]), float(np.clip(dampings[best], 1e-9, 1e9)), False
+    )
+    return moved, StepInfo(gain, promised, len(dampings))
+
+
+def maximise(
+    target: Target, u: Float[np.ndarray, " d"], *, max_steps: int, tolerance: float
+) -> tuple[LevenbergState, list[dict[str, Any]]]:
+    """Climb from one start until a step promises less than ``tolerance`` nats."""
+    state, trace = init(target, u), []
+    while not state.converged and len(trace) < max_steps:
+        state, info = step(target, state, tolerance)
+        trace.append({"log_density": state.log_density, "damping": state.damping, **info._asdict()})
+    return state, trace
+
+
+def laplace(target: Target, state: LevenbergState) -> Laplace:
+    """Normal approximation at a mode, with second differences where noise parameters are concerned."""
+    _, curvature = quadratic_model(target, state.position)
+    if target.noise.any():
+        exact = -_noise_hessian(target.likelihood, state.position, target.noise)
+        index = np.flatnonzero(target.noise)
+        prior = _positive_part(-target.prior_hessian(state.position))
+        curvature[np.ix_(index, index)] = exact + prior[np.ix_(index, index)]
+    values, vectors = np.linalg.eigh(curvature)
+    values = np.maximum(values, 1e-12 * values[-1])
+    return Laplace(state.position, (vectors / values) @ vectors.T, state.log_density)
+
+
+def _noise_hessian(likelihood: Callable, u: np.ndarray, noise: np.ndarray, width: float = 1e-2) -> np.ndarray:
+    """Second differences of the log likelihood along the noise coordinates.
+
+    The width is large for a difference because the log likelihood itself is: 1e5 nats leave 1e-11, over 1e-4.
+    """
+    steps = width * np.eye(len(u))[noise]
+    k = len(steps)
+    points = [u + si * a + sj * b for a in steps for b in steps for si in (1, -1) for sj in (1, -1)]
+    values = likelihood(np.stack(points)).reshape(k, k, 2, 2)
+    return (values[..., 0, 0] - values[..., 0, 1] - values[..., 1, 0] + values[..., 1, 1]) / (4.0 * width**2)
+
+
+def _positive_part(matrix: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T

@@ -1,0 +1,273 @@
+"""Calibration of long recordings: several Levenberg-Marquardt climbs over growing horizons, then Laplace."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, PRNGKeyArray
+
+from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.checkpoints import Checkpoint, open_checkpoint, run_digest
+from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.gauss_newton import Laplace, LevenbergState, laplace, make_target, maximise
+from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains, exclusion_warnings
+from rfdropo_bayes.inference.schedules import block_boundaries
+
+JACOBIANS = ("auto", "forward", "central")
+
+
+@dataclass(frozen=True)
+class LaplaceConfig:
+    """Levenberg-Marquardt and Laplace.
+
+    Attributes:
+        starts: number of climbs.
+        screen: prior draws that the starts are the best of, judged at the first horizon.
+        blocks: horizons of a climb, doubling; short ones first, because a long recording has many local optima.
+        max_steps: most steps of a climb at one horizon.
+        tolerance: a climb ends when a step promises less [nat].
+        jacobian: "forward", "central" or "auto".
+        draws: draws from the normal approximation.
+    """
+
+    starts: int = 4
+    screen: int = 64
+    blocks: int = 3
+    max_steps: int = 60
+    tolerance: float = 1e-5
+    jacobian: str = "auto"
+    draws: int = 2000
+
+    def __post_init__(self) -> None:
+        for name in ("starts", "screen", "blocks", "max_steps", "draws"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} = {getattr(self, name)} is less than 1", where="[inference]")
+        if self.tolerance <= 0.0:
+            raise InputError("tolerance must be positive", where="[inference]")
+        if self.jacobian not in JACOBIANS:
+            raise InputError(
+                f"unknown jacobian {self.jacobian!r}", where="[inference]", remedy=f"one of {', '.join(JACOBIANS)}"
+            )
+
+
+class Climbs(NamedTuple):
+    """State of the climbs.
+
+    Attributes:
+        positions: where each climb stands.
+        log_density: log posterior there, at the horizon of the climb's last visit.
+        converged: of the climb at that horizon.
+        level: index of the present horizon; done: climbs done at it.
+        noise: noise coordinates.
+        ledger, trace, seconds: as in every method.
+    """
+
+    positions: Float[np.ndarray, "start d"]
+    log_density: Float[np.ndarray, " start"]
+    converged: Bool[np.ndarray, " start"]
+    level: int
+    done: int
+    noise: Bool[np.ndarray, " d"] | None
+    ledger: Ledger
+    trace: list[dict[str, Any]]
+    seconds: float
+
+
+class Modes(NamedTuple):
+    """Distinct optima at the full horizon, best evidence first, with what it took to find them."""
+
+    modes: list[Laplace]
+    climbs: Climbs
+    warnings: list[str]
+
+
+def find_modes(
+    problem: Problem,
+    config: LaplaceConfig,
+    key: PRNGKeyArray,
+    *,
+    checkpoint: Checkpoint | None = None,
+    progress: Progress | None = None,
+) -> Modes:
+    """Climb from the best of some prior draws to the optima of the full posterior.
+
+    Raises:
+        InputError: a problem without residuals, or none of the screened draws has a finite likelihood.
+    """
+    if not isinstance(problem, ResidualProblem):
+        raise InputError("this problem has no residuals", where="[inference] method", remedy='use method = "smc"')
+    horizons = block_boundaries(problem.n_rows, config.blocks)
+    saved = checkpoint.load() if checkpoint else None
+    climbs = _screen(problem, config, key, horizons[0]) if saved is None else _unpack(*saved)
+    target = None
+    while climbs.level < len(horizons):
+        began = time.monotonic()
+        if target is None:
+            best = climbs.positions[np.argmax(climbs.log_density)] if climbs.done == 0 else climbs.positions[0]
+            target = make_target(
+                problem, horizons[climbs.level], climbs.ledger, best, config.jacobian, climbs.noise
+            )
+        state, steps = maximise(
+            target, climbs.positions[climbs.done], max_steps=config.max_steps, tolerance=config.tolerance
+        )
+        climbs = _record(climbs, state, len(steps), horizons[climbs.level], target.noise)
+        climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
+        if climbs.done == 0:
+            target = None
+        if checkpoint:
+            checkpoint.save(*_pack(climbs))
+        if progress is not None:
+            share = (climbs.level + climbs.done / config.starts) / len(horizons)
+            progress.stage(share, method="laplace", **climbs.trace[-1])
+    return _collect(problem, config, climbs)
+
+
+def _screen(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int) -> Climbs:
+    ledger = Ledger()
+    began = time.monotonic()
+    u = np.asarray(problem.to_unconstrained(problem.sample_prior(key, max(config.screen, config.starts))), dtype=float)
+    density = evaluate_prior(problem, u) + evaluate_rows(problem, u, horizon, ledger).sum(axis=1)
+    order = np.argsort(-density, kind="stable")[: config.starts]
+    order = order[np.isfinite(density[order])]
+    if len(order) == 0:
+        reasons = ", ".join(f"{name} {count}" for name, count in sorted(ledger.excluded.items())) or "no reason given"
+        raise InputError(
+            f"none of {len(u)} prior draws has a positive likelihood up to row {horizon} ({reasons})",
+            where="[model.priors]",
+            remedy="widen the priors, or look at what the simulator reports for them",
+        )
+    seconds = time.monotonic() - began
+    return Climbs(u[order], density[order], np.zeros(len(order), dtype=bool), 0, 0, None, ledger, [], seconds)
+
+
+def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, noise: np.ndarray) -> Climbs:
+    """Put down one finished climb; after the last one of a horizon drop duplicates and go to the next horizon."""
+    positions, density, converged = climbs.positions.copy(), climbs.log_density.copy(), climbs.converged.copy()
+    positions[climbs.done], density[climbs.done] = state.position, state.log_density
+    converged[climbs.done] = state.converged
+    facts = {"horizon": horizon, "start": climbs.done, "steps": steps, "log_density": state.log_density}
+    climbs.trace.append(facts | {"converged": state.converged, "rollouts": climbs.ledger.rollouts})
+    climbs = climbs._replace(
+        positions=positions, log_density=density, converged=converged, done=climbs.done + 1, noise=noise
+    )
+    if climbs.done < len(positions):
+        return climbs
+    order = np.argsort(-density, kind="stable")
+    kept: list[int] = []
+    for index in order:
+        if all(np.max(np.abs(positions[index] - positions[other])) > 0.02 for other in kept):
+            kept.append(int(index))
+    return climbs._replace(
+        positions=positions[kept],
+        log_density=density[kept],
+        converged=converged[kept],
+        level=climbs.level + 1,
+        done=0,
+    )
+
+
+def _collect(problem: ResidualProblem, config: LaplaceConfig, climbs: Climbs) -> Modes:
+    """Laplace at every optimum that could matter, in the order of their evidence."""
+    warnings = []
+    near = climbs.log_density > climbs.log_density.max() - 30.0
+    assert climbs.noise is not None
+    target = make_target(
+        problem, problem.n_rows, climbs.ledger, climbs.positions[0], config.jacobian, climbs.noise
+    )
+    modes = []
+    for position, density, converged in zip(
+        climbs.positions[near], climbs.log_density[near], climbs.converged[near], strict=True
+    ):
+        modes.append(laplace(target, LevenbergState(position, float(density), 0.0, bool(converged))))
+    modes = _distinct(modes)
+    modes.sort(key=lambda mode: -mode.log_evidence)
+    best = np.argmin(np.max(np.abs(climbs.positions - modes[0].mean), axis=1))
+    if not climbs.converged[best]:
+        warnings.append(f"the best climb had not converged after {config.max_steps} steps; raise max_steps")
+    rivals = [mode for mode in modes[1:] if mode.log_evidence > modes[0].log_evidence - 5.0]
+    if rivals:
+        warnings.append(
+            f"{len(rivals)} further optima have an evidence within 5 nats: one normal distribution does not describe "
+            "this posterior; use the bridge or SMC"
+        )
+    return Modes(modes, climbs, warnings)
+
+
+def _distinct(modes: list[Laplace]) -> list[Laplace]:
+    """Drop optima that lie within one posterior deviation of a better one: climbs stopped on one flat top."""
+    kept: list[Laplace] = []
+    for mode in sorted(modes, key=lambda mode: -mode.log_density):
+        distances = [
+            (mode.mean - other.mean) @ np.linalg.solve(other.covariance, mode.mean - other.mean) for other in kept
+        ]
+        if all(distance > len(mode.mean) for distance in distances):
+            kept.append(mode)
+    return kept
+
+
+def run(
+    problem: Problem,
+    config: LaplaceConfig,
+    key: PRNGKeyArray,
+    *,
+    checkpoint_dir: Path | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> InferenceResult:
+    """Posterior mode and draws of the normal approximation around it, mapped back to physical units."""
+    mode_key, draw_key = jax.random.split(key)
+    digest = run_digest(problem, "laplace", config, key)
+    checkpoint = open_checkpoint(checkpoint_dir, "laplace", digest, resume=resume)
+    found = find_modes(problem, config, mode_key, checkpoint=checkpoint, progress=progress)
+    best = found.modes[0]
+    factor = np.linalg.cholesky(best.covariance)
+    u = best.mean + np.asarray(jax.random.normal(draw_key, (config.draws, len(best.mean)))) @ factor.T
+    draws = chains(problem, [u])
+    ledger = found.climbs.ledger
+    return InferenceResult(
+        method="laplace",
+        draws=draws,
+        log_evidence=(best.log_evidence, float("nan")),
+        trace=found.climbs.trace,
+        rollouts=ledger.rollouts,
+        evaluations=ledger.evaluations,
+        excluded=dict(ledger.excluded),
+        warnings=[
+            *found.warnings,
+            *bound_warnings(draws, problem.bounds),
+            *exclusion_warnings(ledger.excluded, ledger.evaluations),
+        ],
+        seconds=found.climbs.seconds,
+        optimum=mode_values(problem, best),
+        details={
+            "covariance_unconstrained": best.covariance.tolist(),
+            "noise_coordinates": np.flatnonzero(found.climbs.noise).tolist(),
+            "modes": [{"log_evidence": m.log_evidence, **mode_values(problem, m)} for m in found.modes],
+        },
+    )
+
+
+def mode_values(problem: Problem, mode: Laplace) -> dict[str, float]:
+    """A mode in physical units."""
+    values = problem.from_unconstrained(mode.mean[None])
+    return {name: float(np.asarray(values[name])[0]) for name in problem.names}
+
+
+def _pack(climbs: Climbs) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    assert climbs.noise is not None
+    arrays = {name: getattr(climbs, name) for name in ("positions", "log_density", "converged", "noise")}
+    meta = {name: getattr(climbs, name) for name in ("level", "done", "trace", "seconds")}
+    return arrays, meta | {"ledger": asdict(climbs.ledger)}
+
+
+def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Climbs:
+    ledger = Ledger(meta["ledger"]["rollouts"], meta["ledger"]["evaluations"], Counter(meta["ledger"]["excluded"]))
+    return Climbs(**arrays, **{name: meta[name] for name in ("level", "done", "trace", "seconds")}, ledger=ledger)

@@ -1,0 +1,137 @@
+"""The methods an experiment file can name: for each a configuration that has only its own fields, and a function."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxtyping import PRNGKeyArray
+
+from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference import bridge, horizon_smc, laplace, rfdropo
+from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.result import InferenceResult
+
+
+class Method(NamedTuple):
+    """One way of inference.
+
+    Attributes:
+        config: its configuration, a frozen dataclass.
+        run: ``run(problem, config, key, *, checkpoint_dir, resume, progress) -> InferenceResult``.
+    """
+
+    config: type
+    run: Callable[..., InferenceResult]
+
+
+METHODS: dict[str, Method] = {
+    "smc": Method(horizon_smc.SmcConfig, horizon_smc.run),
+    "rfdropo": Method(rfdropo.RfdropoConfig, rfdropo.run),
+    "laplace": Method(laplace.LaplaceConfig, laplace.run),
+    "bridge": Method(bridge.BridgeConfig, bridge.run),
+}
+
+
+def method_named(name: str) -> Method:
+    """Method of a name.
+
+    Raises:
+        InputError: no such method; the nearest name is offered.
+    """
+    if name not in METHODS:
+        raise InputError(f"unknown method {name!r}", where="[inference] method", remedy=_nearest(name, METHODS))
+    return METHODS[name]
+
+
+def make_config(name: str, options: Mapping[str, Any]) -> Any:
+    """Configuration of a method from a table of options, as an experiment file has them.
+
+    Raises:
+        InputError: an option that this method does not have (the nearest is offered), or of a wrong type.
+    """
+    return _build(method_named(name).config, options, "[inference]")
+
+
+def run(
+    problem: Problem,
+    name: str,
+    options: Mapping[str, Any] | Any,
+    key: PRNGKeyArray,
+    *,
+    checkpoint_dir: Path | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> InferenceResult:
+    """Run a method by name.
+
+    Args:
+        problem: to be inferred.
+        name: of the method.
+        options: table of options, or the method's configuration itself.
+        key: random key; the same key gives the same draws.
+        checkpoint_dir: folder for checkpoints; None keeps none.
+        resume: go on from the checkpoints found there; a finished run is then only read.
+        progress: where to report stages.
+    """
+    method = method_named(name)
+    config = options if isinstance(options, method.config) else make_config(name, options)
+    return method.run(problem, config, key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress)
+
+
+def _build(kind: type, options: Mapping[str, Any], where: str) -> Any:
+    hints = typing.get_type_hints(kind)
+    names = [field.name for field in dataclasses.fields(kind)]
+    values = {}
+    for name, value in options.items():
+        if name not in names:
+            raise InputError(f"unknown option {name!r}", where=where, remedy=_nearest(name, names))
+        values[name] = _convert(hints[name], value, f"{where} {name}")
+    return kind(**values)
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    """Value of an option as its field wants it; TOML has lists for tuples and writes 20000 for 20000.0."""
+    if dataclasses.is_dataclass(hint):
+        if isinstance(value, hint):  # type: ignore[arg-type]
+            return value
+        if isinstance(value, Mapping):
+            return _build(hint, value, where)  # type: ignore[arg-type]
+    choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    for choice in choices:
+        origin = typing.get_origin(choice) or choice
+        if choice is type(None) and value is None:
+            return None
+        if origin is bool and isinstance(value, bool):
+            return value
+        if origin is int and isinstance(value, int) and not isinstance(value, bool):
+            return value
+        if origin is float and isinstance(value, int | float) and not isinstance(value, bool):
+            return float(value)
+        if origin is str and isinstance(value, str):
+            return value
+        if origin is tuple and isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):
+            return tuple(value)
+        if isinstance(origin, type) and issubclass(origin, Mapping) and isinstance(value, Mapping):
+            return {name: _pair(item, f"{where}.{name}") for name, item in value.items()}
+    wanted = " or ".join(getattr(choice, "__name__", str(choice)) for choice in choices if choice is not type(None))
+    raise InputError(f"{value!r} is not of type {wanted}", where=where)
+
+
+def _pair(value: Any, where: str) -> tuple[float, float]:
+    if isinstance(value, list | tuple) and len(value) == 2:
+        low, high = value
+        if all(isinstance(x, int | float) and not isinstance(x, bool) for x in (low, high)):
+            return float(low), float(high)
+    raise InputError(f"{value!r} is not a range", where=where, remedy="give [low, high]")
+
+
+def _nearest(name: str, known: Any) -> str:
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f"did you mean {close[0]!r}?" if close else f"one of {', '.join(known)}"
