@@ -26,8 +26,9 @@ TOLERANCE = 1.5e-3  # [m]
 MAX_ACCELERATION = 20.0  # [m/s2]: about 2 g, in excess of what the neighbouring rows show
 LONGEST_RUN = 0.25  # [s]
 _VELOCITY_ROWS = 5
-_DRIFT_PER_ROW = 0.25  # share of the tolerance by which a smooth path may drift from the predicted one per row
-_RESOLVED = 10.0  # a signal is resolved if its typical change is this many times its smallest
+_DRIFT_PER_ROW = 0.02  # share of the tolerance by which a smooth path may drift from the predicted one per row
+_ONSET_ROWS = 3  # over this few rows a motion may start or stop at once
+_FEW = 5.0  # quanta
 
 
 class Faults(NamedTuple):
@@ -89,10 +90,16 @@ def find_held(position: Float[np.ndarray, "time marker 3"]) -> Bool[np.ndarray, 
     held = np.zeros(position.shape[:2], dtype=bool)
     for marker in range(position.shape[1]):
         changes = step[:, marker][step[:, marker] > 0.0]
-        if changes.size == 0 or np.median(changes) < _RESOLVED * changes.min() or repeats[:, marker].mean() > 0.5:
+        if changes.size == 0 or _rounded(changes) or repeats[:, marker].mean() > 0.5:
             continue
         held[1:, marker] = repeats[:, marker] & (~still | (still.mean() < 0.05))
     return held
+
+
+def _rounded(changes: Float[np.ndarray, " n"]) -> bool:
+    """Whether a signal is rounded so coarsely that it repeats by itself: its changes are a few times one quantum."""
+    quanta = changes / changes.min()
+    return bool(np.quantile(quanta, 0.01) < _FEW and np.all(np.abs(quanta - np.rint(quanta)) < 0.01))
 
 
 def fill_missing(
@@ -144,7 +151,8 @@ def _smooth_steps(
 ) -> Bool[np.ndarray, "row back"]:
     """Whether the motion from row ``r - 1 - b`` to row ``r`` is one a body can make, for b = 0 ... reach - 1.
 
-    It is, if it agrees with the velocity before it, after it, or their mean (the onset of a motion agrees with one).
+    It is, if it agrees with the mean of the velocities before and after it; a short one may agree with either alone, as
+    the onset of a motion does.
     """
     arriving, leaving = _end_velocities(time, position)
     smooth = np.zeros((len(time), reach), dtype=bool)
@@ -153,7 +161,7 @@ def _smooth_steps(
         gap = (time[last] - time[first])[:, None]
         step = position[last] - position[first]
         before, after = arriving[first], leaving[last]
-        predictions = (before, after, 0.5 * (before + after))
+        predictions = (before, after, 0.5 * (before + after)) if back < _ONSET_ROWS else (0.5 * (before + after),)
         distance = np.min([np.linalg.norm(step - gap * velocity, axis=1) for velocity in predictions], axis=0)
         smooth[last, back] = distance <= allowed * (1.0 + _DRIFT_PER_ROW * (gap[:, 0] / interval - 1.0).clip(0.0))
     return smooth

@@ -5,17 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from rfdropo_bayes.data.asl_csv import NO_COMMANDS, read_asl_csv
-from rfdropo_bayes.data.csv_table import closest
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
 from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.tables import parse_table
 
 DATA_VARIABLE = "RFDROPO_DATA"
 Format = Literal["sofa-csv", "optitrack-csv", "asl-csv", "csv", "netcdf"]
@@ -36,13 +36,6 @@ class RecordingEntry(BaseModel):
     rows: tuple[int, int] | None = None
 
 
-def _entry(value: Any) -> Any:
-    return {"observations": value} if isinstance(value, str) else value
-
-
-Entry = Annotated[RecordingEntry, BeforeValidator(_entry)]
-
-
 class DataSpec(BaseModel):
     """The [data] table: where the recordings are and how to read them.
 
@@ -58,11 +51,18 @@ class DataSpec(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     format: Format
-    fit: Annotated[list[Entry], Field(min_length=1)]
-    test: list[Entry] = []
+    fit: Annotated[list[RecordingEntry], Field(min_length=1)]
+    test: list[RecordingEntry] = []
     columns: CsvColumns | None = None
     resample: Annotated[float, Field(gt=0)] | None = None
     missing: Literal["error", "mask"] = "error"
+
+    @field_validator("fit", "test", mode="before")
+    @classmethod
+    def _bare_strings(cls, entries: Any) -> Any:
+        if not isinstance(entries, list):
+            return entries
+        return [{"observations": entry} if isinstance(entry, str) else entry for entry in entries]
 
     @model_validator(mode="after")
     def _columns_fit(self) -> DataSpec:
@@ -77,10 +77,7 @@ class DataSpec(BaseModel):
         Raises:
             InputError: naming the first key that is unknown (and the nearest that is known), missing or wrong.
         """
-        try:
-            return cls.model_validate(dict(table))
-        except ValidationError as error:
-            raise explain(error, cls, where) from None
+        return parse_table(cls, table, where=where)
 
 
 class _Source(NamedTuple):
@@ -112,47 +109,6 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
         recording = loaded[key] if source.rows is None else loaded[key].slice_rows(*source.rows)
         recordings.append(recording if spec.resample is None else recording.resample(spec.resample))
     return _distinct_names(recordings, sources)
-
-
-def explain(error: ValidationError, model: type[BaseModel], where: str) -> InputError:
-    """One-line InputError for the first problem pydantic found in a table of the experiment file."""
-    problem = error.errors()[0]
-    path = [str(part) for part in problem["loc"]]
-    place = ".".join([where, *path])
-    if problem["type"] == "extra_forbidden":
-        known = list(_model_at(model, path[:-1]).model_fields)
-        hint = closest(path[-1], known)
-        return InputError(f"unknown key {path[-1]!r}; {hint}", where=place, remedy="correct the key")
-    if problem["type"] == "literal_error":
-        choices = list(get_args(_model_at(model, path[:-1]).model_fields[path[-1]].annotation)) or [
-            str(problem["ctx"]["expected"])
-        ]
-        return InputError(
-            f"{problem['input']!r} is not one of {', '.join(map(str, choices))}; "
-            f"{closest(str(problem['input']), [str(choice) for choice in choices])}",
-            where=place,
-            remedy="choose one of them",
-        )
-    if problem["type"] == "missing":
-        return InputError(f"the key {path[-1]!r} is missing", where=place, remedy="add it")
-    return InputError(
-        problem["msg"].removeprefix("Value error, "), where=place, remedy="correct the value in the experiment file"
-    )
-
-
-def _model_at(model: type[BaseModel], path: list[str]) -> type[BaseModel]:
-    """The table that a location leads to: list indices are skipped, fields are followed into their model."""
-    for part in path:
-        if part in model.model_fields:
-            model = next(_models_in(model.model_fields[part].annotation), model)
-    return model
-
-
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for argument in get_args(annotation):
-        yield from _models_in(argument)
 
 
 def _sources(entries: list[RecordingEntry], base: Path) -> Iterator[_Source]:
@@ -199,7 +155,7 @@ def _read(spec: DataSpec, source: _Source) -> Trajectory:
             raise InputError(
                 "has no commands",
                 where=str(source.observations),
-                remedy="give {observations = ..., commands = ...}, with commands = 'none' for a recording at zero command",
+                remedy="give {observations = ..., commands = ...}; commands = 'none' where nothing was commanded",
             )
         return read_asl_csv(source.observations, source.commands, mask_missing=mask_missing)
     if spec.format == "csv" and spec.columns is not None:

@@ -37,7 +37,7 @@ def test_a_file_cut_anywhere_in_its_last_row_is_noticed(sofa_table, write, tmp_p
     last_row = text.rstrip("\n").rfind("\n") + 1
     for cut in range(last_row + 1, len(text), 7):
         path.write_text(text[:cut])
-        with fails("row 3: .*the file is cut short"):
+        with fails("row 4: .*the file is cut short"):
             read_sofa_csv(path)
     path.write_text(text[:last_row])
     with fails("row 3: the episode does not end"):
@@ -155,17 +155,25 @@ def test_a_plain_csv_needs_the_columns_its_mapping_names(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fits": []}, r"\[data\]\.fits: unknown key 'fits'; did you mean 'fit'\?"),
-        ({"format": "sofa_csv"}, r"'sofa_csv' is not one of sofa-csv, .*did you mean 'sofa-csv'"),
+        ({"fits": []}, r"\[data\]: unknown key 'fits'; did you mean 'fit'\?"),
+        (
+            {"format": "sofa_csv"},
+            "'sofa_csv': Input should be 'sofa-csv', 'optitrack-csv', 'asl-csv', 'csv' or 'netcdf'",
+        ),
         ({"fit": []}, "at least 1 item"),
         ({"resample": -0.1}, "greater than 0"),
         (
             {"fit": [{"observation": "a.csv"}]},
-            "unknown key 'observation'; did you mean 'observations'|'observations' is",
+            "'fit.0.observations' is missing",
         ),
+        ({"fit": [{"observations": "a", "row": [0, 1]}]}, "unknown key 'fit.0.row'; did you mean 'rows'"),
+        ({"fit": "a.csv"}, "fit = 'a.csv': Input should be a valid list"),
         ({"format": "csv"}, r"needs a \[data.columns\] table"),
-        ({"format": "csv", "columns": COLUMNS | {"tme": "t"}}, "unknown key 'tme'; did you mean 'time'"),
-        ({"format": "csv", "columns": COLUMNS | {"position_unit": "metre"}}, "'metre' is not one of m, cm, mm"),
+        ({"format": "csv", "columns": COLUMNS | {"tme": "t"}}, "unknown key 'columns.tme'; did you mean 'time'"),
+        (
+            {"format": "csv", "columns": COLUMNS | {"position_unit": "metre"}},
+            "position_unit = 'metre': Input should be 'm', 'cm' or 'mm'",
+        ),
         ({"format": "csv", "columns": COLUMNS | {"axes": ["x", "z", "y"]}}, "right-handed"),
         ({"format": "csv", "columns": COLUMNS | {"time": "t"}}, "either time"),
         ({"format": "csv", "columns": COLUMNS | {"markers": ["a", "b"]}}, "markers has 2 entries where 1 are needed"),
@@ -178,5 +186,5 @@ def test_tables_with_a_mistake(change, message):
 
 
 def test_a_missing_key_is_named():
-    with fails(r"\[data\]\.fit: the key 'fit' is missing"):
+    with fails(r"\[data\]: the key 'fit' is missing"):
         DataSpec.parse({"format": "netcdf"})

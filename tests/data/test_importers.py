@@ -62,9 +62,9 @@ def test_optitrack_file_by_hand(datasets):
         recording.position[2, 3], [6.033880170e-3, -66.258259117e-3, 162.961840629e-3], atol=1e-11
     )
     np.testing.assert_allclose(recording.time[:3], [0.0, 0.212689, 0.312689], atol=1e-6)
-    # 5, 12, 12, 12: cable 5 pulled once, cable 4 released three times; 82 actions 14 at the end release cable 6
+    # 5, 12, 12, 12: cable 5 pulled once, cable 4 released three times; 83 actions 14 at the end release cable 6
     np.testing.assert_allclose(recording.command[3], 1e-3 * np.array([0, 0, 0, 0, -15, 5, 0, 0]))
-    assert recording.command[-1, 6] == pytest.approx(-82 * 5e-3)
+    assert recording.command[-1, 6] == pytest.approx(-83 * 5e-3)
     # rows 0 and 1 repeat one frame: action 0 left just before row 1, action 1 at row 1; row 1 is no new measurement
     np.testing.assert_allclose(recording.command_time[:3], recording.time[[1, 1, 2]] - [1 / 120, 0, 0], atol=1e-9)
     assert not recording.position_mask[1].any()
@@ -144,7 +144,7 @@ def plain(tmp_path) -> Path:
     lines = ["t,x,y,z,motor,load"]
     for row in range(rows):
         x, y, z = np.array([100.0 + row, -200.0, 30.0]) + noise[row]
-        lines.append(f"{1000 + 20 * row},{x!r},{y!r},{z!r},{row},{row / 10}")
+        lines.append(f"{1000 + 20 * row},{x:.9f},{y:.9f},{z:.9f},{row},{row / 10}")
     path = tmp_path / "own.csv"
     path.write_text("\n".join(lines))
     return path

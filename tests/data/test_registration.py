@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -15,6 +15,7 @@ POINTS = np.array([[0.0, 0.0, 0.1], [0.01, 0.0, 0.2], [0.0, -0.02, 0.3], [0.03, 
 LINE = np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.2], [0.0, 0.0, 0.32]])
 
 
+@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_rigid_motion_is_recovered(seed):
     rng = np.random.default_rng(seed)
@@ -27,6 +28,7 @@ def test_a_rigid_motion_is_recovered(seed):
     assert found.roll_determined
 
 
+@settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_markers_on_a_line_are_aligned_without_roll(seed):
     rng = np.random.default_rng(seed)
@@ -70,6 +72,7 @@ def test_a_recording_moves_with_its_object(build):
     assert moved.sha256 != recording.sha256
 
 
+@settings(deadline=None, max_examples=40)
 @given(offset=st.floats(-0.4, 0.4), rate=st.floats(30.0, 120.0), seed=st.integers(0, 1000))
 def test_the_offset_of_a_clock_is_found_within_a_fifth_of_a_sample(offset, rate, seed):
     rng = np.random.default_rng(seed)
