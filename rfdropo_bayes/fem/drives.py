@@ -30,3 +30,29 @@ class DriveLimits(NamedTuple):
 def no_limits(cables: int) -> DriveLimits:
     """Drives that reach every command within the step."""
     return DriveLimits(np.full(cables, np.inf))
+
+
+def animated_commands(
+    command: Float[np.ndarray, "rows cables"], steps: int, time_step: float
+) -> Float[np.ndarray, "rows steps cables"]:
+    """Commanded displacement of every step when each row's change is carried out by an animation of SOFA's STLIB.
+
+    ``command`` [m] is cumulative, the state before the first row zero. A row's change is handed over in ``steps`` equal updates, one
+    at the start of each of the row's steps, until the animation's elapsed time reaches ``steps - 1`` time steps. Clock and elapsed
+    time are sums of floats: where the sum rounds below the duration, a further update follows in the next row, and its
+    displacement is never taken back.
+    """
+    duration = time_step * (steps - 1)
+    changes = np.diff(np.asarray(command, float), axis=0, prepend=np.zeros((1, command.shape[1]))) / steps
+    reached, clock = np.zeros(command.shape[1]), 0.0
+    running: list[tuple[np.ndarray, float]] = []  # update and start time of each animation
+    result = np.empty((len(changes), steps, command.shape[1]))
+    for row, change in enumerate(changes):
+        for step in range(steps):
+            clock += time_step
+            if step == 0:
+                running.append((change, clock))
+            reached = reached + sum(update for update, _ in running)
+            running = [(update, start) for update, start in running if (clock - start) / duration < 1.0]
+            result[row, step] = reached
+    return result

@@ -14,6 +14,7 @@ simulate, not for accuracy at few unknowns.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -21,7 +22,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.cables import CableLayout
 from rfdropo_bayes.fem.corotational import rotation
+from rfdropo_bayes.fem.layered import PointMap
 
 FRAMES = ("polar", "edges")
 LARGEST_WEIGHTS = 8
@@ -147,10 +150,8 @@ def lumped_masses(body: TetrahedralBody, density: Float[Array, ""]) -> Float[Arr
     return density * volume
 
 
-def locate(
-    body: TetrahedralBody, points: Float[np.ndarray, "points 3"]
-) -> tuple[Int[np.ndarray, "points 8"], Float[np.ndarray, "points 8"]]:
-    """Nodes and weights (barycentric, padded with zeros) of points of the undeformed body [m].
+def locate(body: TetrahedralBody, points: Float[np.ndarray, "points 3"]) -> PointMap:
+    """Bind points of the undeformed body [m] to the four nodes around them (weights padded with zeros).
 
     A point in no element belongs to the one whose centroid is nearest, and follows it by extrapolation (as SOFA's
     BarycentricMapping does).
@@ -167,4 +168,28 @@ def locate(
         rank = np.where(outside > 0.0, np.sum((point - centres) ** 2, axis=1), outside)
         chosen = int(np.argmin(rank))
         node[index, :4], weight[index, :4] = body.element[chosen], natural[chosen]
-    return node, weight
+    return PointMap(node, weight)
+
+
+def mean_points(maps: Sequence[PointMap]) -> PointMap:
+    """Point k is the mean of the k-th points of all maps."""
+    return PointMap(
+        np.concatenate([points.node for points in maps], axis=1),
+        np.concatenate([points.weight for points in maps], axis=1) / len(maps),
+    )
+
+
+def route_cables(
+    body: TetrahedralBody, anchors: Float[np.ndarray, "cables 3"], guides: Sequence[Float[np.ndarray, "guides 3"]]
+) -> CableLayout:
+    """Cables from anchors fixed in space through guide points of the undeformed body [m]."""
+    most = max((len(points) for points in guides), default=1)
+    node = np.zeros((len(guides), most, LARGEST_WEIGHTS), dtype=int)
+    weight = np.zeros((len(guides), most, LARGEST_WEIGHTS))
+    used = np.zeros((len(guides), most), dtype=bool)
+    for cable, points in enumerate(guides):
+        if len(points) == 0:
+            raise InputError("no guide point", where=f"cable {cable}", remedy="give at least the point where it is tied")
+        node[cable], weight[cable] = locate(body, np.concatenate([points, np.repeat(points[-1:], most - len(points), axis=0)]))
+        used[cable, : len(points)] = True
+    return CableLayout(np.asarray(anchors, float).reshape(-1, 3), node, weight, used)

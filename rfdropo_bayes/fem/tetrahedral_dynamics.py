@@ -1,0 +1,144 @@
+"""Implicit Euler for a corotational tetrahedral body pulled by unilateral cables: the reference engine, in JAX.
+
+The step is that of ``fem.dynamics``, with nodal masses and the drive limits of ``fem.drives``. With ``frames="edges"``, equal node masses and a
+start from rest it reproduces SOFA's EulerImplicitSolver, TetrahedronFEMForceField ("large"), UniformMass and CableConstraint under
+FreeMotionAnimationLoop to the digits that SOFA's recordings hold.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from rfdropo_bayes.fem import levels as level_systems
+from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian, unilateral_tensions
+from rfdropo_bayes.fem.drives import DriveLimits
+from rfdropo_bayes.fem.layered import PointMap, point_positions
+from rfdropo_bayes.fem.levels import Levels, node_levels
+from rfdropo_bayes.fem.tetrahedra import (
+    TetrahedralBody,
+    element_rotations,
+    element_tangents,
+    lame_constants,
+    nodal_force,
+)
+
+
+class TetrahedralSystem(NamedTuple):
+    """What does not change between rollouts; static, never traced."""
+
+    body: TetrahedralBody
+    levels: Levels
+    cables: CableLayout
+    limits: DriveLimits
+    guides: Float[np.ndarray, "cables guides nodes"]
+    rest_length: Float[np.ndarray, " cables"]
+
+
+class TetrahedralMaterial(NamedTuple):
+    """Physical parameters of one rollout."""
+
+    young_modulus: Float[Array, ""]  # [Pa]
+    poisson_ratio: Float[Array, ""]
+    node_mass: Float[Array, " nodes"]  # [kg]
+    rayleigh_mass: Float[Array, ""]  # [1/s]
+    rayleigh_stiffness: Float[Array, ""]  # [s]
+    gravity: Float[Array, "3"]  # [m/s2]
+    stiffness_scale: Float[Array, " elements"]  # factor on the stiffness of each element
+
+
+class TetrahedralState(NamedTuple):
+    """Mechanical state at one instant, and the cable displacements measured at the start of the step before."""
+
+    position: Float[Array, "nodes 3"]  # [m]
+    velocity: Float[Array, "nodes 3"]  # [m/s]
+    tension: Float[Array, " cables"]  # [N]
+    measured: Float[Array, " cables"]  # [m]
+
+
+class TetrahedralRollout(NamedTuple):
+    """Recorded motion."""
+
+    position: Float[Array, "rows points 3"]  # [m]
+    tension: Float[Array, "rows cables"]  # [N]
+    state: TetrahedralState
+    cables_converged: Bool[Array, ""]
+
+
+def tetrahedral_system(body: TetrahedralBody, cables: CableLayout, limits: DriveLimits) -> TetrahedralSystem:
+    """Prepare a body and its cables.
+
+    Raises:
+        InputError: parts of the mesh that hang on no held node.
+    """
+    guides = guide_matrix(cables, len(body.rest))
+    rest_length = np.asarray(lengths_and_jacobian(cables, guides, jnp.asarray(body.rest))[0])
+    return TetrahedralSystem(body, node_levels(body.element, body.fixed), cables, limits, guides, rest_length)
+
+
+def state_at_rest(system: TetrahedralSystem) -> TetrahedralState:
+    """The undeformed body, not moving, cables without tension."""
+    rest, none = jnp.asarray(system.body.rest), jnp.zeros(len(system.rest_length))
+    return TetrahedralState(rest, jnp.zeros_like(rest), none, none)
+
+
+def step(
+    system: TetrahedralSystem,
+    material: TetrahedralMaterial,
+    state: TetrahedralState,
+    displacement: Float[Array, " cables"],
+    time_step: float,
+) -> tuple[TetrahedralState, Bool[Array, ""]]:
+    """One implicit Euler step to the commanded cable displacements [m]; also whether the tensions were found."""
+    body, levels = system.body, system.levels
+    lame = tuple(value * material.stiffness_scale for value in lame_constants(material.young_modulus, material.poisson_ratio))
+    turn = element_rotations(body, state.position)
+    lookahead = time_step + material.rayleigh_stiffness
+    force = nodal_force(body, turn, state.position, jnp.asarray(body.rest), lame)
+    force = force + lookahead * nodal_force(body, turn, state.velocity, 0.0, lame)
+    mass = material.node_mass[:, None]
+    right = time_step * (force + mass * (material.gravity - material.rayleigh_mass * state.velocity))
+    inertia = (1.0 + time_step * material.rayleigh_mass) * material.node_mass
+    matrix = level_systems.assemble(
+        levels, body.element, time_step * lookahead * element_tangents(body, turn, lame), inertia
+    )
+    length, jacobian = lengths_and_jacobian(system.cables, system.guides, state.position)
+    shortening = system.rest_length - length
+    target = system.limits.apply(displacement, state.measured)
+    columns = jnp.concatenate([right[None], jacobian])[:, levels.order].reshape(1 + len(length), -1).T
+    solution = level_systems.solve(matrix, columns)
+    growth = jnp.einsum("cni,ni->c", jacobian, state.velocity) + columns[:, 1:].T @ solution[:, 0]
+    compliance = time_step**2 * columns[:, 1:].T @ solution[:, 1:]
+    tension, converged = jnp.zeros(0), jnp.array(True)
+    if len(length):
+        tension, converged = unilateral_tensions(compliance, shortening - time_step * growth - target, state.tension)
+    change = solution[:, 0] - time_step * solution[:, 1:] @ tension
+    velocity = state.velocity.at[levels.order].add(change.reshape(-1, 3))
+    return TetrahedralState(state.position + time_step * velocity, velocity, tension, shortening), converged
+
+
+def simulate(
+    system: TetrahedralSystem,
+    material: TetrahedralMaterial,
+    state: TetrahedralState,
+    displacement: Float[Array, "rows substeps cables"],
+    time_step: float,
+    points: PointMap,
+) -> TetrahedralRollout:
+    """Rollout through the commanded cable displacements [m] of every step, recorded at the end of every row."""
+
+    def one(carry, commanded):
+        state, fine = carry
+        state, converged = step(system, material, state, commanded, time_step)
+        return (state, fine & converged), None
+
+    def row(carry, commands):
+        carry, _ = lax.scan(one, carry, commands)
+        return carry, (point_positions(points, carry[0].position), carry[0].tension)
+
+    (state, converged), (position, tension) = lax.scan(row, (state, jnp.array(True)), displacement)
+    return TetrahedralRollout(position, tension, state, converged)

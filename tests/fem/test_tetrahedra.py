@@ -1,0 +1,227 @@
+"""Corotational tetrahedra: patch test, rigid motion, tangents, momentum, and agreement of both engines."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem import levels as level_systems
+from rfdropo_bayes.fem.drives import DriveLimits, no_limits
+from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
+from rfdropo_bayes.fem.tetrahedra import (
+    FRAMES,
+    element_rotations,
+    element_tangents,
+    equal_node_masses,
+    lame_constants,
+    locate,
+    lumped_masses,
+    nodal_force,
+    route_cables,
+    tetrahedral_body,
+)
+from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, simulate, state_at_rest, tetrahedral_system
+from rfdropo_bayes.runtime import configure_jax
+
+configure_jax()
+
+YOUNG, POISSON = 1.2e6, 0.4
+CUBE_TETRAHEDRA = np.array([[0, 1, 3, 7], [0, 1, 7, 5], [0, 5, 7, 4], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7]])
+
+
+def beam(nx=2, ny=2, nz=5, size=(0.02, 0.02, 0.08), frames="polar", jitter=0.0):
+    """A bar along z of irregular tetrahedra, held at z = 0."""
+    axes = [np.linspace(0.0, length, count + 1) for length, count in zip(size, (nx, ny, nz), strict=True)]
+    z, y, x = np.meshgrid(axes[2], axes[1], axes[0], indexing="ij")
+    rest = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    inside = np.all((rest > 1e-9) & (rest < np.array(size) - 1e-9), axis=1)
+    rest[inside] += jitter * np.random.default_rng(3).uniform(-1, 1, (int(inside.sum()), 3))
+    elements = []
+    for k in range(nz):
+        for j in range(ny):
+            for i in range(nx):
+                corner = [
+                    ((k + c) * (ny + 1) + j + b) * (nx + 1) + i + a for c in range(2) for b in range(2) for a in range(2)
+                ]
+                elements.extend(np.array(corner)[CUBE_TETRAHEDRA])
+    return tetrahedral_body(rest, np.array(elements), rest[:, 2] < 1e-9, frames)
+
+
+def forces(body, position):
+    turn = element_rotations(body, position)
+    return nodal_force(body, turn, position, jnp.asarray(body.rest), lame_constants(YOUNG, POISSON))
+
+
+@pytest.mark.parametrize("frames", FRAMES)
+def test_patch_test_on_distorted_elements(frames):
+    """A homogeneous stretch and shear: no force inside, and the right traction resultant at the end."""
+    body = beam(frames=frames, jitter=2e-3)
+    strain = 1e-7 * np.array([[3.0, 1.0, -2.0], [1.0, -1.0, 0.5], [-2.0, 0.5, 2.0]])
+    position = jnp.asarray(body.rest + body.rest @ strain)
+    force = np.asarray(forces(body, position))
+    inner = np.all((body.rest > 1e-9) & (body.rest < body.rest.max(axis=0) - 1e-9), axis=1)
+    first, shear = lame_constants(YOUNG, POISSON)
+    stress = first * np.trace(strain) * np.eye(3) + 2.0 * shear * strain
+    resultant = -stress[:, 2] * 0.02**2
+    assert inner.sum() >= 4
+    assert np.abs(force[inner]).max() < 1e-5 * np.abs(force).max()
+    np.testing.assert_allclose(force[body.rest[:, 2] > 0.08 - 1e-9].sum(axis=0), resultant, rtol=2e-5, atol=2e-9)
+
+
+@pytest.mark.parametrize("frames", FRAMES)
+def test_rigid_motion_gives_no_force_and_turns_every_element(frames):
+    body = beam(frames=frames, jitter=2e-3)
+    turn = Rotation.from_rotvec([1.9, -0.7, 1.1]).as_matrix()
+    position = jnp.asarray(body.rest @ turn.T + [0.3, -0.1, 0.2])
+    np.testing.assert_allclose(element_rotations(body, position), np.broadcast_to(turn, (len(body.element), 3, 3)), atol=1e-12)
+    scale = YOUNG * 0.02**2
+    assert np.abs(np.asarray(forces(body, position))).max() < 1e-11 * scale
+
+
+@pytest.mark.parametrize("frames", FRAMES)
+def test_tangent_is_the_derivative_at_rest(frames):
+    """There, and only there, the neglected turning of the frames is without effect."""
+    body = beam(1, 1, 2, frames=frames)
+    rest = jnp.asarray(body.rest)
+    exact = -jax.jacfwd(lambda x: forces(body, x))(rest)
+    blocks = element_tangents(body, element_rotations(body, rest), lame_constants(YOUNG, POISSON))
+    total = np.zeros((len(rest), 3, len(rest), 3))
+    for nodes, block in zip(body.element, np.asarray(blocks), strict=True):
+        for a in range(4):
+            for b in range(4):
+                total[nodes[a], :, nodes[b], :] += block[a, b]
+    np.testing.assert_allclose(total, exact, atol=1e-9 * np.abs(exact).max())
+
+
+def test_forces_conserve_momentum():
+    body = beam(jitter=2e-3)
+    position = jnp.asarray(body.rest + 2e-3 * np.random.default_rng(0).normal(size=body.rest.shape))
+    force = np.asarray(forces(body, position))
+    assert np.abs(force.sum(axis=0)).max() < 1e-12 * np.abs(force).sum()
+    torque = np.cross(position, force).sum(axis=0)  # exact for frames of the polar decomposition
+    assert np.abs(torque).max() < 1e-9 * np.abs(np.cross(position, force)).sum()
+
+
+def test_level_solve_agrees_with_a_dense_one():
+    body = beam(jitter=2e-3)
+    system = level_systems.node_levels(body.element, body.fixed)
+    rest = jnp.asarray(body.rest)
+    blocks = element_tangents(body, element_rotations(body, rest), lame_constants(YOUNG, POISSON))
+    matrix = level_systems.assemble(system, body.element, blocks, jnp.full(len(rest), 3.0))
+    size = 3 * len(system.order)
+    dense = np.asarray(level_systems.multiply(matrix, jnp.eye(size)))
+    right = np.random.default_rng(1).normal(size=(size, 2))
+    np.testing.assert_allclose(dense, dense.T, atol=1e-9 * np.abs(dense).max())
+    np.testing.assert_allclose(level_systems.solve(matrix, jnp.asarray(right)), np.linalg.solve(dense, right), rtol=1e-8)
+
+
+def test_masses_add_up_and_points_are_found():
+    body = beam(jitter=2e-3)
+    assert float(lumped_masses(body, 1000.0).sum()) == pytest.approx(1000.0 * 0.02 * 0.02 * 0.08)
+    assert float(equal_node_masses(body, 0.3).sum()) == pytest.approx(0.3)
+    points = np.array([[0.005, 0.013, 0.031], [0.01, 0.01, 0.09]])  # the second lies outside
+    found = locate(body, points)
+    np.testing.assert_allclose(np.einsum("pk,pki->pi", found.weight, body.rest[found.node]), points, atol=1e-15)
+    assert found.weight[0].min() >= -1e-12 and found.weight[1].min() < 0.0
+
+
+def test_refuses_inverted_elements_and_loose_nodes():
+    body = beam(1, 1, 1)
+    with pytest.raises(InputError, match="element 0 has volume -"):
+        tetrahedral_body(body.rest, body.element[:, [1, 0, 2, 3]], body.fixed)
+    with pytest.raises(InputError, match="no node is held"):
+        tetrahedral_body(body.rest, body.element, np.zeros(len(body.rest), bool))
+    loose = np.vstack([body.rest, body.rest + [1.0, 0.0, 0.0]])
+    elements = np.vstack([body.element, body.element + len(body.rest)])
+    held = np.concatenate([body.fixed, np.zeros(len(body.rest), bool)])
+    with pytest.raises(InputError, match="hang on no held node"):
+        level_systems.node_levels(elements, held)
+
+
+def pulled_beam(frames):
+    body = beam(frames=frames, jitter=1e-3)
+    heights = np.linspace(0.01, 0.07, 4)
+    guides = [np.column_stack([np.full(4, x), np.full(4, y), heights]) for x, y in ((0.004, 0.01), (0.016, 0.012), (0.01, 0.003))]
+    anchors = np.array([[0.004, 0.01, 0.0], [0.016, 0.012, 0.0], [0.01, 0.003, 0.0]])
+    return body, route_cables(body, anchors, guides), locate(body, np.array([[0.01, 0.01, 0.08], [0.004, 0.015, 0.05]]))
+
+
+@pytest.mark.parametrize("frames", FRAMES)
+@pytest.mark.parametrize("limits", [no_limits(3), DriveLimits(np.array([0.004, 0.1, 0.1]), 8e-4)], ids=["free", "limited"])
+def test_both_engines_give_the_same_numbers(frames, limits):
+    """Random parameters and commands: 1e-9 m in double precision."""
+    body, cables, points = pulled_beam(frames)
+    rng = np.random.default_rng(7)
+    samples = 6  # does not fill its last lane block
+    parameters = {
+        "young_modulus": rng.uniform(0.3e6, 1e6, samples),
+        "poisson_ratio": rng.uniform(0.2, 0.45, samples),
+        "node_mass": rng.uniform(0.5, 1.5, (samples, len(body.rest))) * 4e-4,
+        "rayleigh_mass": rng.uniform(0.0, 1.0, samples),
+        "rayleigh_stiffness": rng.uniform(0.0, 0.05, samples),
+        "gravity": rng.normal(0.0, 5.0, (samples, 3)),
+        "stiffness_scale": rng.uniform(0.5, 2.0, (samples, len(body.element))),
+    }
+    commands = np.cumsum(rng.choice([0.0, 6e-4, -3e-4], size=(samples, 30, 3)), axis=1)
+    fast = TetrahedralEngine(body, cables, limits, points, threads=2).rollouts(parameters, commands, time_step=0.01, stride=3)
+    system = tetrahedral_system(body, cables, limits)
+
+    def one(values, command):
+        material = TetrahedralMaterial(**values)
+        return simulate(system, material, state_at_rest(system), command.reshape(10, 3, 3), 0.01, points)
+
+    slow = jax.jit(jax.vmap(one))(parameters, commands)
+    assert np.ptp(fast.position[:, :, 0], axis=1).max() > 5e-3  # the bar does bend
+    assert (fast.tension > 0.0).any() and (fast.tension == 0.0).any()
+    assert not fast.diverged.any() and fast.cables_converged.all()
+    np.testing.assert_allclose(fast.position, slow.position, atol=1e-9)
+    np.testing.assert_allclose(fast.tension, slow.tension, atol=1e-5)
+
+
+def test_results_do_not_depend_on_batch_lane_or_threads():
+    body, cables, points = pulled_beam("polar")
+    rng = np.random.default_rng(5)
+    samples = 11
+    parameters = {
+        "young_modulus": rng.uniform(0.3e6, 1e6, samples),
+        "poisson_ratio": np.full(samples, 0.4),
+        "node_mass": np.full((samples, len(body.rest)), 4e-4),
+        "rayleigh_mass": np.full(samples, 0.1),
+        "rayleigh_stiffness": np.full(samples, 0.02),
+        "gravity": np.tile([0.0, -9.81, 0.0], (samples, 1)),
+    }
+    parameters["young_modulus"][4] = np.nan  # a lost sample must not touch its neighbours
+    commands = np.cumsum(np.full((10, 3), [5e-4, 0.0, 2e-4]), axis=0)
+    engine = TetrahedralEngine(body, cables, no_limits(3), points, threads=2)
+    together = engine.rollouts(parameters, commands, time_step=0.01)
+    np.testing.assert_array_equal(together.diverged, np.arange(samples) == 4)
+    single = TetrahedralEngine(body, cables, no_limits(3), points, threads=1)
+    for sample in (0, 3, 5, 10):
+        alone = single.rollouts({name: value[sample : sample + 1] for name, value in parameters.items()}, commands, time_step=0.01)
+        np.testing.assert_array_equal(alone.position[0], together.position[sample])
+        np.testing.assert_array_equal(alone.tension[0], together.tension[sample])
+
+
+def test_gradient_of_the_reference_engine():
+    """Reverse mode against central differences."""
+    body, cables, points = pulled_beam("polar")
+    system = tetrahedral_system(body, cables, no_limits(3))
+    commands = jnp.cumsum(jnp.full((4, 1, 3), jnp.array([6e-4, 0.0, 1e-4])), axis=0)
+
+    def height(logarithm):
+        material = TetrahedralMaterial(
+            young_modulus=jnp.exp(logarithm), poisson_ratio=jnp.array(0.4), node_mass=jnp.full(len(body.rest), 4e-4),
+            rayleigh_mass=jnp.array(0.1), rayleigh_stiffness=jnp.array(0.02), gravity=jnp.array([0.0, -9.81, 0.0]),
+            stiffness_scale=jnp.ones(len(body.element)),
+        )  # fmt: skip
+        return simulate(system, material, state_at_rest(system), commands, 0.01, points).position[-1, 0, 1]
+
+    at, step = jnp.log(5e5), 1e-4
+    jitted = jax.jit(height)
+    difference = (jitted(at + step) - jitted(at - step)) / (2.0 * step)
+    # The step's frames are differentiated too: nothing but round-off and the differences' own error remains.
+    assert float(jax.jit(jax.grad(height))(at)) == pytest.approx(float(difference), rel=1e-5)
