@@ -1,7 +1,7 @@
 """Layered finite elements for slender soft bodies: the differentiable reference engine.
 
-Build a ``System`` (body and cables, static), ``prepare`` it with a ``Material`` once a rollout, start from ``state_at_rest`` or
-``static_equilibrium``, and ``simulate``. Everything after the system is a pure function of arrays.
+Build a ``System`` (body and cables, static), ``prepare`` it with a ``Material`` once a rollout, start from
+``state_at_rest`` or ``static_equilibrium``, and ``simulate``. Everything after the system is a pure function of arrays.
 """
 
 from rfdropo_bayes.runtime import configure_jax

@@ -1,7 +1,7 @@
 """Symmetric positive definite block-tridiagonal systems: factor once, solve for many right-hand sides.
 
-Block elimination along the axis. The pivot blocks are inverted explicitly by symmetric sweeps over their 3 x 3 diagonal blocks,
-which are plain array operations over a batch; a LAPACK call for each small block would cost more than its arithmetic.
+Block elimination along the axis. The pivot blocks are inverted explicitly, by sweeps over their 3 x 3 diagonal blocks:
+plain array operations over a batch, where a LAPACK call for each small block would cost more than its arithmetic.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def multiply(matrix: BlockTridiagonal, vector: Float[Array, "stations b k"]) -> 
 
 
 def invert(block: Float[Array, "b b"]) -> Float[Array, "b b"]:
-    """Inverse of a symmetric positive definite block whose size is a multiple of three (Gauss-Jordan by 3 x 3 pivots)."""
+    """Inverse of a symmetric positive definite block of a size divisible by three (Gauss-Jordan by 3 x 3 pivots)."""
     size = block.shape[-1]
     for first in range(0, size, 3):
         rows = slice(first, first + 3)
@@ -87,8 +87,8 @@ def substitute(factored: BlockFactor, right: Float[Array, "stations b k"]) -> Fl
 def solve(matrix: BlockTridiagonal, right: Float[Array, "stations b k"]) -> Float[Array, "stations b k"]:
     """Solution X of A X = B for k right-hand sides.
 
-    Derivatives go through the solution and not through the elimination: a tangent or a cotangent costs one substitution with
-    the factor that is there already.
+    Derivatives go through the solution and not through the elimination: a tangent or a cotangent costs one substitution
+    with the factor that is there already.
     """
     factored = factor(jax.tree.map(lax.stop_gradient, matrix))
     return lax.custom_linear_solve(

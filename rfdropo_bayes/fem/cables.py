@@ -1,8 +1,8 @@
 """Displacement-driven cables that can pull but not push.
 
-A cable runs straight from a fixed anchor through guide points of the body to the last of them, where it is tied. Its length may
-not exceed the commanded one; tension and slack are complementary (Signorini's condition), which after condensation is a small
-linear complementarity problem.
+A cable runs straight from a fixed anchor through guide points of the body to the last of them, where it is tied. Its
+length may not exceed the commanded one; tension and slack are complementary (Signorini's condition), which after
+condensation is a small linear complementarity problem.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ class Tensions(NamedTuple):
 def cable_layout(
     body: LayeredBody, anchors: Float[np.ndarray, "cables 3"], guides: Sequence[Float[np.ndarray, "guides 3"]]
 ) -> CableLayout:
-    """Cables from fixed anchors through guide points given on the undeformed body [m]; each may have its own number of guides.
+    """Cables from fixed anchors through guide points on the undeformed body [m]; each may have its own number of
+    guides.
 
     Raises:
         InputError: a cable without guides, or with two successive points at the same place.
@@ -58,7 +59,7 @@ def cable_layout(
     for cable, points in enumerate(guides):
         points = np.asarray(points, dtype=float).reshape(-1, 3)
         if len(points) == 0:
-            raise InputError("no guide point", where=f"cable {cable}", remedy="give at least the point where it is tied")
+            raise InputError("no guide point", where=f"cable {cable}", remedy="give the point where it is tied")
         steps = np.linalg.norm(np.diff(np.concatenate([anchors[cable : cable + 1], points]), axis=0), axis=1)
         if not np.all(steps > 1e-9):
             raise InputError("two successive points coincide", where=f"cable {cable}", remedy="remove one of them")
@@ -78,10 +79,11 @@ def guide_matrix(layout: CableLayout, nodes: int) -> Float[np.ndarray, "cables g
 
 
 def lengths_and_jacobian(
-    layout: CableLayout, guides: Float[np.ndarray, "cables guides nodes"], position: Float[Array, "nodes 3"]
+    layout: CableLayout, guides: Float[Array, "cables guides nodes"], position: Float[Array, "nodes 3"]
 ) -> tuple[Float[Array, " cables"], Float[Array, "cables nodes 3"]]:
     """Cable lengths [m] and their derivatives with respect to the node positions."""
-    points = jnp.concatenate([jnp.asarray(layout.anchor)[:, None, :], jnp.einsum("cgn,ni->cgi", guides, position)], axis=1)
+    guided = jnp.einsum("cgn,ni->cgi", guides, position)
+    points = jnp.concatenate([jnp.asarray(layout.anchor)[:, None, :], guided], axis=1)
     used = layout.guide_used[..., None]
     segment = jnp.where(used, points[:, 1:] - points[:, :-1], np.array([1.0, 0.0, 0.0]))
     length = jnp.sqrt(jnp.sum(segment**2, axis=-1, keepdims=True))
@@ -90,7 +92,9 @@ def lengths_and_jacobian(
     return jnp.sum(jnp.where(used, length, 0.0), axis=(1, 2)), jnp.einsum("cgn,cgi->cni", guides, pull)
 
 
-def _masked_solve(matrix: Float[Array, "c c"], right: Float[Array, " c"], active: Bool[Array, " c"]) -> Float[Array, " c"]:
+def _masked_solve(
+    matrix: Float[Array, "c c"], right: Float[Array, " c"], active: Bool[Array, " c"]
+) -> Float[Array, " c"]:
     """Solve for the active unknowns; the others are zero."""
     pair = active[:, None] & active[None, :]
     reduced = jnp.where(pair, matrix, jnp.eye(len(right)))
@@ -102,9 +106,10 @@ def _active_set(
 ) -> tuple[Bool[Array, " c"], Bool[Array, ""]]:
     """Active set of the complementarity problem w = M t + q, by block principal pivoting.
 
-    Exchanging every infeasible index at once is the primal-dual active set method: fast, but it can cycle. After a few exchanges
-    without progress only the infeasible index of highest number is exchanged (Murty), which ends for every positive definite M
-    (Judice and Pires 1994, Computers & Operations Research 21:587-596). M has unit diagonal here, so t and w share a scale.
+    Exchanging every infeasible index at once is the primal-dual active set method: fast, but it can cycle. After a few
+    exchanges without progress only the infeasible index of highest number is exchanged (Murty), which ends for every
+    positive definite M (Judice and Pires 1994, Computers & Operations Research 21:587-596). M has unit diagonal here,
+    so that t and w share a scale.
     """
     count = len(offset)
     tolerance = 1e-10 * jnp.max(jnp.abs(offset))
@@ -136,8 +141,8 @@ def unilateral_tensions(
 ) -> Tensions:
     """Tensions T >= 0 complementary to the slack left, ``slack + compliance @ T`` >= 0.
 
-    ``compliance`` [m/N] is symmetric positive semi-definite, ``slack`` [m] the commanded length minus the length the cable would
-    have without tension. ``previous`` tensions start the active set. Differentiable given that set.
+    ``compliance`` [m/N] is symmetric positive semi-definite, ``slack`` [m] the commanded length minus the length the
+    cable would have without tension. ``previous`` tensions start the active set. Differentiable given that set.
     """
     diagonal = jnp.diagonal(compliance)
     usable = diagonal > 1e-12 * jnp.max(diagonal)

@@ -1,8 +1,9 @@
 """Corotational layers: one rotating frame per layer, internal force and tangent in block-tridiagonal form.
 
-The frame is the rotation of the layer's mean deformation gradient, by Newton's iteration for the polar decomposition (Higham 1986,
-SIAM J. Sci. Stat. Comput. 7:1160-1174). In that frame the layer is linear: f = -R K (R' x - X), tangent R K R' (Felippa and
-Haugen 2005, Comput. Methods Appl. Mech. Engng 194:2285-2335, without the geometric terms).
+The frame is the rotation of the layer's mean deformation gradient, by Newton's iteration for the polar decomposition
+(Higham 1986, SIAM J. Sci. Stat. Comput. 7:1160-1174). In that frame the layer is linear: f = -R K (R' x - X), tangent R
+K R' (Felippa and Haugen 2005, Comput. Methods Appl. Mech. Engng 194:2285-2335, without the geometric terms). A layer of
+several hexahedra side by side turns as one: the sections of a slender body do, and it is one frame instead of four.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ def rotation(deformation: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
     return deformation
 
 
-def frames(gradient: Float[Array, "layers nodes2 3"], position: Float[Array, "layers nodes2 3"]) -> Float[Array, "layers 3 3"]:
+def frames(
+    gradient: Float[Array, "layers nodes2 3"], position: Float[Array, "layers nodes2 3"]
+) -> Float[Array, "layers 3 3"]:
     """Rotation of every layer from its node positions and ``layered.centre_gradient``."""
     return rotation(jnp.einsum("lni,lnj->lij", position, gradient))
 
@@ -57,7 +60,7 @@ def internal_force(
 
 
 def pack(stiffness: Float[Array, "layers dofs dofs"]) -> Float[Array, "layers 9 pairs"]:
-    """Layer stiffness arranged for ``tangent``: the nine component pairs first, then block (lower, upper, coupling) and node pair."""
+    """Layer stiffness for ``tangent``: the nine component pairs, then block (lower, upper, coupling) and node pair."""
     layers, size = stiffness.shape[0], stiffness.shape[1] // 2
     blocks = stiffness[:, :size, :size], stiffness[:, size:, size:], stiffness[:, size:, :size]
     parts = jnp.stack(blocks, axis=1).reshape(layers, 3, size // 3, 3, size // 3, 3)

@@ -2,13 +2,15 @@
 
     A dv = h (f(x) + M g + f_ext - (h + b) K v - a M v) - h J' T,    A = (1 + h a) M + h (h + b) K,    x += h (v + dv)
 
-with Rayleigh damping a M + b K, the corotational tangent K, cable Jacobian J = dl/dx and tensions T >= 0 (Baraff and Witkin 1998;
-the same linearised step as SOFA's EulerImplicitSolver). Everything is a pure function of arrays: batch with ``jax.vmap``, differentiate
-with ``jax.jvp`` or ``jax.grad``. A ``System`` is static and is closed over, never traced.
+with Rayleigh damping a M + b K, the corotational tangent K, cable Jacobian J = dl/dx and tensions T >= 0 (Baraff and
+Witkin 1998; the same linearised step as SOFA's EulerImplicitSolver). Everything is a pure function of arrays: batch
+with ``jax.vmap``, differentiate with ``jax.jvp`` or ``jax.grad``. A ``System`` is static and is closed over, never
+traced.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -27,7 +29,7 @@ LOST = 10.0
 
 
 class System(NamedTuple):
-    """What does not change between rollouts: body, cables, and how many stations from the first one on are held fixed."""
+    """What does not change between rollouts: body, cables, and how many stations are held, from the first one on."""
 
     body: LayeredBody
     cables: CableLayout
@@ -86,13 +88,16 @@ def material(
     density: float,
     rayleigh_mass: float = 0.0,
     rayleigh_stiffness: float = 0.0,
-    gravity: np.ndarray = np.zeros(3),
+    gravity: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> Material:
     """Material of a body without point masses and with the stiffness of its profile; SI units as in ``Material``."""
-    scalars = (young_modulus, poisson_ratio, density, rayleigh_mass, rayleigh_stiffness)
     stations = len(system.body.station)
     return Material(
-        *(jnp.asarray(value, dtype=float) for value in scalars),
+        young_modulus=jnp.asarray(young_modulus, dtype=float),
+        poisson_ratio=jnp.asarray(poisson_ratio, dtype=float),
+        density=jnp.asarray(density, dtype=float),
+        rayleigh_mass=jnp.asarray(rayleigh_mass, dtype=float),
+        rayleigh_stiffness=jnp.asarray(rayleigh_stiffness, dtype=float),
         gravity=jnp.asarray(gravity, dtype=float),
         stiffness_scale=jnp.ones(stations - 1),
         point_mass=jnp.zeros(stations),
@@ -101,7 +106,8 @@ def material(
 
 def without_cables() -> CableLayout:
     """Layout of a body that no cable pulls."""
-    return CableLayout(np.zeros((0, 3)), np.zeros((0, 1, 8), dtype=int), np.zeros((0, 1, 8)), np.zeros((0, 1), dtype=bool))
+    none = np.zeros((0, 1, 8))
+    return CableLayout(np.zeros((0, 3)), none.astype(int), none, none[..., 0].astype(bool))
 
 
 def prepare(system: System, material: Material) -> Prepared:
@@ -120,8 +126,8 @@ def prepare(system: System, material: Material) -> Prepared:
         + lumped,
         layer_mass[:, section:, :section],
     )
-    rest = layered.rest_positions(body)
-    guides = guide_matrix(system.cables, body.nodes)
+    rest = jnp.asarray(layered.rest_positions(body))
+    guides = jnp.asarray(guide_matrix(system.cables, body.nodes))
     weight = multiply(mass, jnp.broadcast_to(material.gravity, (len(body.station), section, 3)))
     return Prepared(
         stiffness=stiffness,
@@ -133,7 +139,7 @@ def prepare(system: System, material: Material) -> Prepared:
         rayleigh_stiffness=material.rayleigh_stiffness,
         gradient=jnp.asarray(layered.centre_gradient(body)),
         rest=jnp.asarray(layered.rest_layers(body)),
-        guides=jnp.asarray(guides),
+        guides=guides,
         rest_length=lengths_and_jacobian(system.cables, guides, rest)[0],
     )
 
@@ -176,7 +182,7 @@ def constrained_increment(
     jacobian: Float[Array, "cables nodes 3"],
     slack: Float[Array, " cables"],
     previous: Float[Array, " cables"],
-):
+) -> tuple[Float[Array, "nodes 3"], Float[Array, " cables"], Bool[Array, ""]]:
     """Solve A u = r - J' T with T >= 0 complementary to slack - J u >= 0; u is zero on the clamped stations.
 
     Returns:
@@ -209,8 +215,8 @@ def step(
 ) -> tuple[State, StepInfo]:
     """One implicit Euler step to the commanded cable displacements [m] (pull > 0) at its end.
 
-    ``external_force`` [N] acts on the nodes throughout the step. A step that is not finite leaves the body where it was, at
-    rest and without tension, and says so: a batch goes on.
+    ``external_force`` [N] acts on the nodes throughout the step. A step that is not finite leaves the body where it
+    was, at rest and without tension, and says so: a batch goes on.
     """
     frame, local = frames_and_displacements(system, prepared, state.position)
     force = corotational.internal_force(prepared.stiffness, frame, local).reshape(-1, 3)

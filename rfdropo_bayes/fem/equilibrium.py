@@ -51,8 +51,8 @@ def _tension_stiffening(
 ) -> BlockTridiagonal:
     """Geometric stiffness N / L of layers in tension against lateral motion of one face relative to the other.
 
-    The corotational tangent leaves it out; without it the iteration for a soft body that hangs in its cables or its own weight
-    swings about the answer with growing amplitude. Compression is left out: its stiffness would be negative.
+    The corotational tangent leaves it out; without it the iteration for a soft body that hangs in its cables or its own
+    weight swings about the answer with growing amplitude. Compression is left out: its stiffness would be negative.
     """
     nodes = system.body.section_nodes
     axis = frame[:, :, 2]
@@ -76,8 +76,18 @@ def _layer_tension(
     return body - jnp.einsum("li,li->l", beyond, frame[:, :, 2])
 
 
-def _increment(system: System, prepared: Prepared, iterate: _Iterate, load, displacement):
-    """Newton increment with the corotational tangent; the cables pull to the commanded displacement in one go."""
+def _increment(
+    system: System,
+    prepared: Prepared,
+    iterate: _Iterate,
+    load: Float[Array, "nodes 3"],
+    displacement: Float[Array, " cables"],
+) -> tuple[Float[Array, "nodes 3"], Float[Array, " cables"], Bool[Array, ""], Float[Array, ""]]:
+    """Newton increment, tensions at its end, whether those were found, and the largest force out of balance at its
+    start.
+
+    The cables pull to the commanded displacement in one go.
+    """
     frame, local = frames_and_displacements(system, prepared, iterate.position)
     force = corotational.internal_force(prepared.stiffness, frame, local).reshape(-1, 3)
     length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, iterate.position)
@@ -101,15 +111,15 @@ def static_equilibrium(
 ) -> tuple[State, EquilibriumInfo]:
     """Body at rest under its weight, the external nodal forces [N] and the commanded cable displacements [m].
 
-    Newton's method with the corotational tangent from the undeformed body. The increments are limited in length, and relaxed
-    more whenever two in a row point against each other, which makes soft bodies far from straight converge too. A fixed number
-    of iterations, so that both modes of differentiation work. Needs at least one clamped station.
+    Newton's method with the corotational tangent from the undeformed body. The increments are limited in length, and
+    relaxed more whenever two in a row point against each other, which makes soft bodies far from straight converge too.
+    A fixed number of iterations, so that both modes of differentiation work. Needs at least one clamped station.
     """
     load = prepared.weight + external_force
     longest = LONGEST_STEP * (system.body.station[-1] - system.body.station[0])
 
-    def iterate(current: _Iterate, _):
-        increment, tension, converged, _ = _increment(system, prepared, current, load, displacement)
+    def iterate(current: _Iterate, _: None) -> tuple[_Iterate, Bool[Array, ""]]:
+        increment, tension, converged, _unbalanced = _increment(system, prepared, current, load, displacement)
         now, before = lax.stop_gradient((increment, current.increment))
         along = jnp.sum(now * before)
         opposed = along < -0.3 * jnp.sqrt(jnp.sum(now**2) * jnp.sum(before**2))

@@ -1,9 +1,9 @@
 """Eight-node hexahedron with incompatible modes: stiffness and consistent mass.
 
-The nine incompatible modes of Wilson, with the gradients of Taylor, Beresford and Wilson (1976), "A non-conforming element for
-stress analysis", Int. J. Numer. Meth. Engng 10:1211-1219: taken at the centre and scaled by the Jacobian, so that distorted
-elements pass the patch test; the enhanced-strain element of Simo and Rifai (1990) with the same modes coincides with it.
-The modes are condensed in the reference configuration.
+The nine incompatible modes of Wilson, with the gradients of Taylor, Beresford and Wilson (1976), "A non-conforming
+element for stress analysis", Int. J. Numer. Meth. Engng 10:1211-1219: taken at the centre and scaled by the Jacobian,
+so that distorted elements pass the patch test; the enhanced-strain element of Simo and Rifai (1990) with the same modes
+coincides with it. The modes are condensed in the reference configuration.
 
 Local nodes are numbered ``iz * 4 + iy * 2 + ix`` (x runs fastest); the degrees of freedom ``node * 3 + axis``.
 """
@@ -30,7 +30,9 @@ def shape_functions(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, 
 def shape_gradients(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 8 3"]:
     """Gradients of the trilinear shape functions in natural coordinates."""
     factors = 1.0 + points[:, None, :] * CORNERS[None]
-    others = np.stack([factors[..., 1] * factors[..., 2], factors[..., 2] * factors[..., 0], factors[..., 0] * factors[..., 1]], -1)
+    others = np.stack(
+        [factors[..., 1] * factors[..., 2], factors[..., 2] * factors[..., 0], factors[..., 0] * factors[..., 1]], -1
+    )
     return others * CORNERS[None] / 8.0
 
 
@@ -66,7 +68,7 @@ def _strain_operator(gradient: Float[Array, "point function 3"]) -> Float[Array,
 def stiffness(
     coordinates: Float[Array, "8 3"], young_modulus: Float[Array, ""], poisson_ratio: Float[Array, ""]
 ) -> Float[Array, "24 24"]:
-    """Stiffness [N/m] of one element with its nine incompatible modes condensed; any non-degenerate node coordinates [m]."""
+    """Stiffness [N/m] of one element, its nine incompatible modes condensed; any non-degenerate coordinates [m]."""
     local = shape_gradients(GAUSS_POINTS)
     jacobian = jnp.einsum("gna,nb->gab", local, coordinates)
     volume = determinant(jacobian)

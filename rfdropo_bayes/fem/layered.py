@@ -1,9 +1,10 @@
 """A slender body layered along its axis: geometry, section profile, and the stiffness and mass of every layer.
 
-The effective section of a layer need not be the square that its nodes span. The stiffness is that of a virtual box with the
-section's ratio of bending to axial stiffness, a = sqrt(3 I / A), and modulus factor A / (4 a_x a_y); it acts on the actual nodes
-through the bilinear interpolation that evaluates their field at the corners of the box. Linear fields pass through that map
-unchanged, so rigid motions stay free of strain. A rank-one term on the twist then sets the torsional stiffness.
+The effective section of a layer need not be the square that its nodes span. The stiffness is that of a virtual box with
+the section's ratio of bending to axial stiffness, a = sqrt(3 I / A), and modulus factor A / (4 a_x a_y); it acts on the
+actual nodes through the bilinear interpolation that evaluates their field at the corners of the box. Linear fields pass
+through that map unchanged, so rigid motions stay free of strain. A rank-one term on the twist then sets the torsional
+stiffness.
 """
 
 from __future__ import annotations
@@ -94,31 +95,31 @@ def profile_body(
     Raises:
         InputError: arrays that do not fit together, stations out of order, or anything not positive.
     """
-    arrays = {
-        "station": (station, -1),
-        "half_width": (half_width, (0, 2)),
-        "axial_area": (axial_area, (-1,)),
-        "bending_moment_area": (bending_moment_area, (-1, 2)),
-        "torsion_constant": (torsion_constant, (-1,)),
-        "mass_area": (mass_area, (-1,)),
-        "mass_moment_area": (mass_moment_area, (-1, 2)),
-    }
     station = np.asarray(station, dtype=float)
     if station.ndim != 1 or len(station) < 2 or not np.all(np.diff(station) > 0.0):
         raise InputError("stations are not an increasing list of at least two", where="body.station")
     if int(nodes_across) != nodes_across or nodes_across < 2:
         raise InputError(f"nodes_across is {nodes_across}", where="body", remedy="use 2 or 3")
-    checked = {}
-    for name, (values, shape) in arrays.items():
+    layers = len(station) - 1
+
+    def checked(name: str, values: np.ndarray, *shape: int) -> np.ndarray:
         values = np.asarray(values, dtype=float)
-        if name != "station":
-            expected = (len(station) + shape[0], *shape[1:])
-            if values.shape != expected:
-                raise InputError(f"shape {values.shape}, expected {expected}", where=f"body.{name}")
-            if not (np.all(np.isfinite(values)) and np.all(values > 0.0)):
-                raise InputError("a value is not positive", where=f"body.{name}")
-        checked[name] = values
-    return LayeredBody(nodes_across=int(nodes_across), **checked)
+        if values.shape != shape:
+            raise InputError(f"shape {values.shape}, expected {shape}", where=f"body.{name}")
+        if not (np.all(np.isfinite(values)) and np.all(values > 0.0)):
+            raise InputError("a value is not positive", where=f"body.{name}")
+        return values
+
+    return LayeredBody(
+        station=station,
+        half_width=checked("half_width", half_width, layers + 1, 2),
+        nodes_across=int(nodes_across),
+        axial_area=checked("axial_area", axial_area, layers),
+        bending_moment_area=checked("bending_moment_area", bending_moment_area, layers, 2),
+        torsion_constant=checked("torsion_constant", torsion_constant, layers),
+        mass_area=checked("mass_area", mass_area, layers),
+        mass_moment_area=checked("mass_moment_area", mass_moment_area, layers, 2),
+    )
 
 
 def rest_positions(body: LayeredBody) -> Float[np.ndarray, "nodes 3"]:
@@ -155,7 +156,7 @@ def _cell_nodes(nodes_across: int) -> Int[np.ndarray, "cells 8"]:
 
 
 def centre_gradient(body: LayeredBody) -> Float[np.ndarray, "layers nodes2 3"]:
-    """Weights g with F = sum_a x_a (x) g_a: the deformation gradient of a layer, mean over the centres of its hexahedra."""
+    """Weights g with F = sum_a x_a (x) g_a: the deformation gradient of a layer, mean over its hexahedra's centres."""
     rest = rest_layers(body)
     local = hexahedron.shape_gradients(np.zeros((1, 3)))[0]
     cells = _cell_nodes(body.nodes_across)
@@ -218,18 +219,16 @@ def layer_stiffness(
 ) -> Float[Array, "layers dofs dofs"]:
     """Stiffness [N/m] of every layer at rest, degrees of freedom ``node * 3 + axis`` with the lower station first.
 
-    Section stiffnesses EA, EI and GJ are those of the profile. The twist correction deflates along K m, where m is the free
-    torsion of the uncorrected layer: the result stays positive semi-definite for any torsion constant, and bending, shear and
-    extension, which are orthogonal to torsion in energy, are untouched.
+    Section stiffnesses EA, EI and GJ are those of the profile. The twist correction deflates along K m, where m is the
+    free torsion of the uncorrected layer: the result stays positive semi-definite for any torsion constant, and
+    bending, shear and extension, which are orthogonal to torsion in energy, are untouched.
     """
     box, factor = _virtual_box(body.axial_area, body.bending_moment_area)
     corners = _box_corners(body, box)
-    hexahedra = jax.vmap(hexahedron.stiffness, (0, None, None))(corners, young_modulus, poisson_ratio)
+    hexahedra = jax.vmap(hexahedron.stiffness, (0, None, None))(jnp.asarray(corners), young_modulus, poisson_ratio)
     hexahedra = (hexahedra * factor[:, None, None]).reshape(len(corners), 8, 3, 8, 3)
     maps = _box_maps(body, box)
-    stiffness = sum(
-        jnp.einsum("lan,laibj,lbm->lnimj", maps[:, cell], hexahedra, maps[:, cell]) for cell in range(maps.shape[1])
-    )
+    stiffness = jnp.einsum("lcan,laibj,lcbm->lnimj", maps, hexahedra, maps)
     stiffness = stiffness.reshape(len(corners), 6 * body.section_nodes, 6 * body.section_nodes)
     shear_modulus = young_modulus / (2.0 * (1.0 + poisson_ratio))
     wanted = shear_modulus * body.torsion_constant / np.diff(body.station)
@@ -243,7 +242,7 @@ def layer_stiffness(
 def layer_mass(body: LayeredBody) -> Float[Array, "layers nodes2 nodes2"]:
     """Consistent mass of every layer per unit density [m^3], for each displacement component alike."""
     box, factor = _virtual_box(body.mass_area, body.mass_moment_area)
-    hexahedra = jax.vmap(hexahedron.mass)(_box_corners(body, box)) * factor[:, None, None]
+    hexahedra = jax.vmap(hexahedron.mass)(jnp.asarray(_box_corners(body, box))) * factor[:, None, None]
     maps = _box_maps(body, box)
     return jnp.einsum("lcan,lab,lcbm->lnm", maps, hexahedra, maps)
 
@@ -251,7 +250,8 @@ def layer_mass(body: LayeredBody) -> Float[Array, "layers nodes2 nodes2"]:
 def attach(body: LayeredBody, points: Float[np.ndarray, "points 3"]) -> PointMap:
     """Bind material points of the undeformed body [m] to the nodes around them.
 
-    Trilinear inside a layer; points beside the square of nodes, or beyond the ends of the axis, follow by extrapolation.
+    Trilinear inside a layer; points beside the square of nodes, or beyond the ends of the axis, follow by
+    extrapolation.
     """
     points = np.atleast_2d(np.asarray(points, dtype=float))
     if points.shape[1] != 3 or not np.all(np.isfinite(points)):

@@ -28,7 +28,14 @@ class _Progress(NamedTuple):
     cables_converged: Bool[Array, ""]
 
 
-def _advance(system: System, prepared: Prepared, progress: _Progress, commands, time_step, external_force) -> _Progress:
+def _advance(
+    system: System,
+    prepared: Prepared,
+    progress: _Progress,
+    commands: Float[Array, "substeps cables"],
+    time_step: float,
+    external_force: Float[Array, "nodes 3"] | float,
+) -> _Progress:
     """The steps of one recorded row."""
 
     def one(progress: _Progress, displacement: Float[Array, " cables"]) -> tuple[_Progress, None]:
@@ -49,12 +56,14 @@ def simulate(
     points: PointMap,
     external_force: Float[Array, "nodes 3"] | float = 0.0,
 ) -> Rollout:
-    """Rollout from ``state`` through the commanded cable displacements [m] of every step, recorded at the end of every row.
+    """Rollout from ``state`` through the commanded cable displacements [m] of every step, recorded after every row.
 
     ``time_step`` [s] is that of one substep; ``external_force`` [N] is constant. Forward and reverse mode both work.
     """
 
-    def row(progress: _Progress, commands):
+    def row(
+        progress: _Progress, commands: Float[Array, "substeps cables"]
+    ) -> tuple[_Progress, tuple[Float[Array, "points 3"], Float[Array, " cables"]]]:
         progress = _advance(system, prepared, progress, commands, time_step, external_force)
         return progress, (point_positions(points, progress.state.position), progress.state.tension)
 
@@ -75,11 +84,11 @@ def simulate_prefix(
 ) -> Rollout:
     """The first ``horizon`` rows of ``simulate``; later rows are zero.
 
-    ``horizon`` may be traced: one compilation serves every prefix, and the rows beyond it cost nothing. No reverse mode.
+    ``horizon`` may be traced: one compilation serves every prefix, and rows beyond it cost nothing. No reverse mode.
     """
     rows = displacement.shape[0]
 
-    def row(index, carry):
+    def row(index: Int[Array, ""], carry: tuple[_Progress, Array, Array]) -> tuple[_Progress, Array, Array]:
         progress, position, tension = carry
         progress = _advance(system, prepared, progress, displacement[index], time_step, external_force)
         here = point_positions(points, progress.state.position)
