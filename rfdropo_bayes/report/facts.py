@@ -1,0 +1,114 @@
+"""What a run knows beside its posterior: the plain input of summary.json and report.html."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import metadata
+from platform import python_version
+from typing import Any
+
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.report.baselines import BaselineErrors
+
+PACKAGES = ("rfdropo_bayes", "jax", "numpyro", "blackjax", "arviz", "numpy", "scipy", "numba")
+
+
+@dataclass(frozen=True)
+class RecordingFacts:
+    """One recording as the data section lists it.
+
+    ``masked`` counts marker positions that are left out as faults, of ``positions`` in all; ``seconds`` is its length.
+    """
+
+    name: str
+    split: str
+    format: str
+    sha256: str
+    rows: int
+    seconds: float
+    sample_time: float
+    masked: int
+    positions: int
+    synthetic: bool
+    provenance: str = ""
+
+    @classmethod
+    def of_trajectory(cls, trajectory: Trajectory, split: str) -> RecordingFacts:
+        """Facts of a recording in the role ``split``, "fit" or "test"."""
+        attributes = trajectory.dataset.attrs
+        mask = trajectory.position_mask
+        return cls(
+            trajectory.name,
+            split,
+            str(attributes["format"]),
+            trajectory.sha256,
+            len(trajectory.time),
+            float(trajectory.time[-1]),
+            float(attributes["sample_time"]),
+            int((~mask).sum()),
+            int(mask.size),
+            trajectory.synthetic,
+            str(attributes["provenance"]),
+        )
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """Everything in summary.json that the posterior itself does not hold.
+
+    Attributes:
+        title: of the experiment.
+        robot: name of its robot.
+        method: of inference.
+        engine: that simulated, with precision and discretisation in words.
+        status: "done", or "interrupted" where the budget or the user ended it early.
+        seed: of the run.
+        rollouts: used, in full-length equivalents; ``evaluations``: parameter sets tried.
+        seconds: of wall time.
+        log_evidence: value and standard deviation in nats (NaN: not measured); None if the method has none.
+        excluded: parameter sets that got no weight, by reason.
+        warnings: sentences.
+        recordings: fit first, then test.
+        model: label -> words, e.g. mechanisms, noise, fixed values, time step.
+        baselines: from `baseline_errors`; empty if not computed.
+        noise_floor: noise between repeats of each marker [m]; None without repeats.
+        phi: distribution to randomise over, {name: {mean, std, low, high, unit}}; None without.
+        optimum: posterior mode; None without.
+        limits: sentences on what this analysis cannot see, beside those that always hold.
+        versions: of the software.
+        details: further plain values of the method.
+    """
+
+    title: str
+    robot: str
+    method: str
+    engine: str
+    status: str
+    seed: int
+    rollouts: float
+    seconds: float
+    evaluations: int = 0
+    log_evidence: tuple[float, float] | None = None
+    excluded: Mapping[str, int] = field(default_factory=dict)
+    warnings: Sequence[str] = ()
+    recordings: Sequence[RecordingFacts] = ()
+    model: Mapping[str, str] = field(default_factory=dict)
+    baselines: Mapping[str, BaselineErrors] = field(default_factory=dict)
+    noise_floor: Mapping[str, float] | None = None
+    phi: Mapping[str, Mapping[str, Any]] | None = None
+    optimum: Mapping[str, float] | None = None
+    limits: Sequence[str] = ()
+    versions: Mapping[str, str] = field(default_factory=dict)
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of Python and of the packages that numbers depend on; those not installed are left out."""
+    versions = {"python": python_version()}
+    for name in PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions

@@ -1,0 +1,86 @@
+"""The result of a run in a few plain sentences, from the numbers of summary.json."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+
+def headline(summary: Mapping[str, Any]) -> list[str]:
+    """What was fitted, how far off it is, against what, what a bound decided, and how many rollouts failed."""
+    return [
+        sentence
+        for sentence in (_fitted(summary), _errors(summary), _against(summary), _bounds(summary), _excluded(summary))
+        if sentence
+    ]
+
+
+def _fitted(summary: Mapping[str, Any]) -> str:
+    free = [name for name, row in summary["parameters"].items() if not row.get("derived")]
+    recordings = [r for r in summary["recordings"] if r["split"] == "fit"]
+    seconds = sum(r["seconds"] for r in recordings)
+    synthetic = " synthetic" if recordings and all(r["synthetic"] for r in recordings) else ""
+    data = (
+        f"{_count(len(recordings), synthetic.strip() + ' recording' if synthetic else 'recording')} ({seconds:.3g} s)"
+    )
+    return f"{_count(len(free), 'parameter')} of {summary['robot']} fitted to {data} with {summary['method']}."
+
+
+def _errors(summary: Mapping[str, Any]) -> str:
+    parts = []
+    for role, words in (("fit", "where it was fitted"), ("test", "on test recordings that no fit saw")):
+        figures = summary["errors"].get(role)
+        if figures and figures["over_time"]:
+            marker, value = list(figures["over_time"].items())[-1]
+            if value is not None:
+                split = ""
+                if figures["moving"] is not None:
+                    split = f" (moving part {figures['moving']:.3g} mm, final pose {figures['final']:.3g} mm)"
+                parts.append(f"{value:.3g} mm {words}{split}")
+    if not parts:
+        return ""
+    tail = "" if summary["rmse"]["test"] else " There are no test recordings: nothing here says how well it predicts."
+    return f"Its last marker ({marker}) is off by {', and by '.join(parts)} (root mean square over time).{tail}"
+
+
+def best_baseline(summary: Mapping[str, Any], role: str) -> tuple[str, float] | None:
+    """Title and error of the best predictor that knows nothing of the robot; None if none was scored."""
+    scored = []
+    for row in summary["baselines"].values():
+        values = list((row[role] or {"over_time": {}})["over_time"].values())
+        if values and values[-1] is not None:
+            scored.append((row["title"], values[-1]))
+    return min(scored, key=lambda pair: pair[1]) if scored else None
+
+
+def _against(summary: Mapping[str, Any]) -> str:
+    own = list(summary["rmse"]["test"].values())
+    best = best_baseline(summary, "test")
+    if not own or own[-1] is None or best is None:
+        return ""
+    title, error = best
+    verdict = "the simulator does better" if own[-1] < error else "the simulator does no better"
+    floor = summary.get("noise_floor_mm")
+    repeats = f"; repeats of one experiment differ by {list(floor.values())[-1]:.3g} mm" if floor else ""
+    return f"The best predictor without a simulator ({title}) is off by {error:.3g} mm there: {verdict}{repeats}."
+
+
+def _bounds(summary: Mapping[str, Any]) -> str:
+    names = [name for name, row in summary["parameters"].items() if row["at_bound"]]
+    if not names:
+        return "No parameter sits on a hard bound."
+    verb = "sits on a hard bound" if len(names) == 1 else "sit on hard bounds"
+    return f"Careful: {', '.join(names)} {verb}, where the bound decides and not the data."
+
+
+def _excluded(summary: Mapping[str, Any]) -> str:
+    total = sum(summary["excluded"].values())
+    if not total:
+        return "No rollout had to be left out."
+    reasons = ", ".join(f"{count} {name}" for name, count in sorted(summary["excluded"].items()))
+    of = f" of {summary['evaluations']}" if summary["evaluations"] else ""
+    return f"{total}{of} rollouts got no weight ({reasons})."
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

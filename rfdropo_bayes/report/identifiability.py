@@ -1,0 +1,144 @@
+"""Which combinations of parameters the data determine, from the posterior covariance of their logarithms.
+
+The covariance of log parameters is, for a posterior that the data dominate, the inverse of their Fisher information.
+An eigenvector of it is a product of powers of parameters; a small eigenvalue means that the data determine this
+product, one that is no smaller than under the prior that they say nothing of it. Parameters that hardly correlate are
+kept apart first, so that products mix only what belongs together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.posteriors import PosteriorRecord
+
+TOGETHER = 0.6  # correlation from which on parameters are described jointly
+DETERMINED, FREE = 0.5, 0.8  # contraction against the prior
+NEGLIGIBLE = 0.2  # exponents below this are left out of the words
+TIMES = " \u00d7 "
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A product of powers of parameters and how well it is known.
+
+    Attributes:
+        powers: exponent of each parameter that takes part; the largest is 1 in absolute value.
+        sd: posterior standard deviation of the logarithm of the product.
+        prior_sd: the same under the prior; None without prior draws.
+        verdict: "determined", "partly" or "free"; "unknown" without prior draws.
+        sentence: the same in words.
+    """
+
+    powers: dict[str, float]
+    sd: float
+    prior_sd: float | None
+    verdict: str
+    sentence: str
+
+    @property
+    def contraction(self) -> float | None:
+        """Posterior over prior standard deviation."""
+        return self.sd / self.prior_sd if self.prior_sd else None
+
+
+def identify(record: PosteriorRecord, *, names: list[str] | None = None) -> list[Combination]:
+    """Combinations of the positive free parameters, best determined first.
+
+    Args:
+        record: posterior, and prior draws to compare with.
+        names: parameters to look at; by default those that all recordings share.
+    """
+    chosen = [info.name for info in record.free if "@" not in info.name] if names is None else names
+    logs = {n: np.log(record.flat(n)) for n in chosen if np.all(record.flat(n) > 0) and np.ptp(record.flat(n)) > 0}
+    prior = {n: np.log(record.prior[n]) for n in logs if n in record.prior and np.all(record.prior[n] > 0)}
+    found = [combination for group in _groups(logs) for combination in _eigen_combinations(group, logs, prior)]
+    return sorted(found, key=lambda c: c.sd if c.contraction is None else c.contraction)
+
+
+def _groups(logs: Mapping[str, Float[np.ndarray, " n"]]) -> list[list[str]]:
+    """Parameters joined by strong correlations."""
+    names = list(logs)
+    if not names:
+        return []
+    correlation = np.abs(np.corrcoef(np.stack([logs[n] for n in names]))).reshape(len(names), len(names))
+    groups: list[set[int]] = []
+    for i in range(len(names)):
+        touching = [g for g in groups if any(correlation[i, j] > TOGETHER for j in g)]
+        groups = [g for g in groups if g not in touching] + [set.union({i}, *touching)]
+    return [[names[i] for i in sorted(group)] for group in sorted(groups, key=min)]
+
+
+def _eigen_combinations(
+    group: list[str], logs: Mapping[str, np.ndarray], prior: Mapping[str, np.ndarray]
+) -> list[Combination]:
+    stack = np.stack([logs[n] for n in group])
+    _, vectors = np.linalg.eigh(np.atleast_2d(np.cov(stack)))
+    combinations = []
+    for vector in vectors.T:
+        powers = _readable(dict(zip(group, vector, strict=True)))
+        sd = float(np.std(sum(p * logs[n] for n, p in powers.items())))
+        known = all(n in prior for n in powers)
+        prior_sd = float(np.std(sum(p * prior[n] for n, p in powers.items()))) if known else None
+        verdict = _verdict(sd, prior_sd)
+        combinations.append(Combination(powers, sd, prior_sd, verdict, _sentence(powers, sd, prior_sd, verdict)))
+    return combinations
+
+
+def _readable(powers: dict[str, float]) -> dict[str, float]:
+    """Largest exponent 1, the first sign positive, small ones dropped, the rest rounded to a tenth."""
+    largest = max(powers.values(), key=abs)
+    kept = {n: round(p / largest, 1) for n, p in powers.items() if abs(p / largest) >= NEGLIGIBLE}
+    sign = 1.0 if next(iter(kept.values())) > 0 else -1.0
+    return {n: sign * p for n, p in kept.items()}
+
+
+def _verdict(sd: float, prior_sd: float | None) -> str:
+    if not prior_sd:
+        return "unknown"
+    return "determined" if sd < DETERMINED * prior_sd else "partly" if sd < FREE * prior_sd else "free"
+
+
+def spread_in_words(sd: float) -> str:
+    """A standard deviation of a logarithm as people say it: +-0.8 %, or a factor of 2.1."""
+    if sd < 0.5:
+        digits = 2 if 100 * sd < 0.1 else 1 if 100 * sd < 10 else 0
+        return f"±{100 * sd:.{digits}f} %"
+    return f"a factor of {np.exp(sd):.2g} either way"
+
+
+def product_in_words(powers: Mapping[str, float]) -> str:
+    """E / density, friction x E, E^0.5 / mass."""
+
+    def factor(name: str, power: float) -> str:
+        return name if power == 1.0 else f"{name}^{power:g}"
+
+    above = [factor(n, p) for n, p in powers.items() if p > 0]
+    below = [factor(n, -p) for n, p in powers.items() if p < 0]
+    numerator, denominator = TIMES.join(above) or "1", TIMES.join(below)
+    if not below:
+        return numerator
+    return f"{numerator} / {denominator}" if len(below) == 1 else f"{numerator} / ({denominator})"
+
+
+def _sentence(powers: Mapping[str, float], sd: float, prior_sd: float | None, verdict: str) -> str:
+    same_sign = len(powers) > 1 and all(p > 0 for p in powers.values())
+    if same_sign and verdict in ("free", "partly"):
+        names = list(powers)
+        subject = f"the common scale of {', '.join(names[:-1])} and {names[-1]}"
+        sd /= sum(powers.values())
+        prior_sd = None if prior_sd is None else prior_sd / sum(powers.values())
+    else:
+        subject = product_in_words(powers)
+    before = f" (prior {spread_in_words(prior_sd)})" if prior_sd else ""
+    how = {
+        "determined": "is determined to",
+        "partly": "is partly determined, to",
+        "free": "is left free by the data:",
+        "unknown": "has a spread of",
+    }[verdict]
+    return f"{subject} {how} {spread_in_words(sd)}{before}"

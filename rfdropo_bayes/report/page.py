@@ -1,0 +1,228 @@
+"""report.html: one file that needs nothing else, from a posterior, the numbers of its summary and its experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.report import check_figures, posterior_figures, trajectory_figures
+from rfdropo_bayes.report.coverage import coverage, transform_curve
+from rfdropo_bayes.report.headline import best_baseline
+from rfdropo_bayes.report.limits import limits
+from rfdropo_bayes.report.scores import MeasuredPath, settled_rows
+from rfdropo_bayes.report.style import Picture, display_name, display_unit, embed
+
+MOST_RECORDINGS = 12
+NOTHING = "\u2013"
+OPEN_RECORDINGS = 2
+COVERAGE_CURVE = tuple(np.round(np.arange(0.1, 1.0, 0.1), 1))
+
+SECTIONS = (
+    ("result", "Result"),
+    ("errors", "Errors beside simpler predictors"),
+    ("data", "Data"),
+    ("model", "Model and priors"),
+    ("posterior", "Posterior"),
+    ("identifiability", "What the data determine"),
+    ("predictions", "Measured against predicted"),
+    ("bands", "Are the bands honest?"),
+    ("computation", "Computation"),
+    ("limits", "What this cannot see"),
+    ("reproduce", "To reproduce"),
+)
+
+
+@dataclass(frozen=True)
+class RecordingView:
+    """Figures of one recording; ``opened`` ones are unfolded."""
+
+    name: str
+    split: str
+    error: float | None
+    bands: Picture
+    path: Picture
+    residuals: Picture
+    opened: bool
+
+
+def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str) -> str:
+    """HTML of the report.
+
+    Args:
+        record: posterior and predictions.
+        summary: content of summary.json, as `build_summary` made it.
+        config: the experiment file as it was run, TOML.
+    """
+    environment = Environment(
+        loader=PackageLoader("rfdropo_bayes.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"number": number, "words": display_name, "duration": duration}
+    stylesheet = environment.loader.get_source(environment, "page.css")[0] if environment.loader else ""
+    return environment.get_template("page.html.j2").render(
+        summary=summary,
+        sections=SECTIONS,
+        stylesheet=Markup(stylesheet),
+        tiles=_tiles(summary),
+        rows=[_posterior_row(name, row) for name, row in summary["parameters"].items()],
+        infos={info.name: info for info in record.parameters},
+        figures=_run_figures(record, summary),
+        recordings=_recording_views(record, summary),
+        total_recordings=len(record.recordings),
+        limits=limits(summary),
+        config=config,
+    )
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """A number for people; an en dash where there is none."""
+    if value is None:
+        return NOTHING
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int) or (isinstance(value, float) and value.is_integer() and abs(value) < 1e6):
+        return f"{int(value)}"
+    return f"{value:.{digits}g}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds, minutes or hours."""
+    if seconds < 100:
+        return f"{seconds:.3g} s"
+    return f"{seconds / 60:.3g} min" if seconds < 6000 else f"{seconds / 3600:.3g} h"
+
+
+def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Value, unit and meaning of the figures at the top of the page."""
+    tiles = []
+    for role, words in (("test", "error on test recordings"), ("fit", "error where fitted")):
+        values = list(summary["rmse"][role].values())
+        if values and values[-1] is not None:
+            tiles.append((number(values[-1]), "mm", words))
+    best = best_baseline(summary, "test" if summary["rmse"]["test"] else "fit")
+    if best is not None:
+        tiles.append((number(best[1]), "mm", f"best without a simulator: {best[0]}"))
+    if summary["coverage"].get("0.9") is not None:
+        tiles.append((f"{100 * summary['coverage']['0.9']:.0f}", "%", "of measurements in the 90 % band"))
+    if summary["log_evidence"]["value"] is not None:
+        sd = summary["log_evidence"]["sd"]
+        tiles.append((f"{summary['log_evidence']['value']:.1f}", "nat", f"log evidence ± {number(sd, 2)}"))
+    tiles.append(
+        (f"{summary['rollouts']:,.0f}".replace(",", "\u202f"), "", f"rollouts in {duration(summary['seconds'])}")
+    )
+    return tiles
+
+
+def _posterior_row(name: str, row: Mapping[str, Any]) -> dict[str, Any]:
+    """A line of the posterior table in units that read well."""
+    factor, unit = display_unit(row["unit"], max(abs(row["q05"]), abs(row["q95"])))
+    keys = ("mean", "sd", "q05", "median", "q95", "prior_q05", "prior_q95")
+    scaled = {key: None if row.get(key) is None else row[key] / factor for key in keys}
+    return {**row, **scaled, "name": name, "unit": unit}
+
+
+def _error_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Model first, then the predictors without a simulator; the parts are those of the test, else of the fit."""
+
+    def row(title: str, own: bool, errors: Mapping[str, Any]) -> dict[str, Any]:
+        last = {r: list(errors[r]["over_time"].values())[-1] if errors.get(r) else None for r in ("fit", "test")}
+        parts = errors.get("test") if summary["rmse"]["test"] else errors.get("fit")
+        return {
+            "title": title,
+            "own": own,
+            **last,
+            "moving": parts["moving"] if parts else None,
+            "final": parts["final"] if parts else None,
+            "description": errors.get("description", "the calibrated simulator"),
+            "reason": errors.get("reason", ""),
+        }
+
+    own = row("this simulator", True, summary["errors"])
+    return [own, *(row(b["title"], False, b) for b in summary["baselines"].values())]
+
+
+def _run_figures(record: PosteriorRecord, summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Figures of the run as a whole; those that there is nothing for are None."""
+    rows = _error_rows(summary)
+    floor = summary.get("noise_floor_mm")
+    scored = any(row[role] is not None for row in rows for role in ("fit", "test"))
+    pair = posterior_figures.paired_names(record)
+    own = [info.name for info in record.free if "@" in info.name]
+    shared = [info.name for info in record.parameters if "@" not in info.name][: posterior_figures.MOST_PANELS]
+    return {
+        "error_rows": rows,
+        "errors": embed(
+            check_figures.error_figure(rows, list(floor.values())[-1] if floor else None),
+            "Bars: error of the last marker for this simulator and for simpler predictors",
+        )
+        if scored
+        else None,
+        "pair": embed(posterior_figures.pair_figure(record, pair), "Scatter of each pair of parameters")
+        if len(pair) > 1
+        else None,
+        "pair_names": pair,
+        "marginals": embed(
+            posterior_figures.prior_posterior_figure(record, shared), "Prior and posterior density of each parameter"
+        )
+        if shared
+        else None,
+        "forest": embed(posterior_figures.forest_figure(record, own), "Intervals of the parameters of each recording")
+        if own
+        else None,
+        "honesty": _honesty(record),
+        "trace": embed(check_figures.trace_figure(record.trace), "Numbers of the sampler over its stages")
+        if any(key in row for row in record.trace for key in check_figures.TRACES)
+        else None,
+        "blocks": embed(check_figures.block_figure(record.block_scores), "Log score per row of each block of rows")
+        if record.block_scores
+        else None,
+    }
+
+
+def _honesty(record: PosteriorRecord) -> Picture | None:
+    curves, shares = {}, {}
+    for role in ("fit", "test"):
+        chosen = [r for r in record.recordings if r.split == role]
+        curve = transform_curve(chosen)
+        if curve is not None:
+            curves[role] = curve
+            shares[role] = coverage(chosen, nominal=COVERAGE_CURVE).over_all
+    figure = check_figures.honesty_figure(curves, shares) if curves else None
+    return embed(figure, "PIT-ECDF and coverage of the predictive bands") if figure else None
+
+
+def _recording_views(record: PosteriorRecord, summary: Mapping[str, Any]) -> list[RecordingView]:
+    """Test recordings first; of many, the first `MOST_RECORDINGS` get figures."""
+    ordered = sorted(record.recordings, key=lambda r: r.split != "test")
+    settled = settled_rows([MeasuredPath.of_prediction(r) for r in ordered])
+    views: list[RecordingView] = []
+    for recording, row in list(zip(ordered, settled, strict=True))[:MOST_RECORDINGS]:
+        already = sum(view.split == recording.split for view in views)
+        views.append(_recording_view(recording, row, summary, opened=already < OPEN_RECORDINGS))
+    return views
+
+
+def _recording_view(
+    recording: RecordingPrediction, settled: int | None, summary: Mapping[str, Any], *, opened: bool
+) -> RecordingView:
+    errors = (summary["errors"].get(recording.split) or {}).get("recordings", {}).get(recording.name, {})
+    return RecordingView(
+        recording.name,
+        recording.split,
+        errors.get("over_time"),
+        embed(trajectory_figures.bands_figure(recording), f"{recording.name}: measured and predicted over time"),
+        embed(trajectory_figures.path_figure(recording), f"{recording.name}: path of the last marker"),
+        embed(
+            trajectory_figures.residual_figure(recording, settled), f"{recording.name}: residuals of the last marker"
+        ),
+        opened,
+    )

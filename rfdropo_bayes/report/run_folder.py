@@ -1,0 +1,53 @@
+"""The files of a run's folder that come after inference: posterior.nc, summary.json, config.toml, report.html."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.report.facts import RunFacts
+from rfdropo_bayes.report.page import render_page
+from rfdropo_bayes.report.summary import build_summary, read_summary, write_summary, write_text
+
+POSTERIOR, SUMMARY, CONFIG, REPORT = "posterior.nc", "summary.json", "config.toml", "report.html"
+
+
+def write_run(folder: Path, record: PosteriorRecord, facts: RunFacts, config: str) -> Path:
+    """Write all four files and return the path of the report.
+
+    The numbers are written before the pictures are drawn, so that a run that is stopped there has lost nothing.
+
+    Raises:
+        InputError: if the folder cannot be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot be made ({error.strerror or error})", where=str(folder), remedy="choose a writable folder"
+        ) from None
+    summary = build_summary(record, facts)
+    record.save(folder / POSTERIOR)
+    write_summary(summary, folder / SUMMARY)
+    write_text(folder / CONFIG, config)
+    write_text(folder / REPORT, render_page(record, summary, config))
+    return folder / REPORT
+
+
+def rebuild_report(folder: Path) -> Path:
+    """Draw report.html again from what the folder holds, without computing anything anew; return its path.
+
+    Raises:
+        InputError: if the folder lacks posterior.nc or summary.json, or one of them is damaged.
+    """
+    folder = Path(folder)
+    summary = read_summary(folder / SUMMARY)
+    record = PosteriorRecord.load(folder / POSTERIOR)
+    try:
+        config = (folder / CONFIG).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        config = ""  # the page says that it is missing
+    write_text(folder / REPORT, render_page(record, summary, config))
+    return folder / REPORT

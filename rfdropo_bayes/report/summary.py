@@ -1,0 +1,203 @@
+"""summary.json: the numbers of a run under names that other programs rely on."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.report.coverage import coverage
+from rfdropo_bayes.report.facts import RunFacts
+from rfdropo_bayes.report.headline import headline
+from rfdropo_bayes.report.identifiability import identify
+from rfdropo_bayes.report.scores import MILLIMETRES, ErrorFigures, MeasuredPath, score
+from rfdropo_bayes.report.tables import posterior_table
+from rfdropo_bayes.tables import parse_table
+
+SCHEMA_VERSION = 1
+
+
+class _Open(BaseModel):
+    model_config = ConfigDict(extra="allow")
+
+
+class ParameterSummary(_Open):
+    """Posterior of one parameter, in its unit."""
+
+    mean: float
+    sd: float
+    q05: float
+    q95: float
+    unit: str
+    at_bound: bool
+
+
+class Evidence(_Open):
+    """Log evidence in nats; null where the method has none."""
+
+    value: float | None
+    sd: float | None
+
+
+class Errors(_Open):
+    """Root mean square distance over time of each marker [mm]; empty without recordings of that role."""
+
+    fit: dict[str, float | None]
+    test: dict[str, float | None]
+
+
+class Summary(_Open):
+    """The part of summary.json that is promised; more keys may follow."""
+
+    schema_version: int
+    status: str
+    engine: str
+    seconds: float
+    rollouts: float
+    parameters: dict[str, ParameterSummary]
+    log_evidence: Evidence
+    rmse: Errors
+
+
+def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
+    """The content of summary.json, ready for JSON: what is not finite is null, its reason under ``not_available``."""
+    figures = model_errors(record)
+    shares = coverage(record.recordings)
+    summary = {
+        "schema_version": SCHEMA_VERSION,
+        **{key: getattr(facts, key) for key in ("title", "status", "robot", "method", "engine", "seed")},
+        "seconds": facts.seconds,
+        "rollouts": facts.rollouts,
+        "evaluations": facts.evaluations,
+        "excluded": dict(facts.excluded),
+        "parameters": {row.name: row.as_dict() for row in posterior_table(record)},
+        "log_evidence": dict(zip(("value", "sd"), facts.log_evidence or (None, None), strict=True)),
+        "rmse": {role: dict(errors.over_time) if errors else {} for role, errors in figures.items()},
+        "errors": {role: asdict(errors) if errors else None for role, errors in figures.items()},
+        "baselines": {name: asdict(errors) for name, errors in facts.baselines.items()},
+        "noise_floor_mm": facts.noise_floor and {m: MILLIMETRES * s for m, s in facts.noise_floor.items()},
+        "coverage": {str(p): share for p, share in shares.over_all.items()},
+        "coverage_by_marker": {m: {str(p): s for p, s in row.items()} for m, row in shares.markers.items()},
+        "identifiability": [{**asdict(c), "contraction": c.contraction} for c in identify(record)],
+        "recordings": [asdict(recording) for recording in facts.recordings],
+        "data_sha256": combined_hash([recording.sha256 for recording in facts.recordings]),
+        "model": dict(facts.model),
+        "phi": facts.phi and {name: dict(values) for name, values in facts.phi.items()},
+        "optimum": facts.optimum and dict(facts.optimum),
+        "warnings": list(facts.warnings),
+        "limits": list(facts.limits),
+        "versions": dict(facts.versions),
+        "details": dict(facts.details),
+    }
+    missing: dict[str, str] = {}
+    if facts.log_evidence is None:
+        missing["log_evidence"] = f"{facts.method} computes no evidence"
+    plain = _plain(summary, "", missing)
+    plain["not_available"] = missing
+    plain["headline"] = headline(plain)
+    check_summary(plain, where="summary.json")
+    return plain
+
+
+def model_errors(record: PosteriorRecord) -> dict[str, ErrorFigures | None]:
+    """Errors of the point predictions, by role."""
+    return {
+        role: score(
+            {r.name: r.central for r in record.recordings if r.split == role},
+            [MeasuredPath.of_prediction(r) for r in record.recordings if r.split == role],
+        )
+        for role in ("fit", "test")
+    }
+
+
+def combined_hash(hashes: list[str]) -> str:
+    """One hash for all recordings, in their order."""
+    return hashlib.sha256("\n".join(hashes).encode()).hexdigest()
+
+
+def _plain(value: Any, path: str, missing: dict[str, str]) -> Any:
+    """Values as JSON has them; a number that is not finite becomes null and is noted."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v, f"{path}.{k}" if path else str(k), missing) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(v, f"{path}[{i}]", missing) for i, v in enumerate(value)]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        missing[path] = _reason(path, value)
+        return None
+    return value
+
+
+def _reason(path: str, value: float) -> str:
+    if path.endswith("r_hat"):
+        return "needs at least two chains"
+    if path == "log_evidence.sd":
+        return "nothing measures it: run more than one replicate"
+    return "not a number" if math.isnan(value) else "infinite"
+
+
+def check_summary(summary: Mapping[str, Any], *, where: str) -> None:
+    """Raise InputError if a promised key is missing or of the wrong type."""
+    parse_table(Summary, summary, where=where)
+    if summary["schema_version"] != SCHEMA_VERSION:
+        raise InputError(
+            f"schema_version is {summary['schema_version']}, this program reads {SCHEMA_VERSION}",
+            where=where,
+            remedy="use the version of the program that wrote it",
+        )
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all.
+
+    Raises:
+        InputError: if it cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        os.replace(partial, path)
+    except OSError as error:
+        raise InputError(
+            f"cannot be written ({error.strerror or error})", where=str(path), remedy="choose a writable folder"
+        ) from None
+
+
+def write_summary(summary: Mapping[str, Any], path: Path) -> None:
+    """Write summary.json.
+
+    Raises:
+        InputError: if it cannot be written.
+    """
+    write_text(path, json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def read_summary(path: Path) -> dict[str, Any]:
+    """Read summary.json.
+
+    Raises:
+        InputError: if it is missing, no JSON, or lacks a promised key.
+    """
+    try:
+        summary = json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError("no such file", where=str(path), remedy="give the folder of a finished calibration") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"is not readable JSON ({error})", where=str(path), remedy="calibrate again") from None
+    if not isinstance(summary, dict):
+        raise InputError("is not a JSON object", where=str(path), remedy="calibrate again")
+    check_summary(summary, where=str(path))
+    return summary

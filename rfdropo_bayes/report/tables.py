@@ -1,0 +1,113 @@
+"""The posterior in numbers: moments, quantiles, sampling diagnostics, and whether a hard bound decided."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, summarise
+
+PILED = 0.13  # of a standard deviation, between a half-normal (0.10) and a uniform distribution (0.17)
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One line of the posterior table; physical (SI) units.
+
+    Attributes:
+        name, unit, description: of the parameter.
+        mean, sd, q05, median, q95: of the draws.
+        at_bound: the posterior is piled up at a hard bound.
+        bound: which one, "low" or "high"; None if neither.
+        prior_q05, prior_q95: of the prior draws, None without them.
+        contraction: posterior over prior standard deviation (of the logarithm where the prior is logarithmic).
+        ess_bulk, ess_tail, mcse_mean, r_hat: ArviZ's diagnostics; ``r_hat`` is NaN for a single chain.
+        derived: a function of other parameters.
+    """
+
+    name: str
+    unit: str
+    description: str
+    mean: float
+    sd: float
+    q05: float
+    median: float
+    q95: float
+    at_bound: bool
+    bound: str | None
+    prior_q05: float | None
+    prior_q95: float | None
+    contraction: float | None
+    ess_bulk: float
+    ess_tail: float
+    mcse_mean: float
+    r_hat: float
+    derived: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything but the name, for summary.json."""
+        return {key: value for key, value in asdict(self).items() if key != "name"}
+
+
+def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
+    """One row per parameter and derived quantity."""
+    diagnostics = summarise(record.posterior)
+    free = {info.name for info in record.free}
+    rows = []
+    for info in record.parameters:
+        draws, prior = record.flat(info.name), record.prior.get(info.name)
+        q05, median, q95 = np.quantile(draws, [0.05, 0.5, 0.95])
+        bound = bound_reached(draws, info) if info.name in free else None
+        before = (None, None) if prior is None else np.quantile(prior, [0.05, 0.95]).tolist()
+        rows.append(
+            ParameterRow(
+                info.name,
+                info.unit,
+                info.description,
+                float(draws.mean()),
+                float(draws.std(ddof=1)) if len(draws) > 1 else 0.0,
+                float(q05),
+                float(median),
+                float(q95),
+                bound is not None,
+                bound,
+                before[0],
+                before[1],
+                None if prior is None else _contraction(draws, prior),
+                diagnostics[info.name]["ess_bulk"],
+                diagnostics[info.name]["ess_tail"],
+                diagnostics[info.name]["mcse_mean"],
+                diagnostics[info.name]["r_hat"],
+                info.name not in free,
+            )
+        )
+    return rows
+
+
+def bound_reached(draws: Float[np.ndarray, " n"], info: ParameterInfo) -> str | None:
+    """The hard bound, "low" or "high", that a posterior is piled up at; None if it is not.
+
+    A posterior that a bound cuts off at its mode has its outer 5 % quantile within a tenth of a standard deviation of
+    that bound, however wide the bounds are. Where the prior is logarithmic the comparison is in logarithms.
+    """
+    low, high = info.low, info.high
+    if info.logarithmic and np.all(draws > 0):
+        draws = np.log(draws)
+        low = np.log(low) if low > 0 else -np.inf
+        high = np.log(high) if high > 0 else -np.inf
+    q05, q95 = np.quantile(draws, [0.05, 0.95])
+    reach = PILED * draws.std()
+    if q05 - low <= reach:
+        return "low"
+    return "high" if high - q95 <= reach else None
+
+
+def _contraction(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"]) -> float | None:
+    """Ratio of standard deviations, of logarithms where all values are positive."""
+    if np.all(draws > 0) and np.all(prior > 0):
+        draws, prior = np.log(draws), np.log(prior)
+    spread = float(np.std(prior))
+    return float(np.std(draws)) / spread if spread > 0 else None

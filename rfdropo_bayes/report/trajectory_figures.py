@@ -1,0 +1,162 @@
+"""Figures of one recording: measured against predicted over time, the marker's path, what is left over."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.report import style
+from rfdropo_bayes.report.coverage import Bands, predictive_bands
+from rfdropo_bayes.report.scores import MILLIMETRES
+
+MOST_MARKERS = 4
+LEAST_SPAN = 4.0  # [mm]: a smaller range of an axis would blow noise up
+AXES = ("x", "y", "z")
+
+
+def shown_markers(count: int) -> list[int]:
+    """Markers that have a row of their own: evenly chosen, the last always among them."""
+    return sorted(
+        {round(i) for i in np.linspace(count - 1, 0, min(count, MOST_MARKERS) + (count > MOST_MARKERS))[:MOST_MARKERS]}
+    )
+
+
+@style.styled
+def bands_figure(recording: RecordingPrediction) -> Figure:
+    """Each coordinate of each shown marker over time, with the 50 % and 90 % predictive bands."""
+    markers = shown_markers(len(recording.marker_names))
+    rows = style.thin(len(recording.time))
+    bands = Bands(*(MILLIMETRES * q for q in predictive_bands(recording.predicted[:, rows])))
+    measured = np.where(recording.mask[..., None], MILLIMETRES * recording.observed, np.nan)[rows]
+    figure = Figure(figsize=(style.WIDTH, 0.75 + 1.75 * len(markers)))
+    grid = figure.subplots(len(markers), 3, sharex=True, squeeze=False)
+    for row, marker in enumerate(markers):
+        for axis in range(3):
+            axes = grid[row, axis]
+            _band(axes, recording.time[rows], bands, marker, axis)
+            axes.plot(
+                recording.time[rows], measured[:, marker, axis], color=style.MEASURED, linewidth=1.1, label="measured"
+            )
+            _at_least(axes, LEAST_SPAN)
+            if row == 0:
+                axes.set_title(AXES[axis])
+            if axis == 0:
+                axes.set_ylabel(f"{recording.marker_names[marker]} [mm]")
+            if row == len(markers) - 1:
+                axes.set_xlabel("time [s]")
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=4)
+    figure.align_ylabels()
+    return figure
+
+
+def _band(axes: Axes, time: np.ndarray, bands: Bands, marker: int, axis: int) -> None:
+    low90, low50, median, high50, high90 = (q[:, marker, axis] for q in bands)
+    axes.fill_between(time, low90, high90, color=style.POSTERIOR, alpha=0.22, linewidth=0, label="90 % band")
+    axes.fill_between(time, low50, high50, color=style.POSTERIOR, alpha=0.38, linewidth=0, label="50 % band")
+    axes.plot(time, median, color=style.POSTERIOR, linewidth=1.0, label="predicted median")
+
+
+def _at_least(axes: Axes, span: float) -> None:
+    low, high = axes.get_ylim()
+    if high - low < span:
+        middle = 0.5 * (low + high)
+        axes.set_ylim(middle - 0.5 * span, middle + 0.5 * span)
+
+
+@style.styled
+def path_figure(recording: RecordingPrediction) -> Figure:
+    """Path of the last marker seen along each axis, and the whole trunk at its first and last row."""
+    measured = np.where(recording.mask[..., None], MILLIMETRES * recording.observed, np.nan)
+    predicted = MILLIMETRES * recording.central
+    rows = style.thin(len(recording.time))
+    figure = Figure(figsize=(style.WIDTH, 3.7))
+    for axes, (across, up) in zip(figure.subplots(1, 3), ((2, 0), (2, 1), (0, 1)), strict=True):
+        for values, colour, words in (
+            (measured, style.MEASURED, "measured"),
+            (predicted, style.POSTERIOR, "predicted"),
+        ):
+            tip = values[rows, -1]
+            axes.plot(tip[:, across], tip[:, up], color=colour, linewidth=1.2, label=f"{words} path of the last marker")
+            for row, dashes in ((0, ":"), (-1, "-")):
+                shape = values[row]
+                axes.plot(
+                    shape[:, across],
+                    shape[:, up],
+                    dashes,
+                    marker="o",
+                    markersize=3,
+                    color=colour,
+                    alpha=0.55,
+                    linewidth=1,
+                )
+        axes.set_xlabel(f"{AXES[across]} [mm]")
+        axes.set_ylabel(f"{AXES[up]} [mm]")
+        axes.set_aspect("equal", adjustable="datalim")
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=2)
+    return figure
+
+
+@style.styled
+def residual_figure(recording: RecordingPrediction, settled: int | None) -> Figure:
+    """What is left of the last marker: per axis over time, its distance over time, and its memory.
+
+    Args:
+        recording: measured and predicted.
+        settled: row from which on the pose is held, None if it is not.
+    """
+    rows = style.thin(len(recording.time))
+    usable = recording.mask[:, -1]
+    residual = MILLIMETRES * np.where(usable[:, None], recording.observed[:, -1] - recording.central[:, -1], np.nan)
+    spread = MILLIMETRES * (recording.predicted[:, rows, -1] - recording.central[rows, -1])
+    figure = Figure(figsize=(style.WIDTH, 2.9))
+    over_time, distance, memory = figure.subplots(1, 3, width_ratios=(1.25, 1.25, 0.9))
+    low, high = np.quantile(spread, [0.05, 0.95], axis=0).mean(axis=-1)
+    over_time.fill_between(
+        recording.time[rows],
+        low,
+        high,
+        color=style.PRIOR,
+        alpha=0.25,
+        linewidth=0,
+        label="90 % band (mean of axes)",
+    )
+    for axis in range(3):
+        over_time.plot(recording.time[rows], residual[rows, axis], color=style.AXIS_COLOURS[axis], label=AXES[axis])
+    over_time.axhline(0.0, color=style.MEASURED, linewidth=0.8)
+    over_time.set_ylabel("measured - predicted [mm]")
+    over_time.legend(ncols=2, loc="best")
+    _at_least(over_time, 1.0)
+    norm = np.linalg.norm(residual, axis=1)
+    distance.plot(recording.time[rows], norm[rows], color=style.POSTERIOR, label="distance")
+    root = float(np.sqrt(np.nanmean(norm**2))) if usable.any() else np.nan
+    distance.axhline(root, color=style.TEST, linestyle="--", label=f"root mean square {root:.3g} mm")
+    if settled is not None:
+        distance.axvspan(recording.time[settled], recording.time[-1], color=style.PRIOR, alpha=0.15, label="pose held")
+    distance.set_ylim(bottom=0.0)
+    distance.set_ylabel("distance [mm]")
+    distance.legend(loc="best")
+    for axes in (over_time, distance):
+        axes.set_xlabel("time [s]")
+    _memory(memory, recording.time, np.nan_to_num(residual))
+    return figure
+
+
+def _memory(axes: Axes, time: np.ndarray, residual: Float[np.ndarray, "time 3"]) -> None:
+    lags = min(len(time) - 1, max(10, len(time) // 3))
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    size = 2 ** int(np.ceil(np.log2(2 * len(time))))
+    power = np.abs(np.fft.rfft(residual, size, axis=0)) ** 2
+    correlation = np.fft.irfft(power, axis=0)[: lags + 1]
+    correlation = correlation / np.where(correlation[:1] > 0, correlation[:1], 1.0)
+    for axis in range(3):
+        axes.plot(step * np.arange(lags + 1), correlation[:, axis], color=style.AXIS_COLOURS[axis], label=AXES[axis])
+    axes.axhspan(-2 / np.sqrt(len(time)), 2 / np.sqrt(len(time)), color=style.PRIOR, alpha=0.2)
+    axes.axhline(0.0, color=style.MEASURED, linewidth=0.8)
+    axes.set_ylim(-1.05, 1.05)
+    axes.set_xlabel("lag [s]")
+    axes.set_ylabel("autocorrelation")
