@@ -69,7 +69,9 @@ def check_mechanisms(mechanisms: Iterable[Mechanism]) -> tuple[Mechanism, ...]:
     owner: dict[str, str] = {}
     for mechanism in chosen:
         if mechanism.stage not in STAGES:
-            raise InputError(f"mechanism {mechanism.name!r} has stage {mechanism.stage!r}", remedy=f"use one of {STAGES}")
+            raise InputError(
+                f"mechanism {mechanism.name!r} has stage {mechanism.stage!r}", remedy=f"use one of {STAGES}"
+            )
         for spec in mechanism.parameters:
             if spec.name in owner:
                 raise InputError(

@@ -1,0 +1,251 @@
+"""A cable-driven trunk: commands, through actuation, body and sensing, to marker positions and tensions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, cable_layout, profile_body
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, sample
+from rfdropo_bayes.simulators.mechanisms import (
+    ActuationMechanism,
+    BodyMechanism,
+    Mechanism,
+    SensingMechanism,
+    check_mechanisms,
+)
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
+from rfdropo_bayes.simulators.protocol import Observation, Result
+
+Values = Mapping[str, Float[Array, ""]]
+
+# Static equilibrium counts as found when the unbalanced force is below this share of the largest force.
+EQUILIBRIUM_TOLERANCE = 1e-3
+
+
+class Motion(NamedTuple):
+    """What an engine returns: rows are time steps, row 0 is the initial state."""
+
+    position: Float[Array, "row marker 3"]
+    tension: Float[Array, "row cable"]
+    diverged: Bool[Array, ""]
+    imbalance: Float[Array, ""]  # relative unbalanced force of the initial equilibrium; 0 for a start at rest
+
+
+class Engine(Protocol):
+    """Computes the motion of a layered body under given cable displacements.
+
+    Attributes:
+        lanes: how many rollouts it likes to be given at once.
+        differentiable: whether JAX can trace derivatives through it.
+    """
+
+    lanes: int
+    differentiable: bool
+
+    def describe(self) -> dict[str, object]:
+        """Name and precision, for the record."""
+
+    def motion(
+        self,
+        material: Material,
+        start: Float[Array, " cable"],
+        displacement: Float[Array, "step cable"],
+        steps: Int[Array, ""] | None,
+    ) -> Motion:
+        """Roll out from the initial state; ``steps`` limits the steps computed, later rows hold no meaning."""
+
+
+@dataclass(frozen=True)
+class Discretisation:
+    """How finely the body and time are cut: nodes across a section, sub-layers per layer, and the time step [s]."""
+
+    time_step: float
+    nodes_across: int = 2
+    refine: int = 1
+
+
+class Assembly(NamedTuple):
+    """A robot as the finite-element engines see it."""
+
+    system: System
+    markers: PointMap
+    station_of: np.ndarray  # index of each of the robot's own stations in the refined body
+
+
+def assemble(robot: Robot, discretisation: Discretisation) -> Assembly:
+    """Cut the robot's body into layers and attach cables and markers to it."""
+    arrays = dict(robot.layered_arrays())
+    body = refined_body(arrays, discretisation.refine, discretisation.nodes_across)
+    system = System(body, cable_layout(body, robot.anchors(), robot.guides()))
+    station_of = np.arange(len(arrays["station"])) * discretisation.refine
+    return Assembly(system, attach(body, robot.marker_points()), station_of)
+
+
+def refined_body(arrays: Mapping[str, np.ndarray | int], refine: int, nodes_across: int) -> LayeredBody:
+    """The body with every layer cut into ``refine`` equal layers of the same section."""
+    station, half_width = np.asarray(arrays["station"]), np.asarray(arrays["half_width"])
+    at = np.arange((len(station) - 1) * refine + 1) / refine
+    rows = np.arange(len(station))
+    sections = {
+        name: np.repeat(np.asarray(value), refine, axis=0)
+        for name, value in arrays.items()
+        if name not in ("station", "half_width", "nodes_across")
+    }
+    return profile_body(
+        station=np.interp(at, rows, station),
+        half_width=np.stack([np.interp(at, rows, half_width[:, i]) for i in range(2)], axis=1),
+        nodes_across=nodes_across,
+        **sections,
+    )
+
+
+@dataclass(frozen=True)
+class TrunkSimulator:
+    """A layered trunk with mechanisms, behind the `Simulator` protocol.
+
+    Order of a rollout: command -> actuation mechanisms -> cable displacements within their limits -> body with its
+    mechanisms -> markers -> sensing mechanisms -> observation.
+
+    Attributes:
+        robot: what is simulated.
+        engine: what computes the motion of the body.
+        assembly: the discretised robot the engine was made for.
+        discretisation: how fine it is.
+        mechanisms: extensions, applied in the order given within each stage.
+    """
+
+    robot: Robot
+    engine: Engine
+    assembly: Assembly
+    discretisation: Discretisation
+    mechanisms: Sequence[Mechanism] = field(default_factory=tuple)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mechanisms", check_mechanisms(self.mechanisms))
+
+    @cached_property
+    def parameters(self) -> tuple[ParameterSpec, ...]:
+        """Parameters of the robot, then those of the mechanisms."""
+        base = tuple(
+            ParameterSpec(name, p.unit, p.low, p.high, p.nominal, p.prior, p.description)
+            for name, p in self.robot.parameter_table().items()
+        )
+        return base + tuple(spec for mechanism in self.mechanisms for spec in mechanism.parameters)
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Markers of the robot."""
+        return self.robot.marker_names
+
+    @property
+    def cable_names(self) -> tuple[str, ...]:
+        """Cables of the robot."""
+        return self.robot.cable_names
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Command channels of the robot."""
+        return self.robot.channel_names
+
+    @property
+    def description(self) -> dict[str, object]:
+        """Engine, precision, discretisation and mechanisms."""
+        return {
+            **self.engine.describe(),
+            "robot": self.robot.name,
+            "time_step_s": self.discretisation.time_step,
+            "nodes_across": self.discretisation.nodes_across,
+            "layers": len(self.assembly.system.body.station) - 1,
+            "mechanisms": [mechanism.name for mechanism in self.mechanisms],
+        }
+
+    def commands(self, time, value, initial, observation_time) -> Commands:
+        """Recorded commands on this simulator's clock, with the robot's ramp and lag."""
+        return commands_on_grid(
+            time,
+            value,
+            initial,
+            observation_time,
+            time_step=self.discretisation.time_step,
+            ramp=self.robot.command.ramp_s,
+            lag_steps=self.robot.command.lag_steps,
+        )
+
+    def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
+        """Simulate from the initial state to the last observation.
+
+        Args:
+            parameters: values by name; those left out are nominal.
+            commands: from `commands`.
+            steps: simulate only so many time steps; rows beyond hold no meaning. None simulates all and is
+                differentiable in reverse mode.
+
+        Raises:
+            InputError: a name that is not a parameter of this simulator.
+        """
+        check_names(parameters, self.parameters, where="rollout")
+        values = {spec.name: jnp.asarray(spec.nominal) for spec in self.parameters} | dict(parameters)
+        start, displacement = self.displacements(values, commands)
+        motion = self.engine.motion(self.material(values), start, displacement, steps)
+        position = sample(motion.position, commands)
+        offset = jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])
+        for mechanism in self.mechanisms:
+            if isinstance(mechanism, SensingMechanism):
+                position = mechanism.sense(values, position)
+        status = jnp.where(
+            motion.diverged,
+            int(Result.DIVERGED),
+            jnp.where(motion.imbalance > EQUILIBRIUM_TOLERANCE, int(Result.NOT_IN_EQUILIBRIUM), int(Result.OK)),
+        )
+        return Observation(position + offset, sample(motion.tension, commands), None, status)
+
+    def displacements(
+        self, values: Values, commands: Commands
+    ) -> tuple[Float[Array, " cable"], Float[Array, "step cable"]]:
+        """Cable displacements [m] before the first step and at the end of every step."""
+        command = jnp.asarray(commands.step)
+        for mechanism in self.mechanisms:
+            if isinstance(mechanism, ActuationMechanism):
+                command = mechanism.actuate(values, command, commands.initial, self.discretisation.time_step)
+        matrix = jnp.asarray(self.robot.channel_matrix(values))
+        limits = jnp.asarray(self.robot.displacement_limits())
+        initial = jnp.clip(matrix @ commands.initial, limits[:, 0], limits[:, 1])
+        moves = jnp.diff(jnp.concatenate([commands.initial[None], command]), axis=0) @ matrix.T
+
+        def wind(level: Array, move: Array) -> tuple[Array, Array]:
+            # A drive at its limit ignores further pulls, and answers the first release at once.
+            level = jnp.clip(level + move, limits[:, 0], limits[:, 1])
+            return level, level
+
+        wound = jax.lax.scan(wind, initial, moves)[1]
+        pretension = jnp.stack([values[name] for name in self.robot.initial_displacement_names])
+        return initial + pretension, wound + pretension
+
+    def material(self, values: Values) -> Material:
+        """Material of the body for these values, body mechanisms included."""
+        body = self.assembly.system.body
+        stations = len(body.station)
+        masses = jnp.asarray(self.robot.point_masses(values))
+        material = Material(
+            young_modulus=values["young_modulus"],
+            poisson_ratio=values["poisson_ratio"],
+            density=jnp.asarray(self.robot.density(values["trunk_mass"])),
+            rayleigh_mass=values["rayleigh_mass"],
+            rayleigh_stiffness=values["rayleigh_stiffness"],
+            gravity=jnp.asarray(self.robot.gravity),
+            stiffness_scale=jnp.ones(stations - 1),
+            point_mass=jnp.zeros(stations).at[self.assembly.station_of].set(masses),
+        )
+        for mechanism in self.mechanisms:
+            if isinstance(mechanism, BodyMechanism):
+                material = mechanism.embody(values, material, body)
+        return material

@@ -53,10 +53,12 @@ def test_observations_between_steps_are_interpolated():
 
 
 def test_stacking_pads_with_the_last_command():
-    stacked = stack_commands([
-        grid([0.0], [1.0], [0.0, 0.01], time_step=0.01),
-        grid([0.0, 0.01], [1.0, 2.0], [0.0, 0.01, 0.02], time_step=0.01),
-    ])
+    stacked = stack_commands(
+        [
+            grid([0.0], [1.0], [0.0, 0.01], time_step=0.01),
+            grid([0.0, 0.01], [1.0, 2.0], [0.0, 0.01, 0.02], time_step=0.01),
+        ]
+    )
     np.testing.assert_array_equal(stacked.step[:, :, 0], [[1.0, 1.0], [1.0, 2.0]])
     np.testing.assert_array_equal(stacked.sample_step, [[0, 1, 1], [0, 1, 2]])
 
