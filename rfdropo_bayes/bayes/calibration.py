@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
 from functools import cached_property
 
@@ -11,7 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.model import TrajectoryModel
-from rfdropo_bayes.bayes.noise import draw_noise, whiten
+from rfdropo_bayes.bayes.noise import draw_noise, noise_specs, whiten
+from rfdropo_bayes.simulators.protocol import Result
 
 Batch = Mapping[str, Float[Array, " n"]]
 
@@ -32,6 +34,27 @@ class CalibrationProblem:
         self.bounds = {p.name: (p.spec.low, p.spec.high) for p in model.space.parameters}
         self.n_rows = model.recordings.time.shape[1]
         self.n_recordings = len(model.recordings.names)
+        self.status_names = {int(result): result.name.lower() for result in Result}
+        noise = {spec.name for spec in noise_specs(model.noise)}
+        self.physical_names = tuple(p.name for p in model.space.parameters if p.spec.name not in noise)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Digest of data, parameters and simulator: a checkpoint belongs to the problem it was made for."""
+        digest = hashlib.sha256()
+        for array in (self.model.recordings.position, self.model.recordings.time, *self.model.recordings.line):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        for array in self.model.recordings.commands:
+            digest.update(np.ascontiguousarray(array).tobytes())
+        priors = [(p.name, sorted((p.table or {}).items())) for p in self.model.space.parameters]
+        rest = (
+            priors,
+            sorted(self.model.fixed.items()),
+            self.model.noise,
+            sorted(self.model.simulator.description.items()),
+        )
+        digest.update(repr(rest).encode())
+        return digest.hexdigest()
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
         """Independent prior draws."""
@@ -68,8 +91,8 @@ class CalibrationProblem:
         rows, status = self._chunked(self._rows, values, horizon)
         rows = rows[:, :horizon]
         finite = np.isfinite(rows).all(axis=1)
-        status = np.where((status == 0) & ~finite, 1, status)
-        return np.where((status == 0)[:, None], rows, -np.inf), status
+        status = np.where((status == Result.OK) & ~finite, Result.DIVERGED, status)
+        return np.where((status == Result.OK)[:, None], rows, -np.inf), status
 
     def rollouts(
         self, values: Batch, horizon: int
@@ -104,11 +127,10 @@ class CalibrationProblem:
         """Simulated marker positions [m] of every recording, without observation noise."""
         return self._chunked(self._positions, values, self.n_rows)
 
-    def predict_noisy(self, key: PRNGKeyArray, values: Batch) -> tuple[np.ndarray, np.ndarray]:
-        """Posterior-predictive positions: a rollout and a noise realisation for every set of values."""
-        position, status = self.predict(values)
+    def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
+        """A realisation of the observation noise [m] for every set of values."""
         time = self.model.recordings.time
-        markers = position.shape[3]
+        markers = self.model.recordings.position.shape[2]
 
         def noise(key: PRNGKeyArray, values: Batch) -> Array:
             sigma, tau = self.model.noise_of(values)
@@ -116,7 +138,8 @@ class CalibrationProblem:
             return jax.vmap(lambda k, t: draw_noise(k, t, markers, sigma, tau))(keys, time)
 
         inferred = {name: jnp.asarray(values[name]) for name in self.names}
-        return position + np.asarray(jax.vmap(noise)(jax.random.split(key, len(position)), inferred)), status
+        count = len(next(iter(inferred.values())))
+        return np.asarray(jax.vmap(noise)(jax.random.split(key, count), inferred))
 
     @cached_property
     def _rows(self) -> Callable:

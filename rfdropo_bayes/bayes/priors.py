@@ -99,7 +99,9 @@ def _check_inside(spec: ParameterSpec, family: str, numbers: Mapping[str, float]
             raise InputError(f"the prior [{low:g}, {high:g}] reaches outside the bounds", where=where, remedy=bounds)
         return
     if family == "HalfNormal":
-        inside = 2 * (stats.norm.cdf(spec.high / numbers["scale"]) - stats.norm.cdf(max(0.0, spec.low) / numbers["scale"]))
+        inside = 2 * (
+            stats.norm.cdf(spec.high / numbers["scale"]) - stats.norm.cdf(max(0.0, spec.low) / numbers["scale"])
+        )
     elif family == "LogNormal":
         bell = stats.lognorm(numbers["sigma"], scale=numbers["median"])
         inside = bell.cdf(spec.high) - bell.cdf(max(spec.low, 0.0))

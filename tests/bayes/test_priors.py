@@ -22,7 +22,8 @@ def test_a_lognormal_is_truncated_to_the_hard_bounds():
     expected = bell.logpdf(at) - np.log(bell.cdf(5e7) - bell.cdf(1e6))
     np.testing.assert_allclose(prior.log_prob(at), expected, rtol=1e-9)
     draws = np.asarray(prior.sample(jax.random.key(0), (2000,)))
-    assert draws.min() >= 1e6 and draws.max() <= 5e7
+    assert draws.min() >= 1e6
+    assert draws.max() <= 5e7
 
 
 def test_a_normal_is_truncated_to_the_hard_bounds():
