@@ -102,7 +102,8 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experime
 
     Args:
         path: the TOML file.
-        overrides: assignments ``table.key=value`` (value in TOML syntax) that replace entries of the file.
+        overrides: assignments that replace entries of the file: ``table.key=value`` (value in TOML syntax), or
+            ``name=value`` for the value of a parameter ([model.fixed]; its prior is then dropped).
 
     Returns:
         the experiment, and its tables as they were read with the overrides in place, for the record.
@@ -115,7 +116,9 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experime
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not text"
-        raise InputError(f"cannot read the experiment file: {reason}", where=str(path), remedy="check the path") from None
+        raise InputError(
+            f"cannot read the experiment file: {reason}", where=str(path), remedy="check the path"
+        ) from None
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -126,11 +129,14 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experime
 
 
 def override(tables: dict[str, Any], assignment: str) -> None:
-    """Apply one ``table.key=value`` to nested tables in place."""
+    """Apply one assignment to nested tables in place."""
     name, equals, text = assignment.partition("=")
     keys = [key.strip() for key in name.split(".")]
     if not equals or not all(keys):
-        raise InputError(f"{assignment!r} is not of the form table.key=value", where="--set", remedy="e.g. seed=1")
+        raise InputError(f"{assignment!r} is not of the form name=value", where="--set", remedy="e.g. --set seed=1")
+    if len(keys) == 1 and keys[0] not in Experiment.model_fields:
+        tables.get("model", {}).get("priors", {}).pop(keys[0], None)
+        keys = ["model", "fixed", keys[0]]
     table: Any = tables
     for key in keys[:-1]:
         table = table.setdefault(key, {})

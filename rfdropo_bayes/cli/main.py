@@ -1,0 +1,95 @@
+"""``rfdropo``: every command takes one experiment file, with overrides on the command line."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rfdropo_bayes import __version__
+from rfdropo_bayes.errors import InputError
+
+INPUT_ERROR, INTERRUPTED = 2, 3
+
+# Typer carries its own copy of click, or uses the installed one, depending on its version.
+USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
+
+app = typer.Typer(
+    name="rfdropo",
+    help="Probabilistic sim-to-real for soft robots: measured trajectories in, a calibrated simulator out.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file")]
+OutFolder = Annotated[Path | None, typer.Option("--out", help="folder to write to; reports/<experiment> by default")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="name=value: a parameter's value, or table.key=value of the experiment file"),
+]
+
+
+@app.callback(invoke_without_command=True)
+def version(show: Annotated[bool, typer.Option("--version", help="print the version and stop")] = False) -> None:
+    """Options common to all commands."""
+    if show:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.command()
+def calibrate(
+    experiment: ExperimentFile,
+    out: OutFolder = None,
+    resume: Annotated[bool, typer.Option(help="go on from the checkpoint of an interrupted run")] = False,
+    overrides: Overrides = None,
+) -> None:
+    """Fit the simulator to recordings: writes posterior.nc, summary.json and report.html."""
+    from rfdropo_bayes.workflow.calibration import run_calibration
+
+    folder = out or _default_folder(experiment)
+    report = run_calibration(experiment, folder, overrides=overrides or [], resume=resume)
+    typer.echo(f"report: {report}")
+
+
+@app.command()
+def simulate(experiment: ExperimentFile, out: OutFolder = None, overrides: Overrides = None) -> None:
+    """Simulate the experiment's commands: writes NetCDF and CSV, prints the error against the recording as JSON."""
+    from rfdropo_bayes.workflow.experiment import load_experiment
+    from rfdropo_bayes.workflow.simulation import run_simulation
+
+    loaded, _ = load_experiment(experiment, overrides or [])
+    report = run_simulation(loaded, experiment.resolve().parent, out or _default_folder(experiment))
+    typer.echo(json.dumps(report, indent=2))
+
+
+@app.command()
+def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a calibration has written")]) -> None:
+    """Write report.html again from the files of a run."""
+    from rfdropo_bayes.workflow.reporting import rebuild_report
+
+    typer.echo(f"report: {rebuild_report(folder)}")
+
+
+def _default_folder(experiment: Path) -> Path:
+    return Path("reports") / experiment.stem
+
+
+def main() -> None:
+    """Run the command line; bad input ends with one line on stderr and status 2, an interrupted run with status 3."""
+    try:
+        sys.exit(app(standalone_mode=False))
+    except InputError as error:
+        print(f"rfdropo: {error}", file=sys.stderr)
+        sys.exit(INPUT_ERROR)
+    except USAGE_ERROR as error:
+        print(f"rfdropo: {error}; see rfdropo --help", file=sys.stderr)
+        sys.exit(INPUT_ERROR)
+    except (KeyboardInterrupt, typer.Abort):
+        print("rfdropo: interrupted; the same command with --resume goes on from here", file=sys.stderr)
+        sys.exit(INTERRUPTED)

@@ -1,0 +1,99 @@
+"""From an experiment's tables to the objects they stand for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
+from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.data import Trajectory, load_recordings
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms import mechanisms_named
+from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
+from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
+from rfdropo_bayes.workflow.engines import build_engine
+from rfdropo_bayes.workflow.experiment import Experiment, matching
+
+Entry = TypeVar("Entry")
+
+
+def find_robot(experiment: Experiment, folder: Path) -> Robot:
+    """The robot an experiment names: one that comes with the package, or a file relative to the experiment's."""
+    beside = folder / experiment.robot
+    return load_robot(beside if beside.suffix == ".toml" and beside.is_file() else experiment.robot)
+
+
+def build_simulator(experiment: Experiment, robot: Robot) -> TrunkSimulator:
+    """Robot, engine, discretisation and mechanisms."""
+    table = experiment.simulator
+    discretisation = Discretisation(table.time_step or robot.time_step_s, table.nodes_across, table.refine)
+    assembly = assemble(robot, discretisation)
+    engine = build_engine(table, assembly, discretisation, robot.initial_state == "equilibrium")
+    return TrunkSimulator(robot, engine, assembly, discretisation, mechanisms_named(experiment.model.mechanisms))
+
+
+def fixed_values(experiment: Experiment, simulator: TrunkSimulator) -> dict[str, float]:
+    """Values of [model.fixed], checked against names and hard bounds."""
+    specs = simulator.parameters + noise_specs(experiment.model.noise)
+    check_names(experiment.model.fixed, specs, where="[model.fixed]")
+    by_name = {spec.name: spec for spec in specs}
+    return {name: check_value(by_name[name], v, where="[model.fixed]") for name, v in experiment.model.fixed.items()}
+
+
+def load_data(experiment: Experiment, folder: Path, role: str) -> list[Trajectory]:
+    """The recordings of one role, ``"fit"`` or ``"test"``."""
+    if experiment.data is None:
+        raise InputError("the experiment has no [data]", remedy="name the recordings to fit")
+    return load_recordings(experiment.data, folder, role=role)
+
+
+def expand_groups(table: Mapping[str, Entry], specs: Sequence[ParameterSpec]) -> dict[str, Entry]:
+    """Write out the keys that stand for several parameters: ``offset`` for ``offset_x``, ``offset_y``, ``offset_z``."""
+    known = [spec.name for spec in specs]
+    expanded: dict[str, Entry] = {}
+    for name, entry in table.items():
+        members = [name] if name in known else [spec for spec in known if spec.startswith(f"{name}_")]
+        expanded |= dict.fromkeys(members or [name], entry)
+    return expanded
+
+
+def build_model(
+    experiment: Experiment, simulator: TrunkSimulator, trajectories: Sequence[Trajectory]
+) -> TrajectoryModel:
+    """The probabilistic program of an experiment for the given recordings.
+
+    The noise parameters are always inferred, unless [model.fixed] holds them.
+
+    Raises:
+        InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
+    """
+    table = experiment.model
+    noise = noise_specs(table.noise)
+    fixed = fixed_values(experiment, simulator)
+    both = sorted(set(fixed) & set(table.priors))
+    if both:
+        raise InputError(f"{both[0]!r} has a prior and a fixed value", where="[model]", remedy="remove one of them")
+    added = [spec.name for mechanism in simulator.mechanisms for spec in mechanism.parameters]
+    specs = simulator.parameters + noise
+    given = expand_groups(table.priors, specs)
+    shared = expand_groups(table.per_recording, specs)
+    defaults = [*added, *shared, *(spec.name for spec in noise)]
+    priors = {**given, **{name: {} for name in defaults if name not in fixed and name not in given}}
+    recordings = gather_recordings(simulator, trajectories)
+    scopes = {
+        name: matching(recordings.names, patterns, where=f"[model.per_recording] {name}")
+        for name, patterns in shared.items()
+    }
+    space = build_space(specs, priors, scopes, recordings.names)
+    return TrajectoryModel(simulator, space, fixed, table.noise, recordings)
+
+
+def build_problem(model: TrajectoryModel) -> CalibrationProblem:
+    """The model as the inference methods see it, in chunks that suit its engine."""
+    lanes = model.simulator.engine.lanes
+    return CalibrationProblem(model, chunk=max(1, lanes // len(model.recordings.names)))

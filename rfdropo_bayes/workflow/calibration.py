@@ -1,0 +1,168 @@
+"""``rfdropo calibrate``: recordings in; posterior.nc, summary.json and report.html out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.data import Trajectory, noise_floor
+from rfdropo_bayes.inference.methods import make_config, method_named, run
+from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.result import InferenceResult
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
+from rfdropo_bayes.report.baselines import baseline_errors
+from rfdropo_bayes.report.facts import RecordingFacts, RunFacts, software_versions
+from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
+from rfdropo_bayes.workflow.experiment import Experiment, describe, load_experiment
+from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.prediction import predict_fitted, predict_new, thin
+from rfdropo_bayes.workflow.reporting import write_outputs
+
+PREDICTIVE_DRAWS = 200
+PRIOR_DRAWS = 2000
+PRIOR_PREDICTIVE_DRAWS = 64
+
+
+def run_calibration(path: Path, out: Path, *, overrides: Sequence[str] = (), resume: bool = False) -> Path:
+    """Fit an experiment and write what it found.
+
+    Args:
+        path: the experiment file.
+        out: folder to write to; checkpoints go to its folder ``checkpoints``.
+        overrides: assignments that replace entries of the file.
+        resume: go on from the checkpoint of an interrupted run of the same experiment.
+
+    Returns:
+        path of report.html.
+
+    Raises:
+        InputError: bad input, before anything long has started.
+    """
+    experiment, tables = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    fitted = load_data(experiment, folder, "fit")
+    tested = load_data(experiment, folder, "test")
+    simulator = build_simulator(experiment, find_robot(experiment, folder))
+    problem = build_problem(build_model(experiment, simulator, fitted))
+    method = experiment.inference.method
+    config = make_config(method, inference_options(experiment))
+    out = output_folder(out)
+    (out / "config.toml").write_text(describe(tables), encoding="utf-8")
+    key, predicting = jax.random.split(jax.random.key(experiment.seed))
+    with Progress(method, show=None, log=out / "log.jsonl") as progress:
+        result = run(problem, method, config, key, checkpoint_dir=out / "checkpoints", resume=resume, progress=progress)
+    record = record_posterior(problem, result, tested, predicting, _attributes(experiment, [*fitted, *tested]))
+    facts = gather_facts(experiment, path.stem, problem, result, fitted, tested)
+    return write_outputs(record, facts, out)
+
+
+def inference_options(experiment: Experiment) -> dict[str, Any]:
+    """Options of the method; the budget is among them where the method takes one."""
+    options = experiment.inference.options
+    fields = {field.name for field in dataclasses.fields(method_named(experiment.inference.method).config)}
+    return {**options, "rollouts": experiment.inference.rollouts} if "rollouts" in fields else options
+
+
+def record_posterior(
+    problem: CalibrationProblem,
+    result: InferenceResult,
+    tested: Sequence[Trajectory],
+    key: jax.Array,
+    attributes: dict[str, Any],
+) -> PosteriorRecord:
+    """Draws, prior draws and predictions of every recording, with the combinations of parameters that rollouts see."""
+    prior_key, fit_key, test_key = jax.random.split(key, 3)
+    prior = {name: np.asarray(v) for name, v in problem.sample_prior(prior_key, PRIOR_DRAWS).items()}
+    values = thin(result.draws, PREDICTIVE_DRAWS)
+    before = {name: column[:PRIOR_PREDICTIVE_DRAWS] for name, column in prior.items()}
+    predictions: list[RecordingPrediction] = predict_fitted(problem, values, fit_key, prior=before)
+    if tested:
+        predictions += predict_new(problem.model, tested, values, test_key, chunk=problem.chunk)
+    record = PosteriorRecord(
+        tuple(
+            ParameterInfo(p.name, p.spec.unit, p.spec.low, p.spec.high, dict(p.table or {}), p.spec.description)
+            for p in problem.model.space.parameters
+        ),
+        result.draws,
+        prior,
+        tuple(predictions),
+        trace=result.trace,
+        block_scores=result.block_scores,
+        log_likelihood=result.log_likelihood,
+        attrs=attributes,
+    )
+    return record.with_derived(scale_free_ratios(problem.names))
+
+
+def scale_free_ratios(names: Sequence[str]) -> list[ProductOfPowers]:
+    """Ratios that motion determines where single stiffnesses and masses are not: cables that impose lengths leave the
+    common scale of all stiffnesses and masses free."""
+    if "young_modulus" in names and "trunk_mass" in names:
+        return [
+            ProductOfPowers(
+                "young_modulus_over_trunk_mass",
+                "Pa/kg",
+                {"young_modulus": 1.0, "trunk_mass": -1.0},
+                "stiffness over mass: what the motion of a trunk with length-driven cables determines",
+            )
+        ]
+    return []
+
+
+def gather_facts(
+    experiment: Experiment,
+    name: str,
+    problem: CalibrationProblem,
+    result: InferenceResult,
+    fitted: Sequence[Trajectory],
+    tested: Sequence[Trajectory],
+) -> RunFacts:
+    """What the report says beside the posterior."""
+    description = problem.model.simulator.description
+    floor = noise_floor(list(fitted))
+    return RunFacts(
+        title=experiment.title or name,
+        robot=str(description["robot"]),
+        method=result.method,
+        engine=f"{description['engine']} {description['precision']}",
+        status="done",
+        seed=experiment.seed,
+        rollouts=float(result.rollouts),
+        seconds=result.seconds,
+        evaluations=result.evaluations,
+        log_evidence=result.log_evidence,
+        excluded=result.excluded,
+        warnings=result.warnings,
+        recordings=[
+            *(RecordingFacts.of_trajectory(t, "fit") for t in fitted),
+            *(RecordingFacts.of_trajectory(t, "test") for t in tested),
+        ],
+        model={
+            "noise": problem.model.noise,
+            "mechanisms": ", ".join(experiment.model.mechanisms) or "none",
+            "fixed": ", ".join(f"{k} = {v:g}" for k, v in problem.model.fixed.items())
+            or "nothing beyond the nominal values",
+            **{key: str(value) for key, value in description.items() if key not in ("mechanisms", "robot")},
+        },
+        baselines=baseline_errors(list(fitted), list(tested)),
+        noise_floor=floor,
+        phi=result.phi,
+        optimum=result.optimum,
+        versions=software_versions(),
+        details=result.details,
+    )
+
+
+def _attributes(experiment: Experiment, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
+    return {
+        "seed": experiment.seed,
+        "robot": experiment.robot,
+        "data_sha256": [trajectory.sha256 for trajectory in trajectories],
+        "versions": software_versions(),
+    }

@@ -1,0 +1,124 @@
+"""Predictions under a posterior: of the recordings it was fitted to, and of recordings it has never seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
+from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import RecordingPrediction
+
+OFFSETS = ("offset_x", "offset_y", "offset_z")
+
+Batch = dict[str, Float[np.ndarray, " n"]]
+
+
+def thin(draws: Mapping[str, Float[np.ndarray, "chain draw"]], count: int) -> Batch:
+    """At most ``count`` draws, evenly spread over chains."""
+    flat = {name: np.asarray(values).reshape(-1) for name, values in draws.items()}
+    size = len(next(iter(flat.values())))
+    index = np.unique(np.linspace(0, size - 1, min(count, size)).round().astype(int))
+    return {name: values[index] for name, values in flat.items()}
+
+
+def predict_fitted(
+    problem: CalibrationProblem, values: Batch, key: PRNGKeyArray, *, prior: Batch | None = None
+) -> list[RecordingPrediction]:
+    """Predictions of the recordings a problem was made from."""
+    return _predictions(problem, values, key, "fit", prior)
+
+
+def predict_new(
+    model: TrajectoryModel, trajectories: Sequence[Trajectory], values: Batch, key: PRNGKeyArray, *, chunk: int
+) -> list[RecordingPrediction]:
+    """Predictions of recordings that no fit has seen, from their commands and at most their first row.
+
+    A parameter that was free per recording takes, for a new one, the values it had in the fitted recordings, one of
+    them at random for every draw. Where the offset of the measuring frame is such a parameter, it is set from the
+    first row: each draw is shifted so that the mean over the markers agrees there.
+    """
+    space, extended = _for_new_recordings(model.space, values, [t.name for t in trajectories], key)
+    fresh = replace(model, space=space, recordings=gather_recordings(model.simulator, trajectories))
+    problem = CalibrationProblem(fresh, chunk=chunk)
+    if any(p.recording and p.spec.name in OFFSETS for p in space.parameters):
+        extended = _offsets_from_first_row(problem, extended)
+    return _predictions(problem, extended, key, "test", None)
+
+
+def _for_new_recordings(
+    space: ParameterSpace, values: Batch, names: Sequence[str], key: PRNGKeyArray
+) -> tuple[ParameterSpace, Batch]:
+    """The space with its per-recording parameters renamed to the new recordings, and values for them."""
+    shared = [p for p in space.parameters if not p.recording]
+    families: dict[str, list[Parameter]] = {}
+    for parameter in space.parameters:
+        if parameter.recording:
+            families.setdefault(parameter.spec.name, []).append(parameter)
+    extended = {p.name: values[p.name] for p in shared}
+    count = len(next(iter(values.values())))
+    parameters = list(shared)
+    for index, recording in enumerate(names):
+        # One fitted recording is chosen per draw for all families at once: its values belong together.
+        chosen = np.asarray(jax.random.randint(jax.random.fold_in(key, index), (count,), 0, 2**31 - 1))
+        for name, members in families.items():
+            pool = np.stack([values[member.name] for member in members])
+            extended[f"{name}{SEPARATOR}{recording}"] = pool[chosen % len(members), np.arange(count)]
+            parameters.append(replace(members[0], recording=recording))
+    return ParameterSpace(tuple(parameters)), extended
+
+
+def _offsets_from_first_row(problem: CalibrationProblem, values: Batch) -> Batch:
+    """Shift each draw's offsets so that simulated and measured markers agree on average in the first row."""
+    recordings = problem.model.recordings
+    position, _ = problem.predict(values)
+    shifted = dict(values)
+    for index, name in enumerate(recordings.names):
+        valid = recordings.line.valid[index, 0]
+        if not valid.any():
+            raise InputError("the first row is masked throughout", where=name, remedy="start the recording later")
+        error = recordings.position[index, 0, valid] - position[:, index, 0, valid]
+        for axis, offset in enumerate(OFFSETS):
+            key = f"{offset}{SEPARATOR}{name}"
+            if key in shifted:
+                shifted[key] = shifted[key] + error[:, :, axis].mean(axis=1)
+    return shifted
+
+
+def _predictions(
+    problem: CalibrationProblem, values: Batch, key: PRNGKeyArray, split: str, prior: Batch | None
+) -> list[RecordingPrediction]:
+    recordings = problem.model.recordings
+    noisy, mean = _ended_well(problem, values, key)
+    before = None if prior is None else _ended_well(problem, prior, key)[0]
+    return [
+        RecordingPrediction(
+            name,
+            split,
+            recordings.time[i, :rows],
+            tuple(problem.model.simulator.marker_names),
+            recordings.position[i, :rows],
+            recordings.line.valid[i, :rows],
+            noisy[:, i, :rows].astype(np.float32),
+            mean[i, :rows],
+            None if before is None else before[:, i, :rows].astype(np.float32),
+        )
+        for i, (name, rows) in enumerate(zip(recordings.names, recordings.rows, strict=True))
+    ]
+
+
+def _ended_well(problem: CalibrationProblem, values: Batch, key: PRNGKeyArray) -> tuple[np.ndarray, np.ndarray]:
+    """Noisy predictions and their noise-free mean over the rollouts that ended well."""
+    position, status = problem.predict(values)
+    fine = status == 0
+    if not fine.any():
+        raise InputError("no rollout under the posterior ended well", where="prediction", remedy="narrow the priors")
+    noise = problem.draw_noise(key, values)
+    return (position + noise)[fine], position[fine].mean(axis=0)

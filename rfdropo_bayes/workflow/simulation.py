@@ -1,0 +1,161 @@
+"""``rfdropo simulate``: the motion an experiment's commands produce, as files, and its distance to the recording."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from rfdropo_bayes.bayes.noise import draw_noise
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.protocol import Observation, Result
+from rfdropo_bayes.simulators.trunk import TrunkSimulator
+from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values, load_data
+from rfdropo_bayes.workflow.commands import random_walk
+from rfdropo_bayes.workflow.experiment import CommandsTable, Experiment, NoiseTable
+from rfdropo_bayes.workflow.files import output_folder
+
+# Number that the first marker's column carries in each source.
+FIRST_COLUMN = {"sofa-csv": 0, "optitrack-csv": 1, "asl-csv": 1}
+
+
+def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str, Any]:
+    """Simulate every recording of the experiment, or the command sequences of its [commands] table.
+
+    Writes, per recording, ``<name>.nc`` (`Trajectory`) and ``<name>.csv`` (time in s, markers in mm, in the source's
+    column names), called ``trajectory`` where there is only one recording.
+
+    Returns:
+        per recording: result code, files, and the error against the measurement [mm].
+
+    Raises:
+        InputError: bad input, or a rollout that did not end well.
+    """
+    simulator = build_simulator(experiment, find_robot(experiment, folder))
+    values = fixed_values(experiment, simulator)
+    physical = {spec.name for spec in simulator.parameters}
+    values = {name: value for name, value in values.items() if name in physical}
+    sources = _sources(experiment, folder, simulator)
+    out = output_folder(out)
+    rollout = jax.jit(simulator.rollout)
+    report: dict[str, Any] = {"simulator": simulator.description, "parameters": values, "recordings": {}}
+    for index, source in enumerate(sources):
+        commands = simulator.commands(source.command_time, source.command, source.initial_command, source.time)
+        observation = jax.device_get(rollout({k: np.asarray(v) for k, v in values.items()}, commands))
+        result = Result(int(observation.status))
+        if result is Result.DIVERGED:
+            raise InputError(f"the rollout of {source.name} diverged", where="simulate", remedy=result.remedy)
+        stem = "trajectory" if len(sources) == 1 else source.name
+        simulated = _as_trajectory(source, observation, simulator, experiment, values, index)
+        simulated.save(out / f"{stem}.nc")
+        _table(source, simulated).to_csv(out / f"{stem}.csv", index=False, float_format="%.6f")
+        report["recordings"][source.name] = {
+            "status": result.name.lower(),
+            "files": [str(out / f"{stem}.nc"), str(out / f"{stem}.csv")],
+            "error_mm": _error(source, observation.position, simulator.marker_names) if experiment.data else None,
+        }
+    (out / "simulation.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    return report
+
+
+def _sources(experiment: Experiment, folder: Path, simulator: TrunkSimulator) -> Sequence[Trajectory]:
+    if experiment.commands is None:
+        return [*load_data(experiment, folder, "fit"), *load_data(experiment, folder, "test")]
+    if experiment.data is not None:
+        raise InputError("the experiment has both [data] and [commands]", remedy="replay one or make the other")
+    seeds = np.random.SeedSequence(experiment.seed).spawn(len(experiment.commands.recordings))
+    return [
+        _generated(experiment.commands, name, simulator, np.random.default_rng(seed))
+        for name, seed in zip(experiment.commands.recordings, seeds, strict=True)
+    ]
+
+
+def _generated(table: CommandsTable, name: str, simulator: TrunkSimulator, rng: np.random.Generator) -> Trajectory:
+    """A recording of random commands whose positions are still to be simulated."""
+    command_time, command = random_walk(table, len(simulator.channel_names), rng)
+    time = table.sample_time * np.arange(round(table.duration / table.sample_time) + 1)
+    rest = np.broadcast_to(simulator.robot.marker_points(), (len(time), len(simulator.marker_names), 3))
+    return Trajectory.build(
+        name=name,
+        robot=simulator.robot.name,
+        format="netcdf",
+        time=time,
+        position=rest,
+        command_time=command_time,
+        command=command,
+        command_unit=simulator.robot.command_unit,
+        marker_names=simulator.marker_names,
+        cable_names=simulator.channel_names,
+        synthetic=True,
+    )
+
+
+def _as_trajectory(
+    source: Trajectory,
+    observation: Observation,
+    simulator: TrunkSimulator,
+    experiment: Experiment,
+    values: Mapping[str, float],
+    index: int,
+) -> Trajectory:
+    """The simulated motion as a recording that says it is synthetic, and how it was made."""
+    position = np.asarray(observation.position)
+    if experiment.noise is not None:
+        key = jax.random.fold_in(jax.random.key(experiment.seed), index)
+        position = position + _noise(experiment.noise, key, source.time, position.shape[1])
+    settings = {
+        "simulator": simulator.description,
+        "parameters": {spec.name: values.get(spec.name, spec.nominal) for spec in simulator.parameters},
+        "noise": None if experiment.noise is None else experiment.noise.model_dump(),
+        "seed": experiment.seed,
+    }
+    return Trajectory.build(
+        name=source.name,
+        robot=simulator.robot.name,
+        format="netcdf",
+        time=source.time,
+        position=position,
+        command_time=source.command_time,
+        command=source.command,
+        command_unit=source.command_unit,
+        initial_command=source.initial_command,
+        marker_names=simulator.marker_names,
+        cable_names=source.cable_names,
+        synthetic=True,
+        provenance="synthetic: made by rfdropo simulate",
+        settings=settings,
+    )
+
+
+def _noise(table: NoiseTable, key, time: Float[np.ndarray, " time"], markers: int) -> np.ndarray:
+    return np.asarray(draw_noise(key, time, markers, table.standard_deviation, table.correlation_time))
+
+
+def _table(source: Trajectory, simulated: Trajectory) -> pd.DataFrame:
+    """Time [s], command, markers [mm]: one row per recorded time."""
+    first = FIRST_COLUMN.get(source.dataset.attrs["format"])
+    columns: dict[str, np.ndarray] = {"time": simulated.time}
+    for i, marker in enumerate(simulated.marker_names):
+        for j, axis in enumerate("xyz"):
+            name = f"{marker}_{axis}" if first is None else f"{axis}{first + i}"
+            columns[name] = 1e3 * simulated.position[:, i, j]
+    return pd.DataFrame(columns)
+
+
+def _error(source: Trajectory, position: np.ndarray, names: Sequence[str]) -> dict[str, float]:
+    """Distance between simulated and measured markers: mean and largest over markers and time, RMS of the last [mm]."""
+    chosen = [source.marker_names.index(name) for name in names]
+    distance = np.linalg.norm(np.asarray(position) - source.position[:, chosen], axis=2)
+    distance = np.where(source.position_mask[:, chosen], distance, np.nan)
+    return {
+        "mean": 1e3 * float(np.nanmean(distance)),
+        "max": 1e3 * float(np.nanmax(distance)),
+        "rms_last_marker": 1e3 * float(np.sqrt(np.nanmean(distance[:, -1] ** 2))),
+    }
