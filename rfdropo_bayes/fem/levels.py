@@ -1,7 +1,7 @@
 """Block-tridiagonal systems of any mesh: nodes grouped by their distance from the held ones, in elements.
 
-An element touches at most two neighbouring levels, so the tangent is block tridiagonal with blocks of differing size. The mesh is known
-when a function is traced, and the elimination is unrolled over its levels.
+An element touches at most two neighbouring levels, so the tangent is block tridiagonal with blocks of differing size.
+The mesh is known when a function is traced, and the elimination is unrolled over its levels.
 """
 
 from __future__ import annotations
@@ -68,8 +68,17 @@ def _merged(sizes: Int[np.ndarray, " levels"]) -> list[int]:
     return joined
 
 
-def _entries(levels: Levels, element: np.ndarray):
-    """For the blocks of all elements in order (element, a, b): which are used, and where in one flat array of all blocks."""
+class _Entries(NamedTuple):
+    """Where the element blocks, in order (element, a, b), go in one flat array of all blocks of the matrix."""
+
+    used: Int[np.ndarray, " pairs"]  # element blocks on or below the diagonal
+    flat: Int[np.ndarray, "pairs 3 3"]  # places of their entries
+    start: Int[np.ndarray, " blocks_1"]
+    height: Int[np.ndarray, " blocks"]
+    width: Int[np.ndarray, " blocks"]
+
+
+def _entries(levels: Levels, element: np.ndarray) -> _Entries:
     size = np.diff(levels.first)
     height = np.concatenate([size, size[1:]]) * 3
     width = np.concatenate([size, size[:-1]]) * 3
@@ -84,11 +93,14 @@ def _entries(levels: Levels, element: np.ndarray):
     axis = np.arange(3)
     rows, columns = 3 * inside[row[used]][:, None] + axis, 3 * inside[column[used]][:, None] + axis
     flat = start[block][:, None, None] + rows[:, :, None] * width[block][:, None, None] + columns[:, None, :]
-    return np.flatnonzero(used), flat, start, height, width
+    return _Entries(np.flatnonzero(used), flat, start, height, width)
 
 
 def assemble(
-    levels: Levels, element: np.ndarray, tangent: Float[Array, "elements 4 4 3 3"], node_diagonal: Float[Array, " nodes"]
+    levels: Levels,
+    element: np.ndarray,
+    tangent: Float[Array, "elements 4 4 3 3"],
+    node_diagonal: Float[Array, " nodes"],
 ) -> LevelMatrix:
     """Sum of element blocks plus a scalar for each node on the diagonal."""
     used, flat, start, height, width = _entries(levels, element)
@@ -101,7 +113,8 @@ def assemble(
     count = len(levels.first) - 1
     nodes = node_diagonal[levels.order]
     diagonal = tuple(
-        block + jnp.diag(jnp.repeat(nodes[levels.first[i] : levels.first[i + 1]], 3)) for i, block in enumerate(blocks[:count])
+        block + jnp.diag(jnp.repeat(nodes[levels.first[i] : levels.first[i + 1]], 3))
+        for i, block in enumerate(blocks[:count])
     )
     return LevelMatrix(diagonal, tuple(blocks[count:]))
 
@@ -123,7 +136,8 @@ def multiply(matrix: LevelMatrix, vector: Float[Array, "n k"]) -> Float[Array, "
 def _eliminate(matrix: LevelMatrix, right: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Block Cholesky, level by level, and both substitutions."""
     parts = _split([len(block) for block in matrix.diagonal], right)
-    factors, couplings = [], []
+    factors: list[Array] = []
+    couplings: list[Array] = []
     for i, block in enumerate(matrix.diagonal):
         if i:
             coupling = solve_triangular(factors[-1], matrix.lower[i - 1].T, lower=True)
@@ -140,8 +154,12 @@ def _eliminate(matrix: LevelMatrix, right: Float[Array, "n k"]) -> Float[Array, 
 
 
 def solve(matrix: LevelMatrix, right: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """Solution X of A X = B for k right-hand sides; derivatives go through the solution, not through the elimination."""
+    """Solution X of A X = B for k right-hand sides; derivatives go through the solution, not through the
+    elimination."""
     constant = jax.tree.map(lax.stop_gradient, matrix)
     return lax.custom_linear_solve(
-        lambda vector: multiply(matrix, vector), right, solve=lambda _, values: _eliminate(constant, values), symmetric=True
+        lambda vector: multiply(matrix, vector),
+        right,
+        solve=lambda _, values: _eliminate(constant, values),
+        symmetric=True,
     )

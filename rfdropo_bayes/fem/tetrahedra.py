@@ -1,15 +1,17 @@
 """Corotational linear tetrahedra: frames, forces and tangents of any tetrahedral mesh.
 
-Each element is linear elastic in a frame that turns with it: f_a = -V Q S(H) g_a with g_a the gradients of the shape functions at
-rest, H = sum_a (Q' x_a - X_a) (x) g_a and S the isotropic law; the tangent is Q K Q', without the geometric terms. Two frames:
+Each element is linear elastic in a frame that turns with it: f_a = -V Q S(H) g_a with g_a the gradients of the shape
+functions at rest, H = sum_a (Q' x_a - X_a) (x) g_a and S the isotropic law; the tangent is Q K Q', without the
+geometric terms. Two frames:
 
-- ``"polar"``: rotation of the polar decomposition of the deformation gradient (Mueller and Gross 2004, Graphics Interface);
+- ``"polar"``: rotation of the polar decomposition of the deformation gradient (Mueller and Gross 2004, Graphics
+  Interface);
 - ``"edges"``: from the element's first three nodes, x along the edge 0-1, z normal to the face 0-1-2, as SOFA's
-  TetrahedronFEMForceField does with ``method="large"`` (Nesme, Payan and Faure 2005, Eurographics short papers). It depends
-  on the order of the element's nodes.
+  TetrahedronFEMForceField does with ``method="large"`` (Nesme, Payan and Faure 2005, Eurographics short papers). It
+  depends on the order of the element's nodes.
 
-Constant-strain tetrahedra are stiff in bending and lock near incompressibility: they are here for fidelity to meshes that others
-simulate, not for accuracy at few unknowns.
+Constant-strain tetrahedra are stiff in bending and lock near incompressibility: they are here for fidelity to meshes
+that others simulate, not for accuracy at few unknowns.
 """
 
 from __future__ import annotations
@@ -52,12 +54,19 @@ def tetrahedral_body(
     """Body from node coordinates [m], tetrahedra of positive volume, and which nodes are held.
 
     Raises:
-        InputError: an unknown kind of frame, arrays that do not fit together, a flat or inverted element, or no held node.
+        InputError: an unknown kind of frame, arrays that do not fit together, a flat or inverted element, or no held
+        node.
     """
     rest, element, fixed = np.asarray(rest, float), np.asarray(element, int), np.asarray(fixed, bool)
     if frames not in FRAMES:
         raise InputError(f"element frames {frames!r}", where="mesh", remedy=f"use one of {FRAMES}")
-    if rest.ndim != 2 or rest.shape[1] != 3 or element.ndim != 2 or element.shape[1] != 4 or fixed.shape != rest.shape[:1]:
+    if (
+        rest.ndim != 2
+        or rest.shape[1] != 3
+        or element.ndim != 2
+        or element.shape[1] != 4
+        or fixed.shape != rest.shape[:1]
+    ):
         raise InputError(f"shapes {rest.shape}, {element.shape} and {fixed.shape} do not fit together", where="mesh")
     if not np.any(fixed):
         raise InputError("no node is held", where="mesh", remedy="fix the nodes of the clamped end")
@@ -105,7 +114,8 @@ def nodal_force(
     rest: Float[Array, "nodes 3"] | float,
     lame: tuple[Float[Array, "..."], Float[Array, "..."]],
 ) -> Float[Array, "nodes 3"]:
-    """Forces -Q K (Q' field - rest) on the nodes [N]: elastic ones from positions; -K v from velocities with ``rest`` zero.
+    """Forces -Q K (Q' field - rest) on the nodes [N]: elastic ones from positions; -K v from velocities with ``rest``
+    zero.
 
     ``lame`` are the Lame constants [Pa], of the body or of each element.
     """
@@ -133,9 +143,7 @@ def element_tangents(
     pairs = jnp.einsum("eai,ebj->eabij", gradient, gradient)
     dots = jnp.einsum("eai,ebi->eab", gradient, gradient)
     scaled = (slice(None), None, None, None, None)
-    return (
-        first[scaled] * pairs + shear[scaled] * (jnp.swapaxes(pairs, 3, 4) + dots[..., None, None] * jnp.eye(3))
-    )
+    return first[scaled] * pairs + shear[scaled] * (jnp.swapaxes(pairs, 3, 4) + dots[..., None, None] * jnp.eye(3))
 
 
 def equal_node_masses(body: TetrahedralBody, mass: Float[Array, ""]) -> Float[Array, " nodes"]:
@@ -189,7 +197,11 @@ def route_cables(
     used = np.zeros((len(guides), most), dtype=bool)
     for cable, points in enumerate(guides):
         if len(points) == 0:
-            raise InputError("no guide point", where=f"cable {cable}", remedy="give at least the point where it is tied")
-        node[cable], weight[cable] = locate(body, np.concatenate([points, np.repeat(points[-1:], most - len(points), axis=0)]))
+            raise InputError(
+                "no guide point", where=f"cable {cable}", remedy="give at least the point where it is tied"
+            )
+        node[cable], weight[cable] = locate(
+            body, np.concatenate([points, np.repeat(points[-1:], most - len(points), axis=0)])
+        )
         used[cable, : len(points)] = True
     return CableLayout(np.asarray(anchors, float).reshape(-1, 3), node, weight, used)

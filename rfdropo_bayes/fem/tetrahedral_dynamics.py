@@ -1,8 +1,9 @@
 """Implicit Euler for a corotational tetrahedral body pulled by unilateral cables: the reference engine, in JAX.
 
-The step is that of ``fem.dynamics``, with nodal masses and the drive limits of ``fem.drives``. With ``frames="edges"``, equal node masses and a
-start from rest it reproduces SOFA's EulerImplicitSolver, TetrahedronFEMForceField ("large"), UniformMass and CableConstraint under
-FreeMotionAnimationLoop to the digits that SOFA's recordings hold.
+The step is that of ``fem.dynamics``, with nodal masses and the drive limits of ``fem.drives``. With
+``frames="edges"``, equal node masses and a start from rest it reproduces SOFA's EulerImplicitSolver,
+TetrahedronFEMForceField ("large"), UniformMass and CableConstraint under FreeMotionAnimationLoop to the digits that
+SOFA's recordings hold.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ def tetrahedral_system(body: TetrahedralBody, cables: CableLayout, limits: Drive
         InputError: parts of the mesh that hang on no held node.
     """
     guides = guide_matrix(cables, len(body.rest))
-    rest_length = np.asarray(lengths_and_jacobian(cables, guides, jnp.asarray(body.rest))[0])
+    rest_length = np.asarray(lengths_and_jacobian(cables, jnp.asarray(guides), jnp.asarray(body.rest))[0])
     return TetrahedralSystem(body, node_levels(body.element, body.fixed), cables, limits, guides, rest_length)
 
 
@@ -95,7 +96,8 @@ def step(
 ) -> tuple[TetrahedralState, Bool[Array, ""]]:
     """One implicit Euler step to the commanded cable displacements [m]; also whether the tensions were found."""
     body, levels = system.body, system.levels
-    lame = tuple(value * material.stiffness_scale for value in lame_constants(material.young_modulus, material.poisson_ratio))
+    first, shear = lame_constants(material.young_modulus, material.poisson_ratio)
+    lame = first * material.stiffness_scale, shear * material.stiffness_scale
     turn = element_rotations(body, state.position)
     lookahead = time_step + material.rayleigh_stiffness
     force = nodal_force(body, turn, state.position, jnp.asarray(body.rest), lame)
@@ -106,8 +108,8 @@ def step(
     matrix = level_systems.assemble(
         levels, body.element, time_step * lookahead * element_tangents(body, turn, lame), inertia
     )
-    length, jacobian = lengths_and_jacobian(system.cables, system.guides, state.position)
-    shortening = system.rest_length - length
+    length, jacobian = lengths_and_jacobian(system.cables, jnp.asarray(system.guides), state.position)
+    shortening = jnp.asarray(system.rest_length) - length
     target = system.limits.apply(displacement, state.measured)
     columns = jnp.concatenate([right[None], jacobian])[:, levels.order].reshape(1 + len(length), -1).T
     solution = level_systems.solve(matrix, columns)

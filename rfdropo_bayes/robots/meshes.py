@@ -47,7 +47,9 @@ def read_tetrahedra(path: str | Path, unit: str) -> TetrahedralMesh:
     cells = [np.asarray(block.data) for block in mesh.cells if block.type == "tetra"]
     found = ", ".join(sorted({block.type for block in mesh.cells})) or "nothing"
     if not cells:
-        raise InputError(f"no tetrahedra, only {found}", where=str(path), remedy="mesh the volume with linear tetrahedra")
+        raise InputError(
+            f"no tetrahedra, only {found}", where=str(path), remedy="mesh the volume with linear tetrahedra"
+        )
     position = np.asarray(mesh.points, dtype=float) * METRES[unit]
     element = np.concatenate(cells).astype(int)
     _check(position, element, str(path))

@@ -23,7 +23,9 @@ def write(path: Path, points=POINTS, tetrahedra=TETRAHEDRA, **options) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("name", "options"), [("a.vtk", {}), ("a.msh", {"file_format": "gmsh22"}), ("b.msh", {"file_format": "gmsh"})])
+@pytest.mark.parametrize(
+    ("name", "options"), [("a.vtk", {}), ("a.msh", {"file_format": "gmsh22"}), ("b.msh", {"file_format": "gmsh"})]
+)
 def test_reads_vtk_and_gmsh_in_metres(tmp_path, name, options):
     mesh = read_tetrahedra(write(tmp_path / name, **options), "mm")
     np.testing.assert_allclose(mesh.position, POINTS * 1e-3, rtol=1e-14)
@@ -62,7 +64,8 @@ def test_refuses_surfaces_unknown_units_and_unreadable_files(tmp_path):
 
 def test_reads_the_trunk_of_softrobots(datasets):
     mesh = read_tetrahedra(datasets / "sofa_trunk" / "trunk.vtk", "mm")
-    assert mesh.position.shape == (709, 3) and mesh.element.shape == (1972, 4)
+    assert mesh.position.shape == (709, 3)
+    assert mesh.element.shape == (1972, 4)
     corners = mesh.position[mesh.element]
     volume = np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 6.0
     assert volume == pytest.approx(38.9e-6, rel=2e-3)

@@ -1,11 +1,14 @@
-"""Cholesky factorisation of symmetric 3 x 3-block matrices of one static pattern, many matrices side by side in SIMD lanes.
+"""Cholesky factorisation of symmetric 3 x 3-block matrices of one static pattern, many matrices side by side in SIMD
+lanes.
 
-The pattern is analysed once: fill-reducing order (multiple minimum degree, from SuperLU through SciPy), elimination tree, fill, and for
-every block of the factor the list of products it receives. The factorisation then runs over these lists, column by column
-("left-looking": George and Liu 1981, Computer Solution of Large Sparse Positive Definite Systems, ch. 5).
+The pattern is analysed once: fill-reducing order (multiple minimum degree, from SuperLU through SciPy), elimination
+tree, fill, and for every block of the factor the list of products it receives. The factorisation then runs over these
+lists, column by column ("left-looking": George and Liu 1981, Computer Solution of Large Sparse Positive Definite
+Systems, ch. 5).
 
-Right-hand sides ride along as dense rows below the matrix. The factorisation turns each row b' into (L^-1 b)', which is the forward
-substitution; products of these rows are b_i' A^-1 b_j, the condensed matrix that cables and contacts need.
+Right-hand sides ride along as dense rows below the matrix. The factorisation turns each row b' into (L^-1 b)', which
+is the forward substitution; products of these rows are b_i' A^-1 b_j, the condensed matrix that cables and contacts
+need.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import scipy.sparse as sparse
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from scipy.sparse.linalg import splu
 
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, load, square_root, store
@@ -25,8 +28,8 @@ class BlockPattern(NamedTuple):
     """Static structure of a factor with ``n`` columns and ``border`` dense block rows below them.
 
     Column j holds the blocks ``first[j]:first[j + 1]``: rows in increasing order, the border rows last. Block t is row
-    ``row[t]``; it receives the products ``source[k, 0] source[k, 1]'`` for k in ``product[t]:product[t + 1]``. The pivot of
-    column j receives ``own[k] own[k]'`` for k in ``own_first[j]:own_first[j + 1]``.
+    ``row[t]``; it receives the products ``source[k, 0] source[k, 1]'`` for k in ``product[t]:product[t + 1]``. The
+    pivot of column j receives ``own[k] own[k]'`` for k in ``own_first[j]:own_first[j + 1]``.
     """
 
     first: Int[np.ndarray, " n_1"]
@@ -39,11 +42,14 @@ class BlockPattern(NamedTuple):
 
 
 def elimination_order(adjacency: sparse.csr_matrix) -> Int[np.ndarray, " n"]:
-    """Order that keeps the fill small: minimum degree, then a postorder, which keeps what is used together close in memory."""
+    """Order that keeps the fill small: minimum degree, then a postorder, which keeps what is used together close in
+    memory."""
     count = adjacency.shape[0]
     degree = np.asarray(np.abs(adjacency).sum(axis=1)).ravel()
     dominant = (sparse.diags(degree + 1.0) - adjacency).tocsc()
-    order = np.argsort(splu(dominant, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).perm_c, kind="stable")
+    order = np.argsort(
+        splu(dominant, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).perm_c, kind="stable"
+    )
     parent = _parents(_columns(adjacency[order][:, order].tocsr()))
     children: list[list[int]] = [[] for _ in range(count + 1)]
     for node, above in enumerate(parent):
@@ -59,7 +65,8 @@ def elimination_order(adjacency: sparse.csr_matrix) -> Int[np.ndarray, " n"]:
 def _columns(matrix: sparse.csr_matrix) -> list[set[int]]:
     """Rows of the factor below the diagonal, column by column: fill passes from a column to its parent."""
     columns = [
-        {int(row) for row in matrix.indices[matrix.indptr[j] : matrix.indptr[j + 1]] if row > j} for j in range(matrix.shape[0])
+        {int(row) for row in matrix.indices[matrix.indptr[j] : matrix.indptr[j + 1]] if row > j}
+        for j in range(matrix.shape[0])
     ]
     for rows in columns:
         if rows:
@@ -107,7 +114,8 @@ def block_slot(pattern: BlockPattern, row: int, column: int) -> int:
 
 @numba.njit(inline="always")
 def _invert_pivot(pivot, j, token):
-    """Replace the lower triangle (00, 10, 11, 20, 21, 22) of a pivot by the inverse of its Cholesky factor, and return it."""
+    """Replace the lower triangle (00, 10, 11, 20, 21, 22) of a pivot by the inverse of its Cholesky factor, and return
+    it."""
     one = fill(1.0, pivot, token)
     i00 = one / square_root(load(pivot, j, token))
     l10 = load(pivot, j + 1, token) * i00
@@ -135,7 +143,11 @@ def _update_pivot(pivot, j, lower, pattern, column, token):
     for k in range(pattern.own_first[column], pattern.own_first[column + 1]):
         block = 9 * pattern.own[k]
         for m in range(3):
-            a, b, c = load(lower, block + m, token), load(lower, block + 3 + m, token), load(lower, block + 6 + m, token)
+            a, b, c = (
+                load(lower, block + m, token),
+                load(lower, block + 3 + m, token),
+                load(lower, block + 6 + m, token),
+            )
             p00 = fnma(a, a, p00)
             p10 = fnma(b, a, p10)
             p11 = fnma(b, b, p11)
@@ -152,7 +164,8 @@ def _update_pivot(pivot, j, lower, pattern, column, token):
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def factor(pattern, pivot, lower, token):
-    """Factorise in place: ``lower`` (9 blocks, lanes) becomes L, ``pivot`` (6 n, lanes) the inverses of its diagonal blocks."""
+    """Factorise in place: ``lower`` (9 blocks, lanes) becomes L, ``pivot`` (6 n, lanes) the inverses of its diagonal
+    blocks."""
     for column in range(len(pattern.first) - 1):
         _update_pivot(pivot, 6 * column, lower, pattern, column, token)
         i00, i10, i11, i20, i21, i22 = _invert_pivot(pivot, 6 * column, token)
@@ -164,7 +177,11 @@ def factor(pattern, pivot, lower, token):
             for k in range(pattern.product[block], pattern.product[block + 1]):
                 left, right = 9 * pattern.source[k, 0], 9 * pattern.source[k, 1]
                 for m in range(3):
-                    x, y, z = load(lower, right + m, token), load(lower, right + 3 + m, token), load(lower, right + 6 + m, token)
+                    x, y, z = (
+                        load(lower, right + m, token),
+                        load(lower, right + 3 + m, token),
+                        load(lower, right + 6 + m, token),
+                    )
                     w = load(lower, left + m, token)
                     a00 = fnma(w, x, a00)
                     a01 = fnma(w, y, a01)
@@ -190,7 +207,8 @@ def factor(pattern, pivot, lower, token):
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def condense(pattern, lower, condensed, token):
-    """Products b_i' A^-1 b_j of all border rows i >= j, after `factor`, into ``condensed`` (rows * rows, lanes), row-major."""
+    """Products b_i' A^-1 b_j of all border rows i >= j, after `factor`, into ``condensed`` (rows * rows, lanes),
+    row-major."""
     rows = 3 * pattern.border
     for i in range(rows):
         for j in range(i + 1):

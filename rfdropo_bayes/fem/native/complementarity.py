@@ -1,16 +1,16 @@
 """Unilateral cable tensions in every lane: block principal pivoting with an exact solve for the active set.
 
-The problem is T >= 0, w = M T + q >= 0, T w = 0 with M symmetric positive definite. First all infeasible indices are exchanged
-between the two sets (the primal-dual active set method); should that cycle, only the infeasible index of highest number is
-(Murty), which ends (Judice and Pires 1994, Computers & Operations Research 21:587-596). A lane that has reached its solution
-stays there bit for bit while others go on.
+The problem is T >= 0, w = M T + q >= 0, T w = 0 with M symmetric positive definite. First all infeasible indices are
+exchanged between the two sets (the primal-dual active set method); should that cycle, only the infeasible index of
+highest number is (Murty), which ends (Judice and Pires 1994, Computers & Operations Research 21:587-596). A lane that
+has reached its solution stays there bit for bit while others go on.
 """
 
 from __future__ import annotations
 
 import numba
 
-from rfdropo_bayes.fem.native.simd import any_greater, fill, fnma, fma, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import any_greater, fill, fma, fnma, load, square_root, store, where_greater
 
 REGULARISATION = 1e-9
 """Relative compliance added to every cable, so that cables which share one route still have a definite tension."""
@@ -50,9 +50,9 @@ def _masked_solve(matrix, offset, active, count, work, tension, token):
 def solve_unilateral(matrix, offset, count, tolerance, active, work, tension, token):
     """Solve for ``tension`` (count, lanes); returns False if a lane is left without a solution.
 
-    ``matrix`` is (count * count, lanes), row-major; ``active`` holds 1 for the indices to try first as positive and else 0, and
-    is left at the solution's. ``work`` is (count * (count + 1), lanes). Slacks, and tensions times their diagonal entry, count as
-    feasible above ``-tolerance`` times the largest offset.
+    ``matrix`` is (count * count, lanes), row-major; ``active`` holds 1 for the indices to try first as positive and
+    else 0, and is left at the solution's. ``work`` is (count * (count + 1), lanes). Slacks, and tensions times their
+    diagonal entry, count as feasible above ``-tolerance`` times the largest offset.
     """
     zero, one = fill(0.0, matrix, token), fill(1.0, matrix, token)
     wrong = count * count
@@ -68,7 +68,9 @@ def solve_unilateral(matrix, offset, count, tolerance, active, work, tension, to
             slack = load(offset, i, token)
             for k in range(count):
                 slack = fma(load(matrix, i * count + k, token), load(tension, k, token), slack)
-            value = where_greater(load(active, i, token), zero, load(tension, i, token) * load(matrix, i * count + i, token), slack)
+            value = where_greater(
+                load(active, i, token), zero, load(tension, i, token) * load(matrix, i * count + i, token), slack
+            )
             bad = where_greater(-value, threshold, one, zero)
             store(work, wrong + i, bad)
             largest = where_greater(bad, zero, fill(1.0 + i, matrix, token), largest)

@@ -1,11 +1,13 @@
 """A vector of lanes as a value inside compiled kernels: one lane is one sample, and lanes never mix.
 
-A `Simd` value is an LLVM vector of 32- or 64-bit floats. The arithmetic operators act lane by lane; a plain number met on the way
-fills all lanes. Nothing is reordered or contracted behind the kernel's back: fused multiply-add happens where `fma` or `fnma` stands and nowhere else,
-so that a lane's result depends neither on its neighbours nor on what the compiler chose to inline.
+A `Simd` value is an LLVM vector of 32- or 64-bit floats. The arithmetic operators act lane by lane; a plain number met
+on the way fills all lanes. Nothing is reordered or contracted behind the kernel's back: fused multiply-add happens
+where `fma` or `fnma` stands and nowhere else, so that a lane's result depends neither on its neighbours nor on what
+the compiler chose to inline.
 
-Kernels keep their data in C-contiguous arrays ``(n, lanes)`` and move rows with `load` and `store`. How many lanes there are must be
-known to the compiler: kernels take it as the tuple made by `lane_token`, whose length is part of its type.
+Kernels keep their data in C-contiguous arrays ``(n, lanes)`` and move rows with `load` and `store`. How many lanes
+there are must be known to the compiler: kernels take it as the tuple made by `lane_token`, whose length is part of its
+type.
 """
 
 from __future__ import annotations
@@ -235,6 +237,8 @@ def any_greater(typing_context, left, right):
 
     def generate(context, builder, sig, arguments):
         bits = builder.fcmp_ordered(">", *arguments)
-        return builder.icmp_unsigned("!=", builder.bitcast(bits, ir.IntType(left.lanes)), ir.Constant(ir.IntType(left.lanes), 0))
+        return builder.icmp_unsigned(
+            "!=", builder.bitcast(bits, ir.IntType(left.lanes)), ir.Constant(ir.IntType(left.lanes), 0)
+        )
 
     return types.boolean(left, right), generate

@@ -1,7 +1,8 @@
 """Kernels of a body of corotational tetrahedra in SIMD lanes: assembly, cables, and the implicit Euler step.
 
-The physics is that of ``fem.tetrahedra`` and ``fem.tetrahedral_dynamics``; this is the same step with samples in lanes. Nodes are numbered
-in elimination order, held nodes after the free ones. Block storage beyond that of the factor is a dump for blocks of held nodes.
+The physics is that of ``fem.tetrahedra`` and ``fem.tetrahedral_dynamics``; this is the same step with samples in
+lanes. Nodes are numbered in elimination order, held nodes after the free ones. Block storage beyond that of the factor
+is a dump for blocks of held nodes.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numba
 import numpy as np
 from jaxtyping import Float, Int
 
-from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, back_substitute, condense, factor
+from rfdropo_bayes.fem.native.block_cholesky import back_substitute, condense, factor
 from rfdropo_bayes.fem.native.complementarity import solve_unilateral
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, load, square_root, store, where_greater
 
@@ -148,7 +149,8 @@ def _rotate_back(axes, x, y, z, token):
 
 @numba.njit(cache=True, forceinline=True, error_model="numpy")
 def _element_force(mesh, e, work, lame, shear, lookahead, token):
-    """Add an element's force at the positions x + lookahead v, in the frame of x, to ``work.force``; fill ``work.turned``."""
+    """Add an element's force at the positions x + lookahead v, in the frame of x, to ``work.force``; fill
+    ``work.turned``."""
     x, v, axes = work.position, work.velocity, work.axes
     zero = fill(0.0, x, token)
     h00, h01, h02, h10, h11, h12, h20, h21, h22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
@@ -161,9 +163,18 @@ def _element_force(mesh, e, work, lame, shear, lookahead, token):
         dx = fma(lookahead, load(v, n, token), load(x, n, token)) - ox
         dy = fma(lookahead, load(v, n + 1, token), load(x, n + 1, token)) - oy
         dz = fma(lookahead, load(v, n + 2, token), load(x, n + 2, token)) - oz
-        u = fma(load(axes, 0, token), dx, fma(load(axes, 1, token), dy, load(axes, 2, token) * dz)) - mesh.edge[e, a - 1, 0]
-        w = fma(load(axes, 3, token), dx, fma(load(axes, 4, token), dy, load(axes, 5, token) * dz)) - mesh.edge[e, a - 1, 1]
-        t = fma(load(axes, 6, token), dx, fma(load(axes, 7, token), dy, load(axes, 8, token) * dz)) - mesh.edge[e, a - 1, 2]
+        u = (
+            fma(load(axes, 0, token), dx, fma(load(axes, 1, token), dy, load(axes, 2, token) * dz))
+            - mesh.edge[e, a - 1, 0]
+        )
+        w = (
+            fma(load(axes, 3, token), dx, fma(load(axes, 4, token), dy, load(axes, 5, token) * dz))
+            - mesh.edge[e, a - 1, 1]
+        )
+        t = (
+            fma(load(axes, 6, token), dx, fma(load(axes, 7, token), dy, load(axes, 8, token) * dz))
+            - mesh.edge[e, a - 1, 2]
+        )
         gx, gy, gz = mesh.gradient[e, a, 0], mesh.gradient[e, a, 1], mesh.gradient[e, a, 2]
         h00, h01, h02 = fma(u, gx, h00), fma(u, gy, h01), fma(u, gz, h02)
         h10, h11, h12 = fma(w, gx, h10), fma(w, gy, h11), fma(w, gz, h12)
@@ -178,8 +189,11 @@ def _element_force(mesh, e, work, lame, shear, lookahead, token):
         n = 3 * mesh.node[e, a]
         if a > 0:
             fx, fy, fz = _rotate_back(
-                axes, fma(s00, gx, fma(s01, gy, s02 * gz)),
-                fma(s01, gx, fma(s11, gy, s12 * gz)), fma(s02, gx, fma(s12, gy, s22 * gz)), token,
+                axes,
+                fma(s00, gx, fma(s01, gy, s02 * gz)),
+                fma(s01, gx, fma(s11, gy, s12 * gz)),
+                fma(s02, gx, fma(s12, gy, s22 * gz)),
+                token,
             )
             sx, sy, sz = sx + fx, sy + fy, sz + fz
         else:
@@ -273,7 +287,11 @@ def _point(cables, p, c, field, fixed, token):
     """Position or velocity of a cable's point; the anchor's is ``fixed``."""
     if p == cables.first[c]:
         zero = fill(0.0, field, token)
-        return zero + cables.anchor[c, 0] * fixed, zero + cables.anchor[c, 1] * fixed, zero + cables.anchor[c, 2] * fixed
+        return (
+            zero + cables.anchor[c, 0] * fixed,
+            zero + cables.anchor[c, 1] * fixed,
+            zero + cables.anchor[c, 2] * fixed,
+        )
     x, y, z = fill(0.0, field, token), fill(0.0, field, token), fill(0.0, field, token)
     for k in range(cables.node.shape[1]):
         n, w = 3 * cables.node[p, k], cables.weight[p, k]
@@ -299,8 +317,8 @@ def _pull(pattern, mesh, cables, p, row, work, x, y, z, token):
 def gather_cables(pattern, mesh, cables, commanded, work, time_step, token):
     """Border rows -dl/dx of all cables, and their slack [m] at the end of the step if nothing changed the velocity.
 
-    The commanded displacement may differ from the one measured a step before by no more than ``rate``, and never exceeds the
-    limit.
+    The commanded displacement may differ from the one measured a step before by no more than ``rate``, and never
+    exceeds the limit.
     """
     one = fill(1.0, work.position, token)
     for c in range(len(cables.rest_length)):
@@ -362,7 +380,9 @@ def solve_step(pattern, mesh, cables, commanded, samples, work, time_step, toler
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def rollout(pattern, mesh, cables, commands, samples, work, points, weights, stride, time_step, tolerance, seen, pulls, token):
+def rollout(
+    pattern, mesh, cables, commands, samples, work, points, weights, stride, time_step, tolerance, seen, pulls, token
+):
     """Steps through ``commands`` (steps, cables, lanes), recording points and tensions after every ``stride`` steps.
 
     ``seen`` is (rows, points, 3, lanes), ``pulls`` (rows, cables, lanes).

@@ -75,9 +75,9 @@ class TetrahedralEngine:
     ) -> Rollouts:
         """Rollouts from rest through the commanded displacements [m] of every step, recorded every ``stride`` steps.
 
-        ``parameters`` holds, with a leading axis of samples: ``young_modulus`` [Pa], ``poisson_ratio``, ``node_mass`` (nodes) [kg],
-        ``rayleigh_mass`` [1/s], ``rayleigh_stiffness`` [s], ``gravity`` (3) [m/s2], and optionally ``stiffness_scale``
-        (elements).
+        ``parameters`` holds, with a leading axis of samples: ``young_modulus`` [Pa], ``poisson_ratio``, ``node_mass``
+        (nodes) [kg], ``rayleigh_mass`` [1/s], ``rayleigh_stiffness`` [s], ``gravity`` (3) [m/s2], and optionally
+        ``stiffness_scale`` (elements).
         """
         samples = len(parameters["young_modulus"])
         commands = np.broadcast_to(commands, (samples, *commands.shape[-2:]))
@@ -91,7 +91,9 @@ class TetrahedralEngine:
         )
 
         def run(chunk: Int[np.ndarray, " lanes"]) -> None:
-            self._run(np.minimum(chunk, samples - 1), chunk[chunk < samples], parameters, commands, time_step, stride, result)
+            self._run(
+                np.minimum(chunk, samples - 1), chunk[chunk < samples], parameters, commands, time_step, stride, result
+            )
 
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(run, chunks))
@@ -156,7 +158,9 @@ class TetrahedralEngine:
 def _numbering(body: TetrahedralBody) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, " nodes"]]:
     """Nodes in elimination order, held ones last, and the place of every node in that order."""
     free = np.flatnonzero(~body.fixed)
-    order = np.concatenate([free[elimination_order(_adjacency(body)[free][:, free].tocsr())], np.flatnonzero(body.fixed)])
+    order = np.concatenate(
+        [free[elimination_order(_adjacency(body)[free][:, free].tocsr())], np.flatnonzero(body.fixed)]
+    )
     number = np.empty(len(order), dtype=np.int64)
     number[order] = np.arange(len(order))
     return order, number
