@@ -1,4 +1,4 @@
-"""Shared fixtures: where the measured data are."""
+"""Shared by all tests: array shapes checked at run time, and where the measured data are."""
 
 from __future__ import annotations
 
@@ -6,8 +6,30 @@ import os
 from pathlib import Path
 
 import pytest
+from jaxtyping import install_import_hook
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+
+# Rooms in which beartype checks every call against its jaxtyping annotations: the numerical ones. Rooms at the border
+# (data, robots, posteriors) refuse wrong shapes themselves, with an InputError, and are tested for that.
+CHECKED_ROOMS = ("fem", "bayes", "inference")
+UNCHECKED_MODULES = (
+    "rfdropo_bayes.fem.native.",  # compiled by Numba, which cannot see through a wrapper
+    # These take NumPy arrays and plain floats where they are annotated with JAX arrays.
+    "rfdropo_bayes.fem.tetrahedra",
+    "rfdropo_bayes.fem.cables",
+    "rfdropo_bayes.bayes.noise",
+)
+
+
+def checked_modules() -> list[str]:
+    """Dotted names of the modules that are checked; a package's own name would stand for everything inside it."""
+    paths = [path for room in CHECKED_ROOMS for path in (REPOSITORY / "rfdropo_bayes" / room).rglob("*.py")]
+    names = (".".join(path.relative_to(REPOSITORY).with_suffix("").parts) for path in paths)
+    return sorted(name for name in names if not name.endswith("__init__") and not name.startswith(UNCHECKED_MODULES))
+
+
+install_import_hook(checked_modules(), "beartype.beartype")
 
 
 @pytest.fixture(scope="session")
