@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.fem.hexahedron import cofactor
 
@@ -40,21 +40,26 @@ def multiply(matrix: BlockTridiagonal, vector: Float[Array, "stations b k"]) -> 
 def invert(block: Float[Array, "b b"]) -> Float[Array, "b b"]:
     """Inverse of a symmetric positive definite block of a size divisible by three (Gauss-Jordan by 3 x 3 pivots)."""
     size = block.shape[-1]
-    for first in range(0, size, 3):
-        rows = slice(first, first + 3)
-        pivot = block[rows, rows]
+
+    def sweep(index: Int[Array, ""], block: Float[Array, "b b"]) -> Float[Array, "b b"]:
+        first = 3 * index
+        pivot = lax.dynamic_slice(block, (first, first), (3, 3))
         adjugate = cofactor(pivot).T
         inverse = adjugate / jnp.dot(pivot[0], adjugate[:, 0])
-        row = (inverse @ block[rows, :]).at[:, rows].set(inverse)
-        column = block[:, rows].at[rows].set(0.0)
-        block = (block.at[:, rows].set(0.0) - column @ row).at[rows, :].set(row)
-    return block
+        row = inverse @ lax.dynamic_slice(block, (first, 0), (3, size))
+        row = lax.dynamic_update_slice(row, inverse, (0, first))
+        column = lax.dynamic_slice(block, (0, first), (size, 3))
+        column = lax.dynamic_update_slice(column, jnp.zeros((3, 3)), (first, 0))
+        rest = lax.dynamic_update_slice(block, jnp.zeros((size, 3)), (0, first))
+        return lax.dynamic_update_slice(rest - column @ row, row, (first, 0))
+
+    return lax.fori_loop(0, size // 3, sweep, block)
 
 
 def factor(matrix: BlockTridiagonal) -> BlockFactor:
     """Eliminate from the first station to the last."""
 
-    def eliminate(previous_inverse, blocks):
+    def eliminate(previous_inverse: Array, blocks: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
         diagonal, lower = blocks
         multiplier = lower @ previous_inverse
         inverse = invert(diagonal - multiplier @ lower.T)
@@ -68,12 +73,12 @@ def factor(matrix: BlockTridiagonal) -> BlockFactor:
 def substitute(factored: BlockFactor, right: Float[Array, "stations b k"]) -> Float[Array, "stations b k"]:
     """Solve with a factor for k right-hand sides."""
 
-    def forward(previous, blocks):
+    def forward(previous: Array, blocks: tuple[Array, Array]) -> tuple[Array, Array]:
         multiplier, values = blocks
         values = values - multiplier @ previous
         return values, values
 
-    def backward(following, blocks):
+    def backward(following: Array, blocks: tuple[Array, Array]) -> tuple[Array, Array]:
         multiplier, values = blocks
         values = values - following
         return multiplier.T @ values, values

@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax import lax
+from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal
 from rfdropo_bayes.fem.hexahedron import cofactor
@@ -22,11 +23,13 @@ POLAR_ITERATIONS = 6
 
 def rotation(deformation: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
     """Rotation R of the polar decomposition F = R U, for det F > 0."""
-    for _ in range(POLAR_ITERATIONS):
-        adjugate = cofactor(deformation)
-        determinant = jnp.sum(deformation[..., :1, :] * adjugate[..., :1, :], axis=-1, keepdims=True)
-        deformation = 0.5 * (deformation + adjugate / determinant)
-    return deformation
+
+    def average(_: Int[Array, ""], current: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
+        adjugate = cofactor(current)
+        determinant = jnp.sum(current[..., :1, :] * adjugate[..., :1, :], axis=-1, keepdims=True)
+        return 0.5 * (current + adjugate / determinant)
+
+    return lax.fori_loop(0, POLAR_ITERATIONS, average, deformation)
 
 
 def frames(

@@ -76,30 +76,24 @@ def _layer_tension(
     return body - jnp.einsum("li,li->l", beyond, frame[:, :, 2])
 
 
-def _increment(
-    system: System,
-    prepared: Prepared,
-    iterate: _Iterate,
-    load: Float[Array, "nodes 3"],
-    displacement: Float[Array, " cables"],
-) -> tuple[Float[Array, "nodes 3"], Float[Array, " cables"], Bool[Array, ""], Float[Array, ""]]:
-    """Newton increment, tensions at its end, whether those were found, and the largest force out of balance at its
-    start.
+class _Forces(NamedTuple):
+    frame: Float[Array, "layers 3 3"]
+    elastic: Float[Array, "nodes 3"]
+    cable: Float[Array, "nodes 3"]
+    layer_tension: Float[Array, " layers"]
+    length: Float[Array, " cables"]
+    jacobian: Float[Array, "cables nodes 3"]
 
-    The cables pull to the commanded displacement in one go.
-    """
+
+def _forces(system: System, prepared: Prepared, iterate: _Iterate) -> _Forces:
+    """Forces of the body and of its cables in the current shape."""
     frame, local = frames_and_displacements(system, prepared, iterate.position)
-    force = corotational.internal_force(prepared.stiffness, frame, local).reshape(-1, 3)
+    elastic = corotational.internal_force(prepared.stiffness, frame, local).reshape(-1, 3)
     length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, iterate.position)
-    cable_force = -jnp.einsum("cni,c->ni", jacobian, iterate.tension)
+    cable = -jnp.einsum("cni,c->ni", jacobian, iterate.tension)
     local_force = jnp.einsum("lij,lj->li", prepared.stiffness, local)
-    stiffening = _tension_stiffening(system, frame, _layer_tension(system, local_force, cable_force, frame))
-    tangent = jax.tree.map(jnp.add, corotational.tangent(prepared.packed, frame), stiffening)
-    slack = prepared.rest_length - displacement - length
-    found = constrained_increment(system, tangent, force + load, jacobian, slack, iterate.tension)
-    held = system.clamped_stations * system.body.section_nodes
-    unbalanced = jnp.max(jnp.abs((force + load + cable_force)[held:]))
-    return *found, unbalanced
+    tension = _layer_tension(system, local_force, cable, frame)
+    return _Forces(frame, elastic, cable, tension, length, jacobian)
 
 
 def static_equilibrium(
@@ -119,7 +113,13 @@ def static_equilibrium(
     longest = LONGEST_STEP * (system.body.station[-1] - system.body.station[0])
 
     def iterate(current: _Iterate, _: None) -> tuple[_Iterate, Bool[Array, ""]]:
-        increment, tension, converged, _unbalanced = _increment(system, prepared, current, load, displacement)
+        forces = _forces(system, prepared, current)
+        stiffening = _tension_stiffening(system, forces.frame, forces.layer_tension)
+        tangent = jax.tree.map(jnp.add, corotational.tangent(prepared.packed, forces.frame), stiffening)
+        slack = prepared.rest_length - displacement - forces.length
+        increment, tension, converged = constrained_increment(
+            system, tangent, forces.elastic + load, forces.jacobian, slack, current.tension
+        )
         now, before = lax.stop_gradient((increment, current.increment))
         along = jnp.sum(now * before)
         opposed = along < -0.3 * jnp.sqrt(jnp.sum(now**2) * jnp.sum(before**2))
@@ -130,9 +130,10 @@ def static_equilibrium(
     start = state_at_rest(system)
     first = _Iterate(start.position, start.tension, jnp.zeros_like(start.position), jnp.array(1.0))
     last, solved = lax.scan(iterate, first, None, length=iterations)
-    unbalanced = _increment(system, prepared, last, load, displacement)[3]
+    forces = _forces(system, prepared, last)
+    unbalanced = (forces.elastic + forces.cable + load)[system.clamped_stations * system.body.section_nodes :]
     loads = jnp.sum(jnp.abs(load)) + jnp.sum(last.tension)
-    residual = unbalanced / jnp.maximum(loads, 1e-300)
+    residual = jnp.max(jnp.abs(unbalanced)) / jnp.maximum(loads, 1e-300)
     moved = State(last.position, jnp.zeros_like(last.position), last.tension)
     state, info = accept(system, prepared, start, moved, solved[-1])
     converged = (residual < TOLERANCE) & info.cables_converged & ~info.diverged
