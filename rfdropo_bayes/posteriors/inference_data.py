@@ -68,7 +68,7 @@ def to_inference_data(
                 "unit": (units or {}).get(name, ""),
                 "low": float(low),
                 "high": float(high),
-                "prior": json.dumps(dict((priors or {}).get(name, {})), sort_keys=True),
+                "prior": json.dumps(dict((priors or {}).get(name, {}))),
                 "description": (descriptions or {}).get(name, ""),
             }
         return dataset

@@ -47,6 +47,9 @@ def error_figure(rows: Sequence[Mapping[str, Any]], noise_floor: float | None) -
         for label, row in zip(axes.get_yticklabels(), rows, strict=False):
             label.set_fontweight("bold" if row["own"] else "normal")
         axes.invert_yaxis()
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside upper right")
     return figure
 
 
@@ -61,7 +64,6 @@ def _bars(axes: Axes, rows: Sequence[Mapping[str, Any]], key: str, noise_floor: 
         axes.text(value + 0.015 * longest, place, f"{value:.3g}", va="center", fontsize=8.5)
     if noise_floor is not None:
         axes.axvline(noise_floor, color=style.TEST, linestyle="--", linewidth=1.2, label="repeats differ by this")
-        axes.legend(loc="lower right")
     axes.set_xlim(0.0, 1.22 * longest)
     axes.grid(axis="y", visible=False)
     axes.xaxis.set_major_locator(MaxNLocator(4))
@@ -86,7 +88,7 @@ def honesty_figure(curves: Mapping[str, TransformCurve], shares: Mapping[str, Ma
     left.axhline(0.0, color=style.MEASURED, linewidth=0.8)
     left.set_xlabel("share of predictive draws below the measured value")
     left.set_ylabel("ECDF - uniform")
-    left.legend(loc="best")
+    left.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     right.plot([0, 1], [0, 1], color=style.MEASURED, linewidth=0.8)
     for role, row in shares.items():
         known = {p: s for p, s in row.items() if s is not None}
@@ -95,7 +97,7 @@ def honesty_figure(curves: Mapping[str, TransformCurve], shares: Mapping[str, Ma
     right.set_ylabel("share of measurements inside")
     right.set_xlim(0, 1)
     right.set_ylim(0, 1)
-    right.legend(loc="best")
+    right.legend(loc="lower right")
     return figure
 
 

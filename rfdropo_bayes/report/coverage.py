@@ -79,7 +79,7 @@ class TransformCurve(NamedTuple):
     half_width: float
 
 
-def transform_curve(recordings: Sequence[RecordingPrediction], *, points: int = 201) -> TransformCurve | None:
+def transform_curve(recordings: Sequence[RecordingPrediction]) -> TransformCurve | None:
     """PIT-ECDF of all usable coordinates.
 
     Neighbouring rows err alike, so that thousands of rows may be worth few independent ones. Their number is estimated
@@ -89,7 +89,8 @@ def transform_curve(recordings: Sequence[RecordingPrediction], *, points: int = 
     values = np.concatenate([s[np.isfinite(s)] for s in series]) if series else np.zeros(0)
     if len(values) == 0:
         return None
-    grid = np.linspace(0.0, 1.0, points)
+    draws = min(len(r.predicted) for r in recordings)
+    grid = np.arange(draws + 2) / (draws + 1.0)  # between the values that the transform can take
     ecdf = np.searchsorted(np.sort(values), grid, side="right") / len(values)
     independent = sum(_independent_values(s[np.isfinite(s)]) for s in series)
     # Coordinates of one row err together too: a trunk has few ways to bend. One marker's worth is the honest count.

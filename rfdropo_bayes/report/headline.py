@@ -23,7 +23,7 @@ def _fitted(summary: Mapping[str, Any]) -> str:
     data = (
         f"{_count(len(recordings), synthetic.strip() + ' recording' if synthetic else 'recording')} ({seconds:.3g} s)"
     )
-    return f"{_count(len(free), 'parameter')} of {summary['robot']} fitted to {data} with {summary['method']}."
+    return f"{_count(len(free), 'parameter')} of {summary['robot']} were inferred from {data} with {summary['method']}."
 
 
 def _errors(summary: Mapping[str, Any]) -> str:
@@ -40,7 +40,7 @@ def _errors(summary: Mapping[str, Any]) -> str:
     if not parts:
         return ""
     tail = "" if summary["rmse"]["test"] else " There are no test recordings: nothing here says how well it predicts."
-    return f"Its last marker ({marker}) is off by {', and by '.join(parts)} (root mean square over time).{tail}"
+    return f"In root mean square over time, its last marker ({marker}) is off by {', and by '.join(parts)}.{tail}"
 
 
 def best_baseline(summary: Mapping[str, Any], role: str) -> tuple[str, float] | None:

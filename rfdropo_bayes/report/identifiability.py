@@ -3,7 +3,8 @@
 The covariance of log parameters is, for a posterior that the data dominate, the inverse of their Fisher information.
 An eigenvector of it is a product of powers of parameters; a small eigenvalue means that the data determine this
 product, one that is no smaller than under the prior that they say nothing of it. Parameters that hardly correlate are
-kept apart first, so that products mix only what belongs together.
+kept apart first, so that products mix only what belongs together. A parameter that may be zero or negative has no
+logarithm to speak of: it stands by itself, in its own unit.
 """
 
 from __future__ import annotations
@@ -14,11 +15,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.report.units import display_unit
 
 TOGETHER = 0.6  # correlation from which on parameters are described jointly
 DETERMINED, FREE = 0.5, 0.8  # contraction against the prior
 NEGLIGIBLE = 0.2  # exponents below this are left out of the words
+WELL_AWAY = 0.4  # prior standard deviation over prior mean
+_HOW = {
+    "determined": "is determined to",
+    "partly": "is partly determined, to",
+    "free": "is left free by the data:",
+    "unknown": "has a spread of",
+}
 TIMES = " \u00d7 "
 
 
@@ -28,13 +37,15 @@ class Combination:
 
     Attributes:
         powers: exponent of each parameter that takes part; the largest is 1 in absolute value.
-        sd: posterior standard deviation of the logarithm of the product.
+        unit: "log" where ``sd`` is that of a logarithm, else the unit of the single parameter.
+        sd: posterior standard deviation of the logarithm of the product, or of the parameter.
         prior_sd: the same under the prior; None without prior draws.
         verdict: "determined", "partly" or "free"; "unknown" without prior draws.
         sentence: the same in words.
     """
 
     powers: dict[str, float]
+    unit: str
     sd: float
     prior_sd: float | None
     verdict: str
@@ -47,17 +58,38 @@ class Combination:
 
 
 def identify(record: PosteriorRecord, *, names: list[str] | None = None) -> list[Combination]:
-    """Combinations of the positive free parameters, best determined first.
+    """Combinations of the free parameters, best determined first.
 
     Args:
         record: posterior, and prior draws to compare with.
         names: parameters to look at; by default those that all recordings share.
     """
-    chosen = [info.name for info in record.free if "@" not in info.name] if names is None else names
-    logs = {n: np.log(record.flat(n)) for n in chosen if np.all(record.flat(n) > 0) and np.ptp(record.flat(n)) > 0}
-    prior = {n: np.log(record.prior[n]) for n in logs if n in record.prior and np.all(record.prior[n] > 0)}
+    chosen = [info for info in record.free if ("@" not in info.name if names is None else info.name in names)]
+    varying = [info for info in chosen if np.ptp(record.flat(info.name)) > 0]
+    scaled = [info.name for info in varying if _has_scale(record, info)]
+    logs = {n: np.log(record.flat(n)) for n in scaled}
+    prior = {n: np.log(record.prior[n]) for n in scaled if n in record.prior}
     found = [combination for group in _groups(logs) for combination in _eigen_combinations(group, logs, prior)]
+    found += [_alone(record, info) for info in varying if info.name not in scaled]
     return sorted(found, key=lambda c: c.sd if c.contraction is None else c.contraction)
+
+
+def _has_scale(record: PosteriorRecord, info: ParameterInfo) -> bool:
+    """True for a parameter whose relative size means something: a logarithmic prior, or one well away from zero."""
+    draws, prior = record.flat(info.name), record.prior.get(info.name, record.flat(info.name))
+    if not (np.all(draws > 0) and np.all(prior > 0)):
+        return False
+    return info.logarithmic or float(prior.std()) < WELL_AWAY * float(prior.mean())
+
+
+def _alone(record: PosteriorRecord, info: ParameterInfo) -> Combination:
+    sd = float(record.flat(info.name).std())
+    prior_sd = float(record.prior[info.name].std()) if info.name in record.prior else None
+    verdict = _verdict(sd, prior_sd)
+    factor, unit = display_unit(info.unit, sd)
+    before = "" if prior_sd is None else f" (prior ±{prior_sd / factor:.2g} {unit})".replace(" )", ")")
+    sentence = f"{info.name} {_HOW[verdict]} ±{sd / factor:.2g} {unit}".rstrip() + before
+    return Combination({info.name: 1.0}, info.unit, sd, prior_sd, verdict, sentence)
 
 
 def _groups(logs: Mapping[str, Float[np.ndarray, " n"]]) -> list[list[str]]:
@@ -85,7 +117,7 @@ def _eigen_combinations(
         known = all(n in prior for n in powers)
         prior_sd = float(np.std(sum(p * prior[n] for n, p in powers.items()))) if known else None
         verdict = _verdict(sd, prior_sd)
-        combinations.append(Combination(powers, sd, prior_sd, verdict, _sentence(powers, sd, prior_sd, verdict)))
+        combinations.append(Combination(powers, "log", sd, prior_sd, verdict, _sentence(powers, sd, prior_sd, verdict)))
     return combinations
 
 
@@ -135,10 +167,4 @@ def _sentence(powers: Mapping[str, float], sd: float, prior_sd: float | None, ve
     else:
         subject = product_in_words(powers)
     before = f" (prior {spread_in_words(prior_sd)})" if prior_sd else ""
-    how = {
-        "determined": "is determined to",
-        "partly": "is partly determined, to",
-        "free": "is left free by the data:",
-        "unknown": "has a spread of",
-    }[verdict]
-    return f"{subject} {how} {spread_in_words(sd)}{before}"
+    return f"{subject} {_HOW[verdict]} {spread_in_words(sd)}{before}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,8 @@ from rfdropo_bayes.report.coverage import coverage, transform_curve
 from rfdropo_bayes.report.headline import best_baseline
 from rfdropo_bayes.report.limits import limits
 from rfdropo_bayes.report.scores import MeasuredPath, settled_rows
-from rfdropo_bayes.report.style import Picture, display_name, display_unit, embed
+from rfdropo_bayes.report.style import Picture, embed
+from rfdropo_bayes.report.units import display_name, display_unit
 
 MOST_RECORDINGS = 12
 NOTHING = "\u2013"
@@ -67,13 +69,14 @@ def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str
         lstrip_blocks=True,
     )
     environment.filters |= {"number": number, "words": display_name, "duration": duration}
+    environment.globals["interval"] = interval
     stylesheet = environment.loader.get_source(environment, "page.css")[0] if environment.loader else ""
     return environment.get_template("page.html.j2").render(
         summary=summary,
         sections=SECTIONS,
         stylesheet=Markup(stylesheet),
         tiles=_tiles(summary),
-        rows=[_posterior_row(name, row) for name, row in summary["parameters"].items()],
+        rows=_posterior_rows(summary),
         infos={info.name: info for info in record.parameters},
         figures=_run_figures(record, summary),
         recordings=_recording_views(record, summary),
@@ -91,7 +94,17 @@ def number(value: Any, digits: int = 3) -> str:
         return "yes" if value else "no"
     if isinstance(value, int) or (isinstance(value, float) and value.is_integer() and abs(value) < 1e6):
         return f"{int(value)}"
-    return f"{value:.{digits}g}"
+    text = f"{value:.{digits}g}"
+    return f"{value:.0f}" if "e+0" in text and abs(value) < 1e6 else text
+
+
+def interval(low: float, high: float) -> str:
+    """Hard bounds in words."""
+    if math.isinf(low) and math.isinf(high):
+        return "none"
+    if math.isinf(high):
+        return f"at least {number(low, 4)}"
+    return f"at most {number(high, 4)}" if math.isinf(low) else f"{number(low, 4)} to {number(high, 4)}"
 
 
 def duration(seconds: float) -> str:
@@ -115,19 +128,27 @@ def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         tiles.append((f"{100 * summary['coverage']['0.9']:.0f}", "%", "of measurements in the 90 % band"))
     if summary["log_evidence"]["value"] is not None:
         sd = summary["log_evidence"]["sd"]
-        tiles.append((f"{summary['log_evidence']['value']:.1f}", "nat", f"log evidence ± {number(sd, 2)}"))
+        words = "log evidence" if sd is None else f"log evidence ± {number(sd, 2)}"
+        tiles.append((f"{summary['log_evidence']['value']:.1f}", "nat", words))
     tiles.append(
         (f"{summary['rollouts']:,.0f}".replace(",", "\u202f"), "", f"rollouts in {duration(summary['seconds'])}")
     )
     return tiles
 
 
-def _posterior_row(name: str, row: Mapping[str, Any]) -> dict[str, Any]:
-    """A line of the posterior table in units that read well."""
-    factor, unit = display_unit(row["unit"], max(abs(row["q05"]), abs(row["q95"])))
-    keys = ("mean", "sd", "q05", "median", "q95", "prior_q05", "prior_q95")
-    scaled = {key: None if row.get(key) is None else row[key] / factor for key in keys}
-    return {**row, **scaled, "name": name, "unit": unit}
+def _posterior_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The posterior table in units that read well, the same one for a parameter in all recordings."""
+    magnitude: dict[str, float] = {}
+    for name, row in summary["parameters"].items():
+        base = name.split("@")[0]
+        magnitude[base] = max(magnitude.get(base, 0.0), abs(row["q05"]), abs(row["q95"]))
+    rows = []
+    for name, row in summary["parameters"].items():
+        factor, unit = display_unit(row["unit"], magnitude[name.split("@")[0]])
+        keys = ("mean", "sd", "q05", "median", "q95", "prior_q05", "prior_q95")
+        scaled = {key: None if row.get(key) is None else row[key] / factor for key in keys}
+        rows.append({**row, **scaled, "name": name, "unit": unit})
+    return rows
 
 
 def _error_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.report import style
+from rfdropo_bayes.report.units import display_unit
 
 MOST_PAIRED = 6
 MOST_PANELS = 24
@@ -41,12 +42,13 @@ class _Scale:
     """How the values of one parameter are put on an axis: unit, logarithm, range."""
 
     def __init__(self, info: ParameterInfo, values: Float[np.ndarray, " n"], *, margin: float = 0.08) -> None:
-        self.factor, unit = style.display_unit(info.unit, float(np.median(np.abs(values))))
+        self.factor, unit = display_unit(info.unit, float(np.median(np.abs(values))))
         self.label = style.label_with_unit(info.name, unit)
         self.log = info.logarithmic and bool(np.all(values > 0))
         low, high = self.forward(np.quantile(values, [0.002, 0.998]))
         spread = (high - low) or abs(high) or 1.0
-        self.limits = self.backward(np.array([low - margin * spread, high + margin * spread]))
+        limits = self.backward(np.array([low - margin * spread, high + margin * spread]))
+        self.limits = np.clip(limits, info.low / self.factor, info.high / self.factor)
 
     def forward(self, values: np.ndarray) -> np.ndarray:
         """From SI values to where they lie on an even axis."""
@@ -68,10 +70,10 @@ class _Scale:
         getattr(axes, f"set_{which}scale")("log" if self.log else "linear")
         getattr(axes, f"set_{which}lim")(*self.limits)
         decades = np.log10(self.limits[1] / self.limits[0]) if self.log else 0.0
-        locator = LogLocator(subs=(1.0,) if decades > 3 else (1.0, 3.0)) if decades > 1.2 else MaxNLocator(ticks)
-        axis.set_major_locator(locator)
+        subs = (1.0,) if decades > 2.5 else (1.0, 3.0) if decades > 1.2 else (1.0, 2.0, 5.0)
+        axis.set_major_locator(LogLocator(subs=subs, numticks=99) if decades > 0.7 else MaxNLocator(ticks))
         axis.set_minor_locator(NullLocator())
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}"))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}" if abs(value) < 1e4 else f"{value:.0f}"))
         axis.set_minor_formatter(NullFormatter())
 
 
@@ -120,10 +122,19 @@ def _wrapped(label: str, width: int = 20) -> str:
 
 
 def _histogram(axes: Axes, values: np.ndarray, scale: _Scale) -> None:
-    axes.hist(values / scale.factor, bins=scale.backward(scale.even(36)).tolist(), color=style.POSTERIOR, alpha=0.85)
+    axes.hist(
+        values / scale.factor,
+        bins=scale.backward(scale.even(_bins(len(values)))).tolist(),
+        color=style.POSTERIOR,
+        alpha=0.85,
+    )
     scale.apply(axes, "x")
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
+
+
+def _bins(number: int) -> int:
+    return int(np.clip(np.sqrt(number), 12, 36))
 
 
 def _cloud(axes: Axes, x: np.ndarray, y: np.ndarray, across: _Scale, up: _Scale, shown: np.ndarray) -> None:
@@ -185,7 +196,7 @@ def _correlation(axes: Axes, u: np.ndarray, v: np.ndarray) -> None:
     style.empty(axes)
     text = f"{r:+.4f}" if abs(r) > 0.99 else f"{r:+.2f}"
     colour = style.TEST if abs(r) > RIDGE else style.MEASURED
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=8 + 5 * abs(r), color=colour)
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=9 + 4 * abs(r), color=colour)
 
 
 @style.styled
@@ -212,7 +223,7 @@ def _before_and_after(
     if log and prior is not None and np.all(prior > 0):
         info = ParameterInfo(info.name, info.unit, info.low, info.high, {"distribution": "LogDerived"})
     scale = _Scale(info, draws if prior is None else np.concatenate([draws, prior]))
-    edges = scale.even(61)
+    edges = scale.even(2 * _bins(len(draws)))
     shown = scale.backward(edges)
     if prior is not None:
         height = _heights(scale.forward(prior), edges)
@@ -250,7 +261,7 @@ def forest_figure(record: PosteriorRecord, names: Sequence[str]) -> Figure:
     for axes, base in zip(grid, bases, strict=False):
         present = [r for r in recordings if f"{base}@{r}" in infos]
         draws = [record.flat(f"{base}@{r}") for r in present]
-        factor, unit = style.display_unit(
+        factor, unit = display_unit(
             infos[f"{base}@{present[0]}"].unit, float(max(np.quantile(np.abs(d), 0.9) for d in draws))
         )
         for recording, values in zip(present, draws, strict=True):
@@ -265,5 +276,5 @@ def forest_figure(record: PosteriorRecord, names: Sequence[str]) -> Figure:
         style.empty(axes)
     for axes in grid[::columns]:
         axes.set_yticks(range(len(recordings)), [r if len(r) < 34 else f"…{r[-32:]}" for r in recordings])
-        axes.invert_yaxis() if axes is grid[0] else None
+        axes.set_ylim(len(recordings) - 0.5, -0.5)
     return figure

@@ -16,6 +16,8 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rfdropo_bayes.report.units import display_name
+
 # Okabe and Ito's palette.
 POSTERIOR = "#0072B2"
 PRIOR = "#8A8A8A"
@@ -99,6 +101,10 @@ def embed(figure: Figure, alt: str, caption: str = "") -> Picture:
     """Figure as SVG inside a data URI."""
     buffer = io.BytesIO()
     with _our_style():
+        engine = figure.get_layout_engine()
+        if engine is not None:  # once, here: savefig would draw everything a second time for it
+            engine.execute(figure)
+            figure.set_layout_engine("none")
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     data = base64.b64encode(buffer.getvalue()).decode("ascii")
     return Picture(f"data:image/svg+xml;base64,{data}", alt, caption, round(96 * figure.get_figwidth()))
@@ -107,33 +113,6 @@ def embed(figure: Figure, alt: str, caption: str = "") -> Picture:
 def thin(rows: int) -> np.ndarray:
     """Indices of the rows that a line shows: all of them, or an even choice that ends with the last."""
     return np.arange(rows) if rows <= POINTS else np.unique(np.linspace(0, rows - 1, POINTS).round().astype(int))
-
-
-_PREFIXED = {"Pa", "m", "s", "N", "Hz"}
-_PREFIX = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
-_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-def display_unit(unit: str, magnitude: float) -> tuple[float, str]:
-    """Factor to divide by and the unit's text, so that values of this magnitude read easily (4.5e6 Pa: 4.5 MPa)."""
-    unit = "" if unit in ("-", "") else unit
-    if not np.isfinite(magnitude) or magnitude <= 0 or 0.1 <= magnitude < 1000:
-        return 1.0, _tidy(unit)
-    exponent = int(np.clip(3 * np.floor(np.log10(magnitude) / 3 + 1e-9), -9, 9))
-    if exponent == 0 or (unit == "kg/m3" and exponent == 3):
-        return 1.0, _tidy(unit)
-    if unit in _PREFIXED and exponent in _PREFIX:
-        return 10.0**exponent, f"{_PREFIX[exponent]}{unit}"
-    return 10.0**exponent, f"10{str(exponent).translate(_SUPERSCRIPT)} {_tidy(unit)}".strip()
-
-
-def _tidy(unit: str) -> str:
-    return unit.replace("m2", "m²").replace("m3", "m³").replace("s2", "s²")
-
-
-def display_name(name: str) -> str:
-    """Parameter name with spaces, which breaks better than underscores."""
-    return name.replace("_", " ")
 
 
 def label_with_unit(name: str, unit: str) -> str:

@@ -23,7 +23,8 @@ class ParameterRow:
         at_bound: the posterior is piled up at a hard bound.
         bound: which one, "low" or "high"; None if neither.
         prior_q05, prior_q95: of the prior draws, None without them.
-        contraction: posterior over prior standard deviation (of the logarithm where the prior is logarithmic).
+        contraction: posterior over prior standard deviation, of the logarithm where the prior is logarithmic and for
+            derived products.
         ess_bulk, ess_tail, mcse_mean, r_hat: ArviZ's diagnostics; ``r_hat`` is NaN for a single chain.
         derived: a function of other parameters.
     """
@@ -76,7 +77,7 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
                 bound,
                 before[0],
                 before[1],
-                None if prior is None else _contraction(draws, prior),
+                None if prior is None else _contraction(draws, prior, log=info.logarithmic or info.name not in free),
                 diagnostics[info.name]["ess_bulk"],
                 diagnostics[info.name]["ess_tail"],
                 diagnostics[info.name]["mcse_mean"],
@@ -105,9 +106,9 @@ def bound_reached(draws: Float[np.ndarray, " n"], info: ParameterInfo) -> str | 
     return "high" if high - q95 <= reach else None
 
 
-def _contraction(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"]) -> float | None:
-    """Ratio of standard deviations, of logarithms where all values are positive."""
-    if np.all(draws > 0) and np.all(prior > 0):
+def _contraction(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"], *, log: bool) -> float | None:
+    """Ratio of standard deviations, of the values or of their logarithms."""
+    if log and np.all(draws > 0) and np.all(prior > 0):
         draws, prior = np.log(draws), np.log(prior)
     spread = float(np.std(prior))
     return float(np.std(draws)) / spread if spread > 0 else None

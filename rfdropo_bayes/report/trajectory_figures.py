@@ -81,7 +81,7 @@ def path_figure(recording: RecordingPrediction) -> Figure:
         ):
             tip = values[rows, -1]
             axes.plot(tip[:, across], tip[:, up], color=colour, linewidth=1.2, label=f"{words} path of the last marker")
-            for row, dashes in ((0, ":"), (-1, "-")):
+            for row, dashes in ((0, ":"), (-1, "-")) if across == 2 else ():
                 shape = values[row]
                 axes.plot(
                     shape[:, across],
@@ -123,27 +123,38 @@ def residual_figure(recording: RecordingPrediction, settled: int | None) -> Figu
         color=style.PRIOR,
         alpha=0.25,
         linewidth=0,
-        label="90 % band (mean of axes)",
+        label="90 % band",
     )
     for axis in range(3):
         over_time.plot(recording.time[rows], residual[rows, axis], color=style.AXIS_COLOURS[axis], label=AXES[axis])
     over_time.axhline(0.0, color=style.MEASURED, linewidth=0.8)
     over_time.set_ylabel("measured - predicted [mm]")
-    over_time.legend(ncols=2, loc="best")
+    _legend_above(over_time, columns=4)
     _at_least(over_time, 1.0)
     norm = np.linalg.norm(residual, axis=1)
     distance.plot(recording.time[rows], norm[rows], color=style.POSTERIOR, label="distance")
     root = float(np.sqrt(np.nanmean(norm**2))) if usable.any() else np.nan
-    distance.axhline(root, color=style.TEST, linestyle="--", label=f"root mean square {root:.3g} mm")
+    distance.axhline(root, color=style.TEST, linestyle="--", label=f"rms {root:.3g} mm")
     if settled is not None:
         distance.axvspan(recording.time[settled], recording.time[-1], color=style.PRIOR, alpha=0.15, label="pose held")
     distance.set_ylim(bottom=0.0)
     distance.set_ylabel("distance [mm]")
-    distance.legend(loc="best")
+    _legend_above(distance, columns=3)
     for axes in (over_time, distance):
         axes.set_xlabel("time [s]")
     _memory(memory, recording.time, np.nan_to_num(residual))
     return figure
+
+
+def _legend_above(axes: Axes, *, columns: int) -> None:
+    axes.legend(
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.0),
+        ncols=columns,
+        handlelength=1.4,
+        columnspacing=1.0,
+        borderaxespad=0.2,
+    )
 
 
 def _memory(axes: Axes, time: np.ndarray, residual: Float[np.ndarray, "time 3"]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -96,7 +97,7 @@ INFOS = (
 
 
 def make_run(rng: np.random.Generator, *, draws: int = 400, rows: int = 90) -> Run:
-    """Posterior with an E / density ridge, a parameter at its bound, three fit recordings, and two repeated test ones."""
+    """Posterior with an E / density ridge, a parameter at its bound, three fit recordings, two repeated test ones."""
     held = commands(rng, rows, hold=True)
     fit = [recording(f"fit_{i}", commands(rng, rows, hold=False), rng, faults=4 * i) for i in range(2)]
     fit.append(recording("fit_hold", held, rng))
@@ -181,4 +182,11 @@ def _prediction(trajectory: Trajectory, split: str, group: int, rng: np.random.G
 
 @pytest.fixture(scope="session")
 def run() -> Run:
+    """Two chains, five recordings, everything a report can hold."""
     return make_run(np.random.default_rng(0))
+
+
+@pytest.fixture(scope="session")
+def toy() -> SimpleNamespace:
+    """What further recordings are made with."""
+    return SimpleNamespace(STEP=STEP, MARKERS=MARKERS, commands=commands, recording=recording)
