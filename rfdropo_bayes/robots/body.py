@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -34,6 +34,10 @@ class Body(Table):
         torsion_constant_m4: GJ / G.
         mass_area_m2: volume per length.
         mass_moment_area_m4: rotary inertia per density and length, ordered like ``bending_moment_area_m4``.
+        reference_poisson_ratio: Poisson ratio that the profile holds for.
+        poisson_stiffening: how the stiffness of each layer depends on Poisson's ratio: with
+            d = (1 - 2 nu)^(1/4) - (1 - 2 reference)^(1/4) its stiffness is 1 + c1 d + c2 d^2 + c3 d^3 times the profile's.
+            Wide vertebrae keep a neck from contracting, and linear tetrahedra lock. Empty: it does not.
         volume_m3: volume of the whole body, clamped part included: what the trunk mass is divided by.
         point_masses: rigid parts on top of the body's own mass.
     """
@@ -46,6 +50,8 @@ class Body(Table):
     torsion_constant_m4: tuple[Positive, ...]
     mass_area_m2: tuple[Positive, ...]
     mass_moment_area_m4: tuple[tuple[Positive, Positive], ...]
+    reference_poisson_ratio: float = Field(default=0.45, ge=0.0, le=0.499)
+    poisson_stiffening: tuple[tuple[float, float, float], ...] = ()
     volume_m3: Positive
     point_masses: tuple[PointMass, ...] = ()
 
@@ -65,6 +71,11 @@ class Body(Table):
         ):
             if len(getattr(self, key)) != layers:
                 raise ValueError(f"{key} has {len(getattr(self, key))} entries for {layers} layers")
+        if self.poisson_stiffening:
+            if len(self.poisson_stiffening) != layers:
+                raise ValueError(f"poisson_stiffening has {len(self.poisson_stiffening)} entries for {layers} layers")
+            if min(np.min(self.stiffness_scale(ratio)) for ratio in np.linspace(0.1, 0.499, 50)) <= 0:
+                raise ValueError("poisson_stiffening makes a layer's stiffness negative")
         for mass in self.point_masses:
             if np.min(np.abs(np.array(self.station_m) - mass.z_m)) > 1e-6:
                 raise ValueError(f"the point mass {mass.parameter} at z = {mass.z_m:g} m is not at a station")
@@ -88,6 +99,14 @@ class Body(Table):
             "mass_area": np.array(self.mass_area_m2),
             "mass_moment_area": np.array(self.mass_moment_area_m4),
         }
+
+    def stiffness_scale(self, poisson_ratio: Any) -> Any:
+        """Factor (S - 1,) on each layer's stiffness at this Poisson ratio (a JAX tracer is welcome)."""
+        if not self.poisson_stiffening:
+            return np.ones(len(self.station_m) - 1) + 0.0 * poisson_ratio
+        first, second, third = np.array(self.poisson_stiffening).T
+        step = (1.0 - 2.0 * poisson_ratio) ** 0.25 - (1.0 - 2.0 * self.reference_poisson_ratio) ** 0.25
+        return 1.0 + step * first + step**2 * second + step**3 * third
 
     def point_mass_placement(self) -> tuple[tuple[str, ...], Float[np.ndarray, "station mass"]]:
         """Names of the point-mass parameters, and the matrix that lumps their values [kg] at the stations."""

@@ -57,25 +57,22 @@ class Cable(Table):
 
 
 class Channels(Table):
-    """How commands become cable displacements: ``displacement = gain @ (radius * command)``.
+    """How commands become cable displacements: ``displacement = radius * gain @ command``.
 
     Attributes:
         names: the channels, in the order of the columns of ``gain``.
         gain: one row per cable, one column per channel; pull > 0.
-        radius_parameter: for each channel the parameter [m] that turns its angle [rad] into a length; absent where
-            commands are lengths.
+        radius_parameter: parameter [m] that turns an angle [rad] into a length; absent where commands are lengths.
     """
 
     names: tuple[Name, ...] = Field(min_length=1)
     gain: tuple[tuple[float, ...], ...]
-    radius_parameter: tuple[Name, ...] | None = None
+    radius_parameter: Name | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Channels:
         if any(len(row) != len(self.names) for row in self.gain):
             raise ValueError(f"a row of gain does not have one entry for each of the {len(self.names)} channels")
-        if self.radius_parameter is not None and len(self.radius_parameter) != len(self.names):
-            raise ValueError(f"radius_parameter does not name one parameter for each of the {len(self.names)} channels")
         if np.any(np.all(np.array(self.gain) == 0, axis=0)):
             raise ValueError("a channel moves no cable")
         return self

@@ -112,7 +112,8 @@ class Robot(Table):
         if (self.command.unit == "rad") != (self.channels.radius_parameter is not None):
             raise ValueError("channels.radius_parameter is needed for commands in rad, and only for those")
         masses = [mass.parameter for mass in self.body.point_masses]
-        for name in (*REQUIRED, *masses, *(self.channels.radius_parameter or ())):
+        radius = [self.channels.radius_parameter] if self.channels.radius_parameter else []
+        for name in (*REQUIRED, *masses, *radius):
             if name not in self.parameters:
                 raise ValueError(f"the parameter {name!r} has no table [parameters.{name}]")
         if self.parameters["poisson_ratio"].high > 0.499:
@@ -184,11 +185,8 @@ class Robot(Table):
         Values may be JAX tracers: the matrix is then one too.
         """
         gain = np.array(self.channels.gain)
-        if self.channels.radius_parameter is None:
-            return gain
-        names = self.channels.radius_parameter
-        radii = [parameters.get(name, self.parameters[name].nominal) for name in names]
-        return sum(radius * gain * (np.arange(len(names)) == i) for i, radius in enumerate(radii))
+        radius = self.channels.radius_parameter
+        return gain if radius is None else parameters.get(radius, self.parameters[radius].nominal) * gain
 
     def parameter_table(self) -> dict[str, Parameter]:
         """Every base parameter by name, with those given per cable written out."""
@@ -214,6 +212,10 @@ class Robot(Table):
     def density(self, trunk_mass: Any) -> Any:
         """Density [kg/m3] of the body when the trunk, clamped part included, has this mass [kg]."""
         return trunk_mass / self.body.volume_m3
+
+    def stiffness_scale(self, poisson_ratio: Any) -> Any:
+        """Factor (layer,) on the stiffness of each layer at this Poisson ratio; see `Body.poisson_stiffening`."""
+        return self.body.stiffness_scale(poisson_ratio)
 
     def point_masses(self, parameters: Mapping[str, Any]) -> Any:
         """Masses lumped at the stations [kg], for these parameter values (JAX tracers welcome)."""
