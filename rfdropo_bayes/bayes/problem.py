@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
-Values = Mapping[str, Float[Array, " n"]]
+# Arrays of JAX or of NumPy: a problem takes and returns either.
+Values = Mapping[str, Float[Any, " n"]]
 
 
 @runtime_checkable
@@ -34,25 +35,23 @@ class Problem(Protocol):
     bounds: dict[str, tuple[float, float]]
     n_rows: int
 
-    def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
+    def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
         """Independent prior draws."""
         ...
 
-    def to_unconstrained(self, values: Values) -> Float[Array, "n d"]:
+    def to_unconstrained(self, values: Values) -> Float[Any, "n d"]:
         """Values as points of the unconstrained space."""
         ...
 
-    def from_unconstrained(self, u: Float[Array, "n d"]) -> dict[str, Float[Array, " n"]]:
+    def from_unconstrained(self, u: Float[Any, "n d"]) -> dict[str, Float[Any, " n"]]:
         """Inverse of `to_unconstrained`."""
         ...
 
-    def log_prior(self, u: Float[Array, "n d"]) -> Float[Array, " n"]:
+    def log_prior(self, u: Float[Any, "n d"]) -> Float[Any, " n"]:
         """Normalised log prior density in the UNCONSTRAINED space, that is with the Jacobian of the transform."""
         ...
 
-    def row_log_likelihood(
-        self, values: Values, horizon: int
-    ) -> tuple[Float[Array, "n horizon"], Int[Array, " n"]]:
+    def row_log_likelihood(self, values: Values, horizon: int) -> tuple[Float[Any, "n horizon"], Int[Any, " n"]]:
         """Log density of each of the first ``horizon`` rows given those before it, for a batch of values.
 
         Returns:
@@ -66,7 +65,7 @@ class Problem(Protocol):
 class ResidualProblem(Problem, Protocol):
     """A problem whose log likelihood is a sum of squares, as Gauss-Newton wants it."""
 
-    def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " m"]:
+    def residuals(self, values: Mapping[str, Float[Any, ""]], horizon: int) -> Float[Any, " m"]:
         """Whitened residuals r of the first ``horizon`` rows for ONE set of values.
 
         ``-0.5 * sum(r**2) + c`` is the log likelihood, where ``c`` depends on noise parameters only. Traceable by JAX
@@ -88,11 +87,11 @@ class RolloutProblem(Problem, Protocol):
     """
 
     @property
-    def observed(self) -> Float[Array, "n_rows feature"]: ...
+    def observed(self) -> Float[Any, "n_rows feature"]: ...
 
     @property
-    def observed_mask(self) -> Bool[Array, "n_rows feature"]: ...
+    def observed_mask(self) -> Bool[Any, "n_rows feature"]: ...
 
-    def rollouts(self, values: Values, horizon: int) -> tuple[Float[Array, "n horizon feature"], Int[Array, " n"]]:
+    def rollouts(self, values: Values, horizon: int) -> tuple[Float[Any, "n horizon feature"], Int[Any, " n"]]:
         """Simulated features of the first ``horizon`` rows, without observation noise, and the status of each."""
         ...

@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
-from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.bayes.problem import Problem, Values
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import horizon_smc
 from rfdropo_bayes.inference.checkpoints import open_checkpoint, run_digest
@@ -88,7 +89,7 @@ class BridgedProblem:
         self.fingerprint = getattr(problem, "fingerprint", "")
         self.status_names = getattr(problem, "status_names", {})
 
-    def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
+    def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
         """Draws of the mixture; components get their exact shares, up to one draw."""
         generator = host_generator(key)
         spread = (np.arange(n) + generator.uniform()) / n
@@ -98,15 +99,15 @@ class BridgedProblem:
         step = np.einsum("nij,nj->ni", self.factors[component], z / np.sqrt(scale)[:, None])
         return self.from_unconstrained(self.means[component] + step)
 
-    def to_unconstrained(self, values: dict[str, Float[Array, " n"]]) -> Float[Array, "n d"]:
+    def to_unconstrained(self, values: Values) -> Float[Any, "n d"]:
         """Columns in the order of ``names``."""
         return np.stack([np.asarray(values[name]) for name in self.names], axis=-1)
 
-    def from_unconstrained(self, u: Float[Array, "n d"]) -> dict[str, Float[Array, " n"]]:
+    def from_unconstrained(self, u: Float[Any, "n d"]) -> dict[str, Float[Any, " n"]]:
         """Columns by name."""
         return {name: u[:, j] for j, name in enumerate(self.names)}
 
-    def log_prior(self, u: Float[Array, "n d"]) -> Float[Array, " n"]:
+    def log_prior(self, u: Float[Any, "n d"]) -> Float[Any, " n"]:
         """Log density of the mixture."""
         parts = [
             share + np.atleast_1d(multivariate_t.logpdf(np.asarray(u), mean, factor @ factor.T, df=self.degrees))
@@ -115,8 +116,8 @@ class BridgedProblem:
         return logsumexp(np.stack(parts), axis=0)
 
     def row_log_likelihood(
-        self, values: dict[str, Float[Array, " n"]], horizon: int
-    ) -> tuple[Float[Array, "n 1"], Int[Array, " n"]]:
+        self, values: Values, horizon: int
+    ) -> tuple[Float[Any, "n 1"], Int[Any, " n"]]:
         """What the mixture lacks to the posterior."""
         u = self.to_unconstrained(values)
         rows, status = self.problem.row_log_likelihood(self.problem.from_unconstrained(u), self.problem.n_rows)

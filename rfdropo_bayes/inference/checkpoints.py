@@ -59,12 +59,13 @@ class Checkpoint:
         if self.path is None:
             return
         text = json.dumps({"digest": self.digest, "schema_version": SCHEMA_VERSION, **meta})
+        entries: dict[str, Any] = {_META: np.frombuffer(text.encode(), dtype=np.uint8), **arrays}
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             handle, temporary = tempfile.mkstemp(dir=self.path.parent, prefix=f".{self.path.name}.")
             try:
                 with os.fdopen(handle, "wb") as file:
-                    np.savez(file, **{_META: np.frombuffer(text.encode(), dtype=np.uint8)}, **arrays)
+                    np.savez(file, allow_pickle=False, **entries)
                     file.flush()
                     os.fsync(file.fileno())
                 os.replace(temporary, self.path)

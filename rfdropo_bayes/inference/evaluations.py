@@ -59,5 +59,5 @@ def evaluate_rows(
 
 def evaluate_prior(problem: Problem, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
     """Log prior at unconstrained points; minus infinity where it is not a number."""
-    density = np.asarray(problem.log_prior(u), dtype=float)
+    density = np.asarray(problem.log_prior(u), dtype=np.float64)
     return np.where(np.isnan(density) | (density == np.inf), -np.inf, density)

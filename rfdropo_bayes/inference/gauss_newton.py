@@ -153,11 +153,14 @@ def _make_linearise(problem: ResidualProblem, horizon: int, ledger: Ledger, u: n
 
         return linearise
 
+    def at(u: np.ndarray) -> np.ndarray:
+        return np.asarray(residuals(jnp.asarray(u)))
+
     def differences(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ledger.charge(problem, 2 * len(u) + 1, horizon)
         steps = DIFFERENCE * np.eye(len(u))
-        columns = [(np.asarray(residuals(u + e)) - np.asarray(residuals(u - e))) / (2.0 * DIFFERENCE) for e in steps]
-        return np.asarray(residuals(u)), np.stack(columns, axis=1)
+        columns = [(at(u + e) - at(u - e)) / (2.0 * DIFFERENCE) for e in steps]
+        return at(u), np.stack(columns, axis=1)
 
     return differences
 
@@ -234,7 +237,8 @@ def maximise(
     target: Target, u: Float[np.ndarray, " d"], *, max_steps: int, tolerance: float
 ) -> tuple[LevenbergState, list[dict[str, Any]]]:
     """Climb from one start until a step promises less than ``tolerance`` nats."""
-    state, trace = init(target, u), []
+    state = init(target, u)
+    trace: list[dict[str, Any]] = []
     while not state.converged and len(trace) < max_steps:
         state, info = step(target, state, tolerance)
         trace.append({"log_density": state.log_density, "damping": state.damping, **info._asdict()})

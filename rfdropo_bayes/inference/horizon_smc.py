@@ -239,7 +239,7 @@ def _affordable_moves(state: SmcState, plan: Plan, horizon: int, n_rows: int, *,
     return max(1, int((left if last else 0.5 * left) / cost + 1e-9))
 
 
-def _facts(info: StageInfo) -> dict[str, float]:
+def _facts(info: StageInfo) -> dict[str, Any]:
     kept = ("progress", "log_evidence_increment", "ess", "moves", "acceptance", "scale", "correlation")
     return {name: getattr(info, name) for name in kept}
 
@@ -346,7 +346,7 @@ def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcSta
     )
 
 
-def _block_scores(horizons: tuple[int, ...], prefixes: Float[np.ndarray, "r n_rows"]) -> list[dict[str, float]]:
+def _block_scores(horizons: tuple[int, ...], prefixes: Float[np.ndarray, "r n_rows"]) -> list[dict[str, Any]]:
     scores, first = [], 0
     for last in horizons:
         block = prefixes[:, last - 1] - (prefixes[:, first - 1] if first else 0.0)

@@ -249,7 +249,7 @@ def run(
         optimum=mode_values(problem, best),
         details={
             "covariance_unconstrained": best.covariance.tolist(),
-            "noise_coordinates": np.flatnonzero(found.climbs.noise).tolist(),
+            "noise_coordinates": np.flatnonzero(np.asarray(found.climbs.noise)).tolist(),
             "modes": [{"log_evidence": m.log_evidence, **mode_values(problem, m)} for m in found.modes],
         },
     )
@@ -270,4 +270,6 @@ def _pack(climbs: Climbs) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Climbs:
     ledger = Ledger(meta["ledger"]["rollouts"], meta["ledger"]["evaluations"], Counter(meta["ledger"]["excluded"]))
-    return Climbs(**arrays, **{name: meta[name] for name in ("level", "done", "trace", "seconds")}, ledger=ledger)
+    named = {name: meta[name] for name in ("level", "done", "trace", "seconds")}
+    saved: dict[str, Any] = {**arrays, **named}
+    return Climbs(ledger=ledger, **saved)

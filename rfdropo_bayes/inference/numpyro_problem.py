@@ -169,7 +169,7 @@ class NumpyroProblem:
         return parts
 
     def _split(self, sites: Mapping[str, Array]) -> dict[str, Array]:
-        flat = {}
+        flat: dict[str, Array] = {}
         for site, shape in self._shapes.items():
             columns = jnp.asarray(sites[site]).reshape(-1, int(np.prod(shape)))
             flat |= {name: columns[:, j] for j, name in enumerate(_components(site, shape))}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from rfdropo_bayes.errors import InputError
 OPTIMISERS = ("cma", "cem")
 
 
+@runtime_checkable
 class Optimiser(Protocol):
     """Minimises a noisy loss over a box."""
 

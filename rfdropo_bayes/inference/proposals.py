@@ -70,10 +70,10 @@ def propose(
     """Propose for all particles at once.
 
     ``random_walk``: ``x' = x + scale L z``.
-    ``crank_nicolson``: ``x' = m + sqrt(1 - scale^2) (x - m) + scale sqrt(s) L z`` with ``s`` inverse gamma, reversible with respect to a Student-t of the reference's location and spread (the
-    t-preconditioned Crank-Nicolson proposal of Grumitt, Karamanis and Seljak 2024). At scale 1 it nearly forgets where
-    it came from, so that one move decorrelates a population that is close to normal; at small scales it is a random
-    walk.
+    ``crank_nicolson``: ``x' = m + sqrt(1 - scale^2) (x - m) + scale sqrt(s) L z`` with ``s`` inverse gamma, reversible
+    with respect to a Student-t of the reference's location and spread (the t-preconditioned Crank-Nicolson proposal of
+    Grumitt, Karamanis and Seljak 2024). At scale 1 it nearly forgets where it came from, so that one move decorrelates
+    a population that is close to normal; at small scales it is a random walk.
 
     Returns:
         proposals, and the log of the proposal's part of the acceptance ratio.

@@ -40,7 +40,7 @@ class InferenceResult:
     draws: Draws
     log_evidence: tuple[float, float] | None = None
     prefix_log_evidence: Float[np.ndarray, " n_rows"] | None = None
-    block_scores: list[dict[str, float]] = field(default_factory=list)
+    block_scores: list[dict[str, Any]] = field(default_factory=list)
     log_likelihood: Float[np.ndarray, "chain draw row"] | None = None
     trace: list[dict[str, Any]] = field(default_factory=list)
     rollouts: float = 0.0

@@ -214,7 +214,7 @@ def losses(
     features, status = (np.asarray(part) for part in problem.rollouts(values, simulated))
     ledger.charge(problem, c * m, simulated)
     features = features[:, :horizon].astype(float) / plan.scale
-    not_a_number = ~np.isfinite(features).all(axis=(1, 2))
+    not_a_number = np.logical_not(np.isfinite(features).all(axis=(1, 2)))
     ledger.exclude(problem, status, not_a_number)
     alive = ((status == 0) & ~not_a_number).reshape(c, m)
     features = features.reshape(c, m, *features.shape[1:])

@@ -80,6 +80,8 @@ def next_step(
     """
     end = log_weights_at(longest)
     alive = np.isfinite(end)
+    if not alive.any():
+        return longest, False
     now = log_weights_at(0.0)
     survivors = log_effective_sample_size(np.where(alive, now, -np.inf))
     # Carried weights may already be just above the target, or below it once dead particles are gone: always advance.

@@ -8,13 +8,13 @@ weights never mix two targets. Log-likelihood rows travel with their particles, 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from blackjax.smc import resampling
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from scipy.special import logsumexp
 
 from rfdropo_bayes.inference.proposals import (
@@ -152,33 +152,54 @@ def advance(
     return moved, info, kept
 
 
-def resample(key: PRNGKeyArray, population: Population) -> Population:
-    """Systematic resampling to equal weights."""
+def cross_references(population: Population) -> tuple[Reference, Reference]:
+    """References for the moves of the first and of the second half of the particles, each fitted to the other half.
+
+    A proposal fitted to the very particles that it moves is not independent of them: second-order errors of the d (d + 1)
+    / 2 covariances then bias the evidence, by -20 / N nats a stage in 8 dimensions. Fitted crosswise they do not.
+    """
+    n = len(population.log_weights)
+    weights = np.exp(population.log_weights)
+    halves = (slice(n // 2, n), slice(0, n // 2))
+    whole = fit_reference(population.position, weights / weights.sum())
+    found = []
+    for half in halves:
+        share = weights[half].sum()
+        usable = share > 0.0 and share**2 / np.sum(weights[half] ** 2) > 2.0
+        found.append(fit_reference(population.position[half], weights[half] / share) if usable else whole)
+    return found[0], found[1]
+
+
+def resample(key: PRNGKeyArray, population: Population) -> tuple[Population, Int[np.ndarray, " n"]]:
+    """Systematic resampling to equal weights; also the ancestor of each particle, in ascending order."""
     n = len(population.log_weights)
     weights = jnp.asarray(np.exp(population.log_weights))
     index = np.asarray(resampling.systematic(key, weights / weights.sum(), n))
-    return population._replace(
+    resampled = population._replace(
         position=population.position[index],
         base=population.base[index],
         rows=population.rows[index],
         log_weights=np.full(n, -np.log(n)),
     )
+    return resampled, index
 
 
 def move(
     key: PRNGKeyArray,
     population: Population,
-    reference: Reference,
+    references: tuple[Reference, Reference],
+    second: Bool[np.ndarray, " n"],
     evaluate: Evaluate,
     tuning: Tuning,
     moves: int,
-) -> tuple[Population, dict[str, float]]:
+) -> tuple[Population, dict[str, Any]]:
     """Metropolis moves of equal-weight particles under the target at ``population.progress``.
 
     Args:
         key: random key.
         population: resampled particles.
-        reference: location and spread that shape the proposals.
+        references: location and spread that shape the proposals of the two halves.
+        second: particles that belong to the second half.
         evaluate: proposals to (base, rows).
         tuning: kernel and stopping rule.
         moves: most moves the budget allows; at least one is made.
@@ -191,9 +212,11 @@ def move(
     correlation = 1.0
     for count in range(max(1, min(moves, tuning.max_moves))):
         generator = host_generator(jax.random.fold_in(key, count))
-        proposal, ratio = propose(
-            generator, population.position, reference, scale, tuning.degrees, tuning.kernel
-        )
+        proposal, ratio = np.empty_like(first), np.empty(len(first))
+        for members, reference in zip((~second, second), references, strict=True):
+            proposal[members], ratio[members] = propose(
+                generator, population.position[members], reference, scale, tuning.degrees, tuning.kernel
+            )
         base, rows = evaluate(proposal)
         proposed = base + path_density(rows, population.progress)
         chosen = accept(generator, ratio + proposed - density)
@@ -205,7 +228,7 @@ def move(
         density = np.where(chosen, proposed, density)
         rates.append(float(chosen.mean()))
         scale = adapt_scale(tuning.kernel, scale, rates[-1], tuning.acceptance)
-        correlation = slowest_correlation(first, population.position, reference)
+        correlation = slowest_correlation(first, population.position, references[0])
         if correlation <= tuning.correlation:
             break
     done = {"moves": len(rates), "acceptance": float(np.mean(rates)), "correlation": correlation, "scale": scale}
@@ -240,9 +263,11 @@ def refresh(
 ) -> tuple[Population, StageInfo]:
     """Resample to equal weights and move under the present target."""
     resample_key, move_key = jax.random.split(key)
-    reference = fit_reference(population.position, np.exp(population.log_weights))
-    population = resample(resample_key, population)
+    references = cross_references(population)
+    population, index = resample(resample_key, population)
+    # Each particle moves by what the OTHER half looks like: see cross_references.
+    halves = index >= len(index) // 2
     if moves == 0:
         return population, info
-    population, done = move(move_key, population, reference, evaluate, tuning, moves)
+    population, done = move(move_key, population, references, halves, evaluate, tuning, moves)
     return population, info._replace(**done)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 
 class LinearGaussian:
@@ -69,3 +69,132 @@ class LinearGaussian:
         covariance = np.linalg.inv(precision)
         mean = covariance @ (self.mean / self.sd**2 + self.design.T @ (self.data / self.noise**2))
         return mean, covariance
+
+
+class Decay:
+    """y = amplitude exp(-rate t) + noise of unknown deviation; log-normal parameters; nonlinear, with a noise parameter.
+
+    ``fails_above``: rollouts with a higher rate fail with status 1, and their likelihood is left as NaN.
+    """
+
+    names = ("amplitude", "rate", "noise")
+    units = {"amplitude": "m", "rate": "1/s", "noise": "m"}  # noqa: RUF012
+    bounds = dict.fromkeys(names, (0.0, np.inf))
+    status_names = {1: "diverged"}  # noqa: RUF012
+
+    def __init__(self, n_rows: int = 60, seed: int = 0, fails_above: float = np.inf, traceable: bool = True) -> None:
+        self.n_rows, self.fails_above, self.traceable = n_rows, fails_above, traceable
+        self.time = np.linspace(0.0, 3.0, n_rows)
+        self.centre = np.log([1.0, 1.0, 0.1])
+        self.spread = np.array([0.7, 0.7, 1.0])
+        self.truth = {"amplitude": 1.4, "rate": 0.8, "noise": 0.05}
+        rng = np.random.default_rng(seed)
+        clean = self.truth["amplitude"] * np.exp(-self.truth["rate"] * self.time)
+        self.data = clean + self.truth["noise"] * rng.normal(size=n_rows)
+        self._rows = jax.jit(self._row_density, static_argnums=1)
+
+    def sample_prior(self, key, n):
+        return self.from_unconstrained(self.centre + self.spread * jax.random.normal(key, (n, 3)))
+
+    def to_unconstrained(self, values):
+        return jnp.stack([jnp.log(jnp.asarray(values[name])) for name in self.names], axis=-1)
+
+    def from_unconstrained(self, u):
+        return {name: jnp.exp(u[:, j]) for j, name in enumerate(self.names)}
+
+    def log_prior(self, u):
+        return jnp.sum(jax.scipy.stats.norm.logpdf(u, self.centre, self.spread), axis=1)
+
+    def _row_density(self, values, horizon):
+        fit = values["amplitude"][:, None] * jnp.exp(-values["rate"][:, None] * self.time[:horizon])
+        return jax.scipy.stats.norm.logpdf(self.data[:horizon], fit, values["noise"][:, None])
+
+    def row_log_likelihood(self, values, horizon):
+        values = {name: jnp.asarray(values[name]) for name in self.names}
+        rows = np.array(self._rows(values, horizon))
+        failed = np.asarray(values["rate"]) > self.fails_above
+        rows[failed] = np.nan
+        return rows, failed.astype(int)
+
+    def residuals(self, values, horizon):
+        kind = jnp if self.traceable else np
+        parts = [kind.asarray(values[name]) for name in self.names]
+        if not self.traceable:
+            parts = [float(part) for part in parts]
+        amplitude, rate, noise = parts
+        return (self.data[:horizon] - amplitude * kind.exp(-rate * self.time[:horizon])) / noise
+
+
+class TwoModes(LinearGaussian):
+    """One row y = |x| + noise in ``d`` dimensions (the rest observed directly): two modes of unequal prior mass."""
+
+    def __init__(self, d: int = 3) -> None:
+        super().__init__(n_rows=d, d=d)
+        self.design, self.noise = np.eye(d), np.full(d, 0.1)
+        self.mean, self.sd = np.full(d, 0.25), np.ones(d)
+        self.data = np.concatenate([[1.0], np.linspace(-0.5, 0.5, d - 1)])
+
+    def _row_density(self, u, horizon):
+        fit = jnp.concatenate([jnp.abs(u[:, :1]), u[:, 1:]], axis=1)[:, :horizon]
+        return jax.scipy.stats.norm.logpdf(self.data[:horizon], fit, self.noise[:horizon])
+
+    def mode_evidence(self):
+        """Log evidence of the modes x > 0 and x < 0 of the first row, together and their shares."""
+        sd = np.hypot(self.sd, self.noise)
+        plus, minus = (norm.logpdf(sign * self.data[0], self.mean[0], sd[0]) for sign in (1.0, -1.0))
+        rest = norm.logpdf(self.data[1:], self.mean[1:], sd[1:]).sum()
+        return float(np.logaddexp(plus, minus) + rest), float(1.0 / (1.0 + np.exp(minus - plus)))
+
+
+class Spring:
+    """Features of a damped oscillation whose frequency and damping differ from rollout to rollout, for RF-DROPO."""
+
+    names = ("frequency", "damping", "noise")
+    physical_names = ("frequency", "damping")
+    units = {"frequency": "1/s", "damping": "1/s", "noise": "m"}  # noqa: RUF012
+    bounds = {"frequency": (1.0, 5.0), "damping": (0.0, 2.0), "noise": (0.0, 1.0)}  # noqa: RUF012
+
+    def __init__(self, n_rows: int = 40, truth: tuple[float, float] = (2.3, 0.4)) -> None:
+        self.n_rows = n_rows
+        self.time = np.linspace(0.0, 3.0, n_rows)
+        self.calls: list[tuple[int, int]] = []
+        self.observed = self._features(np.array([truth[0]]), np.array([truth[1]]))[0]
+        self.observed_mask = np.ones_like(self.observed, dtype=bool)
+
+    def _features(self, frequency, damping):
+        angle = frequency[:, None] * self.time
+        decay = np.exp(-damping[:, None] * self.time)
+        return 0.05 * np.stack([decay * np.cos(angle), decay * np.sin(angle)], axis=-1)
+
+    def rollouts(self, values, horizon):
+        features = self._features(np.asarray(values["frequency"]), np.asarray(values["damping"]))
+        self.calls.append((len(features), horizon))
+        return features[:, :horizon], np.zeros(len(features), dtype=int)
+
+    def sample_prior(self, key, n):
+        keys = jax.random.split(key, 3)
+        return {
+            name: jax.random.uniform(k, (n,), minval=self.bounds[name][0], maxval=self.bounds[name][1])
+            for k, name in zip(keys, self.names, strict=True)
+        }
+
+    def to_unconstrained(self, values):
+        return jnp.stack([_logit(jnp.asarray(values[n]), *self.bounds[n]) for n in self.names], axis=-1)
+
+    def from_unconstrained(self, u):
+        return {
+            name: self.bounds[name][0] + (self.bounds[name][1] - self.bounds[name][0]) * jax.nn.sigmoid(u[:, j])
+            for j, name in enumerate(self.names)
+        }
+
+    def log_prior(self, u):
+        return jnp.sum(jax.nn.log_sigmoid(u) + jax.nn.log_sigmoid(-u), axis=1)
+
+    def row_log_likelihood(self, values, horizon):
+        features, status = self.rollouts(values, horizon)
+        noise = np.asarray(values["noise"])[:, None, None]
+        return norm.logpdf(self.observed[:horizon], features, noise).sum(axis=2), status
+
+
+def _logit(value, low, high):
+    return jnp.log(value - low) - jnp.log(high - value)

@@ -1,0 +1,55 @@
+"""The registry: every method by name, options that only it has."""
+
+from __future__ import annotations
+
+import jax
+import pytest
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference import methods
+
+from .toys import Decay, Spring
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "words"),
+    [
+        ("smd", {}, "did you mean 'smc'"),
+        ("smc", {"particels": 100}, "did you mean 'particles'"),
+        ("smc", {"variance_floor": 1e-5}, "unknown option 'variance_floor'"),
+        ("rfdropo", {"rolouts": 100}, "did you mean 'rollouts'"),
+        ("bridge", {"climb": {"strats": 3}}, "did you mean 'starts'"),
+        ("smc", {"particles": "many"}, "'many' is not of type int"),
+        ("smc", {"particles": True}, "True is not of type int"),
+        ("rfdropo", {"search": {"frequency": [1.0]}}, "is not a range"),
+        ("rfdropo", {"parameters": "frequency"}, "is not of type"),
+    ],
+)
+def test_a_wrong_option_is_named_with_what_was_meant(method, options, words):
+    with pytest.raises(InputError, match=words):
+        methods.make_config(method, options)
+
+
+def test_options_come_as_toml_has_them():
+    config = methods.make_config("rfdropo", {"rollouts": 20000, "parameters": ["a"], "search": {"a": [1, 2]}})
+    assert config.rollouts == 20000.0
+    assert config.parameters == ("a",)
+    assert config.search == {"a": (1.0, 2.0)}
+    assert methods.make_config("bridge", {"climb": {"starts": 3}}).climb.starts == 3
+    assert methods.make_config("smc", {"rollouts": None}).rollouts is None
+
+
+@pytest.mark.parametrize("method", methods.METHODS)
+def test_every_method_answers_in_the_same_form(method):
+    problem = Spring() if method == "rfdropo" else Decay(n_rows=20)
+    options = {"smc": {"particles": 100}, "rfdropo": {"evaluations": 40, "rollouts_per_candidate": 10}}.get(method, {})
+    result = methods.run(problem, method, options, jax.random.key(0))
+    assert result.method == method
+    shapes = {draws.shape for draws in result.draws.values()}
+    assert len(shapes) == 1
+    assert len(shapes.pop()) == 2
+    assert result.rollouts > 0
+    assert result.evaluations > 0
+    assert result.seconds > 0
+    assert result.trace
+    assert all(isinstance(sentence, str) for sentence in result.warnings)

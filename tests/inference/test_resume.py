@@ -1,0 +1,195 @@
+"""A run that is killed and resumed ends with the draws of one that was not."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference import methods
+from rfdropo_bayes.inference.progress import Progress
+
+from .toys import Decay, Spring
+
+KEY = jax.random.key(12)
+OPTIONS = {
+    "smc": {"particles": 60, "replicates": 2, "blocks": 3},
+    "laplace": {"starts": 3, "draws": 50},
+    "bridge": {"particles": 60, "replicates": 2, "climb": {"starts": 2}},
+    "rfdropo": {"evaluations": 60, "rollouts_per_candidate": 10},
+}
+
+
+class Killed(Exception):
+    """Stands for the kill."""
+
+
+class Mortal(Progress):
+    """Dies at a given stage, after its checkpoint was written."""
+
+    def __init__(self, stages):
+        super().__init__()
+        self.left = stages
+
+    def stage(self, share, **facts):
+        self.left -= 1
+        if self.left < 0:
+            raise Killed
+
+
+class Counting(Progress):
+    """Counts stages."""
+
+    count = 0
+
+    def stage(self, share, **facts):
+        self.count += 1
+
+
+def problem_for(method):
+    return Spring() if method == "rfdropo" else Decay(n_rows=20)
+
+
+def same(first, second):
+    for name in first.draws:
+        np.testing.assert_array_equal(first.draws[name], second.draws[name])
+    assert first.rollouts == second.rollouts
+    assert first.excluded == second.excluded
+    np.testing.assert_equal(first.log_evidence, second.log_evidence)
+    np.testing.assert_equal(first.trace, second.trace)
+
+
+@pytest.mark.parametrize("method", OPTIONS)
+def test_resumed_after_a_kill_at_any_stage(method, tmp_path):
+    problem, options, counting = problem_for(method), OPTIONS[method], Counting()
+    whole = methods.run(problem, method, options, KEY, progress=counting)
+    assert counting.count >= 3
+    for stages in sorted({*range(0, counting.count, max(1, counting.count // 6)), counting.count - 1}):
+        folder = tmp_path / str(stages)
+        with pytest.raises(Killed):
+            methods.run(problem, method, options, KEY, checkpoint_dir=folder, progress=Mortal(stages))
+        resumed = methods.run(problem, method, options, KEY, checkpoint_dir=folder, resume=True)
+        same(whole, resumed)
+
+
+def test_a_finished_run_is_only_read(tmp_path):
+    problem = Decay(n_rows=20)
+    first = methods.run(problem, "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path)
+    problem.row_log_likelihood = None  # would fail if it were called
+    again = methods.run(problem, "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path, resume=True)
+    same(first, again)
+
+
+def test_a_kill_inside_a_stage_costs_that_stage_only(tmp_path):
+    """The likelihood itself dies, in the middle of the moves."""
+
+    class Fragile(Decay):
+        calls = 0
+
+        def row_log_likelihood(self, values, horizon):
+            self.calls += 1
+            if self.calls == self.dies_at:
+                raise Killed
+            return super().row_log_likelihood(values, horizon)
+
+    problem = Fragile(n_rows=20)
+    problem.dies_at = -1
+    whole = methods.run(problem, "smc", OPTIONS["smc"], KEY)
+    for dies_at in range(2, problem.calls, 7):
+        problem.calls, problem.dies_at = 0, dies_at
+        folder = tmp_path / str(dies_at)
+        with pytest.raises(Killed):
+            methods.run(problem, "smc", OPTIONS["smc"], KEY, checkpoint_dir=folder)
+        problem.dies_at = -1
+        same(whole, methods.run(problem, "smc", OPTIONS["smc"], KEY, checkpoint_dir=folder, resume=True))
+
+
+SCRIPT = """
+import sys, time
+from pathlib import Path
+import jax
+sys.path.insert(0, sys.argv[1])
+from toys import Decay
+from rfdropo_bayes.inference import methods
+
+class Slow(Decay):
+    def row_log_likelihood(self, values, horizon):
+        time.sleep(0.05)
+        return super().row_log_likelihood(values, horizon)
+
+methods.run(Slow(n_rows=20), "smc", {"particles": 60, "replicates": 2, "blocks": 3}, jax.random.key(12),
+            checkpoint_dir=Path(sys.argv[2]))
+"""
+
+
+def test_sigkill_and_resume(tmp_path):
+    here = Path(__file__).parent
+    environment = {**os.environ, "PYTHONPATH": str(here.parents[1])}
+    process = subprocess.Popen([sys.executable, "-c", SCRIPT, str(here), str(tmp_path)], env=environment)
+    try:
+        deadline = time.monotonic() + 120.0
+        while not (tmp_path / "smc_1.npz").exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert process.poll() is None, "the run ended before it could be killed"
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    finally:
+        process.kill()
+        process.wait()
+    problem = Decay(n_rows=20)
+    whole = methods.run(problem, "smc", OPTIONS["smc"], KEY)
+    same(whole, methods.run(problem, "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path, resume=True))
+
+
+@pytest.mark.parametrize("change", ["options", "key", "data", "prior"])
+def test_a_checkpoint_of_another_run_is_refused(change, tmp_path):
+    problem = Decay(n_rows=20)
+    problem.fingerprint = "first"
+    methods.run(problem, "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path)
+    options, key = dict(OPTIONS["smc"]), KEY
+    if change == "options":
+        options["target_ess"] = 0.6
+    elif change == "key":
+        key = jax.random.key(13)
+    elif change == "data":
+        problem.fingerprint = "second"
+    else:
+        problem.spread = problem.spread * 1.1
+    with pytest.raises(InputError, match="belongs to a run with other data"):
+        methods.run(problem, "smc", options, key, checkpoint_dir=tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "foreign", "empty"])
+def test_a_damaged_checkpoint_is_refused(damage, tmp_path):
+    methods.run(Decay(n_rows=20), "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path)
+    file = tmp_path / "smc_0.npz"
+    if damage == "foreign":
+        np.savez(file, x=np.ones(3))
+    else:
+        file.write_bytes(file.read_bytes()[: 400 if damage == "truncated" else 0])
+    with pytest.raises(InputError, match="damaged"):
+        methods.run(Decay(n_rows=20), "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path, resume=True)
+
+
+def test_without_resume_an_old_checkpoint_is_not_used(tmp_path):
+    methods.run(Decay(n_rows=20), "smc", OPTIONS["smc"], jax.random.key(1), checkpoint_dir=tmp_path)
+    fresh = methods.run(Decay(n_rows=20), "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path)
+    same(fresh, methods.run(Decay(n_rows=20), "smc", OPTIONS["smc"], KEY))
+
+
+def test_the_log_has_a_line_per_stage_in_plain_json(tmp_path):
+    log = tmp_path / "log.jsonl"
+    with Progress("calibrate", log=log) as progress:
+        result = methods.run(Decay(n_rows=20), "smc", OPTIONS["smc"], KEY, progress=progress)
+    lines = [json.loads(line, parse_constant=pytest.fail) for line in log.read_text().splitlines()]
+    assert len(lines) == sum(1 for row in result.trace if not row.get("final"))
+    assert {"time", "elapsed", "run", "horizon", "ess", "rollouts", "stage"} <= lines[0].keys()
