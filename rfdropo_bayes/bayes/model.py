@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.noise import Timeline, draw_noise, row_log_density, timeline
 from rfdropo_bayes.bayes.space import ParameterSpace
@@ -179,7 +179,7 @@ class TrajectoryModel:
         density = jax.vmap(lambda r, line: row_log_density(r, sigma, tau, line))(residual, self.recordings.line)
         return jnp.sum(density, axis=0), jnp.max(observation.status)
 
-    def __call__(self, observe: Bool | bool = True) -> None:
+    def __call__(self, observe: bool = True) -> None:
         """The numpyro model; ``observe=False`` leaves the positions free, for predictive draws."""
         values = {p.name: numpyro.sample(p.name, p.prior) for p in self.space.parameters}
         observation = self.simulate(values)

@@ -53,10 +53,11 @@ class ActuatorLag:
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
     ) -> Float[Array, "step channel"]:
         """Filter the command, starting from rest at its initial value."""
-        share = time_step / (time_step + values["actuator_lag"])
+        # The share that is kept back, so that none is exactly the base simulator.
+        kept = values["actuator_lag"] / (time_step + values["actuator_lag"])
 
         def advance(last: Array, sent: Array) -> tuple[Array, Array]:
-            reached = last + share * (sent - last)
+            reached = sent + kept * (last - sent)
             return reached, reached
 
         return jax.lax.scan(advance, jnp.asarray(initial, command.dtype), command)[1]

@@ -22,7 +22,7 @@ def turn(vector):
 @given(st.tuples(*[st.floats(-0.8, 0.8)] * 3))
 @settings(deadline=None, max_examples=40)
 def test_the_camera_rotates_as_a_rotation_vector_says(vector):
-    expected = Rotation.from_rotvec(vector).apply(np.asarray(POINTS).reshape(-1, 3)).reshape(POINTS.shape)
+    expected = Rotation.from_rotvec(vector).apply(np.array(POINTS).reshape(-1, 3)).reshape(POINTS.shape)
     np.testing.assert_allclose(turn(vector), expected, atol=1e-9)
 
 
