@@ -16,7 +16,7 @@ DEV     = $(VENV)/dev.stamp
 export OPENBLAS_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint format notebooks clean
+.PHONY: help demo test test-all lint format bench notebooks demo-data clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-16s%s\n", $$1, $$2 }'
@@ -40,8 +40,14 @@ format: $(DEV) ## let ruff mend what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+bench: $(CORE) ## rollouts per second of the engines, as a table and as JSON
+	$(BIN)/python benchmarks/rollouts.py --json reports/bench/rollouts.json
+
 notebooks: $(DEV) ## run every notebook from top to bottom
 	$(PYTEST) -m notebook
+
+demo-data: $(CORE) ## make the recordings of the bundled example again
+	$(BIN)/rfdropo simulate experiments/demo_data.toml --out experiments/demo
 
 clean: ## remove the environment and what the tools cached; reports stay
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
