@@ -150,16 +150,19 @@ def load_posterior(path: Path) -> arviz.InferenceData:
 def summarise(posterior: Draws) -> dict[str, dict[str, float]]:
     """ArviZ's summary of each parameter: bulk and tail effective sample size, Monte-Carlo error of the mean, R-hat.
 
-    ``r_hat`` (rank-normalised, split) needs chains and is NaN where there is one only. Chains that never moved give NaN
-    throughout.
+    ``r_hat`` (rank-normalised, split) needs chains and is NaN where there is one only. Chains that never moved, or of
+    fewer than four draws, give NaN throughout.
     """
+    chains, draws = next(iter(posterior.values())).shape
+    if draws < 4:
+        nothing = dict.fromkeys(("ess_bulk", "ess_tail", "mcse_mean", "r_hat"), float("nan"))
+        return {name: dict(nothing) for name in posterior}
     data = arviz.InferenceData(posterior=_draws_dataset(posterior))
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         bulk, tail = arviz.ess(data, method="bulk"), arviz.ess(data, method="tail")
         error = arviz.mcse(data, method="mean")
-        several = next(iter(posterior.values())).shape[0] > 1
-        r_hat = arviz.rhat(data) if several else None
+        r_hat = arviz.rhat(data) if chains > 1 else None
     return {
         name: {
             "ess_bulk": float(bulk[variable_key(name)]),

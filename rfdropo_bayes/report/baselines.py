@@ -120,8 +120,9 @@ def baseline_errors(
 
 def _describe(fir: FirRegression, trained_on: str) -> str:
     powers = "commands" if fir.degree == 1 else f"commands and their powers up to {fir.degree}"
+    history = f"of the last {fir.lags[-1]:.3g} s ({len(fir.lags)} lags)" if len(fir.lags) > 1 else "of the moment"
     return (
-        f"ridge regression on the {powers} of the last {fir.lags[-1]:.3g} s ({len(fir.lags)} lags), trained on "
+        f"ridge regression on the {powers} {history}, trained on "
         f"{trained_on}; history length and penalty by cross-validation there"
     )
 

@@ -20,6 +20,7 @@ from rfdropo_bayes.report.units import display_unit
 
 TOGETHER = 0.6  # correlation from which on parameters are described jointly
 DETERMINED, FREE = 0.5, 0.8  # contraction against the prior
+RIDGE = 5.0  # standard deviation along a ridge over the next largest one
 NEGLIGIBLE = 0.2  # exponents below this are left out of the words
 WELL_AWAY = 0.4  # prior standard deviation over prior mean
 _HOW = {
@@ -86,10 +87,14 @@ def _alone(record: PosteriorRecord, info: ParameterInfo) -> Combination:
     sd = float(record.flat(info.name).std())
     prior_sd = float(record.prior[info.name].std()) if info.name in record.prior else None
     verdict = _verdict(sd, prior_sd)
-    factor, unit = display_unit(info.unit, sd)
-    before = "" if prior_sd is None else f" (prior ±{prior_sd / factor:.2g} {unit})".replace(" )", ")")
-    sentence = f"{info.name} {_HOW[verdict]} ±{sd / factor:.2g} {unit}".rstrip() + before
+    factor, unit = display_unit(info.unit, prior_sd or sd)
+    before = "" if prior_sd is None else f" (prior ±{_short(prior_sd / factor)} {unit})".replace(" )", ")")
+    sentence = f"{info.name} {_HOW[verdict]} ±{_short(sd / factor)} {unit}".rstrip() + before
     return Combination({info.name: 1.0}, info.unit, sd, prior_sd, verdict, sentence)
+
+
+def _short(value: float) -> str:
+    return f"{value:.0f}" if 100 <= value < 1e5 else f"{value:.2g}"
 
 
 def _groups(logs: Mapping[str, Float[np.ndarray, " n"]]) -> list[list[str]]:
@@ -109,16 +114,39 @@ def _eigen_combinations(
     group: list[str], logs: Mapping[str, np.ndarray], prior: Mapping[str, np.ndarray]
 ) -> list[Combination]:
     stack = np.stack([logs[n] for n in group])
-    _, vectors = np.linalg.eigh(np.atleast_2d(np.cov(stack)))
+    before = np.stack([prior[n] for n in group]) if all(n in prior for n in group) else None
     combinations = []
-    for vector in vectors.T:
-        powers = _readable(dict(zip(group, vector, strict=True)))
-        sd = float(np.std(sum(p * logs[n] for n, p in powers.items())))
-        known = all(n in prior for n in powers)
-        prior_sd = float(np.std(sum(p * prior[n] for n, p in powers.items()))) if known else None
+    for weights in _directions(stack):
+        weights = weights / weights[np.argmax(np.abs(weights))]
+        powers = _readable(dict(zip(group, weights, strict=True)))
+        sd = float(np.std(weights @ stack))  # of the exact weights: rounding them would let the ridge leak in
+        prior_sd = None if before is None else float(np.std(weights @ before))
         verdict = _verdict(sd, prior_sd)
         combinations.append(Combination(powers, "log", sd, prior_sd, verdict, _sentence(powers, sd, prior_sd, verdict)))
     return combinations
+
+
+def _directions(stack: Float[np.ndarray, "parameter n"]) -> Float[np.ndarray, "parameter parameter"]:
+    """Weights of the logarithms, one row per combination.
+
+    The eigenvectors of their covariance; but where one ridge dominates three parameters or more, the directions across
+    it, all determined about as well, would come out arbitrarily mixed. There they are the ratios that do not change
+    along the ridge, each against the parameter that changes most.
+    """
+    values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(stack)))
+    if len(values) < 3 or values[-1] < RIDGE**2 * max(values[-2], 0.0):
+        return vectors.T
+    ridge = vectors[:, -1]
+    reference = int(np.argmax(np.abs(ridge)))
+    rows = [ridge]
+    for i in range(len(ridge)):
+        if i != reference:
+            row = np.zeros(len(ridge))
+            row[i] = 1.0
+            if abs(ridge[i]) >= NEGLIGIBLE * abs(ridge[reference]):
+                row[i], row[reference] = -ridge[reference] / ridge[i], 1.0
+            rows.append(row)
+    return np.stack(rows)
 
 
 def _readable(powers: dict[str, float]) -> dict[str, float]:

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
-from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.report import check_figures, posterior_figures, trajectory_figures
 from rfdropo_bayes.report.coverage import coverage, transform_curve
 from rfdropo_bayes.report.headline import best_baseline
@@ -20,7 +20,7 @@ from rfdropo_bayes.report.scores import MeasuredPath, settled_rows
 from rfdropo_bayes.report.style import Picture, embed
 from rfdropo_bayes.report.units import display_name, display_unit
 
-MOST_RECORDINGS = 12
+MOST_RECORDINGS = 8
 NOTHING = "\u2013"
 OPEN_RECORDINGS = 2
 COVERAGE_CURVE = tuple(np.round(np.arange(0.1, 1.0, 0.1), 1))
@@ -68,7 +68,7 @@ def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "words": display_name, "duration": duration}
+    environment.filters |= {"number": number, "words": display_name, "duration": duration, "breakable": breakable}
     environment.globals["interval"] = interval
     stylesheet = environment.loader.get_source(environment, "page.css")[0] if environment.loader else ""
     return environment.get_template("page.html.j2").render(
@@ -77,7 +77,7 @@ def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str
         stylesheet=Markup(stylesheet),
         tiles=_tiles(summary),
         rows=_posterior_rows(summary),
-        infos={info.name: info for info in record.parameters},
+        priors=_prior_rows(record),
         figures=_run_figures(record, summary),
         recordings=_recording_views(record, summary),
         total_recordings=len(record.recordings),
@@ -96,6 +96,11 @@ def number(value: Any, digits: int = 3) -> str:
         return f"{int(value)}"
     text = f"{value:.{digits}g}"
     return f"{value:.0f}" if "e+0" in text and abs(value) < 1e6 else text
+
+
+def breakable(name: str) -> Markup:
+    """A long name that may be broken after its underscores."""
+    return Markup(str(escape(name)).replace("_", "_<wbr>").replace("@", "@<wbr>"))
 
 
 def interval(low: float, high: float) -> str:
@@ -136,6 +141,17 @@ def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     return tiles
 
 
+def _prior_rows(record: PosteriorRecord) -> list[tuple[str, ParameterInfo]]:
+    """Name and facts of every inferred parameter; one line for those that many recordings have of a kind."""
+    kinds: dict[tuple[str, str], list[ParameterInfo]] = {}
+    for info in record.free:
+        kinds.setdefault((info.name.split("@")[0] if "@" in info.name else info.name, str(info.prior)), []).append(info)
+    return [
+        (f"{name} (one for each of {len(infos)} recordings)" if len(infos) > 1 else infos[0].name, infos[0])
+        for (name, _), infos in kinds.items()
+    ]
+
+
 def _posterior_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The posterior table in units that read well, the same one for a parameter in all recordings."""
     magnitude: dict[str, float] = {}
@@ -147,7 +163,7 @@ def _posterior_rows(summary: Mapping[str, Any]) -> list[dict[str, Any]]:
         factor, unit = display_unit(row["unit"], magnitude[name.split("@")[0]])
         keys = ("mean", "sd", "q05", "median", "q95", "prior_q05", "prior_q95")
         scaled = {key: None if row.get(key) is None else row[key] / factor for key in keys}
-        rows.append({**row, **scaled, "name": name, "unit": unit})
+        rows.append({**row, **scaled, "name": name, "unit": unit, "own": "@" in name})
     return rows
 
 

@@ -143,7 +143,9 @@ def _plain(value: Any, path: str, missing: dict[str, str]) -> Any:
 
 def _reason(path: str, value: float) -> str:
     if path.endswith("r_hat"):
-        return "needs at least two chains"
+        return "needs at least two chains of at least four draws"
+    if path.endswith(("ess_bulk", "ess_tail", "mcse_mean")):
+        return "needs at least four draws that are not all equal"
     if path == "log_evidence.sd":
         return "nothing measures it: run more than one replicate"
     return "not a number" if math.isnan(value) else "infinite"

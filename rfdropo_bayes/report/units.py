@@ -14,7 +14,7 @@ def display_unit(unit: str, magnitude: float) -> tuple[float, str]:
     unit = "" if unit in ("-", "") else unit
     if not np.isfinite(magnitude) or magnitude <= 0 or 0.1 <= magnitude < 1000:
         return 1.0, _tidy(unit)
-    exponent = int(np.clip(3 * np.floor(np.log10(magnitude) / 3 + 1e-9), -9, 9))
+    exponent = int(np.clip(3 * np.floor((np.log10(magnitude) + 1.0) / 3 + 1e-9), -9, 9))  # 0.1 to 100 of it
     if exponent == 0 or (unit == "kg/m3" and exponent == 3):
         return 1.0, _tidy(unit)
     if unit in _PREFIXED and exponent in _PREFIX:

@@ -42,6 +42,22 @@ def test_a_scale_ridge_is_named_with_its_ratio_and_its_scale() -> None:
     assert found[-1] is common
 
 
+def test_three_parameters_on_one_ridge_are_reported_as_ratios() -> None:
+    """Eigenvectors across the ridge would mix the two ratios at random; standard deviations known to 3 %."""
+    rng = np.random.default_rng(6)
+    scale = 0.4 * rng.normal(size=4000)
+    widths = {"young_modulus": 0.0, "density": 0.006, "payload_mass": 0.008}
+    draws = {name: np.exp(scale + width * rng.normal(size=4000)) for name, width in widths.items()}
+    found = identify(record(draws, {name: np.exp(0.5 * rng.normal(size=4000)) for name in draws}))
+    assert [c.verdict for c in found] == ["determined", "determined", "free"]
+    assert set(found[2].powers.values()) == {1.0}
+    assert found[2].sentence.startswith("the common scale of young_modulus, density and payload_mass is left free")
+    for combination in found[:2]:
+        assert sorted(combination.powers.values()) == [-1.0, 1.0]
+        variance = sum(widths[name] ** 2 for name in combination.powers)
+        assert combination.sd == pytest.approx(np.sqrt(variance), rel=0.1)
+
+
 def test_a_parameter_that_may_be_zero_stands_by_itself() -> None:
     rng = np.random.default_rng(1)
     draws = {"damping": np.abs(0.002 * rng.normal(size=2000)), "tilt": 0.1 * rng.normal(size=2000)}

@@ -40,7 +40,7 @@ def folder(run: Any, record: PosteriorRecord, tmp_path_factory: pytest.TempPathF
 class Reader(HTMLParser):
     """Collects what a browser would fetch, where links lead, and whether tags are balanced."""
 
-    VOID = frozenset({"meta", "img", "link", "br"})
+    VOID = frozenset({"meta", "img", "link", "br", "wbr"})
 
     def __init__(self) -> None:
         super().__init__()
@@ -212,7 +212,8 @@ def test_numbers_for_people() -> None:
         "0.1 to 0.5",
     ]
     assert display_unit("Pa", 4.5e6) == (1e6, "MPa")
-    assert display_unit("m", 3e-4) == (pytest.approx(1e-6), "\u00b5m")
+    assert display_unit("m", 3e-4) == (pytest.approx(1e-3), "mm")
+    assert display_unit("m", 3e-5) == (pytest.approx(1e-6), "\u00b5m")
     assert display_unit("kg/m3", 1080.0) == (1.0, "kg/m\u00b3")
     assert display_unit("-", 0.45) == (1.0, "")
 
