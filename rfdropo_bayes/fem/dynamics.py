@@ -22,6 +22,8 @@ from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, multiply, solve
 from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian, unilateral_tensions
 from rfdropo_bayes.fem.layered import LayeredBody
 
+Scalar = Float[Array, ""] | float
+
 POISSON_LIMIT = 0.499
 """Larger Poisson ratios are taken as this one: the displacement element has no incompressible limit."""
 LOST = 10.0
@@ -83,12 +85,12 @@ class StepInfo(NamedTuple):
 def material(
     system: System,
     *,
-    young_modulus: float,
-    poisson_ratio: float,
-    density: float,
-    rayleigh_mass: float = 0.0,
-    rayleigh_stiffness: float = 0.0,
-    gravity: Sequence[float] = (0.0, 0.0, 0.0),
+    young_modulus: Scalar,
+    poisson_ratio: Scalar,
+    density: Scalar,
+    rayleigh_mass: Scalar = 0.0,
+    rayleigh_stiffness: Scalar = 0.0,
+    gravity: Sequence[float] | np.ndarray | Array = (0.0, 0.0, 0.0),
 ) -> Material:
     """Material of a body without point masses and with the stiffness of its profile; SI units as in ``Material``."""
     stations = len(system.body.station)
@@ -210,7 +212,7 @@ def step(
     prepared: Prepared,
     state: State,
     displacement: Float[Array, " cables"],
-    time_step: float,
+    time_step: Scalar,
     external_force: Float[Array, "nodes 3"] | float = 0.0,
 ) -> tuple[State, StepInfo]:
     """One implicit Euler step to the commanded cable displacements [m] (pull > 0) at its end.

@@ -13,12 +13,12 @@ from rfdropo_bayes.fem.dynamics import Prepared, State, System, frames_and_displ
 class Energies(NamedTuple):
     """Energies of one state [J]."""
 
-    kinetic: Float[Array, ""]
-    elastic: Float[Array, ""]
-    gravitational: Float[Array, ""]  # zero with every node at the origin
+    kinetic: Float[Array, "..."]
+    elastic: Float[Array, "..."]
+    gravitational: Float[Array, "..."]  # zero with every node at the origin
 
     @property
-    def total(self) -> Float[Array, ""]:
+    def total(self) -> Float[Array, "..."]:
         """Their sum."""
         return self.kinetic + self.elastic + self.gravitational
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rfdropo_bayes.fem.dynamics import Prepared, State, System, step
+from rfdropo_bayes.fem.dynamics import Prepared, Scalar, State, System, step
 from rfdropo_bayes.fem.layered import PointMap, point_positions
 
 
@@ -33,7 +33,7 @@ def _advance(
     prepared: Prepared,
     progress: _Progress,
     commands: Float[Array, "substeps cables"],
-    time_step: float,
+    time_step: Scalar,
     external_force: Float[Array, "nodes 3"] | float,
 ) -> _Progress:
     """The steps of one recorded row."""
@@ -52,7 +52,7 @@ def simulate(
     prepared: Prepared,
     state: State,
     displacement: Float[Array, "rows substeps cables"],
-    time_step: float,
+    time_step: Scalar,
     points: PointMap,
     external_force: Float[Array, "nodes 3"] | float = 0.0,
 ) -> Rollout:
@@ -77,9 +77,9 @@ def simulate_prefix(
     prepared: Prepared,
     state: State,
     displacement: Float[Array, "rows substeps cables"],
-    time_step: float,
+    time_step: Scalar,
     points: PointMap,
-    horizon: Int[Array, ""],
+    horizon: Int[Array, ""] | int,
     external_force: Float[Array, "nodes 3"] | float = 0.0,
 ) -> Rollout:
     """The first ``horizon`` rows of ``simulate``; later rows are zero.
