@@ -1,27 +1,27 @@
 """Effective section profile of a slender body along z, from a linear finite-element solution of its real geometry.
 
-A layer of a layered body is a straight prism; a notched trunk is not. The section of a layer is therefore chosen such that
-its two ends move relative to each other as those of the real body do: end moments, an axial force and a torque act on the
-tip face, the mean rigid motion of the cross-section is measured at every station (least squares over points of its plane),
-and the layer's EI, EA and GJ follow from the differences.
+A layer of a layered body is a straight prism; a notched trunk is not. The section of a layer is therefore chosen such
+that its two ends move relative to each other as those of the real body do: end moments, an axial force and a torque
+act on the tip face, the mean rigid motion of the cross-section is measured at every station (least squares over points
+of its plane), and the layer's EI, EA and GJ follow from the differences.
 
-    python tools/section_profile.py trunk.vtk --robot trunk_physical --element P2 --refine 1 --necks 6 --stiffening
+    python tools/section_profile.py trunk.vtk --robot trunk_physical --necks 6 --extrapolate
     python tools/section_profile.py trunk.vtk --robot trunk_sofa --element P1 --equal-node-masses --stiffening
 
 prints the arrays of a robot file's [body], and compares sag and first modes of the layered body with the solid's.
-The mesh is in millimetres, its axis is z, its tip face is plane. Needs meshio, scikit-fem and pypardiso.
+The mesh is in millimetres, its axis is z, its tip face is plane. Needs scikit-fem and pypardiso.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import meshio
 import numpy as np
 import skfem
 from pypardiso import PyPardisoSolver
@@ -32,6 +32,8 @@ from skfem.helpers import dot
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots.body import poisson_terms
+from rfdropo_bayes.robots.meshes import read_tetrahedra
 
 CLAMP = 0.020  # [m] nodes up to here are held
 GRAVITY = 9.81  # [m/s2]
@@ -87,8 +89,8 @@ class Solid:
 
 def read_mesh(path: Path) -> skfem.MeshTet:
     """Read a tetrahedral mesh given in millimetres."""
-    mesh = meshio.read(path)
-    return skfem.MeshTet(1e-3 * mesh.points.T, mesh.cells_dict["tetra"].T.astype(np.int64))
+    mesh = read_tetrahedra(path, "mm")
+    return skfem.MeshTet(mesh.position.T, np.ascontiguousarray(mesh.element.T, dtype=np.int64))
 
 
 def refine_necks(mesh: skfem.MeshTet, station: np.ndarray, passes: int) -> skfem.MeshTet:
@@ -108,7 +110,7 @@ def refine_necks(mesh: skfem.MeshTet, station: np.ndarray, passes: int) -> skfem
 def clamp_solid(
     coarse: skfem.MeshTet, fine: skfem.MeshTet, element: str, poisson_ratio: float, equal_node_masses: bool = False
 ) -> Solid:
-    """Discretise and factorise; ``equal_node_masses`` spreads the volume equally over the nodes, as SOFA's scene does."""
+    """Discretise and factorise; ``equal_node_masses`` spreads the volume equally over the nodes, as in SOFA's scene."""
     basis = skfem.Basis(fine, skfem.ElementVector(ELEMENTS[element]()), intorder=2)
     stiffness = linear_elasticity(*lame_parameters(1.0, poisson_ratio)).assemble(basis).tocsr()
     if equal_node_masses:
@@ -231,7 +233,7 @@ def plain_sections(mesh: skfem.MeshTet, station: np.ndarray, cuts: int = 24) -> 
     The loads act on the last layer's own face, so that its stiffness cannot be read off the solution.
     """
     rows = []
-    for low, high in zip(station[:-1], station[1:], strict=True):
+    for low, high in itertools.pairwise(station):
         sections = []
         for z in low + (high - low) * (np.arange(cuts) + 0.5) / cuts:
             x, y = section_points(mesh, z)[:2]
@@ -290,8 +292,12 @@ def layered_response(
         here = slice(2 * layer, 2 * layer + 4)
         soft = 12.0 * rigidity[layer] / (shear[layer] * length**2)
         stiffness[here, here] += beam_stiffness(length, rigidity[layer], soft)
-        mass[here, here] += density * profile["mass_area"][layer] * length * BEAM_MASS * np.outer(
-            [1.0, length, 1.0, length], [1.0, length, 1.0, length]
+        mass[here, here] += (
+            density
+            * profile["mass_area"][layer]
+            * length
+            * BEAM_MASS
+            * np.outer([1.0, length, 1.0, length], [1.0, length, 1.0, length])
         )
     force = -GRAVITY * mass[:, ::2].sum(1)
     displacement = np.linalg.solve(stiffness[2:, 2:], force[2:])
@@ -300,16 +306,11 @@ def layered_response(
 
 
 def beam_stiffness(length: float, rigidity: float, soft: float) -> np.ndarray:
-    """Stiffness of a Timoshenko beam: deflection and slope at one end, then the other (Przemieniecki, 1968, ch. 5.6)."""
-    l, s = length, soft
-    return rigidity / (l**3 * (1.0 + s)) * np.array(
-        [
-            [12.0, 6.0 * l, -12.0, 6.0 * l],
-            [6.0 * l, (4.0 + s) * l**2, -6.0 * l, (2.0 - s) * l**2],
-            [-12.0, -6.0 * l, 12.0, -6.0 * l],
-            [6.0 * l, (2.0 - s) * l**2, -6.0 * l, (4.0 + s) * l**2],
-        ]
-    )
+    """Stiffness of a Timoshenko beam: deflection and slope of its ends (Przemieniecki, 1968, ch. 5.6)."""
+    scale = np.diag([1.0, length, 1.0, length])
+    near, far = 4.0 + soft, 2.0 - soft
+    unit = np.array([[12, 6, -12, 6], [6, near, -6, far], [-12, -6, 12, -6], [6, far, -6, near]])
+    return rigidity / (length**3 * (1.0 + soft)) * scale @ unit @ scale
 
 
 @dataclass(frozen=True)
@@ -342,23 +343,21 @@ def toml_arrays(profile: dict[str, np.ndarray]) -> str:
 
 
 def stiffening(
-    mesh: skfem.MeshTet, station: np.ndarray, discretisation: Discretisation, reference: float, ratios: tuple[float, ...]
+    mesh: skfem.MeshTet, station: np.ndarray, how: Discretisation, reference: float, ratios: tuple[float, ...]
 ) -> np.ndarray:
     """Coefficients (layer, 3) of the bending stiffness of each layer over that at the reference Poisson ratio.
 
-    The factor is ``1 + c1 d + c2 d^2 + c3 d^3`` with ``d = (1 - 2 nu)^(1/4) - (1 - 2 reference)^(1/4)``; the relative error
-    is fitted.
+    See `Body.poisson_stiffening` for the functions they multiply; the relative error is fitted (3 % at most here).
     """
 
     def bending(ratio: float) -> np.ndarray:
-        return effective_sections(discretisation.solid(mesh, station, ratio), station)["bending_moment_area"].mean(1)
+        return effective_sections(how.solid(mesh, station, ratio), station)["bending_moment_area"].mean(1)
 
     base = bending(reference)
     factor = np.array([bending(ratio) / base for ratio in ratios])
-    step = (1.0 - 2.0 * np.array(ratios)) ** 0.25 - (1.0 - 2.0 * reference) ** 0.25
-    powers = step[:, None] ** np.arange(1, 4)
+    terms = np.array([poisson_terms(ratio, reference) for ratio in ratios])
     return np.array(
-        [np.linalg.lstsq(powers / column[:, None], (column - 1.0) / column, rcond=None)[0] for column in factor.T]
+        [np.linalg.lstsq(terms / column[:, None], (column - 1.0) / column, rcond=None)[0] for column in factor.T]
     )
 
 
@@ -369,11 +368,13 @@ def main() -> None:
     parser.add_argument("--robot", default="trunk_physical", help="whose stations are used")
     parser.add_argument("--element", choices=sorted(ELEMENTS), default="P2")
     parser.add_argument("--refine", type=int, default=0, help="uniform refinements of the mesh")
-    parser.add_argument("--necks", type=int, default=0, help="passes of bisection about the middle of the 2nd, 4th, ... layer")
-    parser.add_argument("--extrapolate", action="store_true", help="solve with 3 passes fewer too: error falls as edge^2")
+    parser.add_argument("--necks", type=int, default=0, help="passes of bisection about the necks")
+    parser.add_argument(
+        "--extrapolate", action="store_true", help="from a solution with 3 passes fewer: error ~ edge^2"
+    )
     parser.add_argument("--poisson-ratio", type=float, default=0.45)
-    parser.add_argument("--equal-node-masses", action="store_true", help="lay the mass as SOFA's UniformMass does")
-    parser.add_argument("--stiffening", action="store_true", help="also how bending stiffness depends on Poisson's ratio")
+    parser.add_argument("--equal-node-masses", action="store_true", help="the mass of SOFA's UniformMass")
+    parser.add_argument("--stiffening", action="store_true", help="dependence on Poisson's ratio too")
     arguments = parser.parse_args()
 
     robot = load_robot(arguments.robot)
@@ -399,7 +400,7 @@ def main() -> None:
     print(f"# {solid.basis.N} degrees of freedom")
     for name, response in responses.items():
         modes = " and ".join(f"{value:.4f}" for value in response.frequency_hz)
-        print(f"# {name}: sag {1e3 * response.sag_m:.2f} mm at z = {1e3 * station[-2]:.1f} mm, bending modes {modes} Hz")
+        print(f"# {name}: sag {1e3 * response.sag_m:.2f} mm at z = {1e3 * station[-2]:.1f} mm, modes {modes} Hz")
 
 
 if __name__ == "__main__":

@@ -52,8 +52,8 @@ class Cable(Table):
 
     def _points(self, radius: float | tuple[float, ...], z: float | tuple[float, ...]) -> np.ndarray:
         angle = np.deg2rad(self.azimuth_deg)
-        radius, z = np.atleast_1d(radius), np.atleast_1d(z)
-        return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+        distance = np.atleast_1d(radius)
+        return np.stack([distance * np.cos(angle), distance * np.sin(angle), np.atleast_1d(z)], axis=1)
 
 
 class Channels(Table):
