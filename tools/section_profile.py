@@ -42,13 +42,7 @@ NECK_ZONE = 1.5e-3  # [m] half height of the zone first refined about the middle
 RATIOS = (0.1, 0.3, 0.4, 0.43, 0.47, 0.485, 0.495, 0.499)
 SHEAR_FACTOR = 0.89  # of a circle (Cowper, 1966)
 BEAM_MASS = np.array([[156, 22, 54, -13], [22, 4, 13, -3], [54, 13, 156, -22], [-13, -3, -22, 4]]) / 420.0
-UNITS = {
-    "axial_area": "_m2",
-    "bending_moment_area": "_m4",
-    "torsion_constant": "_m4",
-    "mass_area": "_m2",
-    "mass_moment_area": "_m4",
-}
+UNITS = {"axial_area": "_m2", "mass_area": "_m2", "poisson_stiffening": ""}
 ELEMENTS = {"P1": skfem.ElementTetP1, "P2": skfem.ElementTetP2}
 
 
@@ -159,13 +153,8 @@ class SectionMotion:
         self.points = section_points(solid.coarse, z)
         x, y = self.points[:2]
         one, zero = np.ones_like(x), np.zeros_like(x)
-        rigid = np.array(
-            [
-                [one, zero, zero, zero, zero, -y],
-                [zero, one, zero, zero, zero, x],
-                [zero, zero, one, y, -x, zero],
-            ]
-        )
+        along = [one, zero, zero, zero, zero, -y], [zero, one, zero, zero, zero, x], [zero, zero, one, y, -x, zero]
+        rigid = np.array(along)
         self.inverse = np.linalg.pinv(rigid.transpose(0, 2, 1).reshape(-1, 6))
         self.probes = solid.basis.probes(self.points)
 
@@ -338,7 +327,7 @@ def toml_arrays(profile: dict[str, np.ndarray]) -> str:
     lines = []
     for name, values in profile.items():
         rounded = json.dumps(np.vectorize(lambda value: float(f"{value:.4g}"))(values).tolist())
-        lines.append(f"{name}{UNITS.get(name, '')} = {rounded}")
+        lines.append(f"{name}{UNITS.get(name, '_m4')} = {rounded}")
     return "\n".join(lines)
 
 
