@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.special import logsumexp
@@ -115,12 +116,12 @@ class BridgedProblem:
         ]
         return logsumexp(np.stack(parts), axis=0)
 
-    def row_log_likelihood(
-        self, values: Values, horizon: int
-    ) -> tuple[Float[Any, "n 1"], Int[Any, " n"]]:
+    def row_log_likelihood(self, values: Values, horizon: int) -> tuple[Float[Any, "n 1"], Int[Any, " n"]]:
         """What the mixture lacks to the posterior."""
         u = self.to_unconstrained(values)
-        rows, status = self.problem.row_log_likelihood(self.problem.from_unconstrained(u), self.problem.n_rows)
+        rows, status = self.problem.row_log_likelihood(
+            self.problem.from_unconstrained(jnp.asarray(u)), self.problem.n_rows
+        )
         density = evaluate_prior(self.problem, u) + np.asarray(rows).sum(axis=1)
         return (density - self.log_prior(u))[:, None], np.asarray(status)
 
@@ -144,7 +145,7 @@ def run(
         bridged, config.sampler, sample_key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress
     )
     u = np.stack([sampled.draws[name] for name in bridged.names], axis=-1)
-    values = problem.from_unconstrained(u.reshape(-1, u.shape[-1]))
+    values = problem.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
     draws = {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in problem.names}
     ledger = found.climbs.ledger
     excluded = ledger.excluded + Counter(sampled.excluded)

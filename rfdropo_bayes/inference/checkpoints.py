@@ -86,7 +86,7 @@ class Checkpoint:
         if self.path is None or not self.path.exists():
             return None
         try:
-            with np.load(self.path, allow_pickle=False) as file:
+            with self.path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files if name != _META}
                 meta = json.loads(file[_META].tobytes())
             digest = meta["digest"]

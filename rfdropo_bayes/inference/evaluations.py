@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -48,7 +49,7 @@ def evaluate_rows(
     problem: Problem, u: Float[np.ndarray, "n d"], horizon: int, ledger: Ledger
 ) -> Float[np.ndarray, "n horizon"]:
     """Row log likelihoods at unconstrained points; minus infinity throughout for every rollout that is left out."""
-    values = problem.from_unconstrained(u)
+    values = problem.from_unconstrained(jnp.asarray(u))
     rows, status = (np.asarray(part) for part in problem.row_log_likelihood(values, horizon))
     rows = np.asarray(rows, dtype=float)
     ledger.charge(problem, len(u), horizon)
@@ -59,5 +60,5 @@ def evaluate_rows(
 
 def evaluate_prior(problem: Problem, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
     """Log prior at unconstrained points; minus infinity where it is not a number."""
-    density = np.asarray(problem.log_prior(u), dtype=np.float64)
+    density = np.asarray(problem.log_prior(jnp.asarray(u)), dtype=np.float64)
     return np.where(np.isnan(density) | (density == np.inf), -np.inf, density)

@@ -130,7 +130,7 @@ def _prior_derivatives(problem: ResidualProblem) -> tuple[Callable, Callable]:
 
 
 def _make_linearise(problem: ResidualProblem, horizon: int, ledger: Ledger, u: np.ndarray, jacobian: str) -> Callable:
-    def residuals(u: Array) -> Array:
+    def residuals(u: Array) -> Any:
         values = problem.from_unconstrained(u[None])
         return problem.residuals({name: value[0] for name, value in values.items()}, horizon)
 

@@ -84,9 +84,7 @@ class SmcConfig:
     @property
     def tuning(self) -> Tuning:
         """What a stage needs of this."""
-        return Tuning(
-            self.target_ess, self.kernel, self.degrees, self.acceptance, self.correlation, self.max_moves
-        )
+        return Tuning(self.target_ess, self.kernel, self.degrees, self.acceptance, self.correlation, self.max_moves)
 
 
 class Plan(NamedTuple):

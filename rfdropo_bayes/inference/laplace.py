@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
@@ -112,9 +113,7 @@ def find_modes(
         began = time.monotonic()
         if target is None:
             best = climbs.positions[np.argmax(climbs.log_density)] if climbs.done == 0 else climbs.positions[0]
-            target = make_target(
-                problem, horizons[climbs.level], climbs.ledger, best, config.jacobian, climbs.noise
-            )
+            target = make_target(problem, horizons[climbs.level], climbs.ledger, best, config.jacobian, climbs.noise)
         state, steps = maximise(
             target, climbs.positions[climbs.done], max_steps=config.max_steps, tolerance=config.tolerance
         )
@@ -179,9 +178,7 @@ def _collect(problem: ResidualProblem, config: LaplaceConfig, climbs: Climbs) ->
     warnings = []
     near = climbs.log_density > climbs.log_density.max() - 30.0
     assert climbs.noise is not None
-    target = make_target(
-        problem, problem.n_rows, climbs.ledger, climbs.positions[0], config.jacobian, climbs.noise
-    )
+    target = make_target(problem, problem.n_rows, climbs.ledger, climbs.positions[0], config.jacobian, climbs.noise)
     modes = []
     for position, density, converged in zip(
         climbs.positions[near], climbs.log_density[near], climbs.converged[near], strict=True
@@ -257,7 +254,7 @@ def run(
 
 def mode_values(problem: Problem, mode: Laplace) -> dict[str, float]:
     """A mode in physical units."""
-    values = problem.from_unconstrained(mode.mean[None])
+    values = problem.from_unconstrained(jnp.asarray(mode.mean[None]))
     return {name: float(np.asarray(values[name])[0]) for name in problem.names}
 
 

@@ -35,9 +35,10 @@ class Optimiser(Protocol):
         ...
 
 
-def default_population(d: int) -> int:
-    """``4 + floor(3 ln d)``, Hansen's default."""
-    return 4 + math.floor(3.0 * math.log(d))
+def default_population(name: str, d: int) -> int:
+    """``4 + floor(3 ln d)``, Hansen's default for CMA-ES; the cross-entropy method wants 5 d, it keeps little."""
+    hansen = 4 + math.floor(3.0 * math.log(d))
+    return max(hansen, 5 * d) if name == "cem" else hansen
 
 
 def make_optimiser(name: str, d: int, *, high: float, sigma: float, population: int, seed: int) -> Optimiser:
@@ -82,10 +83,11 @@ class CrossEntropy:
         return np.minimum(folded, 2.0 * self.high - folded)
 
     def tell(self, candidates: Float[np.ndarray, "population d"], losses: Float[np.ndarray, " population"]) -> None:
-        """Refit to the elite."""
+        """Refit to the elite; the spread is taken about the OLD mean, so that it cannot collapse on the way."""
         best = candidates[np.argsort(losses, kind="stable")[: self.elites]]
+        spread = np.sqrt(np.mean((best - self.mean) ** 2, axis=0))
         self.mean = self.smoothing * best.mean(axis=0) + (1.0 - self.smoothing) * self.mean
-        self.sd = self.smoothing * best.std(axis=0) + (1.0 - self.smoothing) * self.sd
+        self.sd = self.smoothing * spread + (1.0 - self.smoothing) * self.sd
 
     @property
     def centre(self) -> Float[np.ndarray, " d"]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr, ndtri
 
-from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.bayes.problem import Problem, Values
 from rfdropo_bayes.errors import InputError
 
 WIDTH = 4.0  # every parameter's search range is scaled to [0, 4]
@@ -91,7 +91,7 @@ def search_space(
     problem: Problem,
     names: tuple[str, ...],
     ranges: Mapping[str, tuple[float, float]],
-    prior: Mapping[str, Float[np.ndarray, " n"]],
+    prior: Values,
 ) -> SearchSpace:
     """Search ranges: those asked for, else the hard bounds, or the central 99 % of the prior where these are infinite.
 

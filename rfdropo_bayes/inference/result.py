@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -55,7 +56,7 @@ class InferenceResult:
 
 def chains(problem: Problem, positions: list[np.ndarray]) -> Draws:
     """Unconstrained draws, one array per chain, as named values in physical units."""
-    values = [problem.from_unconstrained(u) for u in positions]
+    values = [problem.from_unconstrained(jnp.asarray(u)) for u in positions]
     return {name: np.stack([np.asarray(v[name], dtype=float) for v in values]) for name in problem.names}
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from scipy.stats import qmc
@@ -46,7 +47,7 @@ class RfdropoConfig:
         evaluations: candidates tried, where no budget is given (paper: 5000).
         rollouts_per_candidate: Monte-Carlo rollouts behind each loss (paper: 100).
         optimiser: "cma" or "cem".
-        population: candidates per generation; None for 4 + floor(3 ln d).
+        population: candidates per generation; None for 4 + floor(3 ln d), or 5 d for "cem".
         sigma: initial step, as a share of the search range.
         horizon: schedule "paper", "linear" or "full".
         levels: rollouts are simulated to one of this many horizons, the shortest that is long enough.
@@ -136,7 +137,7 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
     prior = {name: np.asarray(values) for name, values in problem.sample_prior(key, 1000).items()}
     names = config.parameters or tuple(getattr(problem, "physical_names", problem.names))
     space = search_space(problem, names, config.search, prior)
-    population = config.population or default_population(space.dimension)
+    population = config.population or default_population(config.optimiser, space.dimension)
     fixed = {name: float(np.median(prior[name])) for name in problem.names if name not in names}
     scale = motion_scale(np.asarray(problem.observed, dtype=float), np.asarray(problem.observed_mask))
     finalists = config.finalists if config.mended else 0
@@ -209,8 +210,8 @@ def losses(
     """
     drawn = plan.space.draw(candidates, uniform)
     c, m, _ = drawn.shape
-    values = {name: np.full(c * m, value) for name, value in plan.fixed.items()}
-    values |= {name: drawn[..., j].ravel() for j, name in enumerate(plan.space.names)}
+    values = {name: jnp.full(c * m, value) for name, value in plan.fixed.items()}
+    values |= {name: jnp.asarray(drawn[..., j].ravel()) for j, name in enumerate(plan.space.names)}
     features, status = (np.asarray(part) for part in problem.rollouts(values, simulated))
     ledger.charge(problem, c * m, simulated)
     features = features[:, :horizon].astype(float) / plan.scale
@@ -236,9 +237,7 @@ def step(
     i = len(state.losses)
     m, d = config.rollouts_per_candidate, len(plan.space.names)
     uniform = uniforms(jax.random.fold_in(key, i), m, d, stratified=config.mended)
-    values = losses(
-        problem, plan, config, asked, uniform, plan.horizons[i], plan.simulated[i], state.ledger
-    )
+    values = losses(problem, plan, config, asked, uniform, plan.horizons[i], plan.simulated[i], state.ledger)
     facts = {"generation": i, "horizon": plan.horizons[i], "loss": float(values.min())}
     state.trace.append(facts | {"rollouts": state.ledger.rollouts})
     return state._replace(

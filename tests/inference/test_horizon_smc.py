@@ -124,7 +124,7 @@ def test_a_failure_costs_evidence_by_its_prior_mass():
 
 
 def test_a_prior_that_excludes_the_data_is_named():
-    with pytest.raises(InputError, match="the prior excludes the data.*diverged 200"):
+    with pytest.raises(InputError, match=r"the prior excludes the data.*diverged 200"):
         horizon_smc.run(Decay(fails_above=-1.0), SmcConfig(particles=200), KEY)
 
 
@@ -134,7 +134,7 @@ def test_a_prior_far_from_the_data_collapses_the_evidence():
     exact = far.prefix_log_evidence()[-1]
     result = horizon_smc.run(far, SmcConfig(particles=500, replicates=2), KEY)
     assert exact < near.prefix_log_evidence()[-1] - 100.0
-    assert result.log_evidence[0] == pytest.approx(exact, abs=1.0)
+    assert result.log_evidence[0] == pytest.approx(exact, rel=0.01)
 
 
 @pytest.mark.parametrize("budget", [1500.0, 4000.0, 20000.0])
@@ -154,7 +154,7 @@ def test_a_budget_that_runs_out_is_said():
 
 
 def test_a_budget_that_allows_nothing_is_refused():
-    with pytest.raises(InputError, match="too few.*allow at least"):
+    with pytest.raises(InputError, match=r"too few.*allow at least"):
         horizon_smc.run(LinearGaussian(), SmcConfig(rollouts=20.0), KEY)
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.schedules import (
+    SPACINGS,
     block_boundaries,
     linear_horizon,
     log_effective_sample_size,
@@ -30,7 +31,7 @@ def test_published_schedule_is_the_formula_and_never_sees_the_last_row():
 def test_mended_schedules_grow_and_end_at_the_last_row(iterations, n_rows):
     for schedule in (paper_horizon, linear_horizon):
         taus = [schedule(i, iterations, n_rows) for i in range(iterations)]
-        assert all(1 <= a <= b <= n_rows for a, b in zip(taus, taus[1:] + [n_rows], strict=True))
+        assert all(1 <= a <= b <= n_rows for a, b in zip(taus, [*taus[1:], n_rows], strict=True))
         if iterations > 1 or schedule is linear_horizon:
             assert taus[-1] == n_rows
 
@@ -40,7 +41,7 @@ def test_the_mended_curve_stays_close_to_the_published_one():
     assert 0 <= min(differences) <= max(differences) <= 2
 
 
-@given(n_rows=st.integers(1, 2000), blocks=st.integers(1, 12), spacing=st.sampled_from(["geometric", "linear", "every"]))
+@given(n_rows=st.integers(1, 2000), blocks=st.integers(1, 12), spacing=st.sampled_from(SPACINGS))
 def test_blocks_are_increasing_prefixes_that_end_at_the_data(n_rows, blocks, spacing):
     ends = block_boundaries(n_rows, blocks, spacing)
     assert ends[-1] == n_rows

@@ -72,7 +72,9 @@ class LinearGaussian:
 
 
 class Decay:
-    """y = amplitude exp(-rate t) + noise of unknown deviation; log-normal parameters; nonlinear, with a noise parameter.
+    """y = amplitude exp(-rate t) + noise of unknown deviation; log-normal parameters.
+
+    Nonlinear, with a noise parameter.
 
     ``fails_above``: rollouts with a higher rate fail with status 1, and their likelihood is left as NaN.
     """
