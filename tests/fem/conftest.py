@@ -74,8 +74,8 @@ def settle():
 
 
 @functools.cache
-def _compiled_trace(system_of, clamped: int):
-    system = system_of()._replace(clamped_stations=clamped)
+def _compiled_trace(clamped: int):
+    system = small_trunk()._replace(clamped_stations=clamped)
 
     @jax.jit
     def trace(material, state, displacement, time_step, force):
@@ -99,6 +99,6 @@ def trace():
     def run(material, state, displacement, time_step, clamped=1, force=None):
         assert displacement.shape == (100, 3)
         force = np.zeros(state.position.shape) if force is None else force
-        return _compiled_trace(small_trunk, clamped)(material, state, displacement, time_step, force)
+        return _compiled_trace(clamped)(material, state, displacement, time_step, force)
 
     return run

@@ -209,7 +209,7 @@ def test_a_prefix_is_the_beginning_of_the_whole(trunk, trace, markers, prefix):
 
 
 def test_a_diverged_rollout_is_reported_and_spoils_no_other(prefix):
-    """A density of NaN, and one so large that the body falls out of sight, beside a good one."""
+    """A density of NaN, and a negative one, beside a good one."""
     pulls = jnp.asarray(wandering_pulls()[:20].reshape(10, 2, 3))
     batch = prefix(jnp.array([1050.0, np.nan, -1050.0]), pulls, 10)
     alone = prefix(jnp.array([1050.0, 1050.0, 1050.0]), pulls, 10)
