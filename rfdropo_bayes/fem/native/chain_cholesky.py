@@ -1,9 +1,13 @@
 """Cholesky factorisation of bordered block-tridiagonal matrices, many side by side in SIMD lanes.
 
-The stations of a layered body are eliminated one after the other from the tip to the base. Three arrays hold, for every station, the
-pivot block, the coupling to the next station and the border: rows below the matrix, one for each right-hand side. All are cut into
-3 x 3 tiles and stored panel by panel: rows 3 p to 3 p + 2 of a block with ``size`` columns are panel p, element (3 p + r, c) at
-``(p * size + c) * 3 + r``. One kernel, panel times transposed panel, does nearly all of the work. The factorisation turns a border
+The stations of a layered body are eliminated one after the other from the tip to the base. Three arrays hold, for
+every station, the
+pivot block, the coupling to the next station and the border: rows below the matrix, one for each right-hand side. All
+are cut into
+3 x 3 tiles and stored panel by panel: rows 3 p to 3 p + 2 of a block with ``size`` columns are panel p, element (3 p
++ r, c) at
+``(p * size + c) * 3 + r``. One kernel, panel times transposed panel, does nearly all of the work. The factorisation
+turns a border
 row b' into (L^-1 b)', and products of these rows are b_i' A^-1 b_j.
 """
 
@@ -68,9 +72,7 @@ def _pivot_tile(block, row, length, token):
 def _factor_tile(target, row, block, pivot_row, length, token):
     """Finish the tile of a panel below the diagonal tile after ``length`` columns."""
     t, d = row + 3 * length, pivot_row + 3 * length
-    c0, c1, c2, c3, c4, c5, c6, c7, c8 = _tile_minus_product(
-        target, t, target, row, block, pivot_row, length, token
-    )
+    c0, c1, c2, c3, c4, c5, c6, c7, c8 = _tile_minus_product(target, t, target, row, block, pivot_row, length, token)
     inverse = load(block, d, token)
     c0, c1, c2 = c0 * inverse, c1 * inverse, c2 * inverse
     lower, inverse = load(block, d + 1, token), load(block, d + 4, token)
@@ -146,7 +148,8 @@ def _back_substitute_block(pivot, p, solution, s, tiles, token):
 
 @numba.njit(nogil=True, error_model="numpy")
 def back_substitute(pivot, coupling, border, weight, rows, solution, first, stations, tiles, panels, token):
-    """Solve A x = sum_i weight_i b_i over the first ``rows`` border rows b_i, after all stations >= ``first`` are eliminated."""
+    """Solve A x = sum_i weight_i b_i over the first ``rows`` border rows b_i, after all stations >= ``first`` are
+    eliminated."""
     size = 3 * tiles
     block, frame = 3 * tiles * size, 3 * panels * size
     for station in range(first, stations):

@@ -1,6 +1,7 @@
 """The compiled engine for layered bodies: rollouts of a whole batch on CPUs, the same numbers as ``fem.rollouts``.
 
-Samples fill the lanes of vector registers, blocks of lanes are spread over threads. Lanes never mix and a block knows nothing of the
+Samples fill the lanes of vector registers, blocks of lanes are spread over threads. Lanes never mix and a block knows
+nothing of the
 others: a rollout's result does not depend on its batch, on its place in it or on the number of threads.
 """
 
@@ -40,7 +41,6 @@ class NativeRollout(NamedTuple):
     tension: Float[np.ndarray, "batch rows cables"]  # [N]
     diverged: Bool[np.ndarray, " batch"]
     cables_converged: Bool[np.ndarray, " batch"]
-    residual: Float[np.ndarray, " batch"]  # relative unbalanced force of the initial equilibrium; 0 for a start at rest
 
 
 @cache
@@ -64,7 +64,6 @@ class NativeLayered:
         time_step: of one implicit Euler step [s].
         precision: of all arithmetic; parameters, commands and results are float64 in any case.
         threads: lane blocks computed at the same time; None for all processors this process may use.
-        from_equilibrium: start in static equilibrium under the cable displacements ``start``, else undeformed.
         lanes: samples side by side; None for as many as a vector register holds.
 
     Raises:
@@ -79,14 +78,13 @@ class NativeLayered:
         *,
         precision: Precision = "float64",
         threads: int | None = None,
-        from_equilibrium: bool = False,
         lanes: int | None = None,
     ) -> None:
         if precision not in _TENSION_PROBLEM:
             raise InputError(f"precision {precision!r}", remedy=f"use one of {', '.join(_TENSION_PROBLEM)}")
         if threads is not None and threads < 1:
             raise InputError(f"{threads} threads", remedy="use at least one, or None for all processors")
-        self.system, self.time_step, self.from_equilibrium = system, float(time_step), from_equilibrium
+        self.system, self.time_step = system, float(time_step)
         self.precision, self.dtype = precision, np.dtype(precision)
         self.threads = threads or available_threads()
         self.lanes = lanes or native_lanes(self.dtype)
@@ -100,7 +98,8 @@ class NativeLayered:
         material: Material,
         displacement: Float[np.ndarray, "*batch steps cables"],
         *,
-        start: Float[np.ndarray, "*batch cables"] | None = None,
+        position: Float[np.ndarray, "*batch nodes 3"] | None = None,
+        tension: Float[np.ndarray, "*batch cables"] | None = None,
         steps: int | None = None,
         stride: int = 1,
     ) -> NativeRollout:
@@ -108,8 +107,10 @@ class NativeLayered:
 
         Args:
             material: fields with a leading batch axis, or without one to serve the whole batch.
-            displacement: cable displacements [m] at the end of every step, one sequence for all or one for each rollout.
-            start: cable displacements [m] of the initial equilibrium; None means zero.
+            displacement: cable displacements [m] at the end of every step, one sequence for all or one for each
+            rollout.
+            position: initial node positions [m]; None starts undeformed. The body does not move at first.
+            tension: initial cable tensions [N], where the first tension problem is started; None means zero.
             steps: compute only so many steps.
             stride: record every so many steps.
 
@@ -118,27 +119,35 @@ class NativeLayered:
         """
         displacement = np.asarray(displacement, dtype=float)
         cables = len(self.system.cables.anchor)
-        start = np.zeros(cables) if start is None else np.asarray(start, dtype=float)
-        if displacement.ndim not in (2, 3) or displacement.shape[-1] != cables or start.shape[-1:] != (cables,):
-            raise InputError(
-                f"displacement has shape {displacement.shape} and start {start.shape} for {cables} cables", where="rollout"
-            )
-        batch, count = self._batch(material, displacement, start)
+        if displacement.ndim not in (2, 3) or displacement.shape[-1] != cables:
+            raise InputError(f"displacement has shape {displacement.shape} for {cables} cables", where="rollout")
+        tension = np.zeros((1, cables)) if tension is None else np.asarray(tension, dtype=float).reshape(-1, cables)
+        batch, count = self._batch(material, displacement, self._modes(position), tension)
         steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
         tolerance, regularisation = _TENSION_PROBLEM[self.precision]
-        schedule = Schedule(self.time_step, steps, int(stride), 0, tolerance, regularisation)
+        schedule = Schedule(self.time_step, steps, int(stride), tolerance, regularisation)
         output = _empty_output(count, 1 + steps // stride, self.points, cables)
         self._run(batch, schedule, output, count)
         return NativeRollout(*output)
 
-    def _batch(self, material: Material, displacement: np.ndarray, start: np.ndarray) -> tuple[Batch, int]:
+    def _modes(self, position: np.ndarray | None) -> np.ndarray:
+        """Node positions as section modes, one row a rollout."""
+        if position is None:
+            return self._tables.rest[None]
+        shape = self._tables.shape
+        nodes = np.asarray(position, dtype=float).reshape(-1, len(self.system.body.station), len(shape), 3)
+        return np.einsum("mn,bsni->bsmi", np.linalg.inv(shape), nodes).reshape(len(nodes), -1)
+
+    def _batch(
+        self, material: Material, displacement: np.ndarray, position: np.ndarray, tension: np.ndarray
+    ) -> tuple[Batch, int]:
         """Parameters in the precision of the kernels, and the number of rollouts."""
         layers = len(self.system.body.station) - 1
         width = {"gravity": (3,), "stiffness_scale": (layers,), "point_mass": (layers + 1,)}
         values = {name: np.asarray(value, dtype=float) for name, value in material._asdict().items()}
         sizes = {len(value) for name, value in values.items() if value.ndim > len(width.get(name, ()))}
         sizes |= {len(displacement)} if displacement.ndim == 3 else set()
-        sizes |= {len(start)} if start.ndim == 2 else set()
+        sizes |= {len(position), len(tension)} - {1}
         count = max(sizes, default=1)
         if sizes - {1, count}:
             raise InputError(f"batch axes of lengths {sorted(sizes)}", where="rollout")
@@ -158,7 +167,8 @@ class NativeLayered:
             gravity=rows["gravity"],
             layer_scale=rows["stiffness_scale"],
             point_mass=rows["point_mass"],
-            start=start.reshape(-1, start.shape[-1]),
+            position=position,
+            tension=tension,
             displacement=displacement.reshape(-1, *displacement.shape[-2:]),
         )
         return Batch(*(np.ascontiguousarray(array, dtype=self.dtype) for array in arrays)), count
@@ -191,5 +201,4 @@ def _empty_output(count: int, records: int, points: int, cables: int) -> Output:
         np.zeros((count, records, cables)),
         np.zeros(count, dtype=bool),
         np.ones(count, dtype=bool),
-        np.zeros(count),
     )

@@ -1,6 +1,8 @@
-"""Layer frames, elastic forces, tangent and mass of a layered body in SIMD lanes, in the section modes of `section_modes`.
+"""Layer frames, elastic forces, tangent and mass of a layered body in SIMD lanes, in the section modes of
+`section_modes`.
 
-The physics is that of ``fem.dynamics``. A time step and an iteration for static equilibrium differ in a few factors only, held in
+The physics is that of ``fem.dynamics``. A time step and an iteration for static equilibrium differ in a few factors
+only, held in
 `Factors`.
 """
 
@@ -36,7 +38,9 @@ class Factors(NamedTuple):
 
     elasticity: Float[np.ndarray, "1 lanes"]  # of K in the matrix
     inertia: Float[np.ndarray, "1 lanes"]  # of M in the matrix
-    force: Float[np.ndarray, "1 lanes"]  # of the elastic force, of the weight and of the cable slack in the right-hand side
+    force: Float[
+        np.ndarray, "1 lanes"
+    ]  # of the elastic force, of the weight and of the cable slack in the right-hand side
     strain_rate: Float[np.ndarray, "1 lanes"]  # of -K v there
     drag: Float[np.ndarray, "1 lanes"]  # of -M v there
 
@@ -68,7 +72,6 @@ class Work(NamedTuple):
     accepted: Float[np.ndarray, "1 lanes"]  # 0 where the last step was not taken
     lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken
     failed: Float[np.ndarray, "1 lanes"]  # 1 once tensions were not found
-    imbalance: Float[np.ndarray, "1 lanes"]  # of the static equilibrium
     points: Float[np.ndarray, "point_values lanes"]
 
 
@@ -129,7 +132,8 @@ def _rotation(axes, token):
 
 @numba.njit(nogil=True, error_model="numpy")
 def _local_field(tables, layer, factors, work, token):
-    """``local`` = force * (R' x - X) + strain_rate * R' v, all relative to the lower section's mean: K does not see the difference."""
+    """``local`` = force * (R' x - X) + strain_rate * R' v, all relative to the lower section's mean: K does not see
+    the difference."""
     modes = len(tables.parity)
     x, v, axes = work.position, work.velocity, work.axes
     force, rate = load(factors.force, 0, token), load(factors.strain_rate, 0, token)
@@ -140,7 +144,7 @@ def _local_field(tables, layer, factors, work, token):
         x0, x1, x2 = load(x, row, token), load(x, row + 1, token), load(x, row + 2, token)
         v0, v1, v2 = load(v, row, token), load(v, row + 1, token), load(v, row + 2, token)
         r0, r1, r2 = tables.rest[row], tables.rest[row + 1], tables.rest[row + 2]
-        if row == base or row == above:
+        if row == base or row == above:  # noqa: SIM109 (Numba would build a tuple)
             x0, x1, x2 = x0 - load(x, base, token), x1 - load(x, base + 1, token), x2 - load(x, base + 2, token)
             v0, v1, v2 = v0 - load(v, base, token), v1 - load(v, base + 1, token), v2 - load(v, base + 2, token)
             r0, r1, r2 = r0 - tables.rest[base], r1 - tables.rest[base + 1], r2 - tables.rest[base + 2]
@@ -193,7 +197,8 @@ def _layer_reaction(tables, samples, entry, work, token):
 
 @numba.njit(nogil=True, error_model="numpy")
 def _axis_products(factors, work, token):
-    """``dyads``: r_i r_i' by columns (00, 11, 22), then r_0 r_2', r_1 r_2', r_0 r_1', all times the elasticity factor."""
+    """``dyads``: r_i r_i' by columns (00, 11, 22), then r_0 r_2', r_1 r_2', r_0 r_1', all times the elasticity
+    factor."""
     axes, dyads = work.axes, work.dyads
     scale = load(factors.elasticity, 0, token)
     for n in range(6):
@@ -215,7 +220,11 @@ def _add_block(target, t, stiffness, e, kind, dyads, add, token):
         for r in range(3):
             k, mirrored = 3 * c + r, 3 * r + c
             if kind == 0:
-                value = first * load(dyads, k, token) + second * load(dyads, 9 + k, token) + third * load(dyads, 18 + k, token)
+                value = (
+                    first * load(dyads, k, token)
+                    + second * load(dyads, 9 + k, token)
+                    + third * load(dyads, 18 + k, token)
+                )
             else:
                 d = 18 + 9 * kind
                 value = first * load(dyads, d + k, token) + second * load(dyads, d + mirrored, token)
@@ -227,7 +236,8 @@ def _add_block(target, t, stiffness, e, kind, dyads, add, token):
 
 @numba.njit(nogil=True, error_model="numpy")
 def _layer_tangent(tables, samples, entry, layer, work, whole, token):
-    """Add the tangent of a layer to the pivot of its upper station; ``whole``: set the coupling and start the lower station's pivot."""
+    """Add the tangent of a layer to the pivot of its upper station; ``whole``: set the coupling and start the lower
+    station's pivot."""
     modes = len(tables.parity)
     panel = 9 * modes
     block = modes * panel
@@ -238,7 +248,9 @@ def _layer_tangent(tables, samples, entry, layer, work, whole, token):
             for n in range(m + 1):
                 kind = tables.parity[m] ^ tables.parity[n]
                 if face == 1:
-                    e = _add_block(work.pivot, upper + m * panel + 9 * n, samples.stiffness, e, kind, work.dyads, True, token)
+                    e = _add_block(
+                        work.pivot, upper + m * panel + 9 * n, samples.stiffness, e, kind, work.dyads, True, token
+                    )
                 elif whole:
                     t = upper - block + m * panel + 9 * n
                     e = _add_block(work.pivot, t, samples.stiffness, e, kind, work.dyads, False, token)
@@ -294,10 +306,18 @@ def assemble_layer(tables, samples, factors, layer, work, whole, token):
     _local_field(tables, layer, factors, work, token)
     _layer_reaction(tables, samples, entry, work, token)
     for k in range(2 * modes):
-        x, y, z = load(work.reaction, 3 * k, token), load(work.reaction, 3 * k + 1, token), load(work.reaction, 3 * k + 2, token)
+        x, y, z = (
+            load(work.reaction, 3 * k, token),
+            load(work.reaction, 3 * k + 1, token),
+            load(work.reaction, 3 * k + 2, token),
+        )
         row = 3 * (layer * modes + k)
         for i in range(3):
-            a, b, c = load(work.axes, 3 * i, token), load(work.axes, 3 * i + 1, token), load(work.axes, 3 * i + 2, token)
+            a, b, c = (
+                load(work.axes, 3 * i, token),
+                load(work.axes, 3 * i + 1, token),
+                load(work.axes, 3 * i + 2, token),
+            )
             store(work.field, row + i, load(work.field, row + i, token) - (a * x + b * y + c * z))
     _axis_products(factors, work, token)
     _layer_tangent(tables, samples, entry, layer, work, whole, token)

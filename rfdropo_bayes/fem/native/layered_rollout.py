@@ -16,7 +16,8 @@ from rfdropo_bayes.fem.native.simd import aligned_zeros, fill, load, store, wher
 
 
 class Batch(NamedTuple):
-    """Parameters and commands of a batch in the precision of the kernels, one row a rollout; commands may be one row for all."""
+    """Parameters and commands of a batch in the precision of the kernels, one row a rollout; commands may be one row
+    for all."""
 
     moduli: Float[np.ndarray, "batch 3"]
     density: Float[np.ndarray, "batch 1"]
@@ -24,7 +25,8 @@ class Batch(NamedTuple):
     gravity: Float[np.ndarray, "batch 3"]
     layer_scale: Float[np.ndarray, "batch layers"]
     point_mass: Float[np.ndarray, "batch stations"]
-    start: Float[np.ndarray, "rows cables"]
+    position: Float[np.ndarray, "rows values"]  # initial, in section modes
+    tension: Float[np.ndarray, "rows cables"]  # initial
     displacement: Float[np.ndarray, "rows steps cables"]
 
 
@@ -35,7 +37,6 @@ class Output(NamedTuple):
     tension: Float[np.ndarray, "batch records cables"]
     diverged: Bool[np.ndarray, " batch"]
     cables_converged: Bool[np.ndarray, " batch"]
-    residual: Float[np.ndarray, " batch"]
 
 
 class Schedule(NamedTuple):
@@ -44,7 +45,6 @@ class Schedule(NamedTuple):
     time_step: float
     steps: int
     stride: int  # steps from one recorded row to the next
-    static_iterations: int  # 0 starts at rest
     tolerance: float  # relative, of the tension problem
     regularisation: float  # relative compliance of every cable
 
@@ -101,7 +101,6 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         accepted=rows(1),
         lost=rows(1),
         failed=rows(1),
-        imbalance=rows(1),
         points=rows(3 * (len(tables.point_first) - 1)),
     )
     return Storage(samples, Factors(*(rows(1) for _ in Factors._fields)), work)
@@ -147,16 +146,14 @@ def _prepare(tables, batch, samples, first, token):
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _start_at_rest(tables, work, token):
-    """The undeformed body, not moving, cables without tension."""
-    for row in range(work.position.shape[0]):
-        store(work.position, row, fill(tables.rest[row], work.position, token))
+def _start(batch, work, first, token):
+    """The initial state, not moving."""
+    _fill_lanes(batch.position, first, work.position)
+    _fill_lanes(batch.tension, first, work.tension)
     clear(work.velocity, 0, work.velocity.shape[0], token)
     clear(work.solution, 0, work.solution.shape[0], token)
-    clear(work.tension, 0, work.tension.shape[0], token)
     clear(work.lost, 0, 1, token)
     clear(work.failed, 0, 1, token)
-    clear(work.imbalance, 0, 1, token)
 
 
 @numba.njit(nogil=True, error_model="numpy")
@@ -195,7 +192,6 @@ def _finish(work, output, first):
     for lane in range(min(work.lost.shape[1], output.position.shape[0] - first)):
         output.diverged[first + lane] = work.lost[0, lane] > 0.0
         output.cables_converged[first + lane] = not work.failed[0, lane] > 0.0
-        output.residual[first + lane] = work.imbalance[0, lane]
 
 
 @numba.njit(nogil=True, error_model="numpy")
@@ -211,14 +207,15 @@ def _advance(tables, samples, factors, work, schedule, token):
 
 
 def compile_rollout(sources: str) -> Callable:
-    """The kernel of one lane block; ``sources``, a digest of the kernels' sources, is part of the key it is cached under."""
+    """The kernel of one lane block; ``sources``, a digest of the kernels' sources, is part of the key it is cached
+    under."""
 
     @numba.njit(nogil=True, cache=True, error_model="numpy")
     def rollout(tables, batch, storage, schedule, output, first, token):
         _ = sources
         samples, factors, work = storage
         _prepare(tables, batch, samples, first, token)
-        _start_at_rest(tables, work, token)
+        _start(batch, work, first, token)
         _step_factors(samples, factors, schedule.time_step, token)
         _record(tables, work, output, first, 0, token)
         for step in range(schedule.steps):

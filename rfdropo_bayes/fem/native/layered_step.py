@@ -33,7 +33,8 @@ def _point(first, place, weight, p, field, token):
 
 @numba.njit(nogil=True, error_model="numpy")
 def _pull(tables, g, offset, work, x, y, z, token):
-    """Add a pull on guide g to the border row at ``offset`` of every station; returns the pull times the guide's velocity."""
+    """Add a pull on guide g to the border row at ``offset`` of every station; returns the pull times the guide's
+    velocity."""
     growth = fill(0.0, work.border, token)
     v = work.velocity
     for k in range(tables.guide_first[g], tables.guide_first[g + 1]):
@@ -119,7 +120,8 @@ def _tensions(cables, panels, work, rate, tolerance, regularisation, token):
 
 @numba.njit(nogil=True, error_model="numpy")
 def solve_increment(tables, samples, factors, work, rate, tolerance, regularisation, token):
-    """``solution`` = A^-1 (r - J' T) and the tensions; the matrix is assembled and eliminated station by station from the tip."""
+    """``solution`` = A^-1 (r - J' T) and the tensions; the matrix is assembled and eliminated station by station from
+    the tip."""
     tiles, stations, cables = len(tables.parity), tables.station_mass.shape[0], len(tables.rest_length)
     size, panels = 3 * tiles, (cables + 3) // 3
     frame, block = 3 * panels * size, 3 * tiles * size
@@ -138,10 +140,22 @@ def solve_increment(tables, samples, factors, work, rate, tolerance, regularisat
         for k in range(size):
             t = station * frame + 3 * k
             store(work.border, t, load(work.border, t, token) + load(work.field, station * size + k, token))
-        eliminate(work.pivot, work.coupling, work.border, work.condensed, station, station == held, tiles, panels, token)
+        eliminate(
+            work.pivot, work.coupling, work.border, work.condensed, station, station == held, tiles, panels, token
+        )
     _tensions(cables, panels, work, rate, tolerance, regularisation, token)
     back_substitute(
-        work.pivot, work.coupling, work.border, work.weight, cables + 1, work.solution, held, stations, tiles, panels, token
+        work.pivot,
+        work.coupling,
+        work.border,
+        work.weight,
+        cables + 1,
+        work.solution,
+        held,
+        stations,
+        tiles,
+        panels,
+        token,
     )
 
 

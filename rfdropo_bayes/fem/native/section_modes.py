@@ -1,9 +1,13 @@
 """A layered body in section modes: the coordinates in which its layers are sparse.
 
-The nodes of a section move as constant, linear, ... polynomials in x and y, each even or odd under x -> -x and y -> -y. A layer has both
-mirror planes, so its stiffness couples component i of mode m with component j of mode n only where the parities agree. Of every
-3 x 3 block three entries are left on the diagonal if m and n have the same parity, else two beside it. The stiffness is linear in the
-Lame parameters and in 2 lambda mu / (lambda + 2 mu), which is what condensing the incompatible modes of a box leaves of lambda; three
+The nodes of a section move as constant, linear, ... polynomials in x and y, each even or odd under x -> -x and y ->
+-y. A layer has both
+mirror planes, so its stiffness couples component i of mode m with component j of mode n only where the parities
+agree. Of every
+3 x 3 block three entries are left on the diagonal if m and n have the same parity, else two beside it. The stiffness
+is linear in the
+Lame parameters and in 2 lambda mu / (lambda + 2 mu), which is what condensing the incompatible modes of a box leaves
+of lambda; three
 evaluations of ``layered.layer_stiffness`` therefore give it for every material.
 """
 
@@ -26,15 +30,19 @@ from rfdropo_bayes.fem.layered import (
     rest_positions,
 )
 
-# Entries (row, column) of a block of two modes, by the parity (bit 0: odd in x, bit 1: odd in y) in which the modes differ.
+# Entries (row, column) of a block of two modes, by the parity (bit 0: odd in x, bit 1: odd in y) in which the modes
+# differ.
 BLOCK_ENTRIES = (((0, 0), (1, 1), (2, 2)), ((0, 2), (2, 0)), ((1, 2), (2, 1)), ((0, 1), (1, 0)))
 
 
 class LayeredTables(NamedTuple):
-    """What the kernels know of a body, its cables and its recorded points. Field values count ``(station, mode, component)``.
+    """What the kernels know of a body, its cables and its recorded points. Field values count ``(station, mode,
+    component)``.
 
-    Blocks of a layer come in the order (lower, lower), (upper, upper) with row mode >= column mode, then (lower, upper).
-    Points are sparse sums: point p is the sum of ``weight[k]`` times the mode at row ``place[k]``, k in ``first[p]:first[p + 1]``.
+    Blocks of a layer come in the order (lower, lower), (upper, upper) with row mode >= column mode, then (lower,
+    upper).
+    Points are sparse sums: point p is the sum of ``weight[k]`` times the mode at row ``place[k]``, k in
+    ``first[p]:first[p + 1]``.
     """
 
     parity: Int[np.ndarray, " modes"]
@@ -94,7 +102,9 @@ def _stiffness_by_modulus(body: LayeredBody) -> Float[np.ndarray, "3 layers dofs
     return np.einsum("ij,jlmn->ilmn", np.linalg.inv(np.stack([lame, np.ones(3), condensed], axis=1)), values)
 
 
-def _sparse_points(node: np.ndarray, weight: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sparse_points(
+    node: np.ndarray, weight: np.ndarray, shape: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points given by nodes as sparse sums of modes: first, place, weight."""
     section = len(shape)
     first, place, value = [0], [], []
