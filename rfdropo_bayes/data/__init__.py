@@ -7,7 +7,7 @@ from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
 from rfdropo_bayes.data.registration import Registration, clock_offset, register, shift_commands, to_base_frame
 from rfdropo_bayes.data.repeats import PureError, group_repeats, noise_floor, pure_error
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
-from rfdropo_bayes.data.spec import DATA_VARIABLE, DataSpec, RecordingEntry, load_recordings
+from rfdropo_bayes.data.spec import DATA_VARIABLE, DataSpec, RecordingEntry, find_data_file, load_recordings
 from rfdropo_bayes.data.trajectory import Trajectory
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "Registration",
     "Trajectory",
     "clock_offset",
+    "find_data_file",
     "find_faults",
     "group_repeats",
     "load_recordings",

@@ -92,7 +92,7 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
 
     Args:
         spec: the [data] table.
-        base: folder that paths are relative to, unless the variable RFDROPO_DATA names another.
+        base: folder that paths are relative to, where the folder that RFDROPO_DATA names does not have them.
         role: "fit" or "test".
 
     Raises:
@@ -111,33 +111,42 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
     return _distinct_names(recordings, sources)
 
 
-def _sources(entries: list[RecordingEntry], base: Path) -> Iterator[_Source]:
+def find_data_file(name: str | Path, base: Path) -> Path:
+    """A file beside the recordings, e.g. a mesh, looked for as they are: in RFDROPO_DATA if set, then in ``base``.
+
+    Raises:
+        InputError: no such file.
+    """
+    return _found(str(name), base)[0]
+
+
+def _found(pattern: str, base: Path) -> list[Path]:
+    """Files of a name or glob in the first folder that has any: RFDROPO_DATA, or else the experiment file's own."""
     variable = os.environ.get(DATA_VARIABLE)
-    root = Path(variable) if variable else Path(base)
-    looked = f"looked in {root} ({DATA_VARIABLE})" if variable else f"looked in {root} ({DATA_VARIABLE} is not set)"
+    roots = [Path(variable), Path(base)] if variable else [Path(base)]
+    wanted = Path(pattern)
+    if wanted.is_absolute():
+        roots, wanted = [Path(wanted.anchor)], wanted.relative_to(wanted.anchor)
+    for root in roots:
+        files = sorted(root.glob(str(wanted))) if any(sign in pattern for sign in _GLOB) else [root / wanted]
+        files = [file for file in files if file.is_file()]
+        if files:
+            return files
+    looked = " and ".join(str(root) for root in roots)
+    raise InputError(
+        f"no such file; looked in {looked} ({DATA_VARIABLE} is {'set' if variable else 'not set'})",
+        where=pattern,
+        remedy=f"correct the path, or set {DATA_VARIABLE} to the folder that holds the data",
+    )
+
+
+def _sources(entries: list[RecordingEntry], base: Path) -> Iterator[_Source]:
     for entry in entries:
         commands = None
         if entry.commands not in (None, NO_COMMANDS):
-            commands = _existing(root / str(entry.commands), looked)
-        if any(sign in entry.observations for sign in _GLOB):
-            pattern = Path(entry.observations)
-            anchor = Path(pattern.anchor) if pattern.is_absolute() else root
-            matches = sorted(anchor.glob(str(pattern.relative_to(pattern.anchor))))
-            if not matches:
-                raise InputError(f"nothing matches; {looked}", where=entry.observations, remedy=_WHERE_TO_PUT)
-        else:
-            matches = [_existing(root / entry.observations, looked)]
-        for match in matches:
+            commands = _found(str(entry.commands), base)[0]
+        for match in _found(entry.observations, base):
             yield _Source(match, commands, entry.commands == NO_COMMANDS, entry.rows)
-
-
-_WHERE_TO_PUT = f"correct the path, or set {DATA_VARIABLE} to the folder that holds the data"
-
-
-def _existing(path: Path, looked: str) -> Path:
-    if not path.is_file():
-        raise InputError(f"no such file; {looked}", where=str(path), remedy=_WHERE_TO_PUT)
-    return path
 
 
 def _read(spec: DataSpec, source: _Source) -> Trajectory:

@@ -36,10 +36,15 @@ def test_the_variable_says_where_the_data_are(folder, tmp_path_factory, monkeypa
     monkeypatch.setenv(DATA_VARIABLE, str(folder))
     assert load_recordings(spec, elsewhere)[0].name == "made"
     monkeypatch.setenv(DATA_VARIABLE, str(elsewhere))
-    with pytest.raises(InputError, match=f"\\({DATA_VARIABLE}\\).*set {DATA_VARIABLE} to the folder"):
-        load_recordings(spec, folder)
-    with pytest.raises(InputError, match="nothing matches"):
-        load_recordings(DataSpec.parse({"format": "netcdf", "fit": ["*.nc"]}), folder)
+    with pytest.raises(InputError, match=f"\\({DATA_VARIABLE} is set\\).*set {DATA_VARIABLE} to the folder"):
+        load_recordings(DataSpec.parse({"format": "netcdf", "fit": ["theirs*.nc"]}), folder)
+
+
+def test_what_the_variable_does_not_have_is_looked_for_beside_the_experiment(folder, tmp_path_factory, monkeypatch):
+    """The bundled example lies beside its experiment file, wherever the variable points."""
+    monkeypatch.setenv(DATA_VARIABLE, str(tmp_path_factory.mktemp("data")))
+    spec = DataSpec.parse({"format": "netcdf", "fit": ["ours.nc"]})
+    assert load_recordings(spec, folder)[0].name == "made"
 
 
 def test_an_entry_may_be_a_table_with_rows(folder):
