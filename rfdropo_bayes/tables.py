@@ -36,7 +36,9 @@ def parse_table(schema: type[Parsed], table: Mapping[str, Any], *, where: str) -
         if first["type"] == "missing":
             raise InputError(f"the key {'.'.join(path)!r} is missing", where=where, remedy="add it") from None
         message = first["msg"].removeprefix("Value error, ")
-        raise InputError(f"{'.'.join(path)} = {first['input']!r}: {message}", where=where, remedy="mend the value") from None
+        # A whole table or list would fill the screen; its name says enough.
+        given = f" = {first['input']!r}" if isinstance(first["input"], str | int | float | bool) else ""
+        raise InputError(f"{'.'.join(path)}{given}: {message}", where=where, remedy="mend the value") from None
 
 
 def _fields_at(schema: type[BaseModel], path: list[str]) -> set[str]:

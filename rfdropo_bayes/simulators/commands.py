@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.drives import animated_commands
 
 
 class Commands(NamedTuple):
@@ -69,7 +70,46 @@ def commands_on_grid(
     return Commands(np.asarray(initial, float), _ramped(time, value, initial, end, ramp), sample_step, fraction)
 
 
-def _ramped(time, value, initial, at, ramp: float) -> np.ndarray:
+def animated_on_grid(
+    time: Float[np.ndarray, " command"],
+    value: Float[np.ndarray, "command channel"],
+    initial: Float[np.ndarray, " channel"],
+    observation_time: Float[np.ndarray, " time"],
+    *,
+    time_step: float,
+) -> Commands:
+    """Hand every command over in equal updates, one a step until the next command, as SOFA's scene does.
+
+    See `fem.drives.animated_commands`; otherwise as `commands_on_grid`.
+
+    Raises:
+        InputError: as `commands_on_grid`; or commands that are not evenly spaced, at least two steps apart, from the
+            first observation on.
+    """
+    grid = commands_on_grid(time, value, initial, observation_time, time_step=time_step)
+    clock = (np.asarray(time, float) - observation_time[0]) / time_step
+    start = np.round(clock).astype(int)
+    every = int(start[1] - start[0]) if len(start) > 1 else len(grid.step)
+    even = np.array_equal(start, every * np.arange(len(start))) and np.allclose(clock, start, atol=0.1)
+    if len(start) == 0 or every < 2 or not even:
+        raise InputError(
+            "commands that are not evenly spaced from the first observation on cannot be animated",
+            remedy='use drives = "robot" in [simulator.tetrahedra]',
+        )
+    changes = np.asarray(value, float) - np.asarray(initial, float)
+    steps = animated_commands(changes, every, time_step).reshape(-1, changes.shape[1])
+    length = len(grid.step)
+    held = _pad(steps, max(length, len(steps)))[:length]
+    return grid._replace(step=grid.initial + held)
+
+
+def _ramped(
+    time: Float[np.ndarray, " command"],
+    value: Float[np.ndarray, "command channel"],
+    initial: Float[np.ndarray, " channel"],
+    at: Float[np.ndarray, " step"],
+    ramp: float,
+) -> Float[np.ndarray, "step channel"]:
     """The piecewise-constant command averaged over the last ``ramp`` seconds before each of ``at``."""
     if len(time) == 0:
         return np.broadcast_to(np.asarray(initial, float), (len(at), len(initial))).copy()

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from enum import IntEnum
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.simulators.commands import Commands
@@ -76,8 +77,25 @@ class Simulator(Protocol):
     def description(self) -> dict[str, object]:
         """Engine, precision and discretisation, for the record."""
 
-    def commands(self, time, value, initial, observation_time) -> Commands:
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Names of the command channels, in the order of ``Commands.step``."""
+
+    @property
+    def lanes(self) -> int:
+        """How many rollouts it likes to be given at once."""
+
+    def commands(
+        self,
+        time: Float[np.ndarray, " command"],
+        value: Float[np.ndarray, "command channel"],
+        initial: Float[np.ndarray, " channel"],
+        observation_time: Float[np.ndarray, " time"],
+    ) -> Commands:
         """Bring a recorded command sequence onto the simulator's own clock (see `commands_on_grid`)."""
 
-    def rollout(self, parameters: Mapping[str, Float[Array, ""]], commands: Commands) -> Observation:
-        """Simulate from the initial state to the last observation."""
+    def rollout(
+        self, parameters: Mapping[str, Float[Array, ""]], commands: Commands, steps: Int[Array, ""] | None = None
+    ) -> Observation:
+        """Simulate from the initial state to the last observation, or ``steps`` time steps only (rows beyond hold no
+        meaning)."""

@@ -28,7 +28,6 @@ class ReferenceEngine:
     time_step: float
     from_equilibrium: bool
     lanes: ClassVar[int] = 64
-    differentiable: ClassVar[bool] = True
 
     def describe(self) -> dict[str, object]:
         """Name and precision."""

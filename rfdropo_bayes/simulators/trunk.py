@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -15,17 +13,9 @@ from jaxtyping import Array, Bool, Float, Int
 from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, cable_layout, profile_body
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, sample
-from rfdropo_bayes.simulators.mechanisms import (
-    ActuationMechanism,
-    BodyMechanism,
-    Mechanism,
-    SensingMechanism,
-    check_mechanisms,
-)
-from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
+from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms
 from rfdropo_bayes.simulators.protocol import Observation, Result
-
-Values = Mapping[str, Float[Array, ""]]
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
 
 # Static equilibrium counts as found when the unbalanced force is below this share of the largest force.
 EQUILIBRIUM_TOLERANCE = 1e-3
@@ -45,11 +35,9 @@ class Engine(Protocol):
 
     Attributes:
         lanes: how many rollouts it likes to be given at once.
-        differentiable: whether JAX can trace derivatives through it.
     """
 
-    lanes: int
-    differentiable: bool
+    lanes: ClassVar[int]
 
     def describe(self) -> dict[str, object]:
         """Name and precision, for the record."""
@@ -86,7 +74,7 @@ def assemble(robot: Robot, discretisation: Discretisation) -> Assembly:
     arrays = dict(robot.layered_arrays())
     body = refined_body(arrays, discretisation.refine, discretisation.nodes_across)
     system = System(body, cable_layout(body, robot.anchors(), robot.guides()))
-    station_of = np.arange(len(arrays["station"])) * discretisation.refine
+    station_of = np.arange(len(np.asarray(arrays["station"]))) * discretisation.refine
     return Assembly(system, attach(body, robot.marker_points()), station_of)
 
 
@@ -109,7 +97,7 @@ def refined_body(arrays: Mapping[str, np.ndarray | int], refine: int, nodes_acro
 
 
 @dataclass(frozen=True)
-class TrunkSimulator:
+class TrunkSimulator(RobotSimulator):
     """A layered trunk with mechanisms, behind the `Simulator` protocol.
 
     Order of a rollout: command -> actuation mechanisms -> cable displacements within their limits -> body with its
@@ -132,29 +120,10 @@ class TrunkSimulator:
     def __post_init__(self) -> None:
         object.__setattr__(self, "mechanisms", check_mechanisms(self.mechanisms))
 
-    @cached_property
-    def parameters(self) -> tuple[ParameterSpec, ...]:
-        """Parameters of the robot, then those of the mechanisms."""
-        base = tuple(
-            ParameterSpec(name, p.unit, p.low, p.high, p.nominal, p.prior, p.description)
-            for name, p in self.robot.parameter_table().items()
-        )
-        return base + tuple(spec for mechanism in self.mechanisms for spec in mechanism.parameters)
-
     @property
-    def marker_names(self) -> tuple[str, ...]:
-        """Markers of the robot."""
-        return self.robot.marker_names
-
-    @property
-    def cable_names(self) -> tuple[str, ...]:
-        """Cables of the robot."""
-        return self.robot.cable_names
-
-    @property
-    def channel_names(self) -> tuple[str, ...]:
-        """Command channels of the robot."""
-        return self.robot.channel_names
+    def lanes(self) -> int:
+        """Those of the engine."""
+        return self.engine.lanes
 
     @property
     def description(self) -> dict[str, object]:
@@ -168,7 +137,13 @@ class TrunkSimulator:
             "mechanisms": [mechanism.name for mechanism in self.mechanisms],
         }
 
-    def commands(self, time, value, initial, observation_time) -> Commands:
+    def commands(
+        self,
+        time: Float[np.ndarray, " command"],
+        value: Float[np.ndarray, "command channel"],
+        initial: Float[np.ndarray, " channel"],
+        observation_time: Float[np.ndarray, " time"],
+    ) -> Commands:
         """Recorded commands on this simulator's clock, with the robot's ramp and lag."""
         return commands_on_grid(
             time,
@@ -192,43 +167,16 @@ class TrunkSimulator:
         Raises:
             InputError: a name that is not a parameter of this simulator.
         """
-        check_names(parameters, self.parameters, where="rollout")
-        values = {spec.name: jnp.asarray(spec.nominal) for spec in self.parameters} | dict(parameters)
-        start, displacement = self.displacements(values, commands)
+        values = self.complete(parameters)
+        start, displacement = self.wound(values, commands, self.discretisation.time_step)
         motion = self.engine.motion(self.material(values), start, displacement, steps)
-        position = sample(motion.position, commands)
-        offset = jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])
-        for mechanism in self.mechanisms:
-            if isinstance(mechanism, SensingMechanism):
-                position = mechanism.sense(values, position)
         status = jnp.where(
             motion.diverged,
             int(Result.DIVERGED),
             jnp.where(motion.imbalance > EQUILIBRIUM_TOLERANCE, int(Result.NOT_IN_EQUILIBRIUM), int(Result.OK)),
         )
-        return Observation(position + offset, sample(motion.tension, commands), None, status)
-
-    def displacements(
-        self, values: Values, commands: Commands
-    ) -> tuple[Float[Array, " cable"], Float[Array, "step cable"]]:
-        """Cable displacements [m] before the first step and at the end of every step."""
-        command = jnp.asarray(commands.step)
-        for mechanism in self.mechanisms:
-            if isinstance(mechanism, ActuationMechanism):
-                command = mechanism.actuate(values, command, commands.initial, self.discretisation.time_step)
-        matrix = jnp.asarray(self.robot.channel_matrix(values))
-        limits = jnp.asarray(self.robot.displacement_limits())
-        initial = jnp.clip(matrix @ commands.initial, limits[:, 0], limits[:, 1])
-        moves = jnp.diff(jnp.concatenate([commands.initial[None], command]), axis=0) @ matrix.T
-
-        def wind(level: Array, move: Array) -> tuple[Array, Array]:
-            # A drive at its limit ignores further pulls, and answers the first release at once.
-            level = jnp.clip(level + move, limits[:, 0], limits[:, 1])
-            return level, level
-
-        wound = jax.lax.scan(wind, initial, moves)[1]
-        pretension = jnp.stack([values[name] for name in self.robot.initial_displacement_names])
-        return initial + pretension, wound + pretension
+        position = self.measured(values, sample(motion.position, commands))
+        return Observation(position, sample(motion.tension, commands), None, status)
 
     def material(self, values: Values) -> Material:
         """Material of the body for these values, body mechanisms included."""

@@ -1,0 +1,147 @@
+"""A robot whose body is a tetrahedral mesh: options, and how cables, markers and masses are bound to the mesh."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from pydantic import BaseModel, ConfigDict, Field
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.drives import DriveLimits
+from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.tetrahedra import TetrahedralBody, locate, mean_points, route_cables, tetrahedral_body
+from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralSystem, tetrahedral_system
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots.meshes import TetrahedralMesh
+
+SAME_HEIGHT = 1e-5
+"""[m] A marker so near the height of guides is their mean, where markers are means of guides."""
+
+
+class TetrahedraTable(BaseModel):
+    """[simulator.tetrahedra]: a mesh for the body, and how it is simulated.
+
+    Attributes:
+        mesh: mesh file (VTK, Gmsh), looked for as the recordings are.
+        unit: of its coordinates, which are in the frame of the robot's base.
+        clamp_height: nodes at or below this height are held [m].
+        frames: what turns with an element: the rotation nearest to its deformation, or axes along its edges (SOFA's
+            "large").
+        masses: the trunk's mass in equal parts on all nodes (SOFA's UniformMass), or with the elements' volumes.
+        drives: "robot" follows the robot's ramp, lag and end stops; "sofa" hands a command over in equal updates, as
+            an animation of SOFA's STLIB does, to cables that SOFA's CableConstraint limits.
+        drive_rate: how far the imposed displacement may be from the one last measured [m per step]; for "sofa".
+        guides: cables that end at an earlier guide than the robot's, and how many guides they have.
+        marker_cables: a marker at the height of guides of these cables is their mean; empty: a point of the body.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    mesh: str
+    unit: Literal["m", "cm", "mm"]
+    clamp_height: float
+    frames: Literal["polar", "edges"] = "polar"
+    masses: Literal["equal", "volume"] = "volume"
+    drives: Literal["robot", "sofa"] = "robot"
+    drive_rate: Annotated[float, Field(gt=0.0)] | None = None
+    guides: dict[str, Annotated[int, Field(ge=1)]] = Field(default_factory=dict)
+    marker_cables: tuple[str, ...] = ()
+
+
+class MeshAssembly(NamedTuple):
+    """A robot with a mesh for its body as the finite-element engines see it."""
+
+    system: TetrahedralSystem
+    markers: PointMap
+    node_share: Float[np.ndarray, " nodes"]  # of the trunk's mass
+    layer: Int[np.ndarray, " elements"]  # layer of the robot's section profile that an element lies in
+    station_share: Float[np.ndarray, "nodes stations"]  # of a mass at a station of the robot, on each node
+
+
+def assemble_mesh(robot: Robot, mesh: TetrahedralMesh, table: TetrahedraTable) -> MeshAssembly:
+    """Bind a robot's cables, markers and masses to a mesh.
+
+    Raises:
+        InputError: options that do not fit the robot, or a mesh that nothing holds or that does not hang together.
+    """
+    if robot.initial_state != "rest":
+        raise InputError(
+            f"robot {robot.name!r} starts in equilibrium, a body of tetrahedra at rest",
+            where="[simulator] body",
+            remedy='use body = "layered", or a robot with initial_state = "rest"',
+        )
+    _check_cables(robot, table)
+    body = tetrahedral_body(mesh.position, mesh.element, mesh.position[:, 2] <= table.clamp_height, table.frames)
+    counts = [
+        table.guides.get(name, len(points)) for name, points in zip(robot.cable_names, robot.guides(), strict=True)
+    ]
+    guides = [points[:count] for points, count in zip(robot.guides(), counts, strict=True)]
+    cables = route_cables(body, robot.anchors(), guides)
+    limits = DriveLimits(np.full(len(guides), np.inf))
+    if table.drives == "sofa":
+        limits = DriveLimits(robot.displacement_limits()[:, 1], table.drive_rate or np.inf)
+    station = np.asarray(robot.body.station_m)
+    layer = np.searchsorted(station, body.rest[body.element, 2].mean(axis=1), side="right") - 1
+    return MeshAssembly(
+        tetrahedral_system(body, cables, limits),
+        _markers(robot, body, dict(zip(robot.cable_names, guides, strict=True)), table.marker_cables),
+        _node_share(body, table.masses),
+        np.clip(layer, 0, len(station) - 2),
+        _station_share(body, station),
+    )
+
+
+def _check_cables(robot: Robot, table: TetrahedraTable) -> None:
+    where = "[simulator.tetrahedra]"
+    known = ", ".join(robot.cable_names)
+    for name in (*table.guides, *table.marker_cables):
+        if name not in robot.cable_names:
+            raise InputError(f"the robot has no cable {name!r}", where=where, remedy=f"its cables: {known}")
+    for name, count in table.guides.items():
+        most = len(robot.guides()[robot.cable_names.index(name)])
+        if count > most:
+            raise InputError(f"{count} guides for cable {name!r}", where=where, remedy=f"it has {most}")
+    if table.drive_rate is not None and table.drives != "sofa":
+        raise InputError("drive_rate has no effect", where=where, remedy='it belongs to drives = "sofa"')
+
+
+def _markers(
+    robot: Robot, body: TetrahedralBody, guides: dict[str, np.ndarray], marker_cables: tuple[str, ...]
+) -> PointMap:
+    maps = {name: locate(body, guides[name]) for name in marker_cables}
+    rows = []
+    for name, point in zip(robot.marker_names, robot.marker_points(), strict=True):
+        near = {cable: np.abs(guides[cable][:, 2] - point[2]) < SAME_HEIGHT for cable in marker_cables}
+        found = [PointMap(*(part[at][:1] for part in maps[cable])) for cable, at in near.items() if at.any()]
+        if len(found) not in (0, len(marker_cables)):
+            raise InputError(
+                f"marker {name!r} is at the height of a guide of some cables but not of all",
+                where="[simulator.tetrahedra] marker_cables",
+                remedy="name cables whose guides share their heights",
+            )
+        rows.append(mean_points(found) if found else locate(body, point[None]))
+    width = max(row.node.shape[1] for row in rows)
+    node, weight = (
+        np.concatenate([np.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts])
+        for parts in zip(*rows, strict=True)
+    )
+    return PointMap(node, weight)
+
+
+def _node_share(body: TetrahedralBody, masses: str) -> Float[np.ndarray, " nodes"]:
+    if masses == "equal":
+        return np.full(len(body.rest), 1.0 / len(body.rest))
+    share = np.zeros(len(body.rest))
+    np.add.at(share, body.element, body.volume[:, None] / (4.0 * body.volume.sum()))
+    return share
+
+
+def _station_share(body: TetrahedralBody, station: Float[np.ndarray, " stations"]) -> np.ndarray:
+    """A mass at a station rests in equal parts on the nodes that are nearer to it than to other stations."""
+    nearest = np.argmin(np.abs(body.rest[:, 2:] - station), axis=1)
+    share = (nearest[:, None] == np.arange(len(station))).astype(float)
+    for index in np.flatnonzero(share.sum(axis=0) == 0.0):  # no node so near: the nearest one
+        share[np.argmin(np.abs(body.rest[:, 2] - station[index])), index] = 1.0
+    return share / share.sum(axis=0)

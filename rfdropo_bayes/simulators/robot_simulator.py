@@ -1,0 +1,126 @@
+"""What simulators of a cable-driven robot share, whatever body they compute: parameters, drives and measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.mechanisms import ActuationMechanism, Mechanism, SensingMechanism
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
+from rfdropo_bayes.simulators.protocol import Observation
+
+Values = Mapping[str, Float[Array, ""]]
+
+
+class RobotSimulator:
+    """Base of simulators that move a robot's body by cables; mechanisms act before, in and after the body.
+
+    Attributes:
+        robot: what is simulated.
+        mechanisms: extensions, applied in the order given within each stage.
+    """
+
+    robot: Robot
+    mechanisms: Sequence[Mechanism]
+
+    @property
+    def lanes(self) -> int:
+        """How many rollouts the simulator likes to be given at once."""
+        raise NotImplementedError
+
+    @property
+    def description(self) -> dict[str, object]:
+        """Engine, precision and discretisation, for the record."""
+        raise NotImplementedError
+
+    def commands(
+        self,
+        time: Float[np.ndarray, " command"],
+        value: Float[np.ndarray, "command channel"],
+        initial: Float[np.ndarray, " channel"],
+        observation_time: Float[np.ndarray, " time"],
+    ) -> Commands:
+        """Recorded commands on the simulator's clock."""
+        raise NotImplementedError
+
+    def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
+        """Simulate from the initial state to the last observation, or ``steps`` time steps."""
+        raise NotImplementedError
+
+    @cached_property
+    def parameters(self) -> tuple[ParameterSpec, ...]:
+        """Parameters of the robot, then those of the mechanisms."""
+        base = tuple(
+            ParameterSpec(name, p.unit, p.low, p.high, p.nominal, p.prior, p.description)
+            for name, p in self.robot.parameter_table().items()
+        )
+        return base + tuple(spec for mechanism in self.mechanisms for spec in mechanism.parameters)
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Markers of the robot."""
+        return self.robot.marker_names
+
+    @property
+    def cable_names(self) -> tuple[str, ...]:
+        """Cables of the robot."""
+        return self.robot.cable_names
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Command channels of the robot."""
+        return self.robot.channel_names
+
+    def complete(self, parameters: Values) -> dict[str, Array]:
+        """All values by name; those left out are nominal.
+
+        Raises:
+            InputError: a name that is not a parameter of this simulator.
+        """
+        check_names(parameters, self.parameters, where="rollout")
+        return {spec.name: jnp.asarray(spec.nominal) for spec in self.parameters} | dict(parameters)
+
+    def actuated(self, values: Values, commands: Commands, time_step: float) -> Float[Array, "step channel"]:
+        """Commands that reach the drives at the end of every step."""
+        command = jnp.asarray(commands.step)
+        for mechanism in self.mechanisms:
+            if isinstance(mechanism, ActuationMechanism):
+                command = mechanism.actuate(values, command, commands.initial, time_step)
+        return command
+
+    def pretension(self, values: Values) -> Float[Array, " cable"]:
+        """Cable displacements at zero command [m]."""
+        return jnp.stack([values[name] for name in self.robot.initial_displacement_names])
+
+    def wound(
+        self, values: Values, commands: Commands, time_step: float
+    ) -> tuple[Float[Array, " cable"], Float[Array, "step cable"]]:
+        """Cable displacements [m] before the first step and at the end of every step, by drives with end stops."""
+        command = self.actuated(values, commands, time_step)
+        matrix = jnp.asarray(self.robot.channel_matrix(values))
+        limits = jnp.asarray(self.robot.displacement_limits())
+        initial = jnp.clip(matrix @ commands.initial, limits[:, 0], limits[:, 1])
+        moves = jnp.diff(jnp.concatenate([commands.initial[None], command]), axis=0) @ matrix.T
+
+        def wind(level: Array, move: Array) -> tuple[Array, Array]:
+            # A drive at its limit ignores further pulls, and answers the first release at once.
+            level = jnp.clip(level + move, limits[:, 0], limits[:, 1])
+            return level, level
+
+        levels = jax.lax.scan(wind, initial, moves)[1]
+        pretension = self.pretension(values)
+        return initial + pretension, levels + pretension
+
+    def measured(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
+        """Marker positions as they are measured [m], given the true ones."""
+        for mechanism in self.mechanisms:
+            if isinstance(mechanism, SensingMechanism):
+                position = mechanism.sense(values, position)
+        return position + jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])
