@@ -42,9 +42,8 @@ class CalibrationProblem:
     def fingerprint(self) -> str:
         """Digest of data, parameters and simulator: a checkpoint belongs to the problem it was made for."""
         digest = hashlib.sha256()
-        for array in (self.model.recordings.position, self.model.recordings.time, *self.model.recordings.line):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        for array in self.model.recordings.commands:
+        recordings = self.model.recordings
+        for array in (recordings.position, recordings.time, *recordings.line, *recordings.commands):
             digest.update(np.ascontiguousarray(array).tobytes())
         priors = [(p.name, sorted((p.table or {}).items())) for p in self.model.space.parameters]
         rest = (

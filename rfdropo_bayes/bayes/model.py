@@ -29,11 +29,20 @@ class TrajectoryNoise(dist.Distribution):
 
     support = dist.constraints.independent(dist.constraints.real, 3)
 
-    def __init__(self, position, sigma, tau, time, line: Timeline, *, validate_args: bool | None = None) -> None:
+    def __init__(
+        self,
+        position: Float[Array, "time marker 3"],
+        sigma: Float[Array, ""],
+        tau: Float[Array, ""] | None,
+        time: Float[Array, " time"],
+        line: Timeline,
+        *,
+        validate_args: bool | None = None,
+    ) -> None:
         self.position, self.sigma, self.tau, self.time, self.line = position, sigma, tau, time, line
         super().__init__((), position.shape, validate_args=validate_args)
 
-    def sample(self, key: PRNGKeyArray | None, sample_shape: tuple[int, ...] = ()) -> Array:
+    def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Array:
         """Simulated positions plus one realisation of the noise."""
         count = int(np.prod(sample_shape))
         draw = partial(draw_noise, time=self.time, markers=self.position.shape[1], sigma=self.sigma, tau=self.tau)
@@ -51,6 +60,8 @@ class RecordingSet:
 
     Attributes:
         names: one per recording.
+        markers: the markers that all recordings have.
+        marker_index: where these are among the simulator's.
         time: observation times, from zero [s].
         rows: number of rows of each recording.
         position: measured marker positions [m]; zero where masked.
@@ -58,6 +69,8 @@ class RecordingSet:
     """
 
     names: tuple[str, ...]
+    markers: tuple[str, ...]
+    marker_index: Int[np.ndarray, " marker"]
     time: Float[np.ndarray, "recording time"]
     rows: Int[np.ndarray, " recording"]
     position: Float[np.ndarray, "recording time marker 3"]
@@ -66,10 +79,10 @@ class RecordingSet:
 
 
 def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) -> RecordingSet:
-    """Bring trajectories onto the simulator's clock and markers.
+    """Bring trajectories onto the simulator's clock and markers: those of the robot's that every recording has.
 
     Raises:
-        InputError: no trajectory, two of one name, or markers or cables that the simulator has not.
+        InputError: no trajectory, two of one name, no marker in common, or another number of channels.
     """
     if not trajectories:
         raise InputError("no recordings", where="[data] fit", remedy="name at least one recording")
@@ -77,9 +90,10 @@ def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) 
     if len(set(names)) < len(names):
         raise InputError(f"two recordings share a name: {', '.join(names)}", where="[data]", remedy="list each once")
     length = max(len(trajectory.time) for trajectory in trajectories)
+    markers = _common_markers(simulator, trajectories)
     times, positions, valid, commands = [], [], [], []
     for trajectory in trajectories:
-        chosen = _marker_columns(simulator, trajectory)
+        chosen = [trajectory.marker_names.index(name) for name in markers]
         mask = np.asarray(trajectory.position_mask)[:, chosen]
         position = np.where(mask[:, :, None], np.asarray(trajectory.position)[:, chosen], 0.0)
         missing = length - len(trajectory.time)
@@ -91,6 +105,8 @@ def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) 
     lines = [timeline(time, ok) for time, ok in zip(times, valid, strict=True)]
     return RecordingSet(
         names,
+        markers,
+        np.array([simulator.marker_names.index(name) for name in markers]),
         np.stack(times),
         np.array([len(trajectory.time) for trajectory in trajectories]),
         np.stack(positions),
@@ -99,16 +115,18 @@ def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) 
     )
 
 
-def _marker_columns(simulator: Simulator, trajectory: Trajectory) -> list[int]:
-    known = list(trajectory.marker_names)
-    missing = [name for name in simulator.marker_names if name not in known]
-    if missing:
+def _common_markers(simulator: Simulator, trajectories: Sequence[Trajectory]) -> tuple[str, ...]:
+    """The simulator's markers that every recording has, in the simulator's order."""
+    shared = set.intersection(*(set(trajectory.marker_names) for trajectory in trajectories))
+    markers = tuple(name for name in simulator.marker_names if name in shared)
+    if not markers:
+        known = ", ".join(trajectories[0].marker_names)
         raise InputError(
-            f"the robot's markers {', '.join(missing)} are not in the recording",
-            where=trajectory.name,
-            remedy=f"the recording has {', '.join(known)}: use the robot that was recorded",
+            f"no marker of the robot ({', '.join(simulator.marker_names)}) is in all recordings",
+            where=trajectories[0].name,
+            remedy=f"the recording has {known}: use the robot that was recorded",
         )
-    return [known.index(name) for name in simulator.marker_names]
+    return markers
 
 
 def _commands(simulator: Simulator, trajectory: Trajectory) -> Commands:
@@ -163,11 +181,12 @@ class TrajectoryModel:
                 reverse mode.
 
         Returns:
-            observations with a leading axis over recordings.
+            observations with a leading axis over recordings, and the recordings' markers.
         """
         per_recording = [self.rollout_values(values, name) for name in self.recordings.names]
         stacked = {name: jnp.stack([row[name] for row in per_recording]) for name in per_recording[0]}
-        return jax.vmap(lambda v, c: self.simulator.rollout(v, c, steps))(stacked, self.recordings.commands)
+        observed = jax.vmap(lambda v, c: self.simulator.rollout(v, c, steps))(stacked, self.recordings.commands)
+        return observed._replace(position=observed.position[:, :, self.recordings.marker_index])
 
     def row_log_likelihood(
         self, values: Values, steps: Int[Array, ""] | None = None
@@ -189,7 +208,7 @@ class TrajectoryModel:
             rows = int(self.recordings.rows[index])
             line = Timeline(*(part[index, :rows] for part in self.recordings.line))
             noise = TrajectoryNoise(
-                observation.position[index, :rows], sigma, tau, self.recordings.time[index, :rows], line
+                observation.position[index, :rows], sigma, tau, jnp.asarray(self.recordings.time[index, :rows]), line
             )
             measured = self.recordings.position[index, :rows] if observe else None
             numpyro.sample(f"position@{name}", noise, obs=measured)

@@ -72,7 +72,9 @@ def noise_specs(model: str) -> tuple[ParameterSpec, ...]:
     return (OBSERVATION_NOISE,) if model == "white" else (OBSERVATION_NOISE, NOISE_CORRELATION_TIME)
 
 
-def _conditional(sigma, tau, line: Timeline):
+def _conditional(
+    sigma: Float[Array, ""], tau: Float[Array, ""] | None, line: Timeline
+) -> tuple[Float[Array, "time marker"], Float[Array, "time marker"]]:
     """Coefficient on the previous residual and conditional standard deviation of each row and marker."""
     if tau is None:
         return jnp.zeros_like(line.gap), jnp.broadcast_to(sigma, line.gap.shape)

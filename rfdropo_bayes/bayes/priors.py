@@ -12,28 +12,31 @@ from scipy import stats
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
 
+# The arguments are checked below; a value that rounding puts a hair outside the support needs no warning.
+UNCHECKED = {"validate_args": False}
+
 
 def _normal(spec: ParameterSpec, loc: float, scale: float) -> dist.Distribution:
-    return dist.TruncatedNormal(loc, scale, low=_open(spec.low), high=_open(spec.high))
+    return dist.TruncatedNormal(loc, scale, low=_open(spec.low), high=_open(spec.high), **UNCHECKED)
 
 
 def _half_normal(spec: ParameterSpec, scale: float) -> dist.Distribution:
-    return dist.TruncatedNormal(0.0, scale, low=max(0.0, spec.low), high=_open(spec.high))
+    return dist.TruncatedNormal(0.0, scale, low=max(0.0, spec.low), high=_open(spec.high), **UNCHECKED)
 
 
 def _log_normal(spec: ParameterSpec, median: float, sigma: float) -> dist.Distribution:
     low = math.log(spec.low) if spec.low > 0 else None
     high = math.log(spec.high) if math.isfinite(spec.high) else None
-    base = dist.TruncatedNormal(math.log(median), sigma, low=low, high=high)
-    return dist.TransformedDistribution(base, dist.transforms.ExpTransform())
+    base = dist.TruncatedNormal(math.log(median), sigma, low=low, high=high, **UNCHECKED)
+    return dist.TransformedDistribution(base, dist.transforms.ExpTransform(), **UNCHECKED)
 
 
 def _uniform(spec: ParameterSpec, low: float, high: float) -> dist.Distribution:
-    return dist.Uniform(low, high)
+    return dist.Uniform(low, high, **UNCHECKED)
 
 
 def _log_uniform(spec: ParameterSpec, low: float, high: float) -> dist.Distribution:
-    return dist.LogUniform(low, high)
+    return dist.LogUniform(low, high, **UNCHECKED)
 
 
 def _open(bound: float) -> float | None:
