@@ -71,7 +71,7 @@ def simulate(experiment: ExperimentFile, out: OutFolder = None, overrides: Overr
 @app.command()
 def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a calibration has written")]) -> None:
     """Write report.html again from the files of a run."""
-    from rfdropo_bayes.workflow.reporting import rebuild_report
+    from rfdropo_bayes.report import rebuild_report
 
     typer.echo(f"report: {rebuild_report(folder)}")
 

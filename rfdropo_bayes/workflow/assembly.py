@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
@@ -45,7 +45,7 @@ def fixed_values(experiment: Experiment, simulator: TrunkSimulator) -> dict[str,
     return {name: check_value(by_name[name], v, where="[model.fixed]") for name, v in experiment.model.fixed.items()}
 
 
-def load_data(experiment: Experiment, folder: Path, role: str) -> list[Trajectory]:
+def load_data(experiment: Experiment, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
     """The recordings of one role, ``"fit"`` or ``"test"``."""
     if experiment.data is None:
         raise InputError("the experiment has no [data]", remedy="name the recordings to fit")
@@ -95,5 +95,5 @@ def build_model(
 
 def build_problem(model: TrajectoryModel) -> CalibrationProblem:
     """The model as the inference methods see it, in chunks that suit its engine."""
-    lanes = model.simulator.engine.lanes
+    lanes = model.simulator.lanes
     return CalibrationProblem(model, chunk=max(1, lanes // len(model.recordings.names)))

@@ -16,13 +16,11 @@ from rfdropo_bayes.inference.methods import make_config, method_named, run
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
-from rfdropo_bayes.report.baselines import baseline_errors
-from rfdropo_bayes.report.facts import RecordingFacts, RunFacts, software_versions
+from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, software_versions, write_run
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
 from rfdropo_bayes.workflow.experiment import Experiment, describe, load_experiment
 from rfdropo_bayes.workflow.files import output_folder
 from rfdropo_bayes.workflow.prediction import predict_fitted, predict_new, thin
-from rfdropo_bayes.workflow.reporting import write_outputs
 
 PREDICTIVE_DRAWS = 200
 PRIOR_DRAWS = 2000
@@ -53,13 +51,12 @@ def run_calibration(path: Path, out: Path, *, overrides: Sequence[str] = (), res
     method = experiment.inference.method
     config = make_config(method, inference_options(experiment))
     out = output_folder(out)
-    (out / "config.toml").write_text(describe(tables), encoding="utf-8")
     key, predicting = jax.random.split(jax.random.key(experiment.seed))
     with Progress(method, show=None, log=out / "log.jsonl") as progress:
         result = run(problem, method, config, key, checkpoint_dir=out / "checkpoints", resume=resume, progress=progress)
     record = record_posterior(problem, result, tested, predicting, _attributes(experiment, [*fitted, *tested]))
     facts = gather_facts(experiment, path.stem, problem, result, fitted, tested)
-    return write_outputs(record, facts, out)
+    return write_run(out, record, facts, describe(tables))
 
 
 def inference_options(experiment: Experiment) -> dict[str, Any]:
@@ -125,7 +122,7 @@ def gather_facts(
 ) -> RunFacts:
     """What the report says beside the posterior."""
     description = problem.model.simulator.description
-    floor = noise_floor(list(fitted))
+    floor = noise_floor([*fitted, *tested])
     return RunFacts(
         title=experiment.title or name,
         robot=str(description["robot"]),

@@ -64,7 +64,7 @@ class CommandsTable(Table):
     """[commands]: a random command sequence to simulate, where no recording is replayed.
 
     Every ``interval`` seconds one channel, chosen at random, moves by ``step`` (in the robot's command unit) up or
-    down, within ``[low, high]``; the state is observed every ``sample_time`` seconds.
+    down, within ``[low, high]``; every ``sample_time`` seconds the named markers are observed (all, if none is named).
     """
 
     duration: float = Field(gt=0.0)
@@ -74,6 +74,7 @@ class CommandsTable(Table):
     high: float
     sample_time: float = Field(gt=0.0)
     recordings: list[str] = Field(min_length=1)
+    markers: list[str] = Field(default_factory=list)
 
 
 class NoiseTable(Table):

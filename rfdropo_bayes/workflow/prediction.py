@@ -103,7 +103,7 @@ def _predictions(
             name,
             split,
             recordings.time[i, :rows],
-            tuple(problem.model.simulator.marker_names),
+            recordings.markers,
             recordings.position[i, :rows],
             recordings.line.valid[i, :rows],
             noisy[:, i, :rows].astype(np.float32),

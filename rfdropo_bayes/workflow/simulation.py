@@ -10,12 +10,13 @@ from typing import Any
 import jax
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.noise import draw_noise
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.protocol import Observation, Result
+from rfdropo_bayes.simulators.parameters import nearest
+from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values, load_data
 from rfdropo_bayes.workflow.commands import random_walk
@@ -49,17 +50,20 @@ def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str,
     for index, source in enumerate(sources):
         commands = simulator.commands(source.command_time, source.command, source.initial_command, source.time)
         observation = jax.device_get(rollout({k: np.asarray(v) for k, v in values.items()}, commands))
+        markers = [name for name in simulator.marker_names if name in source.marker_names]
+        chosen = [simulator.marker_names.index(name) for name in markers]
+        position = np.asarray(observation.position)[:, chosen]
         result = Result(int(observation.status))
         if result is Result.DIVERGED:
             raise InputError(f"the rollout of {source.name} diverged", where="simulate", remedy=result.remedy)
         stem = "trajectory" if len(sources) == 1 else source.name
-        simulated = _as_trajectory(source, observation, simulator, experiment, values, index)
+        simulated = _as_trajectory(source, position, markers, simulator, experiment, values, index)
         simulated.save(out / f"{stem}.nc")
         _table(source, simulated).to_csv(out / f"{stem}.csv", index=False, float_format="%.6f")
         report["recordings"][source.name] = {
             "status": result.name.lower(),
             "files": [str(out / f"{stem}.nc"), str(out / f"{stem}.csv")],
-            "error_mm": _error(source, observation.position, simulator.marker_names) if experiment.data else None,
+            "error_mm": _error(source, position, markers) if experiment.data else None,
         }
     (out / "simulation.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
@@ -81,32 +85,41 @@ def _generated(table: CommandsTable, name: str, simulator: TrunkSimulator, rng: 
     """A recording of random commands whose positions are still to be simulated."""
     command_time, command = random_walk(table, len(simulator.channel_names), rng)
     time = table.sample_time * np.arange(round(table.duration / table.sample_time) + 1)
-    rest = np.broadcast_to(simulator.robot.marker_points(), (len(time), len(simulator.marker_names), 3))
+    markers = _known_markers(table.markers or simulator.marker_names, simulator)
+    places = simulator.robot.marker_points()[[simulator.marker_names.index(name) for name in markers]]
     return Trajectory.build(
         name=name,
         robot=simulator.robot.name,
         format="netcdf",
         time=time,
-        position=rest,
+        position=np.tile(places, (len(time), 1, 1)),
         command_time=command_time,
         command=command,
         command_unit=simulator.robot.command_unit,
-        marker_names=simulator.marker_names,
+        marker_names=markers,
         cable_names=simulator.channel_names,
         synthetic=True,
     )
 
 
+def _known_markers(names: Sequence[str], simulator: TrunkSimulator) -> list[str]:
+    for name in names:
+        if name not in simulator.marker_names:
+            remedy = nearest(name, simulator.marker_names)
+            raise InputError(f"unknown marker {name!r}", where="[commands]", remedy=remedy)
+    return [name for name in simulator.marker_names if name in names]
+
+
 def _as_trajectory(
     source: Trajectory,
-    observation: Observation,
+    position: Float[np.ndarray, "time marker 3"],
+    markers: Sequence[str],
     simulator: TrunkSimulator,
     experiment: Experiment,
     values: Mapping[str, float],
     index: int,
 ) -> Trajectory:
     """The simulated motion as a recording that says it is synthetic, and how it was made."""
-    position = np.asarray(observation.position)
     if experiment.noise is not None:
         key = jax.random.fold_in(jax.random.key(experiment.seed), index)
         position = position + _noise(experiment.noise, key, source.time, position.shape[1])
@@ -126,7 +139,7 @@ def _as_trajectory(
         command=source.command,
         command_unit=source.command_unit,
         initial_command=source.initial_command,
-        marker_names=simulator.marker_names,
+        marker_names=markers,
         cable_names=source.cable_names,
         synthetic=True,
         provenance="synthetic: made by rfdropo simulate",
@@ -134,7 +147,7 @@ def _as_trajectory(
     )
 
 
-def _noise(table: NoiseTable, key, time: Float[np.ndarray, " time"], markers: int) -> np.ndarray:
+def _noise(table: NoiseTable, key: PRNGKeyArray, time: Float[np.ndarray, " time"], markers: int) -> np.ndarray:
     return np.asarray(draw_noise(key, time, markers, table.standard_deviation, table.correlation_time))
 
 

@@ -49,7 +49,11 @@ def experiment(tmp_path: Path, *changes: tuple[str, str]) -> str:
         ("young_modulus", "youngs_modulus", "did you mean 'young_modulus'"),
         ("{}", '{ distribution = "Uniform", low = 1.0, high = 2.0 }', "outside the bounds"),
         ("{}", '{ distribution = "Normall", loc = 1.0, scale = 2.0 }', "did you mean 'Normal'"),
-        ("young_modulus = {}", "young_modulus = {}\n[model.fixed]\ntrunk_mass = -0.1", "trunk_mass = -0.1 kg is outside"),
+        (
+            "young_modulus = {}",
+            "young_modulus = {}\n[model.fixed]\ntrunk_mass = -0.1",
+            "trunk_mass = -0.1 kg is outside",
+        ),
         ("young_modulus = {}", "young_modulus = {}\n[model.fixed]\nyoung_modulus = 3e6", "a prior and a fixed value"),
         ('"smc"', '"mcmc"', "unknown method 'mcmc'"),
         ("rollouts = 50", "rolouts = 50", "'rolouts'"),
@@ -82,9 +86,7 @@ def test_a_corrupt_recording(tmp_path, monkeypatch, capsys):
 def test_an_output_folder_that_cannot_be_made(tmp_path, monkeypatch, capsys):
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
-    status, error = run(
-        ["calibrate", experiment(tmp_path), "--out", str(blocked / "out")], monkeypatch, capsys
-    )
+    status, error = run(["calibrate", experiment(tmp_path), "--out", str(blocked / "out")], monkeypatch, capsys)
     assert status == 2
     assert "output folder" in error
     assert error.count("\n") == 1
