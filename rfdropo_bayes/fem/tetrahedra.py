@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.cables import CableLayout
 from rfdropo_bayes.fem.corotational import rotation
+from rfdropo_bayes.fem.dynamics import POISSON_LIMIT
 from rfdropo_bayes.fem.layered import PointMap
 
 FRAMES = ("polar", "edges")
@@ -94,7 +95,8 @@ def _edge_axes(corners: Float[Array, "elements 4 3"]) -> Float[Array, "elements 
 def lame_constants(
     young_modulus: Float[Array, ""], poisson_ratio: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """First Lame constant and shear modulus [Pa]."""
+    """First Lame constant and shear modulus [Pa]; Poisson's ratio is held below `POISSON_LIMIT`."""
+    poisson_ratio = jnp.minimum(poisson_ratio, POISSON_LIMIT)
     shear = young_modulus / (2.0 * (1.0 + poisson_ratio))
     return 2.0 * shear * poisson_ratio / (1.0 - 2.0 * poisson_ratio), shear
 

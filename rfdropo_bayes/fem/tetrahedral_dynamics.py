@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from rfdropo_bayes.fem import levels as level_systems
 from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian, unilateral_tensions
 from rfdropo_bayes.fem.drives import DriveLimits
+from rfdropo_bayes.fem.dynamics import LOST
 from rfdropo_bayes.fem.layered import PointMap, point_positions
 from rfdropo_bayes.fem.levels import Levels, node_levels
 from rfdropo_bayes.fem.tetrahedra import (
@@ -61,12 +62,20 @@ class TetrahedralState(NamedTuple):
     measured: Float[Array, " cables"]  # [m]
 
 
+class TetrahedralInfo(NamedTuple):
+    """How a step went."""
+
+    diverged: Bool[Array, ""]
+    cables_converged: Bool[Array, ""]
+
+
 class TetrahedralRollout(NamedTuple):
-    """Recorded motion."""
+    """Recorded motion; a diverged rollout stays finite, but its rows from then on mean nothing."""
 
     position: Float[Array, "rows points 3"]  # [m]
     tension: Float[Array, "rows cables"]  # [N]
     state: TetrahedralState
+    diverged: Bool[Array, ""]
     cables_converged: Bool[Array, ""]
 
 
@@ -93,8 +102,8 @@ def step(
     state: TetrahedralState,
     displacement: Float[Array, " cables"],
     time_step: float,
-) -> tuple[TetrahedralState, Bool[Array, ""]]:
-    """One implicit Euler step to the commanded cable displacements [m]; also whether the tensions were found."""
+) -> tuple[TetrahedralState, TetrahedralInfo]:
+    """One implicit Euler step to the commanded cable displacements [m]."""
     body, levels = system.body, system.levels
     first, shear = lame_constants(material.young_modulus, material.poisson_ratio)
     lame = first * material.stiffness_scale, shear * material.stiffness_scale
@@ -120,7 +129,20 @@ def step(
         tension, converged = unilateral_tensions(compliance, shortening - time_step * growth - target, state.tension)
     change = solution[:, 0] - time_step * solution[:, 1:] @ tension
     velocity = state.velocity.at[levels.order].add(change.reshape(-1, 3))
-    return TetrahedralState(state.position + time_step * velocity, velocity, tension, shortening), converged
+    moved = TetrahedralState(state.position + time_step * velocity, velocity, tension, shortening)
+    return _accept(system, state, moved, converged)
+
+
+def _accept(
+    system: TetrahedralSystem, state: TetrahedralState, moved: TetrahedralState, converged: Bool[Array, ""]
+) -> tuple[TetrahedralState, TetrahedralInfo]:
+    """The new state if it is finite and near the body, else the old one at rest."""
+    reach = LOST * float(np.ptp(system.body.rest, axis=0).max())
+    away = jnp.max(jnp.abs(moved.position - system.body.rest))
+    fine = (away < reach) & jnp.all(jnp.isfinite(moved.velocity)) & jnp.all(jnp.isfinite(moved.tension))
+    stopped = state._replace(velocity=jnp.zeros_like(state.velocity), tension=jnp.zeros_like(state.tension))
+    kept = TetrahedralState(*(jnp.where(fine, new, old) for new, old in zip(moved, stopped, strict=True)))
+    return kept, TetrahedralInfo(~fine, converged | ~fine)
 
 
 def simulate(
@@ -134,13 +156,15 @@ def simulate(
     """Rollout through the commanded cable displacements [m] of every step, recorded at the end of every row."""
 
     def one(carry, commanded):
-        state, fine = carry
-        state, converged = step(system, material, state, commanded, time_step)
-        return (state, fine & converged), None
+        state, info = carry
+        state, new = step(system, material, state, commanded, time_step)
+        info = TetrahedralInfo(info.diverged | new.diverged, info.cables_converged & new.cables_converged)
+        return (state, info), None
 
     def row(carry, commands):
         carry, _ = lax.scan(one, carry, commands)
         return carry, (point_positions(points, carry[0].position), carry[0].tension)
 
-    (state, converged), (position, tension) = lax.scan(row, (state, jnp.array(True)), displacement)
-    return TetrahedralRollout(position, tension, state, converged)
+    start = state, TetrahedralInfo(jnp.array(False), jnp.array(True))
+    (state, info), (position, tension) = lax.scan(row, start, displacement)
+    return TetrahedralRollout(position, tension, state, info.diverged, info.cables_converged)

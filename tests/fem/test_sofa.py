@@ -90,8 +90,8 @@ def test_follows_sofa_to_its_last_digit_before_contact(scene, datasets, name, ro
 def test_single_precision_stays_close(scene, datasets):
     command, recorded = recording(datasets, "reach_1")
     error = error_mm(scene.fast(command, np.float32), recorded)
-    assert error.mean() < 0.01
-    assert error.max() < 0.15
+    assert error.mean() < 0.001
+    assert error.max() < 0.01
 
 
 @pytest.mark.slow

@@ -206,18 +206,45 @@ def factor(pattern, pivot, lower, token):
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def forward_substitute(pattern, pivot, lower, token):
+    """Turn border row 0, written anew after `factor`, into (L^-1 b)'."""
+    for column in range(len(pattern.first) - 1):
+        block = pattern.first[column + 1] - pattern.border
+        t, j = 9 * block, 6 * column
+        x, y, z = load(lower, t, token), load(lower, t + 1, token), load(lower, t + 2, token)
+        for k in range(pattern.product[block], pattern.product[block + 1]):
+            left, right = 9 * pattern.source[k, 0], 9 * pattern.source[k, 1]
+            for m in range(3):
+                value = load(lower, left + m, token)
+                x = fnma(value, load(lower, right + m, token), x)
+                y = fnma(value, load(lower, right + 3 + m, token), y)
+                z = fnma(value, load(lower, right + 6 + m, token), z)
+        store(lower, t, x * load(pivot, j, token))
+        store(lower, t + 1, fma(x, load(pivot, j + 1, token), y * load(pivot, j + 2, token)))
+        i20, i21, i22 = load(pivot, j + 3, token), load(pivot, j + 4, token), load(pivot, j + 5, token)
+        store(lower, t + 2, fma(x, i20, fma(y, i21, z * i22)))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def condensed_entry(pattern, lower, i, j, token):
+    """Product b_i' A^-1 b_j of two border rows, after `factor`."""
+    total = fill(0.0, lower, token)
+    for column in range(len(pattern.first) - 1):
+        last = pattern.first[column + 1] - pattern.border
+        a, b = 9 * (last + i // 3) + 3 * (i % 3), 9 * (last + j // 3) + 3 * (j % 3)
+        for m in range(3):
+            total = fma(load(lower, a + m, token), load(lower, b + m, token), total)
+    return total
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def condense(pattern, lower, condensed, token):
     """Products b_i' A^-1 b_j of all border rows i >= j, after `factor`, into ``condensed`` (rows * rows, lanes),
     row-major."""
     rows = 3 * pattern.border
     for i in range(rows):
         for j in range(i + 1):
-            total = fill(0.0, lower, token)
-            for column in range(len(pattern.first) - 1):
-                last = pattern.first[column + 1] - pattern.border
-                a, b = 9 * (last + i // 3) + 3 * (i % 3), 9 * (last + j // 3) + 3 * (j % 3)
-                for m in range(3):
-                    total = fma(load(lower, a + m, token), load(lower, b + m, token), total)
+            total = condensed_entry(pattern, lower, i, j, token)
             store(condensed, i * rows + j, total)
             store(condensed, j * rows + i, total)
 

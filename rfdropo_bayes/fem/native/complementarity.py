@@ -19,7 +19,7 @@ MAX_EXCHANGES = 60
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _masked_solve(matrix, offset, active, count, work, tension, token):
+def solve_for_active(matrix, offset, active, count, work, tension, token):
     """Tensions of the active set by Cholesky; the others are zero. ``work`` is (count * count, lanes)."""
     one, zero = fill(1.0, matrix, token), fill(0.0, matrix, token)
     for i in range(count):
@@ -62,7 +62,7 @@ def solve_unilateral(matrix, offset, count, tolerance, active, work, tension, to
         size = where_greater(size, zero, size, -size) * tolerance
         threshold = where_greater(size, threshold, size, threshold)
     for exchange in range(MAX_EXCHANGES):
-        _masked_solve(matrix, offset, active, count, work, tension, token)
+        solve_for_active(matrix, offset, active, count, work, tension, token)
         largest = zero
         for i in range(count):
             slack = load(offset, i, token)

@@ -1,8 +1,8 @@
-"""Kernels of a body of corotational tetrahedra in SIMD lanes: assembly, cables, and the implicit Euler step.
+"""Kernels of a body of corotational tetrahedra in SIMD lanes: frames, forces, and the matrix of an implicit step.
 
-The physics is that of ``fem.tetrahedra`` and ``fem.tetrahedral_dynamics``; this is the same step with samples in
-lanes. Nodes are numbered in elimination order, held nodes after the free ones. Block storage beyond that of the factor
-is a dump for blocks of held nodes.
+The physics is that of ``fem.tetrahedra`` and ``fem.tetrahedral_dynamics``, with samples in lanes. Nodes are numbered
+in elimination order, held nodes after the free ones. Block storage beyond that of the factor is a dump for blocks of
+held nodes.
 """
 
 from __future__ import annotations
@@ -13,9 +13,7 @@ import numba
 import numpy as np
 from jaxtyping import Float, Int
 
-from rfdropo_bayes.fem.native.block_cholesky import back_substitute, condense, factor
-from rfdropo_bayes.fem.native.complementarity import solve_unilateral
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, load, square_root, store
 
 POLAR_ITERATIONS = 6
 
@@ -31,18 +29,6 @@ class Mesh(NamedTuple):
     slot: Int[np.ndarray, "elements 6"]  # blocks (1,0) (2,0) (3,0) (2,1) (3,1) (3,2)
     free: int
     polar: bool
-
-
-class Cables(NamedTuple):
-    """Static cable data; the points of cable c are ``first[c]:first[c + 1]``, the first of them fixed in space."""
-
-    first: Int[np.ndarray, " cables_1"]
-    node: Int[np.ndarray, "points weights"]
-    weight: Float[np.ndarray, "points weights"]
-    anchor: Float[np.ndarray, "cables 3"]
-    rest_length: Float[np.ndarray, " cables"]
-    limit: Float[np.ndarray, " cables"]  # largest displacement [m]
-    rate: float  # largest change of the displacement in a step, against the one measured a step before [m]
 
 
 class Samples(NamedTuple):
@@ -73,7 +59,13 @@ class Work(NamedTuple):
     active: Float[np.ndarray, "cables lanes"]
     tension: Float[np.ndarray, "cables lanes"]
     measured: Float[np.ndarray, "cables lanes"]
+    load: Float[np.ndarray, "border9 lanes"]
+    target: Float[np.ndarray, "cables lanes"]
+    change: Float[np.ndarray, "cables lanes"]
     pivoting: Float[np.ndarray, "scratch lanes"]
+    accepted: Float[np.ndarray, "1 lanes"]
+    lost: Float[np.ndarray, "1 lanes"]
+    unsolved: Float[np.ndarray, "1 lanes"]
     axes: Float[np.ndarray, "9 lanes"]
     turned: Float[np.ndarray, "12 lanes"]
 
@@ -83,7 +75,7 @@ def _cross(ax, ay, az, bx, by, bz):
     return fnma(az, by, ay * bz), fnma(ax, bz, az * bx), fnma(ay, bx, ax * by)
 
 
-@numba.njit(cache=True, forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy")
 def _edge_frame(mesh, e, x, axes, token):
     """Rows of ``axes``: along edge 0-1, across it in the face 0-1-2, normal to the face."""
     one = fill(1.0, x, token)
@@ -108,7 +100,7 @@ def _edge_frame(mesh, e, x, axes, token):
     store(axes, 8, nz)
 
 
-@numba.njit(cache=True, forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy")
 def _polar_frame(mesh, e, x, axes, token):
     """``axes`` = transposed rotation of the polar decomposition of the deformation gradient, by Newton's iteration."""
     for i in range(3):
@@ -147,7 +139,7 @@ def _rotate_back(axes, x, y, z, token):
     )
 
 
-@numba.njit(cache=True, forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy")
 def _element_force(mesh, e, work, lame, shear, lookahead, token):
     """Add an element's force at the positions x + lookahead v, in the frame of x, to ``work.force``; fill
     ``work.turned``."""
@@ -209,7 +201,7 @@ def _element_force(mesh, e, work, lame, shear, lookahead, token):
         store(work.turned, 3 * a + 2, tz)
 
 
-@numba.njit(cache=True, forceinline=True, error_model="numpy")
+@numba.njit(forceinline=True, error_model="numpy")
 def _element_tangent(mesh, e, work, lame, shear, token):
     """Add an element's scaled tangent to the pivots and blocks of the matrix."""
     turned, pivot, lower = work.turned, work.pivot, work.lower
@@ -246,29 +238,46 @@ def _element_tangent(mesh, e, work, lame, shear, token):
             pair += 1
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def _clear(array, token):
+@numba.njit(nogil=True, error_model="numpy")
+def clear(array, token):
+    """Fill with zeros."""
     zero = fill(0.0, array, token)
     for i in range(array.shape[0]):
         store(array, i, zero)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def assemble(pattern, mesh, samples, work, time_step, token):
-    """Matrix (1 + h a) M + h (h + b) K and, as border row 0, the right-hand side h (f + M g - (h + b) K v - a M v)."""
-    _clear(work.pivot, token)
-    _clear(work.lower, token)
-    _clear(work.force, token)
+@numba.njit(forceinline=True, error_model="numpy")
+def _element(mesh, e, samples, work, lookahead, token):
+    """Frame and force of an element; returns its Lame constants times its volume."""
+    if mesh.polar:
+        _polar_frame(mesh, e, work.position, work.axes, token)
+    else:
+        _edge_frame(mesh, e, work.position, work.axes, token)
+    scale = load(samples.element_scale, e, token) * mesh.volume[e]
+    lame, shear = scale * load(samples.first_lame, 0, token), scale * load(samples.shear_modulus, 0, token)
+    _element_force(mesh, e, work, lame, shear, lookahead, token)
+    return lame, shear
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def elastic_forces(mesh, samples, work, time_step, token):
+    """``work.force`` at the positions x + (h + b) v, in the frames of x."""
+    clear(work.force, token)
     lookahead = load(samples.rayleigh_stiffness, 0, token) + time_step
     for e in range(mesh.node.shape[0]):
-        if mesh.polar:
-            _polar_frame(mesh, e, work.position, work.axes, token)
-        else:
-            _edge_frame(mesh, e, work.position, work.axes, token)
-        scale = load(samples.element_scale, e, token) * mesh.volume[e]
-        lame, shear = scale * load(samples.first_lame, 0, token), scale * load(samples.shear_modulus, 0, token)
-        _element_force(mesh, e, work, lame, shear, lookahead, token)
-        scale = time_step * lookahead
+        _element(mesh, e, samples, work, lookahead, token)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def assemble(pattern, mesh, samples, work, time_step, token):
+    """Matrix (1 + h a) M + h (h + b) K and, as border row 0, the right-hand side h (f + M g - (h + b) K v - a M v)."""
+    clear(work.pivot, token)
+    clear(work.lower, token)
+    clear(work.force, token)
+    lookahead = load(samples.rayleigh_stiffness, 0, token) + time_step
+    scale = time_step * lookahead
+    for e in range(mesh.node.shape[0]):
+        lame, shear = _element(mesh, e, samples, work, lookahead, token)
         _element_tangent(mesh, e, work, lame * scale, shear * scale, token)
     drag = load(samples.rayleigh_mass, 0, token)
     inertia = 1.0 + time_step * drag
@@ -280,124 +289,3 @@ def assemble(pattern, mesh, samples, work, time_step, token):
             acceleration = load(samples.gravity, i, token) - drag * load(work.velocity, 3 * node + i, token)
             right = time_step * (load(work.force, 3 * node + i, token) + mass * acceleration)
             store(work.lower, 9 * (pattern.first[node + 1] - pattern.border) + i, right)
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def _point(cables, p, c, field, fixed, token):
-    """Position or velocity of a cable's point; the anchor's is ``fixed``."""
-    if p == cables.first[c]:
-        zero = fill(0.0, field, token)
-        return (
-            zero + cables.anchor[c, 0] * fixed,
-            zero + cables.anchor[c, 1] * fixed,
-            zero + cables.anchor[c, 2] * fixed,
-        )
-    x, y, z = fill(0.0, field, token), fill(0.0, field, token), fill(0.0, field, token)
-    for k in range(cables.node.shape[1]):
-        n, w = 3 * cables.node[p, k], cables.weight[p, k]
-        x = x + load(field, n, token) * w
-        y = y + load(field, n + 1, token) * w
-        z = z + load(field, n + 2, token) * w
-    return x, y, z
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def _pull(pattern, mesh, cables, p, row, work, x, y, z, token):
-    """Add a force on a cable's point to the cable's border row."""
-    for k in range(cables.node.shape[1]):
-        node, w = cables.node[p, k], cables.weight[p, k]
-        if node < mesh.free and w != 0.0:
-            t = 9 * (pattern.first[node + 1] - pattern.border + row // 3) + 3 * (row % 3)
-            store(work.lower, t, load(work.lower, t, token) + x * w)
-            store(work.lower, t + 1, load(work.lower, t + 1, token) + y * w)
-            store(work.lower, t + 2, load(work.lower, t + 2, token) + z * w)
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def gather_cables(pattern, mesh, cables, commanded, work, time_step, token):
-    """Border rows -dl/dx of all cables, and their slack [m] at the end of the step if nothing changed the velocity.
-
-    The commanded displacement may differ from the one measured a step before by no more than ``rate``, and never
-    exceeds the limit.
-    """
-    one = fill(1.0, work.position, token)
-    for c in range(len(cables.rest_length)):
-        row = c + 1
-        x, y, z = _point(cables, cables.first[c], c, work.position, 1.0, token)
-        vx, vy, vz = _point(cables, cables.first[c], c, work.velocity, 0.0, token)
-        length, growth = fill(0.0, work.position, token), fill(0.0, work.position, token)
-        for p in range(cables.first[c] + 1, cables.first[c + 1]):
-            px, py, pz = _point(cables, p, c, work.position, 1.0, token)
-            wx, wy, wz = _point(cables, p, c, work.velocity, 0.0, token)
-            dx, dy, dz = px - x, py - y, pz - z
-            segment = square_root(fma(dx, dx, fma(dy, dy, dz * dz)))
-            length = length + segment
-            scale = one / segment
-            dx, dy, dz = dx * scale, dy * scale, dz * scale
-            growth = growth + (dx * (wx - vx) + dy * (wy - vy) + dz * (wz - vz))
-            _pull(pattern, mesh, cables, p, row, work, -dx, -dy, -dz, token)
-            if p - 1 > cables.first[c]:
-                _pull(pattern, mesh, cables, p - 1, row, work, dx, dy, dz, token)
-            x, y, z, vx, vy, vz = px, py, pz, wx, wy, wz
-        target, before = load(commanded, c, token), load(work.measured, c, token)
-        target = where_greater(target, before + cables.rate, before + cables.rate, target)
-        target = where_greater(before - cables.rate, target, before - cables.rate, target)
-        limit = one * cables.limit[c]
-        target = where_greater(target, limit, limit, target)
-        shortening = cables.rest_length[c] - length
-        store(work.measured, c, shortening)
-        store(work.slack, c, shortening - time_step * growth - target)
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def solve_step(pattern, mesh, cables, commanded, samples, work, time_step, tolerance, token):
-    """One implicit Euler step; returns False if a lane's cable tensions were not found."""
-    count = len(cables.rest_length)
-    assemble(pattern, mesh, samples, work, time_step, token)
-    gather_cables(pattern, mesh, cables, commanded, work, time_step, token)
-    factor(pattern, work.pivot, work.lower, token)
-    condense(pattern, work.lower, work.condensed, token)
-    rows = 3 * pattern.border
-    square = time_step * time_step
-    for i in range(count):
-        free = load(work.slack, i, token) + time_step * load(work.condensed, (i + 1) * rows, token)
-        store(work.slack, i, free)
-        for j in range(count):
-            store(work.compliance, i * count + j, square * load(work.condensed, (i + 1) * rows + j + 1, token))
-    solved = solve_unilateral(
-        work.compliance, work.slack, count, tolerance, work.active, work.pivoting, work.tension, token
-    )
-    _clear(work.weight, token)
-    store(work.weight, 0, fill(1.0, work.weight, token))
-    for i in range(count):
-        store(work.weight, i + 1, time_step * load(work.tension, i, token))
-    back_substitute(pattern, work.pivot, work.lower, work.weight, work.solution, token)
-    for i in range(3 * mesh.free):
-        velocity = load(work.velocity, i, token) + load(work.solution, i, token)
-        store(work.velocity, i, velocity)
-        store(work.position, i, load(work.position, i, token) + time_step * velocity)
-    return solved
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
-def rollout(
-    pattern, mesh, cables, commands, samples, work, points, weights, stride, time_step, tolerance, seen, pulls, token
-):
-    """Steps through ``commands`` (steps, cables, lanes), recording points and tensions after every ``stride`` steps.
-
-    ``seen`` is (rows, points, 3, lanes), ``pulls`` (rows, cables, lanes).
-    """
-    solved = True
-    for step in range(commands.shape[0]):
-        solved &= solve_step(pattern, mesh, cables, commands[step], samples, work, time_step, tolerance, token)
-        if (step + 1) % stride == 0:
-            row = (step + 1) // stride - 1
-            for p in range(points.shape[0]):
-                for i in range(3):
-                    total = fill(0.0, work.position, token)
-                    for k in range(points.shape[1]):
-                        total = total + load(work.position, 3 * points[p, k] + i, token) * weights[p, k]
-                    store(seen[row, p], i, total)
-            for c in range(len(cables.rest_length)):
-                store(pulls[row], c, load(work.tension, c, token))
-    return solved

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,18 +15,21 @@ from jaxtyping import Bool, Float, Int
 
 from rfdropo_bayes.fem.cables import CableLayout
 from rfdropo_bayes.fem.drives import DriveLimits
+from rfdropo_bayes.fem.dynamics import LOST, POISSON_LIMIT
 from rfdropo_bayes.fem.layered import PointMap
-from rfdropo_bayes.fem.native import tetrahedral as kernels
+from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
+from rfdropo_bayes.fem.native.layered import available_threads
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
+from rfdropo_bayes.fem.native.tetrahedral import Mesh, Samples, Work
 from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
 
-LOST = 10.0
-"""A point further from its place at rest than this many body sizes means that the rollout has diverged."""
+# Tolerance of the tension problem, as far as the precision resolves it.
+_TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
 
 
 class Rollouts(NamedTuple):
-    """Recorded motion of a batch."""
+    """Recorded motion of a batch; a diverged rollout stays finite, but its rows from then on mean nothing."""
 
     position: Float[np.ndarray, "samples rows points 3"]  # [m]
     tension: Float[np.ndarray, "samples rows cables"]  # [N]
@@ -54,9 +59,10 @@ class TetrahedralEngine:
     ) -> None:
         self.body, self.dtype, self.points = body, np.dtype(dtype), points
         self.lanes = lanes or native_lanes(dtype)
-        self.threads = threads or os.cpu_count() or 1
+        self.threads = threads or available_threads()
         self._order, self._number = _numbering(body)
-        self._rest = body.rest[self._order]
+        self._rest = body.rest[self._order].astype(self.dtype).ravel()
+        self._reach = LOST * float(np.ptp(body.rest, axis=0).max())
         self._pattern = _pattern(body, self._number, len(cables.anchor))
         # Elements in the order in which the factorisation needs them: their blocks are then still in cache.
         self._elements = np.argsort(self._number[body.element].min(axis=1), kind="stable")
@@ -104,21 +110,23 @@ class TetrahedralEngine:
         inputs = self._samples({name: np.asarray(value)[lane] for name, value in parameters.items()})
         displacement = self._lanes_last(commands[lane])
         work = self._work()
-        rows = displacement.shape[0] // stride
-        seen = aligned_zeros((rows, len(self._nodes), 3, self.lanes), self.dtype)
-        pulls = aligned_zeros((rows, displacement.shape[1], self.lanes), self.dtype)
-        solved = kernels.rollout(
-            self._pattern, self._mesh, self._cables, displacement, inputs, work, self._nodes, self._weights, stride,
-            time_step, 1e-12 if self.dtype.itemsize == 8 else 1e-5, seen, pulls, lane_token(self.lanes),
+        rows, token = displacement.shape[0] // stride, lane_token(self.lanes)
+        output = kernels.Output(
+            self._nodes,
+            self._weights,
+            aligned_zeros((rows, len(self._nodes), 3, self.lanes), self.dtype),
+            aligned_zeros((rows, displacement.shape[1], self.lanes), self.dtype),
+        )
+        single = self.dtype.itemsize == 4
+        schedule = kernels.Schedule(float(time_step), stride, _TOLERANCE[self.dtype.name], self._reach, single)
+        _kernel()(
+            self._pattern, self._mesh, self._cables, self._rest, displacement, inputs, work, schedule, output, token
         )  # fmt: skip
         count = len(kept)
-        position, tension = np.moveaxis(seen, 3, 0)[:count], np.moveaxis(pulls, 2, 0)[:count]
-        reach = LOST * np.ptp(self._rest, axis=0).max()
-        last = np.moveaxis(work.position, 1, 0)[:count].reshape(count, -1, 3)
-        result.position[kept], result.tension[kept] = position, tension
-        with np.errstate(invalid="ignore"):
-            result.diverged[kept] = ~(np.abs(last - self._rest).max(axis=(1, 2)) < reach)
-        result.cables_converged[kept] = solved
+        result.position[kept] = np.moveaxis(output.position, 3, 0)[:count]
+        result.tension[kept] = np.moveaxis(output.tension, 2, 0)[:count]
+        result.diverged[kept] = work.lost[0, :count] > 0.0
+        result.cables_converged[kept] = ~(work.unsolved[0, :count] > 0.0)
 
     def _lanes_last(self, values: np.ndarray) -> np.ndarray:
         """Aligned copy in the engine's precision with the sample axis last."""
@@ -127,11 +135,11 @@ class TetrahedralEngine:
         copy[...] = moved
         return copy
 
-    def _samples(self, values: Mapping[str, np.ndarray]) -> kernels.Samples:
-        young, poisson = np.asarray(values["young_modulus"]), np.asarray(values["poisson_ratio"])
+    def _samples(self, values: Mapping[str, np.ndarray]) -> Samples:
+        young, poisson = np.asarray(values["young_modulus"]), np.minimum(values["poisson_ratio"], POISSON_LIMIT)
         shear = young / (2.0 * (1.0 + poisson))
         scale = values.get("stiffness_scale", np.ones((self.lanes, len(self.body.element))))
-        return kernels.Samples(
+        return Samples(
             self._lanes_last((2.0 * shear * poisson / (1.0 - 2.0 * poisson))[:, None]),
             self._lanes_last(shear[:, None]),
             self._lanes_last(scale[:, self._elements]),
@@ -141,18 +149,28 @@ class TetrahedralEngine:
             self._lanes_last(values["gravity"]),
         )
 
-    def _work(self) -> kernels.Work:
+    def _work(self) -> Work:
         nodes, free, rows = len(self.body.rest), self._mesh.free, 3 * self._pattern.border
-        cables = len(self._cables.rest_length)
+        cables = len(self._cables.limit)
         sizes = {
             "position": 3 * nodes, "velocity": 3 * nodes, "force": 3 * nodes, "pivot": 6 * nodes,
             "lower": 9 * len(self._pattern.row) + 9, "solution": 3 * free, "condensed": rows * rows, "weight": rows,
             "compliance": cables**2, "slack": cables, "active": cables, "tension": cables, "measured": cables,
-            "pivoting": cables * (cables + 1), "axes": 9, "turned": 12,
+            "load": 9 * self._pattern.border * free,
+            "target": cables, "change": cables, "pivoting": cables * (cables + 1), "accepted": 1, "lost": 1,
+            "unsolved": 1, "axes": 9, "turned": 12,
         }  # fmt: skip
-        work = kernels.Work(**{name: aligned_zeros((size, self.lanes), self.dtype) for name, size in sizes.items()})
-        work.position[...] = self._rest.reshape(-1, 1)
+        work = Work(**{name: aligned_zeros((size, self.lanes), self.dtype) for name, size in sizes.items()})
+        work.position[...] = self._rest[:, None]
         return work
+
+
+@cache
+def _kernel() -> Callable:
+    """The rollout kernel. Numba's cache looks at one source file only, hence the digest of all of them."""
+    names = ("block_cholesky", "complementarity", "simd", "tetrahedral", "tetrahedral_rollout")
+    sources = b"".join((Path(__file__).parent / f"{name}.py").read_bytes() for name in names)
+    return kernels.compile_rollout(hashlib.sha256(sources).hexdigest())
 
 
 def _numbering(body: TetrahedralBody) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, " nodes"]]:
@@ -184,7 +202,7 @@ def _pattern(body: TetrahedralBody, number: np.ndarray, cables: int) -> BlockPat
 
 def _mesh(
     body: TetrahedralBody, elements: np.ndarray, number: np.ndarray, pattern: BlockPattern, dtype: np.dtype
-) -> kernels.Mesh:
+) -> Mesh:
     free, dump = int(np.sum(~body.fixed)), len(pattern.row)
     corner, frame = body.element[elements], body.rest_frame[elements]
     ascending = np.argsort(number[corner], axis=1)
@@ -194,7 +212,7 @@ def _mesh(
     node = number[sorted_corner]
     pairs = [(a, b) for b in range(3) for a in range(b + 1, 4)]
     slot = [[block_slot(pattern, nodes[a], nodes[b]) if nodes[a] < free else dump for a, b in pairs] for nodes in node]
-    return kernels.Mesh(
+    return Mesh(
         node.astype(np.int32),
         number[corner[:, :3]].astype(np.int32),
         np.einsum("eij,eaj->eai", frame, gradient).astype(dtype),
@@ -209,7 +227,7 @@ def _mesh(
 def _cables(
     layout: CableLayout, limits: DriveLimits, body: TetrahedralBody, number: np.ndarray, dtype: np.dtype
 ) -> kernels.Cables:
-    first, node, weight, length = [0], [], [], []
+    first, node, weight, segment = [0], [], [], [np.zeros(0)]
     for cable, used in enumerate(layout.guide_used):
         guides = layout.guide_node[cable, used], layout.guide_weight[cable, used]
         node.append(np.concatenate([guides[0][:1] * 0, guides[0]]))
@@ -217,7 +235,7 @@ def _cables(
         first.append(first[-1] + len(node[-1]))
         place = np.einsum("gk,gki->gi", guides[1], body.rest[guides[0]])
         route = np.concatenate([layout.anchor[cable : cable + 1], place])
-        length.append(np.linalg.norm(np.diff(route, axis=0), axis=1).sum())
+        segment.append(np.concatenate([[0.0], np.linalg.norm(np.diff(route, axis=0), axis=1)]))
     width = max([int(np.max(np.nonzero(w)[1])) + 1 for w in weight if np.any(w)], default=1)
     shape = (0, layout.guide_node.shape[2])
     return kernels.Cables(
@@ -225,7 +243,7 @@ def _cables(
         np.ascontiguousarray(number[np.concatenate([np.zeros(shape, dtype=int), *node])][:, :width], dtype=np.int32),
         np.ascontiguousarray(np.concatenate([np.zeros(shape), *weight])[:, :width], dtype=dtype),
         layout.anchor.astype(dtype),
-        np.array(length, dtype=dtype),
+        np.concatenate(segment).astype(dtype),
         np.asarray(limits.displacement, dtype=dtype),
         float(limits.rate),
     )

@@ -1,0 +1,275 @@
+"""Rollouts of a tetrahedral body in SIMD lanes: cables, the implicit Euler step, and one lane block through all steps.
+
+In single precision the elimination loses digits that the motion of a long soft body needs: there the step is refined
+once. Its residual costs one pass over the elements, without tangents, and the factor is used again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from jaxtyping import Float, Int
+
+from rfdropo_bayes.fem.native.block_cholesky import (
+    back_substitute,
+    condense,
+    condensed_entry,
+    factor,
+    forward_substitute,
+)
+from rfdropo_bayes.fem.native.complementarity import solve_for_active, solve_unilateral
+from rfdropo_bayes.fem.native.simd import fill, fma, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.tetrahedral import assemble, clear, elastic_forces
+
+LARGEST = 1e12
+"""[N] A tension beyond means that the rollout has diverged."""
+
+
+class Cables(NamedTuple):
+    """Static cable data; the points of cable c are ``first[c]:first[c + 1]``, the first of them fixed in space."""
+
+    first: Int[np.ndarray, " cables_1"]
+    node: Int[np.ndarray, "points weights"]
+    weight: Float[np.ndarray, "points weights"]
+    anchor: Float[np.ndarray, "cables 3"]
+    rest_segment: Float[np.ndarray, " points"]  # from the point before to this one, at rest [m]; 0 for the first
+    limit: Float[np.ndarray, " cables"]  # largest displacement [m]
+    rate: float  # largest change of the displacement in a step, against the one measured a step before [m]
+
+
+class Schedule(NamedTuple):
+    """How a rollout runs."""
+
+    time_step: float
+    stride: int  # steps between recorded rows
+    tolerance: float  # of the tension problem
+    reach: float  # largest distance of a node from its place at rest [m]
+    refined: bool  # solve every step twice
+
+
+class Output(NamedTuple):
+    """What a lane block records; the last axis is the lane."""
+
+    node: Int[np.ndarray, "points weights"]
+    weight: Float[np.ndarray, "points weights"]
+    position: Float[np.ndarray, "rows points 3 lanes"]
+    tension: Float[np.ndarray, "rows cables lanes"]
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _point(cables, p, c, field, fixed, token):
+    """Position or velocity of a cable's point; the anchor's is ``fixed``."""
+    if p == cables.first[c]:
+        zero = fill(0.0, field, token)
+        return (
+            zero + cables.anchor[c, 0] * fixed,
+            zero + cables.anchor[c, 1] * fixed,
+            zero + cables.anchor[c, 2] * fixed,
+        )
+    x, y, z = fill(0.0, field, token), fill(0.0, field, token), fill(0.0, field, token)
+    for k in range(cables.node.shape[1]):
+        n, w = 3 * cables.node[p, k], cables.weight[p, k]
+        x = x + load(field, n, token) * w
+        y = y + load(field, n + 1, token) * w
+        z = z + load(field, n + 2, token) * w
+    return x, y, z
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _pull(pattern, mesh, cables, p, row, work, x, y, z, token):
+    """Add a force on a cable's point to the cable's border row."""
+    for k in range(cables.node.shape[1]):
+        node, w = cables.node[p, k], cables.weight[p, k]
+        if node < mesh.free and w != 0.0:
+            t = 9 * (pattern.first[node + 1] - pattern.border + row // 3) + 3 * (row % 3)
+            store(work.lower, t, load(work.lower, t, token) + x * w)
+            store(work.lower, t + 1, load(work.lower, t + 1, token) + y * w)
+            store(work.lower, t + 2, load(work.lower, t + 2, token) + z * w)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def set_targets(cables, commanded, work, token):
+    """Displacement that the step imposes on every cable.
+
+    The commanded one may differ from that measured a step before by no more than ``rate``, and never exceeds the limit.
+    """
+    one = fill(1.0, work.position, token)
+    for c in range(len(cables.limit)):
+        target, before = load(commanded, c, token), load(work.measured, c, token)
+        target = where_greater(target, before + cables.rate, before + cables.rate, target)
+        target = where_greater(before - cables.rate, target, before - cables.rate, target)
+        limit = one * cables.limit[c]
+        store(work.target, c, where_greater(target, limit, limit, target))
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def gather_cables(pattern, mesh, cables, work, time_step, token):
+    """Border rows -dl/dx of all cables, and their slack [m] at the end of the step if nothing changed the velocity."""
+    one = fill(1.0, work.position, token)
+    for c in range(len(cables.limit)):
+        row = c + 1
+        x, y, z = _point(cables, cables.first[c], c, work.position, 1.0, token)
+        vx, vy, vz = _point(cables, cables.first[c], c, work.velocity, 0.0, token)
+        # The sum of small differences keeps digits that the difference of the lengths would lose.
+        shortening, growth = fill(0.0, work.position, token), fill(0.0, work.position, token)
+        for p in range(cables.first[c] + 1, cables.first[c + 1]):
+            px, py, pz = _point(cables, p, c, work.position, 1.0, token)
+            wx, wy, wz = _point(cables, p, c, work.velocity, 0.0, token)
+            dx, dy, dz = px - x, py - y, pz - z
+            segment = square_root(fma(dx, dx, fma(dy, dy, dz * dz)))
+            shortening = shortening + (cables.rest_segment[p] - segment)
+            scale = one / segment
+            dx, dy, dz = dx * scale, dy * scale, dz * scale
+            growth = growth + (dx * (wx - vx) + dy * (wy - vy) + dz * (wz - vz))
+            _pull(pattern, mesh, cables, p, row, work, -dx, -dy, -dz, token)
+            if p - 1 > cables.first[c]:
+                _pull(pattern, mesh, cables, p - 1, row, work, dx, dy, dz, token)
+            x, y, z, vx, vy, vz = px, py, pz, wx, wy, wz
+        store(work.measured, c, shortening)
+        store(work.slack, c, shortening - time_step * growth - load(work.target, c, token))
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _substitute(pattern, mesh, work, pull, count, time_step, token):
+    """Add A^-1 (border row 0 + h sum pull_i J_i) to the velocity."""
+    clear(work.weight, token)
+    store(work.weight, 0, fill(1.0, work.weight, token))
+    for i in range(count):
+        store(work.weight, i + 1, time_step * load(pull, i, token))
+    back_substitute(pattern, work.pivot, work.lower, work.weight, work.solution, token)
+    for i in range(3 * mesh.free):
+        store(work.velocity, i, load(work.velocity, i, token) + load(work.solution, i, token))
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _tensions(count, work, tolerance, token):
+    """Unilateral tensions; lanes without a solution are marked in ``unsolved``."""
+    one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
+    if not solve_unilateral(
+        work.compliance, work.slack, count, tolerance, work.active, work.pivoting, work.tension, token
+    ):
+        for c in range(count):
+            bad = load(work.pivoting, count * count + c, token)
+            store(work.unsolved, 0, where_greater(bad, zero, one, load(work.unsolved, 0, token)))
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _keep_border(pattern, work, token):
+    """Copy the border, which the factorisation overwrites, to ``load``: 9 ``border`` rows a node."""
+    size = 9 * pattern.border
+    for node in range(len(pattern.first) - 1):
+        t = 9 * (pattern.first[node + 1] - pattern.border)
+        for k in range(size):
+            store(work.load, size * node + k, load(work.lower, t + k, token))
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _residual(pattern, mesh, samples, work, count, time_step, token):
+    """Write what the step leaves unbalanced to border row 0, and the slack that it leaves the cables."""
+    drag, size = load(samples.rayleigh_mass, 0, token), 9 * pattern.border
+    for c in range(count):
+        store(work.slack, c, load(work.measured, c, token) - load(work.target, c, token))
+    for node in range(mesh.free):
+        mass = load(samples.mass, node, token)
+        for i in range(3):
+            velocity = load(work.velocity, 3 * node + i, token)
+            force = load(work.force, 3 * node + i, token) + mass * (load(samples.gravity, i, token) - drag * velocity)
+            for c in range(count):
+                row = load(work.load, size * node + 3 * (c + 1) + i, token)
+                force = fma(row, load(work.tension, c, token), force)
+                store(work.slack, c, fma(row, time_step * velocity, load(work.slack, c, token)))
+            right = time_step * force - mass * load(work.solution, 3 * node + i, token)
+            store(work.lower, 9 * (pattern.first[node + 1] - pattern.border) + i, right)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _refine(pattern, mesh, samples, work, count, time_step, token):
+    """Solve once more, for what the step's solution leaves unbalanced; which cables pull stays as it is."""
+    elastic_forces(mesh, samples, work, time_step, token)
+    _residual(pattern, mesh, samples, work, count, time_step, token)
+    forward_substitute(pattern, work.pivot, work.lower, token)
+    for i in range(count):
+        free = load(work.slack, i, token) + time_step * condensed_entry(pattern, work.lower, i + 1, 0, token)
+        store(work.slack, i, free)
+    solve_for_active(work.compliance, work.slack, work.active, count, work.pivoting, work.change, token)
+    for i in range(count):
+        store(work.tension, i, load(work.tension, i, token) + load(work.change, i, token))
+    _substitute(pattern, mesh, work, work.change, count, time_step, token)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _accept(rest, count, work, schedule, token):
+    """Take the step x += h v; in the lanes where it is lost, stay in place at rest without tension."""
+    one, zero = fill(1.0, work.position, token), fill(0.0, work.position, token)
+    accepted, reach = one, fill(schedule.reach, work.position, token)
+    for i in range(work.solution.shape[0]):
+        away = load(work.position, i, token) + schedule.time_step * load(work.velocity, i, token) - rest[i]
+        accepted = where_greater(reach, where_greater(away, zero, away, -away), accepted, zero)
+    for c in range(count):
+        accepted = where_greater(zero + LARGEST, load(work.tension, c, token), accepted, zero)
+    for i in range(work.solution.shape[0]):
+        x, v = load(work.position, i, token), load(work.velocity, i, token)
+        store(work.velocity, i, where_greater(accepted, zero, v, zero))
+        store(work.position, i, where_greater(accepted, zero, x + schedule.time_step * v, x))
+    for c in range(count):
+        store(work.tension, c, where_greater(accepted, zero, load(work.tension, c, token), zero))
+    store(work.lost, 0, where_greater(accepted, zero, load(work.lost, 0, token), one))
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def solve_step(pattern, mesh, cables, rest, commanded, samples, work, schedule, token):
+    """One implicit Euler step; marks lanes that diverge in ``lost``, and those whose tensions were not found in
+    ``unsolved``."""
+    count, rows, time_step = len(cables.limit), 3 * pattern.border, schedule.time_step
+    assemble(pattern, mesh, samples, work, time_step, token)
+    set_targets(cables, commanded, work, token)
+    gather_cables(pattern, mesh, cables, work, time_step, token)
+    if schedule.refined:
+        _keep_border(pattern, work, token)
+    factor(pattern, work.pivot, work.lower, token)
+    condense(pattern, work.lower, work.condensed, token)
+    square = time_step * time_step
+    for i in range(count):
+        free = load(work.slack, i, token) + time_step * load(work.condensed, (i + 1) * rows, token)
+        store(work.slack, i, free)
+        for j in range(count):
+            store(work.compliance, i * count + j, square * load(work.condensed, (i + 1) * rows + j + 1, token))
+    _tensions(count, work, schedule.tolerance, token)
+    _substitute(pattern, mesh, work, work.tension, count, time_step, token)
+    if schedule.refined:
+        _refine(pattern, mesh, samples, work, count, time_step, token)
+    _accept(rest, count, work, schedule, token)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def _record(work, output, row, token):
+    for p in range(output.node.shape[0]):
+        for i in range(3):
+            total = fill(0.0, work.position, token)
+            for k in range(output.node.shape[1]):
+                total = total + load(work.position, 3 * output.node[p, k] + i, token) * output.weight[p, k]
+            store(output.position[row, p], i, total)
+    for c in range(output.tension.shape[1]):
+        store(output.tension[row], c, load(work.tension, c, token))
+
+
+def compile_rollout(sources: str) -> Callable:
+    """The kernel of one lane block; ``sources``, a digest of the kernels' sources, is part of the key it is cached
+    under.
+
+    It steps through ``commands`` (steps, cables, lanes) and records after every ``schedule.stride`` steps; ``rest`` are
+    the nodes' coordinates at rest.
+    """
+
+    @numba.njit(nogil=True, cache=True, error_model="numpy")
+    def rollout(pattern, mesh, cables, rest, commands, samples, work, schedule, output, token):
+        _ = sources
+        for step in range(commands.shape[0]):
+            solve_step(pattern, mesh, cables, rest, commands[step], samples, work, schedule, token)
+            if (step + 1) % schedule.stride == 0:
+                _record(work, output, (step + 1) // schedule.stride - 1, token)
+
+    return rollout
