@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rfdropo_bayes.bayes.problem import ResidualProblem
+from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 
 DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order one
@@ -93,6 +93,7 @@ def make_target(
     horizon: int,
     ledger: Ledger,
     u: Float[np.ndarray, " d"],
+    prior: tuple[Callable, Callable],
     jacobian: str = "auto",
     noise: Bool[np.ndarray, " d"] | None = None,
 ) -> Target:
@@ -103,6 +104,7 @@ def make_target(
         horizon: rows to use.
         ledger: every rollout is charged to it; a Jacobian in d directions counts as d + 1.
         u: a point with a finite likelihood, where noise coordinates are looked for.
+        prior: `prior_derivatives`.
         jacobian: "forward" (JAX), "central" differences, or "auto": forward where residuals can be traced.
         noise: noise coordinates, if known.
     """
@@ -113,7 +115,6 @@ def make_target(
     def density(points: np.ndarray) -> np.ndarray:
         return evaluate_prior(problem, points) + likelihood(points)
 
-    prior = _prior_derivatives(problem)
     linearise = _make_linearise(problem, horizon, ledger, u, jacobian)
     if noise is None:
         residual, slope = linearise(u)
@@ -121,7 +122,9 @@ def make_target(
     return Target(density, likelihood, *prior, linearise, noise)
 
 
-def _prior_derivatives(problem: ResidualProblem) -> tuple[Callable, Callable]:
+def prior_derivatives(problem: Problem) -> tuple[Callable, Callable]:
+    """Gradient and Hessian of the log prior at one point; the same at every horizon, so compiled once."""
+
     def single(u: Array) -> Array:
         return jnp.asarray(problem.log_prior(u[None]))[0]
 

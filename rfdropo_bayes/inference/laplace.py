@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +18,14 @@ from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.checkpoints import Checkpoint, open_checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.gauss_newton import Laplace, LevenbergState, laplace, make_target, maximise
+from rfdropo_bayes.inference.gauss_newton import (
+    Laplace,
+    LevenbergState,
+    laplace,
+    make_target,
+    maximise,
+    prior_derivatives,
+)
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains, exclusion_warnings
 from rfdropo_bayes.inference.schedules import block_boundaries
@@ -108,12 +116,14 @@ def find_modes(
     horizons = block_boundaries(problem.n_rows, config.blocks)
     saved = checkpoint.load() if checkpoint else None
     climbs = _screen(problem, config, key, horizons[0]) if saved is None else _unpack(*saved)
-    target = None
+    target, prior = None, prior_derivatives(problem)
     while climbs.level < len(horizons):
         began = time.monotonic()
         if target is None:
             best = climbs.positions[np.argmax(climbs.log_density)] if climbs.done == 0 else climbs.positions[0]
-            target = make_target(problem, horizons[climbs.level], climbs.ledger, best, config.jacobian, climbs.noise)
+            target = make_target(
+                problem, horizons[climbs.level], climbs.ledger, best, prior, config.jacobian, climbs.noise
+            )
         state, steps = maximise(
             target, climbs.positions[climbs.done], max_steps=config.max_steps, tolerance=config.tolerance
         )
@@ -126,7 +136,7 @@ def find_modes(
         if progress is not None:
             share = (climbs.level + climbs.done / config.starts) / len(horizons)
             progress.stage(share, method="laplace", **climbs.trace[-1])
-    return _collect(problem, config, climbs)
+    return _collect(problem, config, climbs, prior)
 
 
 def _screen(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int) -> Climbs:
@@ -173,12 +183,16 @@ def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, noi
     )
 
 
-def _collect(problem: ResidualProblem, config: LaplaceConfig, climbs: Climbs) -> Modes:
+def _collect(
+    problem: ResidualProblem, config: LaplaceConfig, climbs: Climbs, prior: tuple[Callable, Callable]
+) -> Modes:
     """Laplace at every optimum that could matter, in the order of their evidence."""
     warnings = []
     near = climbs.log_density > climbs.log_density.max() - 30.0
     assert climbs.noise is not None
-    target = make_target(problem, problem.n_rows, climbs.ledger, climbs.positions[0], config.jacobian, climbs.noise)
+    target = make_target(
+        problem, problem.n_rows, climbs.ledger, climbs.positions[0], prior, config.jacobian, climbs.noise
+    )
     modes = []
     for position, density, converged in zip(
         climbs.positions[near], climbs.log_density[near], climbs.converged[near], strict=True

@@ -132,12 +132,12 @@ def test_a_prior_far_from_the_data_collapses_the_evidence():
     near, far = LinearGaussian(), LinearGaussian()
     far.mean = far.mean + 30.0
     exact = far.prefix_log_evidence()[-1]
-    result = horizon_smc.run(far, SmcConfig(particles=500, replicates=2), KEY)
+    result = horizon_smc.run(far, SmcConfig(particles=300), KEY)
     assert exact < near.prefix_log_evidence()[-1] - 100.0
     assert result.log_evidence[0] == pytest.approx(exact, rel=0.01)
 
 
-@pytest.mark.parametrize("budget", [1500.0, 4000.0, 20000.0])
+@pytest.mark.parametrize("budget", [1500.0, 8000.0])
 def test_the_budget_is_kept(budget):
     problem = LinearGaussian(n_rows=40, d=8)
     result = horizon_smc.run(problem, SmcConfig(rollouts=budget, replicates=2), KEY)

@@ -92,6 +92,7 @@ def test_a_conjugate_model_has_its_evidence_at_every_prefix():
     np.testing.assert_allclose(result.prefix_log_evidence, exact, atol=0.1)
 
 
+@pytest.mark.slow
 def test_a_simplex_has_fewer_coordinates_than_components():
     counts = np.array([30, 50, 20])
 

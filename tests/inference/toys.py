@@ -94,6 +94,8 @@ class Decay:
         clean = self.truth["amplitude"] * np.exp(-self.truth["rate"] * self.time)
         self.data = clean + self.truth["noise"] * rng.normal(size=n_rows)
         self._rows = jax.jit(self._row_density, static_argnums=1)
+        self.log_prior = jax.jit(self.log_prior)
+        self.from_unconstrained = jax.jit(self.from_unconstrained)
 
     def sample_prior(self, key, n):
         return self.from_unconstrained(self.centre + self.spread * jax.random.normal(key, (n, 3)))
@@ -113,7 +115,7 @@ class Decay:
 
     def row_log_likelihood(self, values, horizon):
         values = {name: jnp.asarray(values[name]) for name in self.names}
-        rows = np.array(self._rows(values, horizon))
+        rows = np.array(self._rows(values, horizon))  # a copy, to write to
         failed = np.asarray(values["rate"]) > self.fails_above
         rows[failed] = np.nan
         return rows, failed.astype(int)
