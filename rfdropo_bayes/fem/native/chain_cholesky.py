@@ -1,21 +1,17 @@
 """Cholesky factorisation of bordered block-tridiagonal matrices, many side by side in SIMD lanes.
 
-The stations of a layered body are eliminated one after the other from the tip to the base. Three arrays hold, for
-every station, the
-pivot block, the coupling to the next station and the border: rows below the matrix, one for each right-hand side. All
-are cut into
-3 x 3 tiles and stored panel by panel: rows 3 p to 3 p + 2 of a block with ``size`` columns are panel p, element (3 p
-+ r, c) at
-``(p * size + c) * 3 + r``. One kernel, panel times transposed panel, does nearly all of the work. The factorisation
-turns a border
-row b' into (L^-1 b)', and products of these rows are b_i' A^-1 b_j.
+The stations of a layered body are eliminated one after the other from the tip to the base. Three arrays hold, for every
+station, the pivot block, the coupling to the next station and the border: rows below the matrix, one for each right-
+hand side. All are cut into 3 x 3 tiles and stored panel by panel: rows 3 p to 3 p + 2 of a block with ``size`` columns
+are panel p, element (3 p + r, c) at ``(p * size + c) * 3 + r``. One kernel, panel times transposed panel, does nearly
+all of the work. The factorisation turns a border row b' into (L^-1 b)', and products of these rows are b_i' A^-1 b_j.
 """
 
 from __future__ import annotations
 
 import numba
 
-from rfdropo_bayes.fem.native.simd import fill, load, square_root, store
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_root, store
 
 
 @numba.njit(inline="always")
@@ -27,15 +23,15 @@ def _tile_minus_product(target, t, left, a, right, b, length, token):
     for k in range(length):
         x, y, z = load(left, a + 3 * k, token), load(left, a + 3 * k + 1, token), load(left, a + 3 * k + 2, token)
         w = load(right, b + 3 * k, token)
-        c0, c1, c2 = c0 - x * w, c1 - y * w, c2 - z * w
+        c0, c1, c2 = fnma(x, w, c0), fnma(y, w, c1), fnma(z, w, c2)
         w = load(right, b + 3 * k + 1, token)
-        c3, c4, c5 = c3 - x * w, c4 - y * w, c5 - z * w
+        c3, c4, c5 = fnma(x, w, c3), fnma(y, w, c4), fnma(z, w, c5)
         w = load(right, b + 3 * k + 2, token)
-        c6, c7, c8 = c6 - x * w, c7 - y * w, c8 - z * w
+        c6, c7, c8 = fnma(x, w, c6), fnma(y, w, c7), fnma(z, w, c8)
     return c0, c1, c2, c3, c4, c5, c6, c7, c8
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@kernel
 def subtract_product(target, t, left, a, right, b, length, token):
     """Subtract the product of two panels from a tile."""
     c0, c1, c2, c3, c4, c5, c6, c7, c8 = _tile_minus_product(target, t, left, a, right, b, length, token)
@@ -50,7 +46,7 @@ def subtract_product(target, t, left, a, right, b, length, token):
     store(target, t + 8, c8)
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@kernel
 def _pivot_tile(block, row, length, token):
     """Finish the diagonal tile after ``length`` columns: its Cholesky factor, with the diagonal inverted."""
     t = row + 3 * length
@@ -61,14 +57,14 @@ def _pivot_tile(block, row, length, token):
     store(block, t, inverse)
     store(block, t + 1, c1)
     store(block, t + 2, c2)
-    inverse = one / square_root(c4 - c1 * c1)
-    c5 = (c5 - c2 * c1) * inverse
+    inverse = one / square_root(fnma(c1, c1, c4))
+    c5 = fnma(c2, c1, c5) * inverse
     store(block, t + 4, inverse)
     store(block, t + 5, c5)
-    store(block, t + 8, one / square_root(c8 - c2 * c2 - c5 * c5))
+    store(block, t + 8, one / square_root(fnma(c5, c5, fnma(c2, c2, c8))))
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@kernel
 def _factor_tile(target, row, block, pivot_row, length, token):
     """Finish the tile of a panel below the diagonal tile after ``length`` columns."""
     t, d = row + 3 * length, pivot_row + 3 * length
@@ -76,7 +72,7 @@ def _factor_tile(target, row, block, pivot_row, length, token):
     inverse = load(block, d, token)
     c0, c1, c2 = c0 * inverse, c1 * inverse, c2 * inverse
     lower, inverse = load(block, d + 1, token), load(block, d + 4, token)
-    c3, c4, c5 = (c3 - c0 * lower) * inverse, (c4 - c1 * lower) * inverse, (c5 - c2 * lower) * inverse
+    c3, c4, c5 = fnma(c0, lower, c3) * inverse, fnma(c1, lower, c4) * inverse, fnma(c2, lower, c5) * inverse
     lower, last, inverse = load(block, d + 2, token), load(block, d + 5, token), load(block, d + 8, token)
     store(target, t, c0)
     store(target, t + 1, c1)
@@ -84,12 +80,12 @@ def _factor_tile(target, row, block, pivot_row, length, token):
     store(target, t + 3, c3)
     store(target, t + 4, c4)
     store(target, t + 5, c5)
-    store(target, t + 6, (c6 - c0 * lower - c3 * last) * inverse)
-    store(target, t + 7, (c7 - c1 * lower - c4 * last) * inverse)
-    store(target, t + 8, (c8 - c2 * lower - c5 * last) * inverse)
+    store(target, t + 6, fnma(c3, last, fnma(c0, lower, c6)) * inverse)
+    store(target, t + 7, fnma(c4, last, fnma(c1, lower, c7)) * inverse)
+    store(target, t + 8, fnma(c5, last, fnma(c2, lower, c8)) * inverse)
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@kernel
 def eliminate(pivot, coupling, border, condensed, station, last, tiles, panels, token):
     """Factorise one station and carry it over to the next, ``station - 1``, and to the condensed matrix.
 
@@ -123,7 +119,7 @@ def eliminate(pivot, coupling, border, condensed, station, last, tiles, panels, 
             subtract_product(border, t, border, b + i * panel, coupling, p + j * panel, size, token)
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@kernel
 def _back_substitute_block(pivot, p, solution, s, tiles, token):
     """Solve L' x = y in place for one station."""
     size = 3 * tiles
@@ -134,36 +130,37 @@ def _back_substitute_block(pivot, p, solution, s, tiles, token):
             t = p + (i * size + 3 * k) * 3
             for r in range(3):
                 value = load(solution, s + 3 * i + r, token)
-                x = x - load(pivot, t + r, token) * value
-                y = y - load(pivot, t + 3 + r, token) * value
-                z = z - load(pivot, t + 6 + r, token) * value
+                x = fnma(load(pivot, t + r, token), value, x)
+                y = fnma(load(pivot, t + 3 + r, token), value, y)
+                z = fnma(load(pivot, t + 6 + r, token), value, z)
         t = p + (k * size + 3 * k) * 3
         z = z * load(pivot, t + 8, token)
-        y = (y - load(pivot, t + 5, token) * z) * load(pivot, t + 4, token)
-        x = (x - load(pivot, t + 1, token) * y - load(pivot, t + 2, token) * z) * load(pivot, t, token)
+        y = fnma(load(pivot, t + 5, token), z, y) * load(pivot, t + 4, token)
+        x = fnma(load(pivot, t + 2, token), z, fnma(load(pivot, t + 1, token), y, x)) * load(pivot, t, token)
         store(solution, row, x)
         store(solution, row + 1, y)
         store(solution, row + 2, z)
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def back_substitute(pivot, coupling, border, weight, rows, solution, first, stations, tiles, panels, token):
-    """Solve A x = sum_i weight_i b_i over the first ``rows`` border rows b_i, after all stations >= ``first`` are
-    eliminated."""
+@kernel
+def back_substitute(pivot, coupling, border, weight, solution, first, stations, tiles, panels, token):
+    """Solve A x = sum_i weight_i b_i over the border rows b_i, after all stations >= ``first`` are eliminated."""
     size = 3 * tiles
     block, frame = 3 * tiles * size, 3 * panels * size
     for station in range(first, stations):
         s = station * size
         for k in range(size):
             value = fill(0.0, pivot, token)
-            for i in range(rows):
-                at = station * frame + (i // 3 * size + k) * 3 + i % 3
-                value = value + load(weight, i, token) * load(border, at, token)
+            for i in range(panels):
+                t = station * frame + (i * size + k) * 3
+                value = fma(load(weight, 3 * i, token), load(border, t, token), value)
+                value = fma(load(weight, 3 * i + 1, token), load(border, t + 1, token), value)
+                value = fma(load(weight, 3 * i + 2, token), load(border, t + 2, token), value)
             if station > first:
                 for i in range(tiles):
                     t = station * block + (i * size + k) * 3
-                    value = value - load(coupling, t, token) * load(solution, s - size + 3 * i, token)
-                    value = value - load(coupling, t + 1, token) * load(solution, s - size + 3 * i + 1, token)
-                    value = value - load(coupling, t + 2, token) * load(solution, s - size + 3 * i + 2, token)
+                    value = fnma(load(coupling, t, token), load(solution, s - size + 3 * i, token), value)
+                    value = fnma(load(coupling, t + 1, token), load(solution, s - size + 3 * i + 1, token), value)
+                    value = fnma(load(coupling, t + 2, token), load(solution, s - size + 3 * i + 2, token), value)
             store(solution, s + k, value)
         _back_substitute_block(pivot, station * block, solution, s, tiles, token)

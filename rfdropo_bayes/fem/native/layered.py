@@ -1,8 +1,7 @@
 """The compiled engine for layered bodies: rollouts of a whole batch on CPUs, the same numbers as ``fem.rollouts``.
 
 Samples fill the lanes of vector registers, blocks of lanes are spread over threads. Lanes never mix and a block knows
-nothing of the
-others: a rollout's result does not depend on its batch, on its place in it or on the number of threads.
+nothing of the others: a rollout's result does not depend on its batch, on its place in it or on the number of threads.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from jaxtyping import Bool, Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
+from rfdropo_bayes.fem.equilibrium import ITERATIONS
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, Storage, compile_rollout, storage
 from rfdropo_bayes.fem.native.section_modes import layered_tables
@@ -41,6 +41,7 @@ class NativeRollout(NamedTuple):
     tension: Float[np.ndarray, "batch rows cables"]  # [N]
     diverged: Bool[np.ndarray, " batch"]
     cables_converged: Bool[np.ndarray, " batch"]
+    residual: Float[np.ndarray, " batch"]  # relative force out of balance in the initial equilibrium; 0 without one
 
 
 @cache
@@ -98,6 +99,7 @@ class NativeLayered:
         material: Material,
         displacement: Float[np.ndarray, "*batch steps cables"],
         *,
+        start: Float[np.ndarray, "*batch cables"] | None = None,
         position: Float[np.ndarray, "*batch nodes 3"] | None = None,
         tension: Float[np.ndarray, "*batch cables"] | None = None,
         steps: int | None = None,
@@ -107,9 +109,11 @@ class NativeLayered:
 
         Args:
             material: fields with a leading batch axis, or without one to serve the whole batch.
-            displacement: cable displacements [m] at the end of every step, one sequence for all or one for each
-            rollout.
-            position: initial node positions [m]; None starts undeformed. The body does not move at first.
+            displacement: cable displacements [m] at the end of every step, one sequence for all or one per rollout.
+            start: cable displacements [m] whose static equilibrium is the initial state, as in
+                ``fem.static_equilibrium``; None leaves that out.
+            position: node positions [m] of the initial state, not moving; None is the undeformed body. Equilibrium is
+                sought from here.
             tension: initial cable tensions [N], where the first tension problem is started; None means zero.
             steps: compute only so many steps.
             stride: record every so many steps.
@@ -118,17 +122,23 @@ class NativeLayered:
             InputError: shapes that do not fit.
         """
         displacement = np.asarray(displacement, dtype=float)
-        cables = len(self.system.cables.anchor)
+        cables = self._tables.cables
         if displacement.ndim not in (2, 3) or displacement.shape[-1] != cables:
             raise InputError(f"displacement has shape {displacement.shape} for {cables} cables", where="rollout")
-        tension = np.zeros((1, cables)) if tension is None else np.asarray(tension, dtype=float).reshape(-1, cables)
-        batch, count = self._batch(material, displacement, self._modes(position), tension)
+        state = {
+            "position": self._modes(position),
+            "tension": _cable_rows(tension, cables, "tension"),
+            "start": _cable_rows(start, cables, "start"),
+            "displacement": displacement.reshape(-1, displacement.shape[-2] * cables),
+        }
+        batch = self._batch(material, state)
         steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
-        tolerance, regularisation = _TENSION_PROBLEM[self.precision]
-        schedule = Schedule(self.time_step, steps, int(stride), tolerance, regularisation)
-        output = _empty_output(count, 1 + steps // stride, self.points, cables)
-        self._run(batch, schedule, output, count)
-        return NativeRollout(*output)
+        settling = 0 if start is None else ITERATIONS
+        schedule = Schedule(self.time_step, steps, int(stride), settling, *_TENSION_PROBLEM[self.precision])
+        output = _empty_output(batch.count, 1 + steps // stride, self.points, cables)
+        self._run(batch, schedule, output)
+        codes = output.diverged.view(bool), output.cables_converged.view(bool)
+        return NativeRollout(output.position, output.tension, *codes, output.residual)
 
     def _modes(self, position: np.ndarray | None) -> np.ndarray:
         """Node positions as section modes, one row a rollout."""
@@ -136,19 +146,16 @@ class NativeLayered:
             return self._tables.rest[None]
         shape = self._tables.shape
         nodes = np.asarray(position, dtype=float).reshape(-1, len(self.system.body.station), len(shape), 3)
-        return np.einsum("mn,bsni->bsmi", np.linalg.inv(shape), nodes).reshape(len(nodes), -1)
+        return np.einsum("mn,bsni->bsmi", self._tables.inverse, nodes).reshape(len(nodes), -1)
 
-    def _batch(
-        self, material: Material, displacement: np.ndarray, position: np.ndarray, tension: np.ndarray
-    ) -> tuple[Batch, int]:
-        """Parameters in the precision of the kernels, and the number of rollouts."""
-        layers = len(self.system.body.station) - 1
+    def _batch(self, material: Material, state: dict[str, np.ndarray]) -> Batch:
+        """Parameters, initial states and commands in the precision of the kernels."""
+        layers = self._tables.stations - 1
         width = {"gravity": (3,), "stiffness_scale": (layers,), "point_mass": (layers + 1,)}
         values = {name: np.asarray(value, dtype=float) for name, value in material._asdict().items()}
         sizes = {len(value) for name, value in values.items() if value.ndim > len(width.get(name, ()))}
-        sizes |= {len(displacement)} if displacement.ndim == 3 else set()
-        sizes |= {len(position), len(tension)} - {1}
-        count = max(sizes, default=1)
+        sizes |= {len(value) for value in state.values()}
+        count = max(sizes)
         if sizes - {1, count}:
             raise InputError(f"batch axes of lengths {sorted(sizes)}", where="rollout")
         rows = {}
@@ -160,27 +167,27 @@ class NativeLayered:
         modulus, ratio = rows["young_modulus"], np.minimum(rows["poisson_ratio"], POISSON_LIMIT)
         shear = modulus / (2.0 * (1.0 + ratio))
         lame = 2.0 * shear * ratio / (1.0 - 2.0 * ratio)
-        arrays = Batch(
-            moduli=np.stack([lame, shear, 2.0 * lame * shear / (lame + 2.0 * shear)], axis=1),
-            density=rows["density"][:, None],
-            damping=np.stack([rows["rayleigh_mass"], rows["rayleigh_stiffness"]], axis=1),
-            gravity=rows["gravity"],
-            layer_scale=rows["stiffness_scale"],
-            point_mass=rows["point_mass"],
-            position=position,
-            tension=tension,
-            displacement=displacement.reshape(-1, *displacement.shape[-2:]),
-        )
-        return Batch(*(np.ascontiguousarray(array, dtype=self.dtype) for array in arrays)), count
+        arrays = {
+            "moduli": np.stack([lame, shear, 2.0 * lame * shear / (lame + 2.0 * shear)], axis=1),
+            "density": rows["density"][:, None],
+            "damping": np.stack([rows["rayleigh_mass"], rows["rayleigh_stiffness"]], axis=1),
+            "gravity": rows["gravity"],
+            "layer_scale": rows["stiffness_scale"],
+            "point_mass": rows["point_mass"],
+            **state,
+        }
+        arrays = {name: np.ascontiguousarray(array, dtype=self.dtype) for name, array in arrays.items()}
+        pitches = {f"{name}_pitch": value.shape[1] if len(value) > 1 else 0 for name, value in state.items()}
+        return Batch(**arrays, count=count, **pitches)
 
-    def _run(self, batch: Batch, schedule: Schedule, output: Output, count: int) -> None:
+    def _run(self, batch: Batch, schedule: Schedule, output: Output) -> None:
         """All lane blocks, in this thread or in several."""
         kernel, tables, token = _kernel(), self._tables, self._token
 
         def block(first: int) -> None:
-            kernel(tables, batch, self._storage(), schedule, output, first, token)
+            kernel(tables, batch, *self._storage(), schedule, output, first, token)
 
-        firsts = range(0, count, self.lanes)
+        firsts = range(0, batch.count, self.lanes)
         if min(self.threads, len(firsts)) < 2:
             for first in firsts:
                 block(first)
@@ -195,10 +202,20 @@ class NativeLayered:
         return self._local.storage
 
 
+def _cable_rows(values: np.ndarray | None, cables: int, name: str) -> Float[np.ndarray, "rows cables"]:
+    """One row for each rollout, or one for all; zero where nothing is given."""
+    rows = np.zeros(cables) if values is None else np.asarray(values, dtype=float)
+    if rows.ndim not in (1, 2) or rows.shape[-1] != cables:
+        raise InputError(f"{name} has shape {rows.shape} for {cables} cables", where="rollout")
+    return rows.reshape(-1, cables)
+
+
 def _empty_output(count: int, records: int, points: int, cables: int) -> Output:
     return Output(
         np.zeros((count, records, points, 3)),
         np.zeros((count, records, cables)),
-        np.zeros(count, dtype=bool),
-        np.ones(count, dtype=bool),
+        np.zeros(count, dtype=np.uint8),
+        np.zeros(count, dtype=np.uint8),
+        np.zeros(count),
+        records,
     )

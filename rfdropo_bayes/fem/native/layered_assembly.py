@@ -2,19 +2,17 @@
 `section_modes`.
 
 The physics is that of ``fem.dynamics``. A time step and an iteration for static equilibrium differ in a few factors
-only, held in
-`Factors`.
+only, held in `Factors`. ``tables``, ``samples``, ``factors`` and ``work`` are records of addresses.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.fem.native.simd import fill, load, store
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store
 
 POLAR_ITERATIONS = 6
 
@@ -38,9 +36,7 @@ class Factors(NamedTuple):
 
     elasticity: Float[np.ndarray, "1 lanes"]  # of K in the matrix
     inertia: Float[np.ndarray, "1 lanes"]  # of M in the matrix
-    force: Float[
-        np.ndarray, "1 lanes"
-    ]  # of the elastic force, of the weight and of the cable slack in the right-hand side
+    force: Float[np.ndarray, "1 lanes"]  # of the elastic force and of the weight in the right-hand side
     strain_rate: Float[np.ndarray, "1 lanes"]  # of -K v there
     drag: Float[np.ndarray, "1 lanes"]  # of -M v there
 
@@ -69,56 +65,53 @@ class Work(NamedTuple):
     pivoting: Float[np.ndarray, "scratch lanes"]
     commanded: Float[np.ndarray, "cables lanes"]
     unsolved: Float[np.ndarray, "1 lanes"]  # 1 where the tensions were not found
-    accepted: Float[np.ndarray, "1 lanes"]  # 0 where the last step was not taken
     lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken
     failed: Float[np.ndarray, "1 lanes"]  # 1 once tensions were not found
     points: Float[np.ndarray, "point_values lanes"]
+    before: Float[np.ndarray, "values lanes"]  # static iteration: the increment before
+    relaxation: Float[np.ndarray, "1 lanes"]
+    beyond: Float[np.ndarray, "layers3 lanes"]  # force of the cables on the stations beyond each layer
+    imbalance: Float[np.ndarray, "1 lanes"]
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def clear(array, first, last, token):
+@kernel
+def clear(rows, first, last, token):
     """Zero the rows from first to last."""
-    zero = fill(0.0, array, token)
+    zero = fill(0.0, rows, token)
     for i in range(first, last):
-        store(array, i, zero)
+        store(rows, i, zero)
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _deformation(tables, layer, position, axes, token):
+@kernel
+def _deformation(parity, slope, modes, layer, position, axes, token):
     """Mean deformation gradient of a layer into ``axes``, row-major."""
-    modes = len(tables.parity)
     clear(axes, 0, 9, token)
-    for face in range(2):
-        for m in range(modes):
-            if tables.parity[m] == 3:
-                continue
-            column = (tables.parity[m] + 2) % 3
-            slope = tables.gradient[layer, face, m]
-            row = 3 * ((layer + face) * modes + m)
-            for i in range(3):
-                store(axes, 3 * i + column, load(axes, 3 * i + column, token) + load(position, row + i, token) * slope)
+    for k in range(2 * modes):
+        kind = parity[k % modes]
+        if kind == 3:
+            continue
+        column = (kind + 2) % 3
+        factor = fill(slope[2 * modes * layer + k], position, token)
+        row = 3 * (layer * modes + k)
+        for i in range(3):
+            store(axes, 3 * i + column, fma(load(position, row + i, token), factor, load(axes, 3 * i + column, token)))
 
 
-@numba.njit(inline="always")
-def _cross(ax, ay, az, bx, by, bz):
-    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-
-
-@numba.njit(nogil=True, error_model="numpy")
+@kernel
 def _rotation(axes, token):
     """Rotation of the polar decomposition in place, by Newton's iteration."""
-    one = fill(1.0, axes, token)
+    one, half = fill(1.0, axes, token), fill(0.5, axes, token)
     a0, a1, a2 = load(axes, 0, token), load(axes, 1, token), load(axes, 2, token)
     b0, b1, b2 = load(axes, 3, token), load(axes, 4, token), load(axes, 5, token)
     c0, c1, c2 = load(axes, 6, token), load(axes, 7, token), load(axes, 8, token)
     for _ in range(POLAR_ITERATIONS):
-        u0, u1, u2 = _cross(b0, b1, b2, c0, c1, c2)
-        v0, v1, v2 = _cross(c0, c1, c2, a0, a1, a2)
-        w0, w1, w2 = _cross(a0, a1, a2, b0, b1, b2)
-        scale = one / (a0 * u0 + a1 * u1 + a2 * u2)
-        a0, a1, a2 = 0.5 * (a0 + u0 * scale), 0.5 * (a1 + u1 * scale), 0.5 * (a2 + u2 * scale)
-        b0, b1, b2 = 0.5 * (b0 + v0 * scale), 0.5 * (b1 + v1 * scale), 0.5 * (b2 + v2 * scale)
-        c0, c1, c2 = 0.5 * (c0 + w0 * scale), 0.5 * (c1 + w1 * scale), 0.5 * (c2 + w2 * scale)
+        u0, u1, u2 = fnma(b2, c1, b1 * c2), fnma(b0, c2, b2 * c0), fnma(b1, c0, b0 * c1)
+        v0, v1, v2 = fnma(c2, a1, c1 * a2), fnma(c0, a2, c2 * a0), fnma(c1, a0, c0 * a1)
+        w0, w1, w2 = fnma(a2, b1, a1 * b2), fnma(a0, b2, a2 * b0), fnma(a1, b0, a0 * b1)
+        scale = half * (one / fma(a0, u0, fma(a1, u1, a2 * u2)))
+        a0, a1, a2 = fma(half, a0, u0 * scale), fma(half, a1, u1 * scale), fma(half, a2, u2 * scale)
+        b0, b1, b2 = fma(half, b0, v0 * scale), fma(half, b1, v1 * scale), fma(half, b2, v2 * scale)
+        c0, c1, c2 = fma(half, c0, w0 * scale), fma(half, c1, w1 * scale), fma(half, c2, w2 * scale)
     store(axes, 0, a0)
     store(axes, 1, a1)
     store(axes, 2, a2)
@@ -130,246 +123,226 @@ def _rotation(axes, token):
     store(axes, 8, c2)
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _local_field(tables, layer, factors, work, token):
-    """``local`` = force * (R' x - X) + strain_rate * R' v, all relative to the lower section's mean: K does not see
-    the difference."""
-    modes = len(tables.parity)
-    x, v, axes = work.position, work.velocity, work.axes
-    force, rate = load(factors.force, 0, token), load(factors.strain_rate, 0, token)
-    base = 3 * layer * modes
-    above = base + 3 * modes
-    for k in range(2 * modes):
-        row = base + 3 * k
-        x0, x1, x2 = load(x, row, token), load(x, row + 1, token), load(x, row + 2, token)
-        v0, v1, v2 = load(v, row, token), load(v, row + 1, token), load(v, row + 2, token)
-        r0, r1, r2 = tables.rest[row], tables.rest[row + 1], tables.rest[row + 2]
-        if row == base or row == above:  # noqa: SIM109 (Numba would build a tuple)
-            x0, x1, x2 = x0 - load(x, base, token), x1 - load(x, base + 1, token), x2 - load(x, base + 2, token)
-            v0, v1, v2 = v0 - load(v, base, token), v1 - load(v, base + 1, token), v2 - load(v, base + 2, token)
-            r0, r1, r2 = r0 - tables.rest[base], r1 - tables.rest[base + 1], r2 - tables.rest[base + 2]
-        for i in range(3):
-            a, b, c = load(axes, i, token), load(axes, 3 + i, token), load(axes, 6 + i, token)
-            rest = r0 if i == 0 else (r1 if i == 1 else r2)
-            strain = a * x0 + b * x1 + c * x2 - rest
-            store(work.local, 3 * k + i, force * strain + rate * (a * v0 + b * v1 + c * v2))
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def _couple(stiffness, e, kind, work, row, column, twice, token):
-    """Add one block of K times ``local`` to ``reaction``, and its transpose if ``twice``; returns the next entry."""
-    u, f = work.local, work.reaction
-    if kind == 0:
-        i0, j0, i1, j1, count = 0, 0, 1, 1, 3
-    elif kind == 1:
-        i0, j0, i1, j1, count = 0, 2, 2, 0, 2
-    elif kind == 2:
-        i0, j0, i1, j1, count = 1, 2, 2, 1, 2
-    else:
-        i0, j0, i1, j1, count = 0, 1, 1, 0, 2
-    for n in range(count):
-        i = i0 if n == 0 else (i1 if n == 1 else 2)
-        j = j0 if n == 0 else (j1 if n == 1 else 2)
-        k = load(stiffness, e + n, token)
-        store(f, row + i, load(f, row + i, token) + k * load(u, column + j, token))
-        if twice:
-            store(f, column + j, load(f, column + j, token) + k * load(u, row + i, token))
-    return e + count
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def _layer_reaction(tables, samples, entry, work, token):
-    """``reaction`` = K ``local`` for the layer whose stiffness starts at ``entry``."""
-    modes = len(tables.parity)
-    clear(work.reaction, 0, 6 * modes, token)
-    e = entry
-    for face in range(2):
-        for m in range(modes):
-            for n in range(m + 1):
-                kind = tables.parity[m] ^ tables.parity[n]
-                row, column = 3 * (face * modes + m), 3 * (face * modes + n)
-                e = _couple(samples.stiffness, e, kind, work, row, column, m != n, token)
-    for m in range(modes):
-        for n in range(modes):
-            kind = tables.parity[m] ^ tables.parity[n]
-            e = _couple(samples.stiffness, e, kind, work, 3 * m, 3 * (modes + n), True, token)
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def _axis_products(factors, work, token):
-    """``dyads``: r_i r_i' by columns (00, 11, 22), then r_0 r_2', r_1 r_2', r_0 r_1', all times the elasticity
-    factor."""
-    axes, dyads = work.axes, work.dyads
-    scale = load(factors.elasticity, 0, token)
-    for n in range(6):
-        i = (0, 1, 2, 0, 1, 0)[n]
-        j = (0, 1, 2, 2, 2, 1)[n]
-        for c in range(3):
-            factor = scale * load(axes, 3 * c + j, token)
-            for r in range(3):
-                store(dyads, 9 * n + 3 * c + r, load(axes, 3 * r + i, token) * factor)
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def _add_block(target, t, stiffness, e, kind, dyads, add, token):
-    """Write a turned block of K as the tile at ``t``, or add it; returns the next entry."""
-    zero = fill(0.0, target, token)
-    first, second = load(stiffness, e, token), load(stiffness, e + 1, token)
-    third = load(stiffness, e + 2, token) if kind == 0 else zero
-    for c in range(3):
-        for r in range(3):
-            k, mirrored = 3 * c + r, 3 * r + c
-            if kind == 0:
-                value = (
-                    first * load(dyads, k, token)
-                    + second * load(dyads, 9 + k, token)
-                    + third * load(dyads, 18 + k, token)
-                )
-            else:
-                d = 18 + 9 * kind
-                value = first * load(dyads, d + k, token) + second * load(dyads, d + mirrored, token)
-            if add:
-                value = value + load(target, t + k, token)
-            store(target, t + k, value)
-    return e + 3 if kind == 0 else e + 2
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def _layer_tangent(tables, samples, entry, layer, work, whole, token):
-    """Add the tangent of a layer to the pivot of its upper station; ``whole``: set the coupling and start the lower
-    station's pivot."""
-    modes = len(tables.parity)
-    panel = 9 * modes
-    block = modes * panel
-    upper = (layer + 1) * block
-    e = entry
-    for face in range(2):
-        for m in range(modes):
-            for n in range(m + 1):
-                kind = tables.parity[m] ^ tables.parity[n]
-                if face == 1:
-                    e = _add_block(
-                        work.pivot, upper + m * panel + 9 * n, samples.stiffness, e, kind, work.dyads, True, token
-                    )
-                elif whole:
-                    t = upper - block + m * panel + 9 * n
-                    e = _add_block(work.pivot, t, samples.stiffness, e, kind, work.dyads, False, token)
-                else:
-                    e += 3 if kind == 0 else 2
-    if whole:
-        for m in range(modes):
-            for n in range(modes):
-                kind = tables.parity[m] ^ tables.parity[n]
-                t = upper + m * panel + 9 * n
-                e = _add_block(work.coupling, t, samples.stiffness, e, kind, work.dyads, False, token)
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def add_station_mass(tables, samples, factors, station, work, token):
-    """Add the inertia of a station to its pivot."""
-    modes = len(tables.parity)
-    inertia = load(factors.inertia, 0, token)
-    entry = station * tables.station_mass.shape[1]
-    for m in range(modes):
-        for n in range(m + 1):
-            if tables.parity[m] == tables.parity[n]:
-                value = inertia * load(samples.station_mass, entry, token)
-                for i in range(3):
-                    t = ((station * modes + m) * 3 * modes + 3 * n + i) * 3 + i
-                    store(work.pivot, t, load(work.pivot, t, token) + value)
-                entry += 1
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def add_layer_mass(tables, samples, factors, layer, work, token):
-    """Add the inertia that couples the stations of a layer."""
-    modes = len(tables.parity)
-    inertia = load(factors.inertia, 0, token)
-    entry = layer * tables.layer_mass.shape[1]
-    for m in range(modes):
-        for n in range(modes):
-            if tables.parity[m] == tables.parity[n]:
-                value = inertia * load(samples.layer_mass, entry, token)
-                for i in range(3):
-                    t = (((layer + 1) * modes + m) * 3 * modes + 3 * n + i) * 3 + i
-                    store(work.coupling, t, load(work.coupling, t, token) + value)
-                entry += 1
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def assemble_layer(tables, samples, factors, layer, work, whole, token):
-    """Force of a layer on its stations, and its part of the matrix; see `_layer_tangent` for ``whole``."""
-    modes = len(tables.parity)
-    entry = layer * tables.stiffness.shape[1]
-    _deformation(tables, layer, work.position, work.axes, token)
-    _rotation(work.axes, token)
-    _local_field(tables, layer, factors, work, token)
-    _layer_reaction(tables, samples, entry, work, token)
-    for k in range(2 * modes):
-        x, y, z = (
-            load(work.reaction, 3 * k, token),
-            load(work.reaction, 3 * k + 1, token),
-            load(work.reaction, 3 * k + 2, token),
-        )
-        row = 3 * (layer * modes + k)
-        for i in range(3):
-            a, b, c = (
-                load(work.axes, 3 * i, token),
-                load(work.axes, 3 * i + 1, token),
-                load(work.axes, 3 * i + 2, token),
-            )
-            store(work.field, row + i, load(work.field, row + i, token) - (a * x + b * y + c * z))
-    _axis_products(factors, work, token)
-    _layer_tangent(tables, samples, entry, layer, work, whole, token)
-
-
-@numba.njit(nogil=True, error_model="numpy")
-def _body_acceleration(samples, factors, work, row, mode, token):
-    """Gravity less Rayleigh drag, times their factors, for one mode of one station: three components."""
-    v, g = work.velocity, samples.gravity
-    drag = load(factors.drag, 0, token)
-    x, y, z = -drag * load(v, row, token), -drag * load(v, row + 1, token), -drag * load(v, row + 2, token)
-    if mode == 0:
-        force = load(factors.force, 0, token)
-        x, y, z = x + force * load(g, 0, token), y + force * load(g, 1, token), z + force * load(g, 2, token)
+@kernel
+def _relative(field, row, base, constant, token):
+    """One mode of a field; constant modes relative to that of the lower section."""
+    x, y, z = load(field, row, token), load(field, row + 1, token), load(field, row + 2, token)
+    if constant:
+        x, y, z = x - load(field, base, token), y - load(field, base + 1, token), z - load(field, base + 2, token)
     return x, y, z
 
 
-@numba.njit(inline="always")
-def _add_to_field(field, row, mass, x, y, z, token):
-    store(field, row, load(field, row, token) + mass * x)
-    store(field, row + 1, load(field, row + 1, token) + mass * y)
-    store(field, row + 2, load(field, row + 2, token) + mass * z)
+@kernel
+def _local_field(rest, modes, layer, factors, work, token):
+    """``local`` = force * (R' x - X) + strain_rate * R' v, relative to the lower section: K does not see the
+    difference."""
+    axes = work.axes
+    force, rate = load(factors.force, 0, token), load(factors.strain_rate, 0, token)
+    base = 3 * layer * modes
+    for k in range(2 * modes):
+        row = base + 3 * k
+        constant = k == 0 or k == modes
+        x0, x1, x2 = _relative(work.position, row, base, constant, token)
+        v0, v1, v2 = _relative(work.velocity, row, base, constant, token)
+        for i in range(3):
+            still = rest[row + i] - rest[base + i] if constant else rest[row + i]
+            a, b, c = load(axes, i, token), load(axes, 3 + i, token), load(axes, 6 + i, token)
+            strain = fma(a, x0, fma(b, x1, fma(c, x2, fill(-still, axes, token))))
+            speed = fma(a, v0, fma(b, v1, c * v2))
+            store(work.local, 3 * k + i, fma(force, strain, rate * speed))
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def start_loads(tables, samples, factors, work, token):
-    """``field`` = M (gravity - drag v): the right-hand side without the elastic forces."""
-    modes, stations = len(tables.parity), tables.station_mass.shape[0]
-    clear(work.field, 0, 3 * modes * stations, token)
-    entry, coupled = 0, 0
-    for station in range(stations):
-        base = 3 * station * modes
+@kernel
+def _layer_reaction(row, column, entries, modes, stiffness, first, local, reaction, token):
+    """``reaction`` = K ``local`` for the layer whose stiffness starts at row ``first``."""
+    clear(reaction, 0, 6 * modes, token)
+    for e in range(entries):
+        i, j = row[e], column[e]
+        k = load(stiffness, first + e, token)
+        store(reaction, i, fma(k, load(local, j, token), load(reaction, i, token)))
+        if i != j:
+            store(reaction, j, fma(k, load(local, i, token), load(reaction, j, token)))
+
+
+@kernel
+def _add_layer_force(axes, reaction, field, row, modes, token):
+    """Subtract R ``reaction`` from the field of a layer's stations, which starts at ``row``."""
+    for k in range(2 * modes):
+        x, y, z = load(reaction, 3 * k, token), load(reaction, 3 * k + 1, token), load(reaction, 3 * k + 2, token)
+        for i in range(3):
+            a, b, c = load(axes, 3 * i, token), load(axes, 3 * i + 1, token), load(axes, 3 * i + 2, token)
+            t = row + 3 * k + i
+            store(field, t, fnma(a, x, fnma(b, y, fnma(c, z, load(field, t, token)))))
+
+
+@kernel
+def _dyad(axes, dyads, slot, i, j, scale, token):
+    """``dyads``: nine values r_i r_j' by columns, times a scale; r are the columns of the frame."""
+    for c in range(3):
+        factor = scale * load(axes, 3 * c + j, token)
+        for r in range(3):
+            store(dyads, 9 * slot + 3 * c + r, load(axes, 3 * r + i, token) * factor)
+
+
+@kernel
+def _same_parity_tile(target, t, stiffness, e, dyads, add, token):
+    """Write (or add) the turned block of two modes of equal parity: three entries on its diagonal."""
+    first, second, third = load(stiffness, e, token), load(stiffness, e + 1, token), load(stiffness, e + 2, token)
+    for k in range(9):
+        value = load(target, t + k, token) if add else fill(0.0, target, token)
+        value = fma(first, load(dyads, k, token), value)
+        value = fma(second, load(dyads, 9 + k, token), value)
+        store(target, t + k, fma(third, load(dyads, 18 + k, token), value))
+
+
+@kernel
+def _mixed_parity_tile(target, t, stiffness, e, dyads, d, add, token):
+    """Write (or add) the turned block of two modes of different parity: two entries that mirror each other's place."""
+    first, second = load(stiffness, e, token), load(stiffness, e + 1, token)
+    for c in range(3):
+        for r in range(3):
+            k = 3 * c + r
+            value = load(target, t + k, token) if add else fill(0.0, target, token)
+            value = fma(first, load(dyads, d + k, token), value)
+            store(target, t + k, fma(second, load(dyads, d + 3 * r + c, token), value))
+
+
+@kernel
+def _tangent_block(parity, modes, target, t, stiffness, e, dyads, triangle, add, token):
+    """Turned stiffness of one pair of faces into tiles from ``t`` on; returns the entry after its last."""
+    for m in range(modes):
+        for n in range(m + 1 if triangle else modes):
+            kind = parity[m] ^ parity[n]
+            tile = t + 9 * (m * modes + n)
+            if kind == 0:
+                _same_parity_tile(target, tile, stiffness, e, dyads, add, token)
+                e += 3
+            else:
+                _mixed_parity_tile(target, tile, stiffness, e, dyads, 18 + 9 * kind, add, token)
+                e += 2
+    return e
+
+
+@kernel
+def _layer_tangent(parity, modes, stiffness, first, layer, whole, factors, work, token):
+    """Add the tangent of a layer to the pivot of its upper station; ``whole``: set the coupling, and start the pivot of
+    the lower one."""
+    dyads, scale = work.dyads, load(factors.elasticity, 0, token)
+    _dyad(work.axes, dyads, 0, 0, 0, scale, token)
+    _dyad(work.axes, dyads, 1, 1, 1, scale, token)
+    _dyad(work.axes, dyads, 2, 2, 2, scale, token)
+    _dyad(work.axes, dyads, 3, 0, 2, scale, token)
+    _dyad(work.axes, dyads, 4, 1, 2, scale, token)
+    _dyad(work.axes, dyads, 5, 0, 1, scale, token)
+    block = 9 * modes * modes
+    upper = (layer + 1) * block
+    e = first
+    if whole:
+        e = _tangent_block(parity, modes, work.pivot, upper - block, stiffness, e, dyads, True, False, token)
+    else:
         for m in range(modes):
             for n in range(m + 1):
-                if tables.parity[m] == tables.parity[n]:
-                    row, column = base + 3 * m, base + 3 * n
-                    mass = load(samples.station_mass, entry, token)
-                    x, y, z = _body_acceleration(samples, factors, work, column, n, token)
-                    _add_to_field(work.field, row, mass, x, y, z, token)
-                    if m != n:
-                        x, y, z = _body_acceleration(samples, factors, work, row, m, token)
-                        _add_to_field(work.field, column, mass, x, y, z, token)
-                    entry += 1
-        if station + 1 == stations:
-            break
+                e += 3 if parity[m] == parity[n] else 2
+    e = _tangent_block(parity, modes, work.pivot, upper, stiffness, e, dyads, True, True, token)
+    if whole:
+        _tangent_block(parity, modes, work.coupling, upper, stiffness, e, dyads, False, False, token)
+
+
+@kernel
+def add_station_mass(parity, modes, target, t, mass, entry, inertia, token):
+    """Add the inertia of a station to its pivot, whose tiles start at ``t``."""
+    for m in range(modes):
+        for n in range(m + 1):
+            if parity[m] == parity[n]:
+                value = inertia * load(mass, entry, token)
+                tile = t + 9 * (m * modes + n)
+                for i in range(3):
+                    store(target, tile + 4 * i, load(target, tile + 4 * i, token) + value)
+                entry += 1
+
+
+@kernel
+def add_layer_mass(parity, modes, target, t, mass, entry, inertia, token):
+    """Add the inertia that couples the stations of a layer, in tiles from ``t`` on."""
+    for m in range(modes):
+        for n in range(modes):
+            if parity[m] == parity[n]:
+                value = inertia * load(mass, entry, token)
+                tile = t + 9 * (m * modes + n)
+                for i in range(3):
+                    store(target, tile + 4 * i, load(target, tile + 4 * i, token) + value)
+                entry += 1
+
+
+@kernel
+def layer_frame(tables, layer, work, token):
+    """Frame of a layer into ``axes``."""
+    _deformation(tables.parity, tables.gradient, tables.modes, layer, work.position, work.axes, token)
+    _rotation(work.axes, token)
+
+
+@kernel
+def add_layer_force(tables, samples, factors, layer, work, token):
+    """Add the elastic force of a layer in its frame to ``field``; leaves ``reaction``, the force it resists in that
+    frame."""
+    modes, first = tables.modes, layer * tables.entries
+    _local_field(tables.rest, modes, layer, factors, work, token)
+    _layer_reaction(
+        tables.entry_row,
+        tables.entry_column,
+        tables.entries,
+        modes,
+        samples.stiffness,
+        first,
+        work.local,
+        work.reaction,
+        token,
+    )
+    _add_layer_force(work.axes, work.reaction, work.field, 3 * layer * modes, modes, token)
+
+
+@kernel
+def assemble_layer(tables, samples, factors, layer, work, whole, token):
+    """Frame and force of a layer, and its part of the matrix; see `_layer_tangent` for ``whole``."""
+    layer_frame(tables, layer, work, token)
+    add_layer_force(tables, samples, factors, layer, work, token)
+    first = layer * tables.entries
+    _layer_tangent(tables.parity, tables.modes, samples.stiffness, first, layer, whole, factors, work, token)
+
+
+@kernel
+def _add_momentum(field, row, mass, velocity, v, constant, gravity, force, drag, token):
+    """Add mass * (force * gravity - drag * velocity) of the mode at ``v`` to the mode at ``row``."""
+    for i in range(3):
+        value = -(drag * load(velocity, v + i, token))
+        if constant:
+            value = fma(force, load(gravity, i, token), value)
+        store(field, row + i, fma(mass, value, load(field, row + i, token)))
+
+
+@kernel
+def start_loads(tables, samples, factors, work, token):
+    """``field`` = M (force * gravity - drag * v): the right-hand side without the elastic forces."""
+    modes, parity, field, v, g = tables.modes, tables.parity, work.field, work.velocity, samples.gravity
+    force, drag = load(factors.force, 0, token), load(factors.drag, 0, token)
+    clear(field, 0, 3 * modes * tables.stations, token)
+    entry, coupled = 0, 0
+    for station in range(tables.stations):
+        base = 3 * station * modes
         for m in range(modes):
+            row = base + 3 * m
+            for n in range(m + 1):
+                if parity[m] == parity[n]:
+                    mass, column = load(samples.station_mass, entry, token), base + 3 * n
+                    _add_momentum(field, row, mass, v, column, n == 0, g, force, drag, token)
+                    if m != n:
+                        _add_momentum(field, column, mass, v, row, m == 0, g, force, drag, token)
+                    entry += 1
+            if station + 1 == tables.stations:
+                continue
             for n in range(modes):
-                if tables.parity[m] == tables.parity[n]:
-                    row, column = base + 3 * m, base + 3 * (modes + n)
-                    mass = load(samples.layer_mass, coupled, token)
-                    x, y, z = _body_acceleration(samples, factors, work, column, n, token)
-                    _add_to_field(work.field, row, mass, x, y, z, token)
-                    x, y, z = _body_acceleration(samples, factors, work, row, m, token)
-                    _add_to_field(work.field, column, mass, x, y, z, token)
+                if parity[m] == parity[n]:
+                    mass, column = load(samples.layer_mass, coupled, token), base + 3 * (modes + n)
+                    _add_momentum(field, row, mass, v, column, n == 0, g, force, drag, token)
+                    _add_momentum(field, column, mass, v, row, m == 0, g, force, drag, token)
                     coupled += 1

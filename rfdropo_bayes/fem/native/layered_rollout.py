@@ -7,17 +7,18 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, UInt8
 
 from rfdropo_bayes.fem.native.layered_assembly import Factors, Samples, Work, clear
-from rfdropo_bayes.fem.native.layered_step import accept, solve_increment
+from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
+from rfdropo_bayes.fem.native.layered_step import point, solve_increment, take_step
 from rfdropo_bayes.fem.native.section_modes import LayeredTables, border_panels
-from rfdropo_bayes.fem.native.simd import aligned_zeros, fill, load, store, where_greater
+from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store
 
 
 class Batch(NamedTuple):
-    """Parameters and commands of a batch in the precision of the kernels, one row a rollout; commands may be one row
-    for all."""
+    """Parameters and commands of a batch in the precision of the kernels, one row a rollout; commands may be one
+    row for all."""
 
     moduli: Float[np.ndarray, "batch 3"]
     density: Float[np.ndarray, "batch 1"]
@@ -27,7 +28,13 @@ class Batch(NamedTuple):
     point_mass: Float[np.ndarray, "batch stations"]
     position: Float[np.ndarray, "rows values"]  # initial, in section modes
     tension: Float[np.ndarray, "rows cables"]  # initial
+    start: Float[np.ndarray, "rows cables"]  # displacements of the initial equilibrium
     displacement: Float[np.ndarray, "rows steps cables"]
+    count: int
+    position_pitch: int  # from one row to the next, 0 where one serves all
+    tension_pitch: int
+    start_pitch: int
+    displacement_pitch: int
 
 
 class Output(NamedTuple):
@@ -35,8 +42,10 @@ class Output(NamedTuple):
 
     position: Float[np.ndarray, "batch records points 3"]
     tension: Float[np.ndarray, "batch records cables"]
-    diverged: Bool[np.ndarray, " batch"]
-    cables_converged: Bool[np.ndarray, " batch"]
+    diverged: UInt8[np.ndarray, " batch"]
+    cables_converged: UInt8[np.ndarray, " batch"]
+    residual: Float[np.ndarray, " batch"]
+    records: int
 
 
 class Schedule(NamedTuple):
@@ -45,6 +54,7 @@ class Schedule(NamedTuple):
     time_step: float
     steps: int
     stride: int  # steps from one recorded row to the next
+    static_iterations: int  # 0 leaves out the equilibrium
     tolerance: float  # relative, of the tension problem
     regularisation: float  # relative compliance of every cable
 
@@ -59,7 +69,7 @@ class Storage(NamedTuple):
 
 def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
     """Zeroed, aligned storage of one lane block."""
-    modes, stations, cables = len(tables.parity), len(tables.station_mass), len(tables.rest_length)
+    modes, stations, cables = tables.modes, tables.stations, tables.cables
     size, panels, layers = 3 * modes, border_panels(cables), stations - 1
 
     def rows(count: int) -> np.ndarray:
@@ -70,7 +80,7 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         density=rows(1),
         layer_scale=rows(layers),
         point_mass=rows(stations),
-        stiffness=rows(layers * tables.stiffness.shape[1]),
+        stiffness=rows(layers * tables.entries),
         station_mass=rows(tables.station_mass.size),
         layer_mass=rows(tables.layer_mass.size),
         gravity=rows(3),
@@ -85,7 +95,7 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         condensed=rows(9 * panels * panels),
         solution=rows(stations * size),
         field=rows(stations * size),
-        weight=rows(cables + 1),
+        weight=rows(3 * panels),
         axes=rows(9),
         dyads=rows(54),
         local=rows(2 * size),
@@ -98,112 +108,114 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         pivoting=rows(cables * (cables + 1)),
         commanded=rows(cables),
         unsolved=rows(1),
-        accepted=rows(1),
         lost=rows(1),
         failed=rows(1),
-        points=rows(3 * (len(tables.point_first) - 1)),
+        points=rows(3 * tables.points),
+        before=rows(stations * size),
+        relaxation=rows(1),
+        beyond=rows(3 * layers),
+        imbalance=rows(1),
     )
     return Storage(samples, Factors(*(rows(1) for _ in Factors._fields)), work)
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _fill_lanes(source, first, target):
-    """Spread rows of a batch over lanes; lanes beyond the batch repeat its last row, and one row serves all."""
-    for lane in range(target.shape[1]):
-        row = min(first + lane, source.shape[0] - 1)
-        for i in range(source.shape[1]):
-            target[i, lane] = source[row, i]
+@kernel
+def _fill_lanes(source, pitch, offset, width, first, count, target, token):
+    """Spread rows of a batch, ``pitch`` apart, over lanes; lanes beyond the batch repeat its last row."""
+    lanes = len(token)
+    for lane in range(lanes):
+        row = min(first + lane, count - 1) * pitch + offset
+        for i in range(width):
+            target[i * lanes + lane] = source[row + i]
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _prepare(tables, batch, samples, first, token):
+@kernel
+def _prepare(tables, samples, token):
     """Stiffness and mass of a block's rollouts."""
-    _fill_lanes(batch.moduli, first, samples.moduli)
-    _fill_lanes(batch.density, first, samples.density)
-    _fill_lanes(batch.damping, first, samples.damping)
-    _fill_lanes(batch.gravity, first, samples.gravity)
-    _fill_lanes(batch.layer_scale, first, samples.layer_scale)
-    _fill_lanes(batch.point_mass, first, samples.point_mass)
-    layers, entries = tables.stiffness.shape[0], tables.stiffness.shape[1]
-    for layer in range(layers):
+    for layer in range(tables.stations - 1):
         scale = load(samples.layer_scale, layer, token)
         lame, shear = scale * load(samples.moduli, 0, token), scale * load(samples.moduli, 1, token)
         condensed = scale * load(samples.moduli, 2, token)
-        for e in range(entries):
-            k = tables.stiffness[layer, e]
-            store(samples.stiffness, layer * entries + e, lame * k[0] + shear * k[1] + condensed * k[2])
+        for e in range(layer * tables.entries, (layer + 1) * tables.entries):
+            value = shear * tables.stiffness[3 * e + 1]
+            value = fma(lame, fill(tables.stiffness[3 * e], lame, token), value)
+            store(samples.stiffness, e, fma(condensed, fill(tables.stiffness[3 * e + 2], lame, token), value))
     density = load(samples.density, 0, token)
-    pairs = tables.station_mass.shape[1]
-    for station in range(layers + 1):
+    for station in range(tables.stations):
         lumped = load(samples.point_mass, station, token)
-        for p in range(pairs):
-            value = density * tables.station_mass[station, p] + lumped * tables.lumped[p]
-            store(samples.station_mass, station * pairs + p, value)
-    coupled = tables.layer_mass.shape[1]
-    for layer in range(layers):
-        for p in range(coupled):
-            store(samples.layer_mass, layer * coupled + p, density * tables.layer_mass[layer, p])
+        for p in range(tables.pairs):
+            value = density * tables.station_mass[station * tables.pairs + p]
+            value = fma(lumped, fill(tables.lumped[p], lumped, token), value)
+            store(samples.station_mass, station * tables.pairs + p, value)
+    for p in range((tables.stations - 1) * tables.coupled):
+        store(samples.layer_mass, p, density * tables.layer_mass[p])
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _start(batch, work, first, token):
-    """The initial state, not moving."""
-    _fill_lanes(batch.position, first, work.position)
-    _fill_lanes(batch.tension, first, work.tension)
-    clear(work.velocity, 0, work.velocity.shape[0], token)
-    clear(work.solution, 0, work.solution.shape[0], token)
+@kernel
+def _start(tables, batch, samples, work, first, token):
+    """Parameters and initial state of a block's rollouts, not moving."""
+    count, values = batch.count, 3 * tables.modes * tables.stations
+    _fill_lanes(batch.moduli, 3, 0, 3, first, count, samples.moduli, token)
+    _fill_lanes(batch.density, 1, 0, 1, first, count, samples.density, token)
+    _fill_lanes(batch.damping, 2, 0, 2, first, count, samples.damping, token)
+    _fill_lanes(batch.gravity, 3, 0, 3, first, count, samples.gravity, token)
+    layers = tables.stations - 1
+    _fill_lanes(batch.layer_scale, layers, 0, layers, first, count, samples.layer_scale, token)
+    _fill_lanes(batch.point_mass, layers + 1, 0, layers + 1, first, count, samples.point_mass, token)
+    _fill_lanes(batch.position, batch.position_pitch, 0, values, first, count, work.position, token)
+    _fill_lanes(batch.tension, batch.tension_pitch, 0, tables.cables, first, count, work.tension, token)
+    _prepare(tables, samples, token)
+    clear(work.velocity, 0, values, token)
+    clear(work.solution, 0, values, token)
     clear(work.lost, 0, 1, token)
     clear(work.failed, 0, 1, token)
+    clear(work.imbalance, 0, 1, token)
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _step_factors(samples, factors, time_step, token):
+@kernel
+def _step_factors(samples, factors, length, token):
     """Factors of an implicit Euler step."""
+    time_step, drag = fill(length, samples.damping, token), load(samples.damping, 0, token)
     lookahead = time_step + load(samples.damping, 1, token)
-    one = fill(1.0, samples.damping, token)
     store(factors.elasticity, 0, time_step * lookahead)
-    store(factors.inertia, 0, one + time_step * load(samples.damping, 0, token))
-    store(factors.force, 0, one * time_step)
+    store(factors.inertia, 0, fma(time_step, drag, fill(1.0, drag, token)))
+    store(factors.force, 0, time_step)
     store(factors.strain_rate, 0, time_step * lookahead)
-    store(factors.drag, 0, time_step * load(samples.damping, 0, token))
+    store(factors.drag, 0, time_step * drag)
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _record(tables, work, output, first, row, token):
+@kernel
+def _record(tables, work, output, row, first, count, token):
     """Write points and tensions of the lanes that belong to the batch."""
-    points, cables = len(tables.point_first) - 1, len(tables.rest_length)
+    points, cables, lanes = tables.points, tables.cables, len(token)
     for p in range(points):
-        for i in range(3):
-            total = fill(0.0, work.position, token)
-            for k in range(tables.point_first[p], tables.point_first[p + 1]):
-                total = total + load(work.position, tables.point_place[k] + i, token) * tables.point_weight[k]
-            store(work.points, 3 * p + i, total)
-    for lane in range(min(len(token), output.position.shape[0] - first)):
-        for p in range(points):
-            for i in range(3):
-                output.position[first + lane, row, p, i] = work.points[3 * p + i, lane]
+        x, y, z = point(tables.point_first, tables.point_place, tables.point_weight, p, work.position, token)
+        store(work.points, 3 * p, x)
+        store(work.points, 3 * p + 1, y)
+        store(work.points, 3 * p + 2, z)
+    for lane in range(min(lanes, count - first)):
+        at = (first + lane) * output.records + row
+        for k in range(3 * points):
+            output.position[at * 3 * points + k] = work.points[k * lanes + lane]
         for c in range(cables):
-            output.tension[first + lane, row, c] = work.tension[c, lane]
+            output.tension[at * cables + c] = work.tension[c * lanes + lane]
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _finish(work, output, first):
+@kernel
+def _finish(work, output, first, count, token):
     """Write the result codes of the lanes that belong to the batch."""
-    for lane in range(min(work.lost.shape[1], output.position.shape[0] - first)):
-        output.diverged[first + lane] = work.lost[0, lane] > 0.0
-        output.cables_converged[first + lane] = not work.failed[0, lane] > 0.0
+    for lane in range(min(len(token), count - first)):
+        output.diverged[first + lane] = 1 if work.lost[lane] > 0.0 else 0
+        output.cables_converged[first + lane] = 0 if work.failed[lane] > 0.0 else 1
+        output.residual[first + lane] = work.imbalance[lane]
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _advance(tables, samples, factors, work, schedule, token):
-    """One time step, and what went wrong in it."""
-    solve_increment(
-        tables, samples, factors, work, 1.0 / schedule.time_step, schedule.tolerance, schedule.regularisation, token
-    )
-    accept(tables, work, schedule.time_step, token)
-    zero, one = fill(0.0, work.lost, token), fill(1.0, work.lost, token)
-    store(work.lost, 0, where_greater(load(work.accepted, 0, token), zero, load(work.lost, 0, token), one))
-    store(work.failed, 0, where_greater(load(work.unsolved, 0, token), zero, one, load(work.failed, 0, token)))
+@kernel
+def _start_motion(tables, samples, factors, work, schedule, token):
+    """End of the static iterations, if there were any."""
+    if schedule.static_iterations > 0:
+        finish_settling(tables, samples, factors, work, token)
+    _step_factors(samples, factors, schedule.time_step, token)
 
 
 def compile_rollout(sources: str) -> Callable:
@@ -211,18 +223,31 @@ def compile_rollout(sources: str) -> Callable:
     under."""
 
     @numba.njit(nogil=True, cache=True, error_model="numpy")
-    def rollout(tables, batch, storage, schedule, output, first, token):
+    def rollout(tables, batch, samples, factors, work, schedule, output, first, token):
         _ = sources
-        samples, factors, work = storage
-        _prepare(tables, batch, samples, first, token)
-        _start(batch, work, first, token)
-        _step_factors(samples, factors, schedule.time_step, token)
-        _record(tables, work, output, first, 0, token)
-        for step in range(schedule.steps):
-            _fill_lanes(batch.displacement[:, step], first, work.commanded)
-            _advance(tables, samples, factors, work, schedule, token)
-            if (step + 1) % schedule.stride == 0:
-                _record(tables, work, output, first, (step + 1) // schedule.stride, token)
-        _finish(work, output, first)
+        tables, batch, output = addresses(tables), addresses(batch), addresses(output)
+        samples, factors, work = addresses(samples), addresses(factors), addresses(work)
+        count, cables, static_iterations = batch.count, tables.cables, schedule.static_iterations
+        _start(tables, batch, samples, work, first, token)
+        start_settling(tables, factors, work, token)
+        _fill_lanes(batch.start, batch.start_pitch, 0, cables, first, count, work.commanded, token)
+        # Static iterations come first. They and the steps share one call, which would else be compiled twice.
+        for step in range(-static_iterations, schedule.steps + 1):
+            if step == 0:
+                _start_motion(tables, samples, factors, work, schedule, token)
+            if step >= 0:
+                if step % schedule.stride == 0:
+                    _record(tables, work, output, step // schedule.stride, first, count, token)
+                if step == schedule.steps:
+                    break
+                pitch, offset = batch.displacement_pitch, step * cables
+                _fill_lanes(batch.displacement, pitch, offset, cables, first, count, work.commanded, token)
+            rate = 1.0 / schedule.time_step if step >= 0 else 1.0
+            solve_increment(tables, samples, factors, work, rate, schedule, step < 0, token)
+            if step >= 0:
+                take_step(tables, work, schedule.time_step, token)
+            else:
+                take_increment(tables, work, token)
+        _finish(work, output, first, count, token)
 
     return rollout

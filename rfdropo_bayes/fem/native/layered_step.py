@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numba
-
 from rfdropo_bayes.fem.native.chain_cholesky import back_substitute, eliminate
 from rfdropo_bayes.fem.native.complementarity import solve_unilateral
 from rfdropo_bayes.fem.native.layered_assembly import (
@@ -13,103 +11,120 @@ from rfdropo_bayes.fem.native.layered_assembly import (
     clear,
     start_loads,
 )
-from rfdropo_bayes.fem.native.simd import fill, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.tension_stiffening import stiffen, sum_cable_forces
 
 LARGEST = 1e30
 """Tensions beyond this [N] are not finite."""
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _point(first, place, weight, p, field, token):
+@kernel
+def point(first, place, weight, p, field, token):
     """Point p of a sparse list."""
     x, y, z = fill(0.0, field, token), fill(0.0, field, token), fill(0.0, field, token)
     for k in range(first[p], first[p + 1]):
-        row, w = place[k], weight[k]
-        x = x + load(field, row, token) * w
-        y = y + load(field, row + 1, token) * w
-        z = z + load(field, row + 2, token) * w
+        row, w = place[k], fill(weight[k], field, token)
+        x = fma(load(field, row, token), w, x)
+        y = fma(load(field, row + 1, token), w, y)
+        z = fma(load(field, row + 2, token), w, z)
     return x, y, z
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _pull(tables, g, offset, work, x, y, z, token):
+@kernel
+def _pull(tables, g, offset, border, velocity, x, y, z, token):
     """Add a pull on guide g to the border row at ``offset`` of every station; returns the pull times the guide's
     velocity."""
-    growth = fill(0.0, work.border, token)
-    v = work.velocity
+    growth = fill(0.0, border, token)
     for k in range(tables.guide_first[g], tables.guide_first[g + 1]):
-        row, w = tables.guide_place[k], tables.guide_weight[k]
+        row, w = tables.guide_place[k], fill(tables.guide_weight[k], border, token)
         t = tables.guide_slot[k] + offset
-        a, b, c = x * w, y * w, z * w
-        store(work.border, t, load(work.border, t, token) + a)
-        store(work.border, t + 3, load(work.border, t + 3, token) + b)
-        store(work.border, t + 6, load(work.border, t + 6, token) + c)
-        growth = growth + (a * load(v, row, token) + b * load(v, row + 1, token) + c * load(v, row + 2, token))
+        store(border, t, fma(x, w, load(border, t, token)))
+        store(border, t + 3, fma(y, w, load(border, t + 3, token)))
+        store(border, t + 6, fma(z, w, load(border, t + 6, token)))
+        moved = fma(
+            x, load(velocity, row, token), fma(y, load(velocity, row + 1, token), z * load(velocity, row + 2, token))
+        )
+        growth = fma(w, moved, growth)
     return growth
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def gather_cables(tables, work, rate, size, token):
+@kernel
+def _gather_cable(tables, c, offset, work, token):
+    """Border row dl/dx of a cable; returns how much shorter than at rest it is, and dl/dt."""
+    x, one = work.position, fill(1.0, work.position, token)
+    px, py, pz = (
+        fill(tables.anchor[3 * c], x, token),
+        fill(tables.anchor[3 * c + 1], x, token),
+        fill(tables.anchor[3 * c + 2], x, token),
+    )
+    bx, by, bz = fill(0.0, x, token), fill(0.0, x, token), fill(0.0, x, token)
+    shorter, growth = fill(tables.rest_length[c], x, token), fill(0.0, x, token)
+    first, last = tables.cable_first[c], tables.cable_first[c + 1]
+    for g in range(first, last):
+        gx, gy, gz = point(tables.guide_first, tables.guide_place, tables.guide_weight, g, x, token)
+        dx, dy, dz = gx - px, gy - py, gz - pz
+        segment = square_root(fma(dx, dx, fma(dy, dy, dz * dz)))
+        shorter = shorter - segment
+        scale = one / segment
+        dx, dy, dz = dx * scale, dy * scale, dz * scale
+        if g > first:
+            growth = growth + _pull(tables, g - 1, offset, work.border, work.velocity, bx - dx, by - dy, bz - dz, token)
+        px, py, pz, bx, by, bz = gx, gy, gz, dx, dy, dz
+    return shorter, growth + _pull(tables, last - 1, offset, work.border, work.velocity, bx, by, bz, token)
+
+
+@kernel
+def gather_cables(tables, work, rate, token):
     """Border rows dl/dx of all cables; ``slack`` = rate * (commanded length - length) - dl/dt."""
-    one, zero = fill(1.0, work.position, token), fill(0.0, work.position, token)
-    for c in range(len(tables.rest_length)):
+    for c in range(tables.cables):
         row = c + 1
-        offset = row // 3 * 3 * size + row % 3
-        x, y, z = zero + tables.anchor[c, 0], zero + tables.anchor[c, 1], zero + tables.anchor[c, 2]
-        bx, by, bz = zero, zero, zero
-        length, growth = zero, zero
-        first, last = tables.cable_first[c], tables.cable_first[c + 1]
-        for g in range(first, last):
-            px, py, pz = _point(tables.guide_first, tables.guide_place, tables.guide_weight, g, work.position, token)
-            dx, dy, dz = px - x, py - y, pz - z
-            segment = square_root(dx * dx + dy * dy + dz * dz)
-            length = length + segment
-            scale = one / segment
-            dx, dy, dz = dx * scale, dy * scale, dz * scale
-            if g > first:
-                growth = growth + _pull(tables, g - 1, offset, work, bx - dx, by - dy, bz - dz, token)
-            x, y, z, bx, by, bz = px, py, pz, dx, dy, dz
-        growth = growth + _pull(tables, last - 1, offset, work, bx, by, bz, token)
-        shorter = tables.rest_length[c] - length
+        offset = row // 3 * 9 * tables.modes + row % 3
+        shorter, growth = _gather_cable(tables, c, offset, work, token)
         store(work.slack, c, (shorter - load(work.commanded, c, token)) * rate - growth)
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _condensed_entry(work, i, j, panels, token):
+@kernel
+def _condensed_entry(condensed, i, j, panels, token):
     """Entry i >= j of b_i' A^-1 b_j, from its negative in tiles."""
-    t = 9 * (i // 3 * panels + j // 3) + 3 * (j % 3) + i % 3
-    return -load(work.condensed, t, token)
+    return -load(condensed, 9 * (i // 3 * panels + j // 3) + 3 * (j % 3) + i % 3, token)
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _tensions(cables, panels, work, rate, tolerance, regularisation, token):
-    """Unilateral tensions; leaves the weights of the border rows in ``weight`` and failed lanes in ``unsolved``."""
+@kernel
+def _scale_problem(cables, panels, work, regularisation, token):
+    """Tension problem with unit diagonal; a cable that no motion of the body can shorten takes no part."""
     one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
     largest = zero
     for c in range(cables):
-        diagonal = _condensed_entry(work, c + 1, c + 1, panels, token)
+        diagonal = _condensed_entry(work.condensed, c + 1, c + 1, panels, token)
         largest = where_greater(diagonal, largest, diagonal, largest)
     for c in range(cables):
-        diagonal = _condensed_entry(work, c + 1, c + 1, panels, token)
+        diagonal = _condensed_entry(work.condensed, c + 1, c + 1, panels, token)
         usable = where_greater(diagonal, 1e-12 * largest, one, zero)
         scale = usable / square_root(where_greater(usable, zero, diagonal, one))
         store(work.scale, c, scale)
-        remaining = load(work.slack, c, token) - _condensed_entry(work, c + 1, 0, panels, token)
+        remaining = load(work.slack, c, token) - _condensed_entry(work.condensed, c + 1, 0, panels, token)
         store(work.slack, c, remaining * scale)
         for d in range(c + 1):
-            value = _condensed_entry(work, c + 1, d + 1, panels, token) * scale * load(work.scale, d, token)
+            value = _condensed_entry(work.condensed, c + 1, d + 1, panels, token) * scale * load(work.scale, d, token)
             if c == d:
                 value = value + regularisation
             store(work.compliance, c * cables + d, value)
             store(work.compliance, d * cables + c, value)
         store(work.active, c, usable * where_greater(load(work.tension, c, token), zero, one, zero))
-    store(work.unsolved, 0, zero)
+
+
+@kernel
+def _tensions(cables, panels, work, rate, tolerance, regularisation, token):
+    """Unilateral tensions; leaves the weights of the border rows in ``weight`` and failed lanes in ``unsolved``."""
+    one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
+    _scale_problem(cables, panels, work, regularisation, token)
+    unsolved = zero
     if not solve_unilateral(
         work.compliance, work.slack, cables, tolerance, work.active, work.pivoting, work.tension, token
     ):
         for c in range(cables):
-            bad = load(work.pivoting, cables * cables + c, token)
-            store(work.unsolved, 0, where_greater(bad, zero, one, load(work.unsolved, 0, token)))
+            unsolved = where_greater(load(work.pivoting, cables * cables + c, token), zero, one, unsolved)
+    store(work.unsolved, 0, unsolved)
     store(work.weight, 0, one)
     for c in range(cables):
         impulse = load(work.scale, c, token) * load(work.tension, c, token)
@@ -118,81 +133,75 @@ def _tensions(cables, panels, work, rate, tolerance, regularisation, token):
         store(work.tension, c, impulse * rate)
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def solve_increment(tables, samples, factors, work, rate, tolerance, regularisation, token):
-    """``solution`` = A^-1 (r - J' T) and the tensions; the matrix is assembled and eliminated station by station from
-    the tip."""
-    tiles, stations, cables = len(tables.parity), tables.station_mass.shape[0], len(tables.rest_length)
+@kernel
+def solve_increment(tables, samples, factors, work, rate, schedule, static, token):
+    """``solution`` = A^-1 (r - J' T) and the tensions; the matrix is assembled and eliminated station by station."""
+    tiles, stations, cables, held = tables.modes, tables.stations, tables.cables, tables.held
     size, panels = 3 * tiles, (cables + 3) // 3
     frame, block = 3 * panels * size, 3 * tiles * size
-    held = tables.held
+    inertia = load(factors.inertia, 0, token)
     clear(work.border, 0, stations * frame, token)
     clear(work.condensed, 0, 9 * panels * panels, token)
     clear(work.pivot, (stations - 1) * block, stations * block, token)
-    gather_cables(tables, work, rate, size, token)
+    gather_cables(tables, work, rate, token)
     start_loads(tables, samples, factors, work, token)
+    if static:
+        sum_cable_forces(tables, work, token)
     for station in range(stations - 1, held - 1, -1):
+        last = station == held
         if station > 0:
-            assemble_layer(tables, samples, factors, station - 1, work, station > held, token)
-        add_station_mass(tables, samples, factors, station, work, token)
-        if station > held:
-            add_layer_mass(tables, samples, factors, station - 1, work, token)
+            assemble_layer(tables, samples, factors, station - 1, work, not last, token)
+            if static:
+                stiffen(tables, station - 1, work, not last, token)
+        entry, t = station * tables.pairs, station * block
+        add_station_mass(tables.parity, tiles, work.pivot, t, samples.station_mass, entry, inertia, token)
+        if not last:
+            entry = (station - 1) * tables.coupled
+            add_layer_mass(tables.parity, tiles, work.coupling, t, samples.layer_mass, entry, inertia, token)
         for k in range(size):
             t = station * frame + 3 * k
             store(work.border, t, load(work.border, t, token) + load(work.field, station * size + k, token))
-        eliminate(
-            work.pivot, work.coupling, work.border, work.condensed, station, station == held, tiles, panels, token
-        )
-    _tensions(cables, panels, work, rate, tolerance, regularisation, token)
+        eliminate(work.pivot, work.coupling, work.border, work.condensed, station, last, tiles, panels, token)
+    _tensions(cables, panels, work, rate, schedule.tolerance, schedule.regularisation, token)
     back_substitute(
-        work.pivot,
-        work.coupling,
-        work.border,
-        work.weight,
-        cables + 1,
-        work.solution,
-        held,
-        stations,
-        tiles,
-        panels,
-        token,
+        work.pivot, work.coupling, work.border, work.weight, work.solution, held, stations, tiles, panels, token
     )
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def _near(tables, work, time_step, token):
-    """``accepted`` = 1 in the lanes whose step is finite and leaves every node near its place at rest."""
-    modes, stations = len(tables.parity), tables.station_mass.shape[0]
-    one, zero = fill(1.0, work.position, token), fill(0.0, work.position, token)
-    accepted = one
-    reach = zero + tables.reach[0]
-    for station in range(stations):
+@kernel
+def near(tables, work, time_step, token):
+    """One in the lanes whose step is finite and leaves every node near its place at rest, zero elsewhere."""
+    modes, one, zero = tables.modes, fill(1.0, work.position, token), fill(0.0, work.position, token)
+    accepted, reach = one, fill(tables.reach, work.position, token)
+    for station in range(tables.stations):
+        base = 3 * station * modes
         for node in range(modes):
             for i in range(3):
                 away = zero
                 for m in range(modes):
-                    row = 3 * (station * modes + m) + i
-                    moved = load(work.position, row, token) - tables.rest[row]
-                    moved = moved + time_step * (load(work.velocity, row, token) + load(work.solution, row, token))
-                    away = away + moved * tables.shape[node, m]
+                    row = base + 3 * m + i
+                    speed = load(work.velocity, row, token) + load(work.solution, row, token)
+                    moved = fma(time_step, speed, load(work.position, row, token) - tables.rest[row])
+                    away = fma(moved, fill(tables.shape[node * modes + m], one, token), away)
                 away = where_greater(away, zero, away, -away)
                 accepted = where_greater(reach, away, accepted, zero)
-    for c in range(len(tables.rest_length)):
+    for c in range(tables.cables):
         accepted = where_greater(zero + LARGEST, load(work.tension, c, token), accepted, zero)
-    store(work.accepted, 0, accepted)
+    return accepted
 
 
-@numba.njit(nogil=True, error_model="numpy")
-def accept(tables, work, time_step, token):
-    """Take the step x += h (v + solution); where it is lost, stay in place at rest without tension."""
-    _near(tables, work, time_step, token)
-    zero = fill(0.0, work.position, token)
-    accepted = load(work.accepted, 0, token)
-    for row in range(work.position.shape[0]):
+@kernel
+def take_step(tables, work, length, token):
+    """Take the step x += length * (v + solution); where it is lost, stay in place at rest without tension."""
+    zero, time_step = fill(0.0, work.position, token), fill(length, work.position, token)
+    accepted = near(tables, work, time_step, token)
+    for row in range(3 * tables.modes * tables.stations):
         x = load(work.position, row, token)
         v = load(work.velocity, row, token) + load(work.solution, row, token)
         store(work.velocity, row, where_greater(accepted, zero, v, zero))
-        store(work.position, row, where_greater(accepted, zero, x + time_step * v, x))
-    for c in range(len(tables.rest_length)):
+        store(work.position, row, where_greater(accepted, zero, fma(time_step, v, x), x))
+    for c in range(tables.cables):
         store(work.tension, c, where_greater(accepted, zero, load(work.tension, c, token), zero))
-    store(work.unsolved, 0, where_greater(accepted, zero, load(work.unsolved, 0, token), zero))
+    store(work.lost, 0, where_greater(accepted, zero, load(work.lost, 0, token), fill(1.0, zero, token)))
+    failed = where_greater(accepted, zero, load(work.unsolved, 0, token), zero)
+    store(work.failed, 0, where_greater(failed, zero, failed, load(work.failed, 0, token)))

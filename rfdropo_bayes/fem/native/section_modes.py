@@ -1,14 +1,11 @@
 """A layered body in section modes: the coordinates in which its layers are sparse.
 
-The nodes of a section move as constant, linear, ... polynomials in x and y, each even or odd under x -> -x and y ->
--y. A layer has both
-mirror planes, so its stiffness couples component i of mode m with component j of mode n only where the parities
-agree. Of every
-3 x 3 block three entries are left on the diagonal if m and n have the same parity, else two beside it. The stiffness
-is linear in the
-Lame parameters and in 2 lambda mu / (lambda + 2 mu), which is what condensing the incompatible modes of a box leaves
-of lambda; three
-evaluations of ``layered.layer_stiffness`` therefore give it for every material.
+The nodes of a section move as constant, linear, ... polynomials in x and y, each even or odd under x -> -x and y -> -y.
+A layer has both mirror planes, so its stiffness couples component i of mode m with component j of mode n only where the
+parities agree. Of every 3 x 3 block three entries are left on the diagonal if m and n have the same parity, else two
+beside it. The stiffness is linear in the Lame parameters and in 2 lambda mu / (lambda + 2 mu), which is what condensing
+the incompatible modes of a box leaves of lambda; three evaluations of ``layered.layer_stiffness`` therefore give it for
+every material.
 """
 
 from __future__ import annotations
@@ -40,14 +37,17 @@ class LayeredTables(NamedTuple):
     component)``.
 
     Blocks of a layer come in the order (lower, lower), (upper, upper) with row mode >= column mode, then (lower,
-    upper).
-    Points are sparse sums: point p is the sum of ``weight[k]`` times the mode at row ``place[k]``, k in
+    upper). Points are sparse sums: point p is the sum of ``weight[k]`` times the mode at row ``place[k]``, k in
     ``first[p]:first[p + 1]``.
     """
 
     parity: Int[np.ndarray, " modes"]
     shape: Float[np.ndarray, "nodes modes"]  # value of every mode at the nodes of a section
+    inverse: Float[np.ndarray, "modes nodes"]
+    square: Float[np.ndarray, " modes"]  # sum over the nodes
     stiffness: Float[np.ndarray, "layers entries 3"]  # per lambda, mu and 2 lambda mu / (lambda + 2 mu) [m]
+    entry_row: Int[np.ndarray, " entries"]  # of a layer's 6 modes values, in the order of ``stiffness``
+    entry_column: Int[np.ndarray, " entries"]
     station_mass: Float[np.ndarray, "stations pairs"]  # per density, of the pairs of equal parity [m3]
     layer_mass: Float[np.ndarray, "layers coupled"]
     lumped: Float[np.ndarray, " pairs"]  # of a unit mass shared by the nodes of a section
@@ -63,8 +63,15 @@ class LayeredTables(NamedTuple):
     point_first: Int[np.ndarray, " points_1"]
     point_place: Int[np.ndarray, " entries"]
     point_weight: Float[np.ndarray, " entries"]
-    reach: Float[np.ndarray, " 1"]  # a node farther from its rest position has been lost [m]
+    reach: float  # a node farther from its rest position has been lost [m]
     held: int
+    modes: int
+    stations: int
+    entries: int
+    pairs: int
+    coupled: int
+    cables: int
+    points: int
 
 
 def section_modes(nodes_across: int) -> tuple[Float[np.ndarray, "nodes modes"], Int[np.ndarray, " modes"]]:
@@ -73,7 +80,7 @@ def section_modes(nodes_across: int) -> tuple[Float[np.ndarray, "nodes modes"], 
     line = np.linalg.qr(np.vander(grid, increasing=True))[0]
     line = line / line[-1]
     odd = np.arange(nodes_across) % 2
-    return np.kron(line, line), (odd[None, :] + 2 * odd[:, None]).ravel().astype(np.int32)
+    return np.kron(line, line), (odd[None, :] + 2 * odd[:, None]).ravel().astype(np.int64)
 
 
 def block_pairs(modes: int) -> list[tuple[int, int, int, int]]:
@@ -152,7 +159,7 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
     moduli = np.einsum("am,plaibj,bn->plminj", faces, moduli, faces, optimize=True)
     mass = np.einsum("am,lab,bn->lmn", faces, layer_mass(body), faces, optimize=True)
     blocks = [(f * modes + m, g * modes + n, parity[m] ^ parity[n]) for f, m, g, n in block_pairs(modes)]
-    stiffness = [moduli[:, :, r, i, c, j] for r, c, kind in blocks for i, j in BLOCK_ENTRIES[kind]]
+    entries = [(r, i, c, j) for r, c, kind in blocks for i, j in BLOCK_ENTRIES[kind]]
     below = [(m, n) for m in range(modes) for n in range(m + 1) if parity[m] == parity[n]]
     coupled = [(m, n) for m in range(modes) for n in range(modes) if parity[m] == parity[n]]
     station_mass = np.zeros((layers + 1, len(below)))
@@ -167,7 +174,11 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
     tables = LayeredTables(
         parity=parity,
         shape=shape,
-        stiffness=np.transpose(np.array(stiffness), (2, 0, 1)),
+        inverse=np.linalg.inv(shape),
+        square=np.sum(shape**2, axis=0),
+        stiffness=np.stack([moduli[:, :, r, i, c, j].T for r, i, c, j in entries], axis=1),
+        entry_row=np.array([3 * r + i for r, i, _, _ in entries], dtype=np.int64),
+        entry_column=np.array([3 * c + j for _, _, c, j in entries], dtype=np.int64),
         station_mass=station_mass,
         layer_mass=np.stack([mass[:, m, modes + n] for m, n in coupled], axis=1),
         lumped=np.array([shape[:, m] @ shape[:, n] for m, n in below]) / modes,
@@ -178,13 +189,20 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
         point_first=point_first,
         point_place=point_place,
         point_weight=point_weight,
-        reach=np.array([LOST * (body.station[-1] - body.station[0])]),
-        held=system.clamped_stations,
+        reach=float(LOST * (body.station[-1] - body.station[0])),
+        held=int(system.clamped_stations),
+        modes=modes,
+        stations=layers + 1,
+        entries=len(entries),
+        pairs=len(below),
+        coupled=len(coupled),
+        cables=len(system.cables.anchor),
+        points=len(points.node),
     )
     return LayeredTables(*(_as_kernel_array(value, dtype) for value in tables))
 
 
-def _as_kernel_array(value: np.ndarray | int, dtype: type) -> np.ndarray | int:
-    if isinstance(value, int):
+def _as_kernel_array(value: np.ndarray | float, dtype: type) -> np.ndarray | float:
+    if not isinstance(value, np.ndarray):
         return value
     return np.ascontiguousarray(value, dtype=dtype if value.dtype.kind == "f" else value.dtype)

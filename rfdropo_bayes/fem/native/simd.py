@@ -5,9 +5,9 @@ on the way fills all lanes. Nothing is reordered or contracted behind the kernel
 where `fma` or `fnma` stands and nowhere else, so that a lane's result depends neither on its neighbours nor on what
 the compiler chose to inline.
 
-Kernels keep their data in C-contiguous arrays ``(n, lanes)`` and move rows with `load` and `store`. How many lanes
-there are must be known to the compiler: kernels take it as the tuple made by `lane_token`, whose length is part of its
-type.
+Kernels keep their data in C-contiguous arrays ``(n, lanes)``, or know their `addresses`, and move rows with `load` and
+`store`. The number of lanes must be known to the compiler: kernels take it as the tuple made by `lane_token`, whose
+length is part of its type.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections.abc import Callable
 from typing import Any
 
 import llvmlite.binding as llvm
+import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
@@ -31,6 +32,10 @@ from numba.extending import (
 
 ALIGNMENT = 64
 """Bytes to which work arrays are aligned: one cache line, and the widest vector register."""
+
+
+kernel = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+"""Decorator of functions that only kernels call: wrappers for calls from Python take a quarter of the compilation."""
 
 
 class SimdType(types.Type):
@@ -75,8 +80,12 @@ def aligned_zeros(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 def _pointer(context, builder, array_type, array, row, simd: SimdType):
-    """Address of row ``row`` of an array ``(n, lanes)``."""
-    data = context.make_array(array_type)(context, builder, array).data
+    """Address of row ``row`` of an array ``(n, lanes)``, given as such or by its address."""
+    data = (
+        array
+        if isinstance(array_type, types.CPointer)
+        else context.make_array(array_type)(context, builder, array).data
+    )
     offset = builder.mul(row, ir.Constant(row.type, simd.lanes))
     return builder.bitcast(builder.gep(data, [offset]), vector_type(simd).as_pointer())
 
@@ -107,6 +116,30 @@ def store(typing_context, array, row, value):
         return context.get_dummy_value()
 
     return types.void(array, row, value), generate
+
+
+@intrinsic
+def addresses(typing_context, record):
+    """A named tuple of arrays as one of bare addresses, its numbers as they are.
+
+    Arrays are structures whose owners are counted; handing addresses from kernel to kernel compiles several times
+    faster. An address takes one index and knows no bounds. The arrays must outlive it.
+    """
+
+    def bare(kind):
+        return types.CPointer(kind.dtype) if isinstance(kind, types.Array) else kind
+
+    result = types.BaseTuple.from_types([bare(kind) for kind in record.types], record.instance_class)
+
+    def generate(context, builder, sig, arguments):
+        fields = cgutils.unpack_tuple(builder, arguments[0])
+        values = [
+            context.make_array(kind)(context, builder, field).data if isinstance(kind, types.Array) else field
+            for field, kind in zip(fields, record.types, strict=True)
+        ]
+        return context.make_tuple(builder, result, values)
+
+    return result(record), generate
 
 
 def _splat(context, builder, number, number_type, simd: SimdType):
