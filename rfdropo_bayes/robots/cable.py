@@ -20,6 +20,7 @@ class Cable(Table):
         anchor_z_m, anchor_radius_m: axial coordinate of the anchor, and its distance from the axis.
         guide_z_m: axial coordinates of the guides.
         guide_radius_m: distance of each guide from the axis.
+        anchor_azimuth_deg: azimuth of the anchor, where it differs.
         displacement_limit_m: least and greatest displacement, pull > 0; commands beyond are held at the limit.
     """
 
@@ -27,6 +28,7 @@ class Cable(Table):
     azimuth_deg: float
     anchor_z_m: float
     anchor_radius_m: Positive
+    anchor_azimuth_deg: float | None = None
     guide_z_m: tuple[float, ...] = Field(min_length=1)
     guide_radius_m: tuple[Positive, ...]
     displacement_limit_m: Pair
@@ -44,16 +46,18 @@ class Cable(Table):
 
     def anchor(self) -> Float[np.ndarray, "3"]:
         """Where the cable leaves the base [m]."""
-        return self._points(self.anchor_radius_m, self.anchor_z_m)[0]
+        azimuth = self.azimuth_deg if self.anchor_azimuth_deg is None else self.anchor_azimuth_deg
+        return _points(azimuth, self.anchor_radius_m, self.anchor_z_m)[0]
 
     def guides(self) -> Float[np.ndarray, "guide 3"]:
         """Guide points in the undeformed body [m], the last is where the cable ends."""
-        return self._points(self.guide_radius_m, self.guide_z_m)
+        return _points(self.azimuth_deg, self.guide_radius_m, self.guide_z_m)
 
-    def _points(self, radius: float | tuple[float, ...], z: float | tuple[float, ...]) -> np.ndarray:
-        angle = np.deg2rad(self.azimuth_deg)
-        distance = np.atleast_1d(radius)
-        return np.stack([distance * np.cos(angle), distance * np.sin(angle), np.atleast_1d(z)], axis=1)
+
+def _points(azimuth: float, radius: float | tuple[float, ...], z: float | tuple[float, ...]) -> np.ndarray:
+    """Points (n, 3) at an azimuth [deg]."""
+    angle, distance = np.deg2rad(azimuth), np.atleast_1d(radius)
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle), np.atleast_1d(z)], axis=1)
 
 
 class Channels(Table):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from typing import Any
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots.robot import Robot
@@ -22,6 +23,8 @@ def known_robots() -> dict[str, Path]:
 def load_robot(name_or_path: str | Path) -> Robot:
     """Read and validate a robot description.
 
+    A file with a key ``base`` describes a variant of that robot: its tables replace the base's of the same name.
+
     Args:
         name_or_path: name of a robot that comes with the package, or path of a TOML file.
 
@@ -30,13 +33,22 @@ def load_robot(name_or_path: str | Path) -> Robot:
             hold together.
     """
     path = _find(name_or_path)
+    return parse_table(Robot, _read(path), where=str(path))
+
+
+def _read(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Tables of a robot file; those it has itself replace those of the robot that it names as its ``base``."""
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot be read: {error}", where=str(path), remedy="give a readable TOML file") from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"is not valid TOML: {error}", where=str(path), remedy="mend the file") from None
-    return parse_table(Robot, table, where=str(path))
+    if "base" not in table:
+        return table
+    if path in derived:
+        raise InputError("is its own base", where=str(path), remedy="name another robot as base, or none")
+    return _read(_find(str(table.pop("base"))), (*derived, path)) | table
 
 
 def _find(name_or_path: str | Path) -> Path:

@@ -33,7 +33,6 @@ class TetrahedraTable(BaseModel):
         drives: "robot" follows the robot's ramp, lag and end stops; "sofa" hands a command over in equal updates, as
             an animation of SOFA's STLIB does, to cables that SOFA's CableConstraint limits.
         drive_rate: how far the imposed displacement may be from the one last measured [m per step]; for "sofa".
-        guides: cables that end at an earlier guide than the robot's, and how many guides they have.
         marker_cables: a marker at the height of guides of these cables is their mean; empty: a point of the body.
     """
 
@@ -46,7 +45,6 @@ class TetrahedraTable(BaseModel):
     masses: Literal["equal", "volume"] = "volume"
     drives: Literal["robot", "sofa"] = "robot"
     drive_rate: Annotated[float, Field(gt=0.0)] | None = None
-    guides: dict[str, Annotated[int, Field(ge=1)]] = Field(default_factory=dict)
     marker_cables: tuple[str, ...] = ()
 
 
@@ -74,10 +72,7 @@ def assemble_mesh(robot: Robot, mesh: TetrahedralMesh, table: TetrahedraTable) -
         )
     _check_cables(robot, table)
     body = tetrahedral_body(mesh.position, mesh.element, mesh.position[:, 2] <= table.clamp_height, table.frames)
-    counts = [
-        table.guides.get(name, len(points)) for name, points in zip(robot.cable_names, robot.guides(), strict=True)
-    ]
-    guides = [points[:count] for points, count in zip(robot.guides(), counts, strict=True)]
+    guides = robot.guides()
     cables = route_cables(body, robot.anchors(), guides)
     limits = DriveLimits(np.full(len(guides), np.inf))
     if table.drives == "sofa":
@@ -96,13 +91,9 @@ def assemble_mesh(robot: Robot, mesh: TetrahedralMesh, table: TetrahedraTable) -
 def _check_cables(robot: Robot, table: TetrahedraTable) -> None:
     where = "[simulator.tetrahedra]"
     known = ", ".join(robot.cable_names)
-    for name in (*table.guides, *table.marker_cables):
+    for name in table.marker_cables:
         if name not in robot.cable_names:
             raise InputError(f"the robot has no cable {name!r}", where=where, remedy=f"its cables: {known}")
-    for name, count in table.guides.items():
-        most = len(robot.guides()[robot.cable_names.index(name)])
-        if count > most:
-            raise InputError(f"{count} guides for cable {name!r}", where=where, remedy=f"it has {most}")
     if table.drive_rate is not None and table.drives != "sofa":
         raise InputError("drive_rate has no effect", where=where, remedy='it belongs to drives = "sofa"')
 

@@ -10,13 +10,17 @@ from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.space import build_space
-from rfdropo_bayes.data import Trajectory, load_recordings
+from rfdropo_bayes.data import Trajectory, find_data_file, load_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.robots.meshes import read_tetrahedra
+from rfdropo_bayes.simulators.mesh_body import assemble_mesh
+from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
-from rfdropo_bayes.workflow.engines import build_engine
+from rfdropo_bayes.workflow.engines import build_engine, build_mesh_engine
 from rfdropo_bayes.workflow.experiment import Experiment, matching
 
 Entry = TypeVar("Entry")
@@ -28,16 +32,24 @@ def find_robot(experiment: Experiment, folder: Path) -> Robot:
     return load_robot(beside if beside.suffix == ".toml" and beside.is_file() else experiment.robot)
 
 
-def build_simulator(experiment: Experiment, robot: Robot) -> TrunkSimulator:
-    """Robot, engine, discretisation and mechanisms."""
+def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path()) -> RobotSimulator:
+    """Robot, body, engine and mechanisms; ``folder`` is that of the experiment file, for the mesh of a body."""
     table = experiment.simulator
-    discretisation = Discretisation(table.time_step or robot.time_step_s, table.nodes_across, table.refine)
+    time_step = table.time_step or robot.time_step_s
+    mechanisms = mechanisms_named(experiment.model.mechanisms)
+    if table.body == "tetrahedra" and table.tetrahedra is not None:
+        options = table.tetrahedra
+        mesh = read_tetrahedra(find_data_file(options.mesh, folder), options.unit)
+        bound = assemble_mesh(robot, mesh, options)
+        engine = build_mesh_engine(table, bound, time_step)
+        return MeshTrunkSimulator(robot, engine, bound, options, time_step, mechanisms)
+    discretisation = Discretisation(time_step, table.nodes_across, table.refine)
     assembly = assemble(robot, discretisation)
-    engine = build_engine(table, assembly, discretisation, robot.initial_state == "equilibrium")
-    return TrunkSimulator(robot, engine, assembly, discretisation, mechanisms_named(experiment.model.mechanisms))
+    layered = build_engine(table, assembly, discretisation, robot.initial_state == "equilibrium")
+    return TrunkSimulator(robot, layered, assembly, discretisation, mechanisms)
 
 
-def fixed_values(experiment: Experiment, simulator: TrunkSimulator) -> dict[str, float]:
+def fixed_values(experiment: Experiment, simulator: RobotSimulator) -> dict[str, float]:
     """Values of [model.fixed], checked against names and hard bounds."""
     specs = simulator.parameters + noise_specs(experiment.model.noise)
     check_names(experiment.model.fixed, specs, where="[model.fixed]")
@@ -63,7 +75,7 @@ def expand_groups(table: Mapping[str, Entry], specs: Sequence[ParameterSpec]) ->
 
 
 def build_model(
-    experiment: Experiment, simulator: TrunkSimulator, trajectories: Sequence[Trajectory]
+    experiment: Experiment, simulator: RobotSimulator, trajectories: Sequence[Trajectory]
 ) -> TrajectoryModel:
     """The probabilistic program of an experiment for the given recordings.
 

@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rfdropo_bayes.data import DataSpec
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.mesh_body import TetrahedraTable
 from rfdropo_bayes.tables import parse_table
 
 
@@ -36,14 +37,30 @@ class ModelTable(Table):
 
 
 class SimulatorTable(Table):
-    """[simulator]: engine and discretisation; what is left out is the robot's own."""
+    """[simulator]: body, engine and discretisation; what is left out is the robot's own.
 
+    ``body`` is made of the layers of the robot's section profile (``nodes_across``, ``refine``) or of the mesh that
+    ``tetrahedra`` describes. An experiment may describe both; the body that is not chosen has no effect.
+    """
+
+    body: Literal["layered", "tetrahedra"] = "layered"
+    tetrahedra: TetrahedraTable | None = None
     engine: Literal["auto", "jax", "numba"] = "auto"
     precision: Literal["float64", "float32"] = "float64"
     time_step: float | None = Field(default=None, gt=0.0, le=0.1)
     nodes_across: Literal[2, 3] = 2
     refine: int = Field(default=1, ge=1, le=16)
     threads: int | None = Field(default=None, ge=1)
+
+    @model_validator(mode="after")
+    def _has_mesh(self) -> SimulatorTable:
+        if self.body == "tetrahedra" and self.tetrahedra is None:
+            raise InputError(
+                'body = "tetrahedra" without a mesh',
+                where="[simulator]",
+                remedy="add a table [simulator.tetrahedra] with mesh, unit and clamp_height",
+            )
+        return self
 
 
 class InferenceTable(BaseModel):

@@ -17,7 +17,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.protocol import Result
-from rfdropo_bayes.simulators.trunk import TrunkSimulator
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values, load_data
 from rfdropo_bayes.workflow.commands import random_walk
 from rfdropo_bayes.workflow.experiment import CommandsTable, Experiment, NoiseTable
@@ -39,7 +39,7 @@ def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str,
     Raises:
         InputError: bad input, or a rollout that did not end well.
     """
-    simulator = build_simulator(experiment, find_robot(experiment, folder))
+    simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
     values = fixed_values(experiment, simulator)
     physical = {spec.name for spec in simulator.parameters}
     values = {name: value for name, value in values.items() if name in physical}
@@ -69,7 +69,7 @@ def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str,
     return report
 
 
-def _sources(experiment: Experiment, folder: Path, simulator: TrunkSimulator) -> Sequence[Trajectory]:
+def _sources(experiment: Experiment, folder: Path, simulator: RobotSimulator) -> Sequence[Trajectory]:
     if experiment.commands is None:
         return [*load_data(experiment, folder, "fit"), *load_data(experiment, folder, "test")]
     if experiment.data is not None:
@@ -81,7 +81,7 @@ def _sources(experiment: Experiment, folder: Path, simulator: TrunkSimulator) ->
     ]
 
 
-def _generated(table: CommandsTable, name: str, simulator: TrunkSimulator, rng: np.random.Generator) -> Trajectory:
+def _generated(table: CommandsTable, name: str, simulator: RobotSimulator, rng: np.random.Generator) -> Trajectory:
     """A recording of random commands whose positions are still to be simulated."""
     command_time, command = random_walk(table, len(simulator.channel_names), rng)
     time = table.sample_time * np.arange(round(table.duration / table.sample_time) + 1)
@@ -102,7 +102,7 @@ def _generated(table: CommandsTable, name: str, simulator: TrunkSimulator, rng: 
     )
 
 
-def _known_markers(names: Sequence[str], simulator: TrunkSimulator) -> list[str]:
+def _known_markers(names: Sequence[str], simulator: RobotSimulator) -> list[str]:
     for name in names:
         if name not in simulator.marker_names:
             remedy = nearest(name, simulator.marker_names)
@@ -114,7 +114,7 @@ def _as_trajectory(
     source: Trajectory,
     position: Float[np.ndarray, "time marker 3"],
     markers: Sequence[str],
-    simulator: TrunkSimulator,
+    simulator: RobotSimulator,
     experiment: Experiment,
     values: Mapping[str, float],
     index: int,
