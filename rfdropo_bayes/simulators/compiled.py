@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.fem import Material, prepare, state_at_rest, static_equilibrium
+from rfdropo_bayes.fem import Material
 from rfdropo_bayes.fem.native.layered import NativeLayered
 from rfdropo_bayes.simulators.differences import (
     ACCELERATION,
@@ -24,25 +24,19 @@ from rfdropo_bayes.simulators.differences import (
 )
 from rfdropo_bayes.simulators.trunk import Assembly, Motion
 
-Inputs = tuple[Material, Float[Array, "node 3"], Float[Array, " cable"], Float[Array, "step cable"]]
+Inputs = tuple[Material, Float[Array, " cable"], Float[Array, "step cable"]]
 
 
 def input_sizes(inputs: Inputs) -> Inputs:
     """Sizes that perturbations of the inputs are relative to."""
-    material, position, tension, displacement = inputs
+    material, start, displacement = inputs
     magnitudes = Material(*(jnp.abs(value) + 1e-12 for value in material))._replace(
         gravity=jnp.full_like(material.gravity, ACCELERATION),
         point_mass=jnp.full_like(material.point_mass, MASS),
         rayleigh_mass=jnp.abs(material.rayleigh_mass) + MASS_DAMPING,
         rayleigh_stiffness=jnp.abs(material.rayleigh_stiffness) + STIFFNESS_DAMPING,
     )
-    # The initial tensions only start an iteration: no perturbation is too large for them.
-    return (
-        magnitudes,
-        jnp.full_like(position, LENGTH),
-        jnp.full_like(tension, jnp.inf),
-        jnp.full_like(displacement, LENGTH),
-    )
+    return magnitudes, jnp.full_like(start, LENGTH), jnp.full_like(displacement, LENGTH)
 
 
 @dataclass(frozen=True)
@@ -87,20 +81,14 @@ class CompiledEngine:
     ) -> Motion:
         """See `Engine.motion`. Derivatives are central differences along each tangent, two rollouts per direction."""
         limit = jnp.asarray(displacement.shape[0] if steps is None else steps, jnp.float64)
-        system = self.assembly.system
-        state, imbalance = state_at_rest(system), jnp.zeros(())
-        if self.from_equilibrium:
-            state, found = static_equilibrium(system, prepare(system, material), start)
-            imbalance = found.residual
-        motion = self._differentiable((material, state.position, state.tension, displacement), limit)
-        return motion._replace(imbalance=imbalance)
+        return self._differentiable((material, start, displacement), limit)
 
     @cached_property
     def _differentiable(self) -> Callable[[Inputs, Array], Motion]:
         return with_differences(self._call, input_sizes, self.precision)
 
     def _call(self, inputs: Inputs, limit: Array) -> Motion:
-        material, position, tension, displacement = inputs
+        material, start, displacement = inputs
         rows, cables = displacement.shape[0] + 1, displacement.shape[1]
         shapes = Motion(
             jax.ShapeDtypeStruct((rows, len(self.assembly.markers.node), 3), jnp.float64),
@@ -109,12 +97,10 @@ class CompiledEngine:
             jax.ShapeDtypeStruct((), jnp.float64),
         )
         return jax.pure_callback(
-            self._on_host, shapes, material, position, tension, displacement, limit, vmap_method="broadcast_all"
+            self._on_host, shapes, material, start, displacement, limit, vmap_method="broadcast_all"
         )
 
-    def _on_host(
-        self, material: Material, position: Array, tension: Array, displacement: Array, limit: Array
-    ) -> Motion:
+    def _on_host(self, material: Material, start: Array, displacement: Array, limit: Array) -> Motion:
         """Flatten whatever batch axes vmap has added, roll out, and restore them."""
         batch = displacement.shape[:-2]
         count = int(np.prod(batch))
@@ -122,8 +108,7 @@ class CompiledEngine:
         found = self._native.rollout(
             flat,
             flattened(np.asarray(displacement), len(batch), count),
-            position=flattened(np.asarray(position), len(batch), count),
-            tension=flattened(np.asarray(tension), len(batch), count),
+            start=flattened(np.asarray(start), len(batch), count) if self.from_equilibrium else None,
             steps=int(np.max(limit)),
         )
         rows = displacement.shape[-2] + 1
@@ -131,7 +116,7 @@ class CompiledEngine:
             padded(found.position, rows).reshape(*batch, rows, -1, 3),
             padded(found.tension, rows).reshape(*batch, rows, displacement.shape[-1]),
             found.diverged.reshape(batch),
-            np.zeros(batch),
+            found.residual.reshape(batch),
         )
 
 
