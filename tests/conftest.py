@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import meshio
+import numpy as np
 import pytest
 from jaxtyping import install_import_hook
 
@@ -39,3 +41,26 @@ def datasets() -> Path:
     if not folder.is_dir():
         pytest.skip(f"measured data not found at {folder}; set RFDROPO_DATA to the folder that holds them")
     return folder
+
+
+BAR_CELLS = (2, 2, 10)
+BAR_SIZE = (26.0, 26.0, 195.0)  # [mm]
+CUBE_TETRAHEDRA = np.array([[0, 1, 3, 7], [0, 1, 7, 5], [0, 5, 7, 4], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7]])
+
+
+@pytest.fixture(scope="session")
+def bar_mesh(tmp_path_factory) -> Path:
+    """Mesh file in mm: a bar of few tetrahedra about the axis, as long and as thick as the SOFA trunk."""
+    nx, ny, nz = BAR_CELLS
+    z, y, x = np.meshgrid(
+        np.linspace(0.0, BAR_SIZE[2], nz + 1),
+        np.linspace(-BAR_SIZE[1] / 2, BAR_SIZE[1] / 2, ny + 1),
+        np.linspace(-BAR_SIZE[0] / 2, BAR_SIZE[0] / 2, nx + 1),
+        indexing="ij",
+    )
+    offset = np.array([(c * (ny + 1) + b) * (nx + 1) + a for c in range(2) for b in range(2) for a in range(2)])
+    first = np.array([(k * (ny + 1) + j) * (nx + 1) + i for k in range(nz) for j in range(ny) for i in range(nx)])
+    elements = (first[:, None, None] + offset[CUBE_TETRAHEDRA]).reshape(-1, 4)
+    path = tmp_path_factory.mktemp("mesh") / "bar.vtk"
+    meshio.write_points_cells(path, np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1), [("tetra", elements)])
+    return path

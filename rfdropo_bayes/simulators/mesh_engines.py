@@ -44,7 +44,7 @@ class MeshEngine(Protocol):
         lanes: how many rollouts it likes to be given at once.
     """
 
-    lanes: int
+    lanes: ClassVar[int]
 
     def describe(self) -> dict[str, object]:
         """Name and precision, for the record."""
@@ -163,7 +163,8 @@ class CompiledMeshEngine:
             flattened(np.asarray(displacement), len(batch), count)[:, : int(np.max(limit))],
             time_step=self.time_step,
         )
-        first = point_positions(self.assembly.markers, self.assembly.system.body.rest)
+        markers, rest = self.assembly.markers, self.assembly.system.body.rest
+        first = np.einsum("pk,pki->pi", markers.weight, rest[markers.node])
         position = np.concatenate([np.broadcast_to(first, (count, 1, *first.shape)), found.position], axis=1)
         tension = np.concatenate([np.zeros((count, 1, displacement.shape[-1])), found.tension], axis=1)
         return MeshMotion(

@@ -34,7 +34,7 @@ def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str,
     column names), called ``trajectory`` where there is only one recording.
 
     Returns:
-        per recording: result code, files, and the error against the measurement [mm].
+        per recording: result code, files, and the error against the measurement [mm]; and that over all recordings.
 
     Raises:
         InputError: bad input, or a rollout that did not end well.
@@ -47,6 +47,7 @@ def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str,
     out = output_folder(out)
     rollout = jax.jit(simulator.rollout)
     report: dict[str, Any] = {"simulator": simulator.description, "parameters": values, "recordings": {}}
+    distances = []
     for index, source in enumerate(sources):
         commands = simulator.commands(source.command_time, source.command, source.initial_command, source.time)
         observation = jax.device_get(rollout({k: np.asarray(v) for k, v in values.items()}, commands))
@@ -60,11 +61,13 @@ def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str,
         simulated = _as_trajectory(source, position, markers, simulator, experiment, values, index)
         simulated.save(out / f"{stem}.nc")
         _table(source, simulated).to_csv(out / f"{stem}.csv", index=False, float_format="%.6f")
+        distances.append(_distance(source, position, markers))
         report["recordings"][source.name] = {
             "status": result.name.lower(),
             "files": [str(out / f"{stem}.nc"), str(out / f"{stem}.csv")],
-            "error_mm": _error(source, position, markers) if experiment.data else None,
+            "error_mm": _errors([distances[-1]]) if experiment.data else None,
         }
+    report["error_mm"] = _errors(distances) if experiment.data else None
     (out / "simulation.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
 
@@ -162,13 +165,19 @@ def _table(source: Trajectory, simulated: Trajectory) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def _error(source: Trajectory, position: np.ndarray, names: Sequence[str]) -> dict[str, float]:
-    """Distance between simulated and measured markers: mean and largest over markers and time, RMS of the last [mm]."""
+def _distance(source: Trajectory, position: np.ndarray, names: Sequence[str]) -> Float[np.ndarray, "time marker"]:
+    """Distance between simulated and measured markers [mm]; not a number where the measurement is masked."""
     chosen = [source.marker_names.index(name) for name in names]
-    distance = np.linalg.norm(np.asarray(position) - source.position[:, chosen], axis=2)
-    distance = np.where(source.position_mask[:, chosen], distance, np.nan)
+    distance = 1e3 * np.linalg.norm(np.asarray(position) - source.position[:, chosen], axis=2)
+    return np.where(source.position_mask[:, chosen], distance, np.nan)
+
+
+def _errors(distances: Sequence[np.ndarray]) -> dict[str, float]:
+    """Mean and largest distance over markers and time, and the root mean square over time of the last marker's [mm]."""
+    every = np.concatenate([distance.ravel() for distance in distances])
+    last = np.concatenate([distance[:, -1] for distance in distances])
     return {
-        "mean": 1e3 * float(np.nanmean(distance)),
-        "max": 1e3 * float(np.nanmax(distance)),
-        "rms_last_marker": 1e3 * float(np.sqrt(np.nanmean(distance[:, -1] ** 2))),
+        "mean": float(np.nanmean(every)),
+        "max": float(np.nanmax(every)),
+        "rms_last_marker": float(np.sqrt(np.nanmean(last**2))),
     }
