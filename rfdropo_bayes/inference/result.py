@@ -69,16 +69,22 @@ def bound_warnings(
 ) -> list[str]:
     """A sentence for every parameter with more than ``share`` of its draws within ``edge`` of its range from a bound.
 
-    Draws that pile up on a bound say that the bound, not the data, decides: a uniform posterior has 1 % there.
+    Draws that pile up on a bound say that the bound, not the data, decides: a uniform posterior has 1 % there. Bounds
+    that lie decades apart are compared in logarithms: a linear range would put every ordinary value at the lower one.
     """
     sentences = []
     for name, values in draws.items():
         low, high = bounds[name]
         if not np.isfinite(high - low):
             continue
-        margin = edge * (high - low)
-        for side, bound, near in (("lower", low, values < low + margin), ("upper", high, values > high - margin)):
+        if low > 0.0 and high > 100.0 * low:
+            values, start, end = np.log(values), np.log(low), np.log(high)
+        else:
+            start, end = low, high
+        reach = edge * (end - start)
+        for side, near in (("lower", values < start + reach), ("upper", values > end - reach)):
             if np.mean(near) > share:
+                bound = low if side == "lower" else high
                 sentences.append(
                     f"{name} sits on its {side} bound {bound:g}: {np.mean(near):.0%} of the draws are there"
                 )
