@@ -1,0 +1,65 @@
+"""``rfdropo calibrate`` from recordings to report: what it writes, and that a killed run ends as if it had not been."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.workflow.calibration import run_calibration
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+DEMO = REPOSITORY / "experiments" / "demo.toml"
+SHORT = [
+    'data.fit=[{observations="demo/demo_1.nc", rows=[0, 20]}]',
+    'data.test=["demo/demo_3.nc"]',
+    "simulator.refine=1",
+    "inference.particles=50",
+    "inference.rollouts=400",
+    "inference.blocks=3",
+]
+
+
+@pytest.mark.slow
+def test_a_calibration_writes_what_it_promises(tmp_path):
+    report = run_calibration(DEMO, tmp_path, overrides=SHORT)
+    assert report.read_text().startswith("<!DOCTYPE html>")
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["status"] == "done"
+    assert set(summary["parameters"]) >= {"young_modulus", "poisson_ratio", "trunk_mass", "observation_noise"}
+    assert summary["rmse"]["test"]["m4"] > 0
+    record = PosteriorRecord.load(tmp_path / "posterior.nc")
+    assert {r.split for r in record.recordings} == {"fit", "test"}
+    assert all(np.isfinite(record.flat(p.name)).all() for p in record.parameters)
+
+
+def command(out: Path, *extra: str) -> list[str]:
+    overrides = [argument for override in SHORT for argument in ("--set", override)]
+    return [sys.executable, "-m", "rfdropo_bayes", "calibrate", str(DEMO), "--out", str(out), *overrides, *extra]
+
+
+@pytest.mark.slow
+def test_a_killed_run_resumes_to_the_same_posterior(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    subprocess.run(command(whole), env=environment, check=True, capture_output=True)
+    running = subprocess.Popen(command(killed), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    log = killed / "log.jsonl"
+    while not (log.exists() and len(log.read_text().splitlines()) >= 3):
+        assert running.poll() is None, "the run ended before it could be killed"
+        time.sleep(0.05)
+    running.send_signal(signal.SIGKILL)
+    running.wait()
+    assert not (killed / "posterior.nc").exists()
+    subprocess.run(command(killed, "--resume"), env=environment, check=True, capture_output=True)
+    first, second = (PosteriorRecord.load(folder / "posterior.nc") for folder in (whole, killed))
+    for parameter in first.parameters:
+        np.testing.assert_array_equal(first.flat(parameter.name), second.flat(parameter.name))
