@@ -178,7 +178,7 @@ def _interpolation(grid: np.ndarray, points: np.ndarray) -> Float[np.ndarray, "p
     return matrix
 
 
-def _box_maps(body: LayeredBody, box: Float[np.ndarray, "layers 2"]) -> Float[np.ndarray, "layers cells 8 nodes2"]:
+def box_maps(body: LayeredBody, box: Float[np.ndarray, "layers 2"]) -> Float[np.ndarray, "layers cells 8 nodes2"]:
     """For every hexahedron of the virtual box, the map from layer nodes to its corners."""
     across, section = body.nodes_across, body.section_nodes
     grid = np.linspace(-1.0, 1.0, across)
@@ -191,7 +191,7 @@ def _box_maps(body: LayeredBody, box: Float[np.ndarray, "layers 2"]) -> Float[np
     return maps[:, _cell_nodes(across)]
 
 
-def _virtual_box(area: np.ndarray, moment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def virtual_box(area: np.ndarray, moment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Half widths (layers, 2) of the box with the section's I / A, and the factor that restores its area."""
     half = np.sqrt(3.0 * moment / area[:, None])
     return half, area / (4.0 * half[:, 0] * half[:, 1])
@@ -203,7 +203,7 @@ def _box_corners(body: LayeredBody, box: np.ndarray) -> Float[np.ndarray, "layer
     return half[:, None, :] * hexahedron.CORNERS[None]
 
 
-def _twist(body: LayeredBody) -> Float[np.ndarray, "layers dofs"]:
+def free_twist(body: LayeredBody) -> Float[np.ndarray, "layers dofs"]:
     """Displacement of the layer nodes in free torsion by one radian from face to face, warping included."""
     rest = rest_layers(body)
     length = np.diff(body.station)[:, None]
@@ -223,16 +223,16 @@ def layer_stiffness(
     free torsion of the uncorrected layer: the result stays positive semi-definite for any torsion constant, and
     bending, shear and extension, which are orthogonal to torsion in energy, are untouched.
     """
-    box, factor = _virtual_box(body.axial_area, body.bending_moment_area)
+    box, factor = virtual_box(body.axial_area, body.bending_moment_area)
     corners = _box_corners(body, box)
     hexahedra = jax.vmap(hexahedron.stiffness, (0, None, None))(jnp.asarray(corners), young_modulus, poisson_ratio)
     hexahedra = (hexahedra * factor[:, None, None]).reshape(len(corners), 8, 3, 8, 3)
-    maps = _box_maps(body, box)
+    maps = box_maps(body, box)
     stiffness = jnp.einsum("lcan,laibj,lcbm->lnimj", maps, hexahedra, maps)
     stiffness = stiffness.reshape(len(corners), 6 * body.section_nodes, 6 * body.section_nodes)
     shear_modulus = young_modulus / (2.0 * (1.0 + poisson_ratio))
     wanted = shear_modulus * body.torsion_constant / np.diff(body.station)
-    twist = _twist(body)
+    twist = free_twist(body)
     reaction = jnp.einsum("lij,lj->li", stiffness, twist)
     actual = jnp.einsum("li,li->l", twist, reaction)
     change = (wanted - actual) / actual**2
@@ -241,9 +241,9 @@ def layer_stiffness(
 
 def layer_mass(body: LayeredBody) -> Float[Array, "layers nodes2 nodes2"]:
     """Consistent mass of every layer per unit density [m^3], for each displacement component alike."""
-    box, factor = _virtual_box(body.mass_area, body.mass_moment_area)
+    box, factor = virtual_box(body.mass_area, body.mass_moment_area)
     hexahedra = jax.vmap(hexahedron.mass)(jnp.asarray(_box_corners(body, box))) * factor[:, None, None]
-    maps = _box_maps(body, box)
+    maps = box_maps(body, box)
     return jnp.einsum("lcan,lab,lcbm->lnm", maps, hexahedra, maps)
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numba
 
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_root, store
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, inlined, kernel, load, square_root, store
 
 
 @numba.njit(inline="always")
@@ -85,7 +85,7 @@ def _factor_tile(target, row, block, pivot_row, length, token):
     store(target, t + 8, fnma(c5, last, fnma(c2, lower, c8)) * inverse)
 
 
-@kernel
+@inlined
 def eliminate(pivot, coupling, border, condensed, station, last, tiles, panels, token):
     """Factorise one station and carry it over to the next, ``station - 1``, and to the condensed matrix.
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, inlined, kernel, load, store
 
 POLAR_ITERATIONS = 6
 
@@ -223,7 +223,7 @@ def _tangent_block(parity, modes, target, t, stiffness, e, dyads, triangle, add,
     return e
 
 
-@kernel
+@inlined
 def _layer_tangent(parity, modes, stiffness, first, layer, whole, factors, work, token):
     """Add the tangent of a layer to the pivot of its upper station; ``whole``: set the coupling, and start the pivot of
     the lower one."""
@@ -301,7 +301,7 @@ def add_layer_force(tables, samples, factors, layer, work, token):
     _add_layer_force(work.axes, work.reaction, work.field, 3 * layer * modes, modes, token)
 
 
-@kernel
+@inlined
 def assemble_layer(tables, samples, factors, layer, work, whole, token):
     """Frame and force of a layer, and its part of the matrix; see `_layer_tangent` for ``whole``."""
     layer_frame(tables, layer, work, token)

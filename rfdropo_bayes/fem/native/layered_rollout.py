@@ -13,7 +13,7 @@ from rfdropo_bayes.fem.native.layered_assembly import Factors, Samples, Work, cl
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
 from rfdropo_bayes.fem.native.layered_step import point, solve_increment, take_step
 from rfdropo_bayes.fem.native.section_modes import LayeredTables, border_panels
-from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store
+from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, inlined, kernel, load, store
 
 
 class Batch(NamedTuple):
@@ -129,7 +129,7 @@ def _fill_lanes(source, pitch, offset, width, first, count, target, token):
             target[i * lanes + lane] = source[row + i]
 
 
-@kernel
+@inlined
 def _prepare(tables, samples, token):
     """Stiffness and mass of a block's rollouts."""
     for layer in range(tables.stations - 1):
@@ -151,7 +151,7 @@ def _prepare(tables, samples, token):
         store(samples.layer_mass, p, density * tables.layer_mass[p])
 
 
-@kernel
+@inlined
 def _start(tables, batch, samples, work, first, token):
     """Parameters and initial state of a block's rollouts, not moving."""
     count, values = batch.count, 3 * tables.modes * tables.stations
@@ -172,7 +172,7 @@ def _start(tables, batch, samples, work, first, token):
     clear(work.imbalance, 0, 1, token)
 
 
-@kernel
+@inlined
 def _step_factors(samples, factors, length, token):
     """Factors of an implicit Euler step."""
     time_step, drag = fill(length, samples.damping, token), load(samples.damping, 0, token)
@@ -210,7 +210,7 @@ def _finish(work, output, first, count, token):
         output.residual[first + lane] = work.imbalance[lane]
 
 
-@kernel
+@inlined
 def _start_motion(tables, samples, factors, work, schedule, token):
     """End of the static iterations, if there were any."""
     if schedule.static_iterations > 0:

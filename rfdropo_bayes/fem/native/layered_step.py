@@ -11,7 +11,7 @@ from rfdropo_bayes.fem.native.layered_assembly import (
     clear,
     start_loads,
 )
-from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, inlined, kernel, load, square_root, store, where_greater
 from rfdropo_bayes.fem.native.tension_stiffening import stiffen, sum_cable_forces
 
 LARGEST = 1e30
@@ -89,7 +89,7 @@ def _condensed_entry(condensed, i, j, panels, token):
     return -load(condensed, 9 * (i // 3 * panels + j // 3) + 3 * (j % 3) + i % 3, token)
 
 
-@kernel
+@inlined
 def _scale_problem(cables, panels, work, regularisation, token):
     """Tension problem with unit diagonal; a cable that no motion of the body can shorten takes no part."""
     one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
@@ -113,7 +113,7 @@ def _scale_problem(cables, panels, work, regularisation, token):
         store(work.active, c, usable * where_greater(load(work.tension, c, token), zero, one, zero))
 
 
-@kernel
+@inlined
 def _tensions(cables, panels, work, rate, tolerance, regularisation, token):
     """Unilateral tensions; leaves the weights of the border rows in ``weight`` and failed lanes in ``unsolved``."""
     one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
@@ -133,7 +133,7 @@ def _tensions(cables, panels, work, rate, tolerance, regularisation, token):
         store(work.tension, c, impulse * rate)
 
 
-@kernel
+@inlined
 def solve_increment(tables, samples, factors, work, rate, schedule, static, token):
     """``solution`` = A^-1 (r - J' T) and the tensions; the matrix is assembled and eliminated station by station."""
     tiles, stations, cables, held = tables.modes, tables.stations, tables.cables, tables.held

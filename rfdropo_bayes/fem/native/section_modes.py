@@ -3,29 +3,20 @@
 The nodes of a section move as constant, linear, ... polynomials in x and y, each even or odd under x -> -x and y -> -y.
 A layer has both mirror planes, so its stiffness couples component i of mode m with component j of mode n only where the
 parities agree. Of every 3 x 3 block three entries are left on the diagonal if m and n have the same parity, else two
-beside it. The stiffness is linear in the Lame parameters and in 2 lambda mu / (lambda + 2 mu), which is what condensing
-the incompatible modes of a box leaves of lambda; three evaluations of ``layered.layer_stiffness`` therefore give it for
-every material.
+beside it.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.fem.cables import CableLayout
 from rfdropo_bayes.fem.dynamics import LOST, System
-from rfdropo_bayes.fem.layered import (
-    LayeredBody,
-    PointMap,
-    centre_gradient,
-    layer_mass,
-    layer_stiffness,
-    rest_positions,
-)
+from rfdropo_bayes.fem.layered import PointMap, centre_gradient, rest_positions
+from rfdropo_bayes.fem.native.layer_moduli import layer_moduli, layer_volume
 
 # Entries (row, column) of a block of two modes, by the parity (bit 0: odd in x, bit 1: odd in y) in which the modes
 # differ.
@@ -99,16 +90,6 @@ def _both_faces(shape: np.ndarray) -> Float[np.ndarray, "nodes2 modes2"]:
     return np.kron(np.eye(2), shape)
 
 
-def _stiffness_by_modulus(body: LayeredBody) -> Float[np.ndarray, "3 layers dofs dofs"]:
-    """Layer stiffness per lambda, mu and 2 lambda mu / (lambda + 2 mu)."""
-    evaluate = jax.jit(jax.vmap(lambda modulus, ratio: layer_stiffness(body, modulus, ratio)))
-    ratio = np.array([0.0, 0.25, 0.45])
-    values = np.asarray(evaluate(2.0 * (1.0 + ratio), ratio))  # with unit shear modulus
-    lame = 2.0 * ratio / (1.0 - 2.0 * ratio)
-    condensed = 2.0 * lame / (lame + 2.0)
-    return np.einsum("ij,jlmn->ilmn", np.linalg.inv(np.stack([lame, np.ones(3), condensed], axis=1)), values)
-
-
 def _sparse_points(
     node: np.ndarray, weight: np.ndarray, shape: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -155,9 +136,8 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
     shape, parity = section_modes(body.nodes_across)
     modes, layers = len(parity), len(body.station) - 1
     faces = _both_faces(shape)
-    moduli = _stiffness_by_modulus(body).reshape(3, layers, 2 * modes, 3, 2 * modes, 3)
-    moduli = np.einsum("am,plaibj,bn->plminj", faces, moduli, faces, optimize=True)
-    mass = np.einsum("am,lab,bn->lmn", faces, layer_mass(body), faces, optimize=True)
+    moduli = np.einsum("am,plaibj,bn->plminj", faces, layer_moduli(body), faces, optimize=True)
+    mass = np.einsum("am,lab,bn->lmn", faces, layer_volume(body), faces, optimize=True)
     blocks = [(f * modes + m, g * modes + n, parity[m] ^ parity[n]) for f, m, g, n in block_pairs(modes)]
     entries = [(r, i, c, j) for r, c, kind in blocks for i, j in BLOCK_ENTRIES[kind]]
     below = [(m, n) for m in range(modes) for n in range(m + 1) if parity[m] == parity[n]]

@@ -36,6 +36,8 @@ ALIGNMENT = 64
 
 kernel = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 """Decorator of functions that only kernels call: wrappers for calls from Python take a quarter of the compilation."""
+inlined = numba.njit(inline="always")
+"""Decorator of functions that call kernels from one place: a level of calls is compiled into every level above it."""
 
 
 class SimdType(types.Type):
