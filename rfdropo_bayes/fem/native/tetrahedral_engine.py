@@ -58,6 +58,7 @@ class TetrahedralEngine:
         threads: int | None = None,
     ) -> None:
         self.body, self.dtype, self.points = body, np.dtype(dtype), points
+        self._kernel = _kernel()  # here, so that threads do not make one each
         self.lanes = lanes or native_lanes(dtype)
         self.threads = threads or available_threads()
         self._order, self._number = _numbering(body)
@@ -119,7 +120,7 @@ class TetrahedralEngine:
         )
         single = self.dtype.itemsize == 4
         schedule = kernels.Schedule(float(time_step), stride, _TOLERANCE[self.dtype.name], self._reach, single)
-        _kernel()(
+        self._kernel(
             self._pattern, self._mesh, self._cables, self._rest, displacement, inputs, work, schedule, output, token
         )  # fmt: skip
         count = len(kept)
