@@ -23,7 +23,8 @@ def parse_table(schema: type[Parsed], table: Mapping[str, Any], *, where: str) -
     try:
         return schema.model_validate(dict(table))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
+        # A renamed key is both unknown and missing: its own name says more.
+        first = min(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")
         inner = first.get("ctx", {}).get("error")
         if isinstance(inner, InputError):
             raise inner from None

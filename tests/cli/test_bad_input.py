@@ -12,7 +12,7 @@ from rfdropo_bayes.cli import main
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo"
 
 EXPERIMENT = """
-robot = "trunk_physical"
+robot = "smooth_arm"
 [data]
 format = "netcdf"
 fit = ["{demo}/demo_1.nc"]
@@ -44,8 +44,8 @@ def experiment(tmp_path: Path, *changes: tuple[str, str]) -> str:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"trunk_physical"', '"trunk_fysical"', "unknown robot 'trunk_fysical'"),
-        ("[model.priors]", 'model.mechanisms = ["paylod"]\n[model.priors]', "did you mean 'payload'"),
+        ('"smooth_arm"', '"smooth_harm"', "unknown robot 'smooth_harm'"),
+        ("[model.priors]", '[model]\nmechanisms = ["paylod"]\n[model.priors]', "did you mean 'payload'"),
         ("young_modulus", "youngs_modulus", "did you mean 'young_modulus'"),
         ("{}", '{ distribution = "Uniform", low = 1.0, high = 2.0 }', "outside the bounds"),
         ("{}", '{ distribution = "Normall", loc = 1.0, scale = 2.0 }', "did you mean 'Normal'"),
@@ -58,7 +58,7 @@ def experiment(tmp_path: Path, *changes: tuple[str, str]) -> str:
         ('"smc"', '"mcmc"', "unknown method 'mcmc'"),
         ("rollouts = 50", "rolouts = 50", "'rolouts'"),
         ("demo_1.nc", "demo_9.nc", "no such file"),
-        ("fit =", "fits =", "'fits'"),
+        ("fit =", "fits =", "did you mean 'fit'"),
         ('"netcdf"', '"netcfd"', "netcdf"),
         ("robot =", "robot", "not valid TOML"),
         ("rollouts = 50", "rollouts = -1", "rollouts"),
