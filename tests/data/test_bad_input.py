@@ -164,7 +164,7 @@ def test_a_plain_csv_needs_the_columns_its_mapping_names(tmp_path):
         ({"resample": -0.1}, "greater than 0"),
         (
             {"fit": [{"observation": "a.csv"}]},
-            "'fit.0.observations' is missing",
+            "unknown key 'fit.0.observation'; did you mean 'observations'",
         ),
         ({"fit": [{"observations": "a", "row": [0, 1]}]}, "unknown key 'fit.0.row'; did you mean 'rows'"),
         ({"fit": "a.csv"}, "fit = 'a.csv': Input should be a valid list"),
