@@ -3,10 +3,10 @@
 Observation noise among the parameters. The residuals r are whitened, so the log likelihood is ``-r'r / 2 + c`` where c
 holds the log determinants and depends on noise parameters alone. Noise parameters stay in the vector that is optimised
 (they are not profiled out: their posterior and their correlation with the rest are wanted). They are found by testing
-along which coordinates the log likelihood and ``-r'r / 2`` differ. Along these the gradient is taken from the log
-likelihood itself, by central differences; and since ``J'J`` holds only one half of the information about a scale
-(``m`` instead of ``2 m``), their block of the Hessian at the optimum is taken by second differences of the log
-likelihood. Physical parameters keep the Gauss-Newton block.
+along which coordinates ``c`` changes. Along these the gradient is taken from the log likelihood itself, by central
+differences; and since ``J'J`` holds only one half of the information about a scale (``m`` instead of ``2 m``), their
+block of the Hessian at the optimum is taken by second differences of the log likelihood. Physical parameters keep the
+Gauss-Newton block.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class LevenbergState(NamedTuple):
         position: unconstrained point.
         log_density: log posterior there.
         damping: Levenberg-Marquardt's, relative to the diagonal of the Hessian.
-        converged: the last step promised less than the tolerance.
+        converged: the last step promised less than the tolerance, or little more and delivered less.
     """
 
     position: Float[np.ndarray, " d"]
@@ -103,7 +103,7 @@ def make_target(
         problem: with residuals.
         horizon: rows to use.
         ledger: every rollout is charged to it; a Jacobian in d directions counts as d + 1.
-        u: a point with a finite likelihood, where noise coordinates are looked for.
+        u: a point with a finite likelihood, around which noise coordinates are looked for.
         prior: `prior_derivatives`.
         jacobian: "forward" (JAX), "central" differences, or "auto": forward where residuals can be traced.
         noise: noise coordinates, if known.
@@ -115,10 +115,12 @@ def make_target(
     def density(points: np.ndarray) -> np.ndarray:
         return evaluate_prior(problem, points) + likelihood(points)
 
-    linearise = _make_linearise(problem, horizon, ledger, u, jacobian)
+    residuals_at, linearise = _make_linearise(problem, horizon, ledger, u, jacobian)
     if noise is None:
-        residual, slope = linearise(u)
-        noise = _noise_coordinates(likelihood, u, -slope.T @ residual)
+        ledger.charge(problem, 2 * len(u) + 1, horizon)
+        noise = _noise_coordinates(
+            lambda points: likelihood(points) + 0.5 * np.sum(residuals_at(points) ** 2, axis=1), u
+        )
     return Target(density, likelihood, *prior, linearise, noise)
 
 
@@ -132,55 +134,67 @@ def prior_derivatives(problem: Problem) -> tuple[Callable, Callable]:
     return (lambda u: np.asarray(gradient(u))), (lambda u: np.asarray(hessian(u)))
 
 
-def _make_linearise(problem: ResidualProblem, horizon: int, ledger: Ledger, u: np.ndarray, jacobian: str) -> Callable:
+def _make_linearise(
+    problem: ResidualProblem, horizon: int, ledger: Ledger, u: np.ndarray, jacobian: str
+) -> tuple[Callable, Callable]:
+    """Residuals of a batch of points, not charged; residuals and Jacobian at one point, charged."""
+
     def residuals(u: Array) -> Any:
         values = problem.from_unconstrained(u[None])
         return problem.residuals({name: value[0] for name, value in values.items()}, horizon)
 
-    if jacobian == "auto":
-        jacobian = "forward" if _traceable(residuals, u) else "central"
-    if jacobian == "forward":
+    batched = jax.jit(jax.vmap(residuals)) if _works(lambda f, u: f(u), residuals, u) else None
 
-        @jax.jit
-        def both(u: Array) -> tuple[Array, Array]:
-            def tangent(direction: Array) -> tuple[Array, Array]:
-                return jax.jvp(residuals, (u,), (direction,))
-
-            value, columns = jax.vmap(tangent, out_axes=(None, 1))(jnp.eye(len(u)))
-            return value, columns
-
-        def linearise(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            ledger.charge(problem, len(u) + 1, horizon)
-            value, columns = both(u)
-            return np.asarray(value), np.asarray(columns)
-
-        return linearise
-
-    def at(u: np.ndarray) -> np.ndarray:
-        return np.asarray(residuals(jnp.asarray(u)))
+    def at(points: np.ndarray) -> np.ndarray:
+        if batched:
+            return np.asarray(batched(jnp.asarray(points)))
+        return np.stack([np.asarray(residuals(jnp.asarray(point))) for point in points])
 
     def differences(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ledger.charge(problem, 2 * len(u) + 1, horizon)
         steps = DIFFERENCE * np.eye(len(u))
-        columns = [(at(u + e) - at(u - e)) / (2.0 * DIFFERENCE) for e in steps]
-        return at(u), np.stack(columns, axis=1)
+        values = at(np.concatenate([u[None], u + steps, u - steps]))
+        upper, lower = values[1 : len(u) + 1], values[len(u) + 1 :]
+        return values[0], (upper - lower).T / (2.0 * DIFFERENCE)
 
-    return differences
+    @jax.jit
+    def both(u: Array) -> tuple[Array, Array]:
+        return jax.vmap(lambda e: _directional(residuals, u, e), out_axes=(None, 1))(jnp.eye(len(u)))
+
+    def forward(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ledger.charge(problem, len(u) + 1, horizon)
+        value, columns = both(jnp.asarray(u))
+        return np.asarray(value), np.asarray(columns)
+
+    if jacobian == "auto":
+        jacobian = "forward" if _works(_directional, residuals, u) else "central"
+    return at, forward if jacobian == "forward" else differences
 
 
-def _traceable(residuals: Callable, u: np.ndarray) -> bool:
+def _directional(residuals: Callable, u: Array, direction: Array | None = None) -> tuple[Array, Array]:
+    """Residuals and their derivative along a direction."""
+    return jax.jvp(residuals, (u,), (jnp.ones_like(u) if direction is None else direction,))
+
+
+def _works(transform: Callable, residuals: Callable, u: np.ndarray) -> bool:
+    """Whether JAX can trace something of the residuals; a host callback has no derivative, plain NumPy no trace."""
     try:
-        jax.eval_shape(residuals, u)
-    except (jax.errors.JAXTypeError, TypeError):
+        jax.eval_shape(lambda u: transform(residuals, u), jnp.asarray(u))
+    except (jax.errors.JAXTypeError, TypeError, ValueError, NotImplementedError):
         return False
     return True
 
 
-def _noise_coordinates(likelihood: Callable, u: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-    """Coordinates where the slope of the log likelihood is not that of ``-r'r / 2``: the log determinant's doing."""
-    slope = _slope(likelihood, u, np.ones(len(u), dtype=bool))
-    scale = np.maximum(np.abs(slope), np.abs(gradient))
-    return np.abs(slope - gradient) > 1e-2 * scale + 1e-3
+def _noise_coordinates(determinant: Callable, u: np.ndarray, width: float = 0.05) -> np.ndarray:
+    """Coordinates along which the log determinant ``c`` changes.
+
+    It is the log likelihood plus ``r'r / 2`` of the SAME rollouts, whose errors cancel, single precision included.
+    """
+    steps = width * np.eye(len(u))
+    values = determinant(np.concatenate([u[None], u + steps, u - steps]))
+    changes = np.abs(values[1:] - values[0]).reshape(2, len(u))
+    # A rollout that fails says nothing; its other side does.
+    return np.max(np.where(np.isfinite(changes), changes, 0.0), axis=0) > 1e-2 + 1e-6 * abs(values[0])
 
 
 def _slope(likelihood: Callable, u: np.ndarray, chosen: np.ndarray) -> np.ndarray:
@@ -228,10 +242,12 @@ def step(target: Target, state: LevenbergState, tolerance: float) -> tuple[Leven
     gain = float(densities[best] - state.log_density)
     if gain <= 0.0:
         # The differences left are those of rounding, or the model is useless here: smaller steps next time.
-        stuck = state.damping > 1e8
+        stuck = state.damping > 1e8 or promised < 100.0 * tolerance
         return state._replace(damping=state.damping * 1e5, converged=stuck), StepInfo(0.0, promised, len(dampings))
+    # An engine in single precision has gradients that promise a little for ever; what it delivers tells.
+    idle = gain < tolerance and promised < 100.0 * tolerance
     moved = LevenbergState(
-        state.position + moves[best], float(densities[best]), float(np.clip(dampings[best], 1e-9, 1e9)), False
+        state.position + moves[best], float(densities[best]), float(np.clip(dampings[best], 1e-9, 1e9)), idle
     )
     return moved, StepInfo(gain, promised, len(dampings))
 

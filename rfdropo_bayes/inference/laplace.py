@@ -51,7 +51,7 @@ class LaplaceConfig:
     screen: int = 64
     blocks: int = 3
     max_steps: int = 60
-    tolerance: float = 1e-5
+    tolerance: float = 1e-4
     jacobian: str = "auto"
     draws: int = 2000
 

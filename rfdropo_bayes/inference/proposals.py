@@ -25,13 +25,17 @@ class Reference(NamedTuple):
 
 
 def fit_reference(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"]) -> Reference:
-    """Weighted mean and covariance; shrunk towards its diagonal where particles are few for the dimension."""
+    """Weighted mean and covariance.
+
+    Shrunk towards its diagonal only where too few particles are effective to span the space: a ridge, such as that of
+    stiffness and mass, is a correlation near one, and a little shrinkage makes proposals across it hopeless.
+    """
     d = position.shape[1]
     mean = weights @ position
     centred = position - mean
     covariance = (weights[:, None] * centred).T @ centred
     effective = 1.0 / np.sum(weights**2)
-    shrinkage = min(1.0, d / max(effective, 1.0))
+    shrinkage = max(0.0, 1.0 - effective / (2.0 * (d + 1)))
     diagonal = np.diag(covariance)
     floor = 1e-12 * max(diagonal.max(), 1e-300)
     covariance = (1.0 - shrinkage) * covariance + np.diag(shrinkage * diagonal + floor)

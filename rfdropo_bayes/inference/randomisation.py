@@ -93,7 +93,9 @@ def search_space(
     ranges: Mapping[str, tuple[float, float]],
     prior: Values,
 ) -> SearchSpace:
-    """Search ranges: those asked for, else the hard bounds, or the central 99 % of the prior where these are infinite.
+    """Search ranges: those asked for, else the central 99 % of the prior, which like the paper's is inside the bounds.
+
+    Hard bounds would not do: they exclude the impossible and span decades, where a search range is linear.
 
     Raises:
         InputError: an unknown parameter, or a range that is empty or outside the bounds.
@@ -108,11 +110,9 @@ def search_space(
     for name, (low, high) in zip(names, bounds, strict=True):
         if name in ranges:
             chosen.append(tuple(ranges[name]))
-        elif np.isfinite(high - low):
-            chosen.append((low, high))
         else:
             quantiles = np.quantile(np.asarray(prior[name]), [0.005, 0.995])
-            chosen.append((float(quantiles[0]), float(quantiles[1])))
+            chosen.append((max(float(quantiles[0]), low), min(float(quantiles[1]), high)))
         if not (low <= chosen[-1][0] < chosen[-1][1] <= high):
             raise InputError(
                 f"the search range {chosen[-1]} of {name} is empty or leaves its bounds [{low:g}, {high:g}]",

@@ -54,7 +54,7 @@ class RfdropoConfig:
         variance_floor: added to the variances, in squared units of the trajectory's root mean square motion.
         finalists: candidates scored again at the full horizon.
         parameters: names to search; empty for all that rollouts depend on.
-        search: ranges that differ from the hard bounds, by name.
+        search: ranges that differ from the central 99 % of the prior, by name.
         draws: draws of the final distribution.
         mended: False gives the published schedule (99 of 100 rows) and returns the lowest loss at any horizon.
     """

@@ -24,9 +24,9 @@ def test_a_linear_model_has_its_closed_form_posterior_and_evidence():
     result = laplace.run(problem, LaplaceConfig(blocks=2), KEY)
     mean, covariance = problem.posterior()
     sd = np.sqrt(np.diag(covariance))
-    assert result.log_evidence[0] == pytest.approx(problem.prefix_log_evidence()[-1], abs=1e-4)
+    assert result.log_evidence[0] == pytest.approx(problem.prefix_log_evidence()[-1], abs=1e-3)
     np.testing.assert_allclose(result.details["covariance_unconstrained"], covariance, rtol=1e-6, atol=1e-12)
-    np.testing.assert_array_less(np.abs(np.array(list(result.optimum.values())) - mean), 0.01 * sd)
+    np.testing.assert_array_less(np.abs(np.array(list(result.optimum.values())) - mean), 0.02 * sd)
     draws = np.stack([result.draws[name].ravel() for name in problem.names], axis=1)
     # 2000 independent draws: 5 standard errors of a mean are 0.11 sd, of a deviation 8 %.
     np.testing.assert_array_less(np.abs(draws.mean(axis=0) - mean), 0.11 * sd)
@@ -44,6 +44,26 @@ def test_a_noise_parameter_is_found_and_gets_its_full_information(traceable):
     for name, truth in problem.truth.items():
         draws = result.draws[name]
         assert abs(draws.mean() - truth) < 4.0 * draws.std()
+
+
+def test_a_host_callback_has_no_derivative_and_gets_differences():
+    class Remote(Decay):
+        def residuals(self, values, horizon):
+            shape = jax.ShapeDtypeStruct((horizon,), float)
+            fit = jax.pure_callback(
+                lambda a, r: a * np.exp(-r * self.time[:horizon]),
+                shape,
+                values["amplitude"],
+                values["rate"],
+                vmap_method="sequential",
+            )
+            return (self.data[:horizon] - fit) / values["noise"]
+
+    u = np.array([0.3, -0.2, -2.5])
+    plain, remote = (
+        make_target(problem, 60, Ledger(), u, prior_derivatives(problem)) for problem in (Decay(), Remote())
+    )
+    np.testing.assert_allclose(remote.linearise(u)[1], plain.linearise(u)[1], rtol=1e-6, atol=1e-6)
 
 
 def test_central_differences_agree_with_forward_derivatives():

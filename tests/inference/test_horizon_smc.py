@@ -13,6 +13,7 @@ import pytest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import horizon_smc
 from rfdropo_bayes.inference.horizon_smc import SmcConfig
+from rfdropo_bayes.inference.result import bound_warnings
 
 from .toys import Decay, LinearGaussian, TwoModes
 
@@ -175,3 +176,24 @@ def test_draws_on_a_bound_are_warned_of():
 
     result = horizon_smc.run(Bounded(), SmcConfig(particles=200), KEY)
     assert any("x0 sits on its upper bound" in sentence for sentence in result.warnings)
+
+
+def test_a_wide_positive_range_is_measured_in_decades():
+    draws = {"noise": np.full((1, 50), 2e-3), "mass": np.full((1, 50), 1.01e-3), "tilt": np.full((1, 50), 2e-3)}
+    sentences = bound_warnings(draws, {"noise": (1e-6, 1.0), "mass": (1e-3, 1e3), "tilt": (0.0, 1.0)})
+    assert [sentence.split()[0] for sentence in sentences] == ["mass", "tilt"]
+
+
+def test_a_ridge_is_followed_by_few_particles():
+    """Two parameters seen through their sum only, to 1 in 1000 of their spread: 150 particles know its direction."""
+    problem = LinearGaussian(n_rows=8, d=4)
+    problem.design[:, 1] = problem.design[:, 0]
+    problem.noise = problem.noise * 0.01
+    problem.data = problem.design @ problem.mean
+    result = horizon_smc.run(problem, SmcConfig(particles=150, replicates=2), KEY)
+    _, covariance = problem.posterior()
+    assert covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]) < -0.999
+    assert result.log_evidence[0] == pytest.approx(problem.prefix_log_evidence()[-1], abs=1.0)
+    last = [row for row in result.trace if row.get("final")]
+    assert min(row["acceptance"] for row in last) > 0.3
+    assert result.draws["x0"].std() == pytest.approx(np.sqrt(covariance[0, 0]), rel=0.25)

@@ -71,7 +71,7 @@ def test_the_default_population_is_hansens():
 def test_draws_are_truncated_normals_inside_the_hard_bounds():
     problem = Spring()
     prior = problem.sample_prior(KEY, 100)
-    space = search_space(problem, ("frequency", "damping"), {"frequency": (2.0, 3.0)}, prior)
+    space = search_space(problem, ("frequency", "damping"), {"frequency": (2.0, 3.0), "damping": (0.0, 2.0)}, prior)
     vector = np.array([2.0, 0.0, 4.0, 4.0])  # damping: mean on its lower bound, widest spread
     mean, std = space.unpack(vector)
     np.testing.assert_allclose(mean, [2.5, 0.0])
@@ -195,3 +195,13 @@ def test_a_budget_that_allows_no_generation_is_refused():
 def test_the_search_space_is_checked(wrong, words):
     with pytest.raises(InputError, match=words):
         rfdropo.run(Spring(), RfdropoConfig(evaluations=10, rollouts_per_candidate=10, **wrong), KEY)
+
+
+def test_the_search_range_is_that_of_the_prior_inside_the_bounds():
+    problem = Spring()
+    problem.bounds = {**problem.bounds, "frequency": (1e-3, 1e3)}
+    prior = {"frequency": np.linspace(1.0, 5.0, 1001), "damping": np.linspace(-1.0, 2.0, 1001), "noise": np.ones(3)}
+    space = search_space(problem, ("frequency", "damping"), {}, prior)
+    np.testing.assert_allclose([space.low[0], space.high[0]], [1.02, 4.98])
+    assert (space.hard_low[0], space.hard_high[0]) == (1e-3, 1e3)
+    assert space.low[1] == 0.0
