@@ -1,9 +1,12 @@
-"""Rollouts per second of both engines: 100 solves each, the notched trunk, eight cables moving.
+"""Rollouts per second of both engines, 100 solves each: a uniform bar, and the notched trunk behind its simulator.
 
     python benchmarks/rollouts.py [--json FILE] [--seconds S] [--batch N]
 
-The parameters differ from rollout to rollout, as in inference. Compilation is not counted; the best of the repeats is.
-The JAX engine uses as many processors as XLA likes; the Numba engine is timed on one thread and on all.
+The bar has 20 layers of 4 nodes and 8 cables; it is timed at the engine. The trunk is timed as inference calls it,
+through commands, limits and markers. Parameters differ from rollout to rollout. Compilation is not counted; the best of
+the repeats is. The JAX engine uses as many processors as XLA likes; the Numba engine is timed on one thread and on all.
+
+The last column is how far the tip of the bar, held at one end, sags under its own weight, against the heavy elastica.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,63 +24,133 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rfdropo_bayes import fem
 from rfdropo_bayes.robots import load_robot
-from rfdropo_bayes.simulators.protocol import Observation, Result
-from rfdropo_bayes.simulators.trunk import TrunkSimulator
+from rfdropo_bayes.simulators.protocol import Result
+from rfdropo_bayes.simulators.trunk import Assembly, Discretisation, Engine
 from rfdropo_bayes.workflow.assembly import build_simulator
-from rfdropo_bayes.workflow.experiment import Experiment
+from rfdropo_bayes.workflow.engines import build_engine
+from rfdropo_bayes.workflow.experiment import Experiment, SimulatorTable
 
 SOLVES = 100
-ROBOT = "trunk_sofa"
+TIME_STEP = 0.01  # [s]
+TRUNK = "trunk_sofa"
+LENGTH, HALF_WIDTH, LAYERS, CABLES = 0.195, 0.01, 20, 8
+SAG = 0.0948  # [m] of the tip, heavy elastica of the bar's length, section, modulus and density
+
+Values = dict[str, jax.Array]
+Run = Callable[[Values], jax.Array]  # number of rollouts that failed
 
 
 class Case(NamedTuple):
-    """One row of the table: an engine, its precision, its threads (None: all) and the batch it is given."""
+    """One row of the table: a body, an engine, its precision, its threads (None: all) and the batch it is given."""
 
+    body: str
     engine: str
     precision: str
     threads: int | None
     batch: int
 
+    @property
+    def table(self) -> SimulatorTable:
+        """What an experiment says of the engine."""
+        threads = {"threads": self.threads} if self.engine == "numba" else {}
+        return SimulatorTable(engine=self.engine, precision=self.precision, **threads)
+
 
 def cases(batch: int) -> Iterator[Case]:
-    """Both engines; the slower one gets an eighth of the batch."""
-    yield Case("jax", "float64", None, max(1, batch // 8))
-    processors = os.cpu_count() or 1
-    for precision in ("float64", "float32"):
-        for threads in sorted({1, processors}):
-            yield Case("numba", precision, threads, batch)
+    """Both bodies on both engines; the slower engine gets an eighth of the batch."""
+    for body in ("bar", TRUNK):
+        yield Case(body, "jax", "float64", None, max(1, batch // 8))
+        for precision in ("float64", "float32"):
+            for threads in sorted({1, os.cpu_count() or 1}):
+                yield Case(body, "numba", precision, threads, batch)
 
 
-def simulator(case: Case) -> TrunkSimulator:
-    """The trunk on the engine of a case, at the robot's own discretisation."""
-    table: dict[str, Any] = {"engine": case.engine, "precision": case.precision}
-    if case.engine == "numba":
-        table["threads"] = case.threads
-    return build_simulator(Experiment(robot=ROBOT, simulator=table), load_robot(ROBOT))
+def drawn(nominal: dict[str, float], batch: int) -> Values:
+    """Parameters around their nominal values."""
+    factors = np.random.default_rng(0).uniform(0.8, 1.2, (len(nominal), batch))
+    return {name: jnp.asarray(value * factor) for (name, value), factor in zip(nominal.items(), factors, strict=True)}
 
 
-def batched_rollout(trunk: TrunkSimulator, batch: int) -> tuple[Any, dict[str, jax.Array]]:
-    """A compiled function of a batch of parameters, and such a batch, drawn around the nominal values."""
-    step = trunk.discretisation.time_step
-    channels = len(trunk.channel_names)
-    duration = SOLVES * step
-    clock = np.arange(0, SOLVES, 10) * step
-    share = clock[:, None] / duration
-    pulls = 0.01 * share * np.sin(2 * np.pi * share + np.pi / 2 * np.arange(channels))  # [m]; opposite cables give way
-    commands = trunk.commands(clock, pulls, np.zeros(channels), np.array([0.0, duration]))
-    drawn = np.random.default_rng(0).uniform(0.8, 1.2, (2, batch))
-    nominal = {spec.name: spec.nominal for spec in trunk.parameters}
+def pulls(channels: int, steps: int) -> np.ndarray:
+    """Commands [m] that grow and go round; opposite cables give way."""
+    share = np.arange(steps)[:, None] / steps
+    return 0.01 * share * np.sin(2 * np.pi * share + np.pi / 2 * np.arange(channels))
+
+
+def bar() -> Assembly:
+    """The uniform bar with cables on a circle, guided at every other station."""
+    body = fem.uniform_body(LENGTH, HALF_WIDTH, HALF_WIDTH, LAYERS)
+    angle = 2 * np.pi * np.arange(CABLES) / CABLES
+    circle = 0.009 * np.stack([np.cos(angle), np.sin(angle), np.zeros(CABLES)], axis=1)
+    height = np.array([0.0, 0.0, 1.0])
+    guides = [place + height * body.station[2::2, None] for place in circle]
+    system = fem.System(body, fem.cable_layout(body, circle - 0.01 * height, guides))
+    return Assembly(system, fem.attach(body, LENGTH * height[None]), np.arange(LAYERS + 1))
+
+
+def bar_material(young_modulus: jax.Array, density: jax.Array, **changes: Any) -> fem.Material:
+    """Soft silicone, hanging from the side."""
+    damping = {"rayleigh_mass": 0.1, "rayleigh_stiffness": 0.01}
+    return fem.material(
+        bar().system,
+        young_modulus=young_modulus,
+        poisson_ratio=0.45,
+        density=density,
+        gravity=(9.81, 0.0, 0.0),
+        **(damping | changes),
+    )
+
+
+def bar_engine(case: Case, from_equilibrium: bool) -> Engine:
+    """The engine of a case, for the bar."""
+    return build_engine(case.table, bar(), Discretisation(TIME_STEP), from_equilibrium)
+
+
+def bar_rollouts(case: Case) -> tuple[Run, Values]:
+    """Rollouts of the bar at the engine."""
+    engine, displacement = bar_engine(case, False), jnp.asarray(pulls(CABLES, SOLVES))
+
+    def failed(values: Values) -> jax.Array:
+        return engine.motion(bar_material(**values), jnp.zeros(CABLES), displacement, None).diverged
+
+    return jax.jit(lambda values: jnp.sum(jax.vmap(failed)(values))), drawn(
+        {"young_modulus": 4.5e5, "density": 1000.0}, case.batch
+    )
+
+
+def sag_error(case: Case) -> float:
+    """Relative error of the bar's sag, cables slack."""
+    slack = jnp.full(CABLES, -0.1)
+    material = bar_material(jnp.asarray(4.5e5), jnp.asarray(1000.0))
+    motion = bar_engine(case, True).motion(material, slack, slack[None], None)
+    return float(motion.position[0, 0, 0]) / SAG - 1.0
+
+
+def trunk_rollouts(case: Case) -> tuple[Run, Values]:
+    """Rollouts of the trunk at the simulator."""
+    trunk = build_simulator(Experiment(robot=TRUNK, simulator=case.table), load_robot(TRUNK))
+    step = trunk.description["time_step_s"]
+    channels, clock = len(trunk.channel_names), np.arange(0, SOLVES, 10) * step
+    ends = np.array([0.0, SOLVES * step])
+    commands = trunk.commands(clock, pulls(channels, len(clock)), np.zeros(channels), ends)
+    nominal = {spec.name: float(spec.nominal) for spec in trunk.parameters}
+
+    def failed(values: Values) -> jax.Array:
+        return trunk.rollout(values, commands).status != Result.OK
+
     names = ("young_modulus", "trunk_mass")
-    values = {name: jnp.asarray(nominal[name] * factor) for name, factor in zip(names, drawn, strict=True)}
-    return jax.jit(jax.vmap(lambda one: trunk.rollout(one, commands))), values
+    return jax.jit(lambda values: jnp.sum(jax.vmap(failed)(values))), drawn(
+        {name: nominal[name] for name in names}, case.batch
+    )
 
 
 def measure(case: Case, seconds: float) -> dict[str, Any]:
     """Best rate of a case over repeats that fill ``seconds``, with its first call and its failures."""
-    run, values = batched_rollout(simulator(case), case.batch)
+    run, values = bar_rollouts(case) if case.body == "bar" else trunk_rollouts(case)
     started = time.perf_counter()
-    first: Observation = jax.block_until_ready(run(values))
+    failed = int(jax.block_until_ready(run(values)))
     first_call = time.perf_counter() - started
     best, spent = float("inf"), 0.0
     while spent < seconds:
@@ -85,8 +158,8 @@ def measure(case: Case, seconds: float) -> dict[str, Any]:
         jax.block_until_ready(run(values))
         elapsed = time.perf_counter() - started
         best, spent = min(best, elapsed), spent + elapsed
-    failed = int(np.sum(np.asarray(first.status) != Result.OK))
-    return case._asdict() | {"rollouts_per_second": case.batch / best, "first_call_s": first_call, "failed": failed}
+    row = case._asdict() | {"rollouts_per_second": case.batch / best, "first_call_s": first_call, "failed": failed}
+    return row | ({"sag_error": sag_error(case)} if case.body == "bar" else {})
 
 
 def main() -> None:
@@ -96,20 +169,22 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="time spent on each row")
     parser.add_argument("--batch", type=int, default=512, help="rollouts in a batch")
     options = parser.parse_args()
-    print(f"{ROBOT}, {SOLVES} solves a rollout, {os.cpu_count()} processors")
-    print(f"{'engine':8}{'precision':11}{'threads':>8}{'batch':>7}{'rollouts/s':>12}{'first call':>12}{'failed':>8}")
+    print(f"{SOLVES} solves a rollout, {os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}")
+    print(f"{'body':12}{'engine':8}{'precision':11}{'threads':>8}", end="")
+    print(f"{'rollouts/s':>12}{'first call':>12}{'failed':>8}{'sag':>9}")
     rows = []
     for case in cases(options.batch):
         row = measure(case, options.seconds)
         rows.append(row)
+        sag = f"{100 * row['sag_error']:+8.2f}%" if "sag_error" in row else ""
         print(
-            f"{case.engine:8}{case.precision:11}{case.threads or 'all':>8}{case.batch:7d}"
-            f"{row['rollouts_per_second']:12.1f}{row['first_call_s']:10.1f} s{row['failed']:8d}",
+            f"{case.body:12}{case.engine:8}{case.precision:11}{case.threads or 'all':>8}"
+            f"{row['rollouts_per_second']:12.1f}{row['first_call_s']:10.1f} s{row['failed']:8d}{sag:>9}",
             flush=True,
         )
     if options.json:
         machine = {"processors": os.cpu_count(), "machine": platform.machine(), "python": platform.python_version()}
-        table = {"robot": ROBOT, "solves": SOLVES, "machine": machine, "rows": rows, "schema_version": 1}
+        table = {"solves": SOLVES, "machine": machine, "load": os.getloadavg(), "rows": rows, "schema_version": 1}
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(table, indent=2) + "\n")
 

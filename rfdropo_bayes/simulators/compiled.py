@@ -20,6 +20,7 @@ from rfdropo_bayes.simulators.differences import (
     MASS,
     MASS_DAMPING,
     STIFFNESS_DAMPING,
+    incompressibility_margin,
     with_differences,
 )
 from rfdropo_bayes.simulators.trunk import Assembly, Motion
@@ -31,6 +32,7 @@ def input_sizes(inputs: Inputs) -> Inputs:
     """Sizes that perturbations of the inputs are relative to."""
     material, start, displacement = inputs
     magnitudes = Material(*(jnp.abs(value) + 1e-12 for value in material))._replace(
+        poisson_ratio=incompressibility_margin(material.poisson_ratio),
         gravity=jnp.full_like(material.gravity, ACCELERATION),
         point_mass=jnp.full_like(material.point_mass, MASS),
         rayleigh_mass=jnp.abs(material.rayleigh_mass) + MASS_DAMPING,

@@ -17,7 +17,7 @@ Output = TypeVar("Output")
 # 1e-5 m of the positions) is divided by it: near the cube root of the precision both are small.
 DIFFERENCE = {"float64": 1e-5, "float32": 1e-2}
 # Sizes that perturbations are relative to, where a value may be zero: [m] of cable, [kg], [m/s2], [1/s], [s].
-LENGTH, MASS, ACCELERATION, MASS_DAMPING, STIFFNESS_DAMPING = 0.05, 0.1, 9.81, 0.1, 0.01
+LENGTH, MASS, ACCELERATION, MASS_DAMPING, STIFFNESS_DAMPING = 0.005, 0.1, 9.81, 1.0, 0.01
 
 
 def with_differences(
@@ -57,3 +57,8 @@ def _relative_size(sizes: Inputs, directions: Inputs) -> Float[Array, ""]:
     ratios = jax.tree.map(lambda d, s: jnp.max(jnp.abs(d) / s, initial=0.0), directions, sizes)
     largest = jnp.max(jnp.stack(jax.tree.leaves(ratios)))
     return jnp.where(largest > 0.0, largest, 1.0)
+
+
+def incompressibility_margin(poisson_ratio: Float[Array, ""]) -> Float[Array, ""]:
+    """Size of a Poisson ratio: stiffness against volume change goes with 1 / (1 - 2 nu), and must change little."""
+    return jnp.clip(4.0 * (0.5 - poisson_ratio), 0.004, 0.4)

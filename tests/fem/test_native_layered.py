@@ -268,3 +268,24 @@ def test_bad_settings_are_named():
         NativeLayered(system, points, TIME_STEP, precision="float16")
     with pytest.raises(InputError, match="threads"):
         NativeLayered(system, points, TIME_STEP, threads=0)
+
+
+def test_single_precision_while_nearly_incompressible():
+    """A long soft body whose resistance to volume change drowns that to bending in single precision, unless refined."""
+    layers, batch = 20, 4
+    body = fem.uniform_body(0.195, 0.01, 0.01, layers)
+    angle = 2.0 * np.pi * np.arange(4) / 4
+    circle = 0.009 * np.stack([np.cos(angle), np.sin(angle), np.zeros(4)], axis=1)
+    guides = [place + np.array([0.0, 0.0, 1.0]) * body.station[2::2, None] for place in circle]
+    system = fem.System(body, fem.cable_layout(body, circle - [0.0, 0.0, 0.01], guides))
+    points = fem.attach(body, np.array([[0.0, 0.0, 0.195]]))
+    material = random_materials(system, batch, 16)._replace(
+        poisson_ratio=np.array([0.45, 0.48, 0.49, 0.499]), rayleigh_stiffness=np.full(batch, 0.01)
+    )
+    displacement = np.cumsum(5e-4 * np.random.default_rng(17).normal(size=(batch, 100, 4)), axis=1)
+    double, single = (
+        NativeLayered(system, points, TIME_STEP, precision=precision, threads=1).rollout(material, displacement)
+        for precision in AGREEMENT
+    )
+    assert np.ptp(double.position, axis=1).max() > 0.03, "nothing moved"
+    np.testing.assert_allclose(single.position, double.position, rtol=0.0, atol=AGREEMENT["float32"])

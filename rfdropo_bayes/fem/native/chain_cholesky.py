@@ -120,47 +120,82 @@ def eliminate(pivot, coupling, border, condensed, station, last, tiles, panels, 
 
 
 @kernel
-def _back_substitute_block(pivot, p, solution, s, tiles, token):
-    """Solve L' x = y in place for one station."""
-    size = 3 * tiles
-    for k in range(tiles - 1, -1, -1):
-        row = s + 3 * k
-        x, y, z = load(solution, row, token), load(solution, row + 1, token), load(solution, row + 2, token)
-        for i in range(k + 1, tiles):
-            t = p + (i * size + 3 * k) * 3
-            for r in range(3):
-                value = load(solution, s + 3 * i + r, token)
-                x = fnma(load(pivot, t + r, token), value, x)
-                y = fnma(load(pivot, t + 3 + r, token), value, y)
-                z = fnma(load(pivot, t + 6 + r, token), value, z)
-        t = p + (k * size + 3 * k) * 3
-        z = z * load(pivot, t + 8, token)
-        y = fnma(load(pivot, t + 5, token), z, y) * load(pivot, t + 4, token)
-        x = fnma(load(pivot, t + 2, token), z, fnma(load(pivot, t + 1, token), y, x)) * load(pivot, t, token)
-        store(solution, row, x)
-        store(solution, row + 1, y)
-        store(solution, row + 2, z)
-
-
-@kernel
-def back_substitute(pivot, coupling, border, weight, solution, first, stations, tiles, panels, token):
-    """Solve A x = sum_i weight_i b_i over the border rows b_i, after all stations >= ``first`` are eliminated."""
-    size = 3 * tiles
-    block, frame = 3 * tiles * size, 3 * panels * size
+def combine_border(border, weight, values, first, stations, size, panels, token):
+    """``values`` = sum_i weight_i L^-1 b_i over the border rows b_i, after all stations >= ``first`` are eliminated."""
     for station in range(first, stations):
-        s = station * size
         for k in range(size):
-            value = fill(0.0, pivot, token)
+            value = fill(0.0, border, token)
             for i in range(panels):
-                t = station * frame + (i * size + k) * 3
+                t = ((station * panels + i) * size + k) * 3
                 value = fma(load(weight, 3 * i, token), load(border, t, token), value)
                 value = fma(load(weight, 3 * i + 1, token), load(border, t + 1, token), value)
                 value = fma(load(weight, 3 * i + 2, token), load(border, t + 2, token), value)
+            store(values, station * size + k, value)
+
+
+@kernel
+def _subtract_rows(block, t, values, source, target, tiles, size, token):
+    """Subtract three columns of a block, from tile row ``t`` on, times three values from the values below."""
+    x, y, z = load(values, source, token), load(values, source + 1, token), load(values, source + 2, token)
+    for i in range(tiles):
+        for r in range(3):
+            k, row = t + 3 * i * size + r, target + 3 * i + r
+            value = fnma(load(block, k, token), x, load(values, row, token))
+            value = fnma(load(block, k + 3, token), y, value)
+            store(values, row, fnma(load(block, k + 6, token), z, value))
+
+
+@kernel
+def substitute_forward(pivot, coupling, values, first, stations, tiles, token):
+    """Solve L x = y in place."""
+    size = 3 * tiles
+    for station in range(stations - 1, first - 1, -1):
+        s, p = station * size, station * size * size
+        for k in range(tiles):
+            row, t = s + 3 * k, p + 3 * (k * size + 3 * k)
+            x = load(values, row, token) * load(pivot, t, token)
+            y = fnma(load(pivot, t + 1, token), x, load(values, row + 1, token)) * load(pivot, t + 4, token)
+            z = fnma(load(pivot, t + 2, token), x, load(values, row + 2, token))
+            z = fnma(load(pivot, t + 5, token), y, z) * load(pivot, t + 8, token)
+            store(values, row, x)
+            store(values, row + 1, y)
+            store(values, row + 2, z)
+            _subtract_rows(pivot, t + 3 * size, values, row, row + 3, tiles - k - 1, size, token)
             if station > first:
-                for i in range(tiles):
-                    t = station * block + (i * size + k) * 3
-                    value = fnma(load(coupling, t, token), load(solution, s - size + 3 * i, token), value)
-                    value = fnma(load(coupling, t + 1, token), load(solution, s - size + 3 * i + 1, token), value)
-                    value = fnma(load(coupling, t + 2, token), load(solution, s - size + 3 * i + 2, token), value)
-            store(solution, s + k, value)
-        _back_substitute_block(pivot, station * block, solution, s, tiles, token)
+                _subtract_rows(coupling, p + 9 * k, values, row, s - size, tiles, size, token)
+
+
+@kernel
+def _subtract_columns(block, t, values, source, target, tiles, size, token):
+    """Subtract the transpose of three columns of a block, from tile row ``t`` on, times the values below from three
+    values."""
+    x, y, z = load(values, target, token), load(values, target + 1, token), load(values, target + 2, token)
+    for i in range(tiles):
+        for r in range(3):
+            k, value = t + 3 * i * size + r, load(values, source + 3 * i + r, token)
+            x = fnma(load(block, k, token), value, x)
+            y = fnma(load(block, k + 3, token), value, y)
+            z = fnma(load(block, k + 6, token), value, z)
+    return x, y, z
+
+
+@kernel
+def substitute_back(pivot, coupling, values, first, stations, tiles, token):
+    """Solve L' x = y in place."""
+    size = 3 * tiles
+    for station in range(first, stations):
+        s, p = station * size, station * size * size
+        for k in range(tiles - 1, -1, -1):
+            row, t = s + 3 * k, p + 3 * (k * size + 3 * k)
+            if station > first:
+                x, y, z = _subtract_columns(coupling, p + 9 * k, values, s - size, row, tiles, size, token)
+                store(values, row, x)
+                store(values, row + 1, y)
+                store(values, row + 2, z)
+            x, y, z = _subtract_columns(pivot, t + 3 * size, values, row + 3, row, tiles - k - 1, size, token)
+            z = z * load(pivot, t + 8, token)
+            y = fnma(load(pivot, t + 5, token), z, y) * load(pivot, t + 4, token)
+            x = fnma(load(pivot, t + 2, token), z, fnma(load(pivot, t + 1, token), y, x)) * load(pivot, t, token)
+            store(values, row, x)
+            store(values, row + 1, y)
+            store(values, row + 2, z)

@@ -27,8 +27,9 @@ from rfdropo_bayes.fem.native.section_modes import layered_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
 
 Precision = Literal["float64", "float32"]
-# Tolerance of the tension problem and relative compliance added to every cable, as far as the precision resolves them.
-_TENSION_PROBLEM = {"float64": (1e-12, 0.0), "float32": (1e-6, 1e-6)}
+# Tolerance of the tension problem and relative compliance added to every cable, as far as the precision resolves them;
+# refinements of every step's linear solution.
+_NUMERICS = {"float64": (1e-12, 0.0, 0), "float32": (1e-6, 1e-6, 1)}
 
 
 class NativeRollout(NamedTuple):
@@ -81,8 +82,8 @@ class NativeLayered:
         threads: int | None = None,
         lanes: int | None = None,
     ) -> None:
-        if precision not in _TENSION_PROBLEM:
-            raise InputError(f"precision {precision!r}", remedy=f"use one of {', '.join(_TENSION_PROBLEM)}")
+        if precision not in _NUMERICS:
+            raise InputError(f"precision {precision!r}", remedy=f"use one of {', '.join(_NUMERICS)}")
         if threads is not None and threads < 1:
             raise InputError(f"{threads} threads", remedy="use at least one, or None for all processors")
         self.system, self.time_step = system, float(time_step)
@@ -134,7 +135,7 @@ class NativeLayered:
         batch = self._batch(material, state)
         steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
         settling = 0 if start is None else ITERATIONS
-        schedule = Schedule(self.time_step, steps, int(stride), settling, *_TENSION_PROBLEM[self.precision])
+        schedule = Schedule(self.time_step, steps, int(stride), settling, *_NUMERICS[self.precision])
         output = _empty_output(batch.count, 1 + steps // stride, self.points, cables)
         self._run(batch, schedule, output)
         codes = output.diverged.view(bool), output.cables_converged.view(bool)

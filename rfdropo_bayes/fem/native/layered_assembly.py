@@ -51,12 +51,14 @@ class Work(NamedTuple):
     border: Float[np.ndarray, "station_frame lanes"]
     condensed: Float[np.ndarray, "frame2 lanes"]
     solution: Float[np.ndarray, "values lanes"]
-    field: Float[np.ndarray, "values lanes"]
+    field: Float[np.ndarray, "values lanes"]  # right-hand side without cables
+    correction: Float[np.ndarray, "values lanes"]
     weight: Float[np.ndarray, "rows lanes"]
-    axes: Float[np.ndarray, "9 lanes"]  # frame of a layer, row-major
+    axes: Float[np.ndarray, "layers9 lanes"]  # frame of every layer, row-major
     dyads: Float[np.ndarray, "54 lanes"]  # products of its columns
     local: Float[np.ndarray, "layer_values lanes"]
     reaction: Float[np.ndarray, "layer_values lanes"]
+    pull: Float[np.ndarray, "guides3 lanes"]  # of a cable with unit tension on the body
     slack: Float[np.ndarray, "cables lanes"]
     scale: Float[np.ndarray, "cables lanes"]
     compliance: Float[np.ndarray, "cables2 lanes"]
@@ -84,8 +86,8 @@ def clear(rows, first, last, token):
 
 @kernel
 def _deformation(parity, slope, modes, layer, position, axes, token):
-    """Mean deformation gradient of a layer into ``axes``, row-major."""
-    clear(axes, 0, 9, token)
+    """Mean deformation gradient of a layer into its ``axes``, row-major."""
+    clear(axes, 9 * layer, 9 * layer + 9, token)
     for k in range(2 * modes):
         kind = parity[k % modes]
         if kind == 3:
@@ -94,16 +96,17 @@ def _deformation(parity, slope, modes, layer, position, axes, token):
         factor = fill(slope[2 * modes * layer + k], position, token)
         row = 3 * (layer * modes + k)
         for i in range(3):
-            store(axes, 3 * i + column, fma(load(position, row + i, token), factor, load(axes, 3 * i + column, token)))
+            t = 9 * layer + 3 * i + column
+            store(axes, t, fma(load(position, row + i, token), factor, load(axes, t, token)))
 
 
 @kernel
-def _rotation(axes, token):
+def _rotation(axes, t, token):
     """Rotation of the polar decomposition in place, by Newton's iteration."""
     one, half = fill(1.0, axes, token), fill(0.5, axes, token)
-    a0, a1, a2 = load(axes, 0, token), load(axes, 1, token), load(axes, 2, token)
-    b0, b1, b2 = load(axes, 3, token), load(axes, 4, token), load(axes, 5, token)
-    c0, c1, c2 = load(axes, 6, token), load(axes, 7, token), load(axes, 8, token)
+    a0, a1, a2 = load(axes, t, token), load(axes, t + 1, token), load(axes, t + 2, token)
+    b0, b1, b2 = load(axes, t + 3, token), load(axes, t + 4, token), load(axes, t + 5, token)
+    c0, c1, c2 = load(axes, t + 6, token), load(axes, t + 7, token), load(axes, t + 8, token)
     for _ in range(POLAR_ITERATIONS):
         u0, u1, u2 = fnma(b2, c1, b1 * c2), fnma(b0, c2, b2 * c0), fnma(b1, c0, b0 * c1)
         v0, v1, v2 = fnma(c2, a1, c1 * a2), fnma(c0, a2, c2 * a0), fnma(c1, a0, c0 * a1)
@@ -112,15 +115,15 @@ def _rotation(axes, token):
         a0, a1, a2 = fma(half, a0, u0 * scale), fma(half, a1, u1 * scale), fma(half, a2, u2 * scale)
         b0, b1, b2 = fma(half, b0, v0 * scale), fma(half, b1, v1 * scale), fma(half, b2, v2 * scale)
         c0, c1, c2 = fma(half, c0, w0 * scale), fma(half, c1, w1 * scale), fma(half, c2, w2 * scale)
-    store(axes, 0, a0)
-    store(axes, 1, a1)
-    store(axes, 2, a2)
-    store(axes, 3, b0)
-    store(axes, 4, b1)
-    store(axes, 5, b2)
-    store(axes, 6, c0)
-    store(axes, 7, c1)
-    store(axes, 8, c2)
+    store(axes, t, a0)
+    store(axes, t + 1, a1)
+    store(axes, t + 2, a2)
+    store(axes, t + 3, b0)
+    store(axes, t + 4, b1)
+    store(axes, t + 5, b2)
+    store(axes, t + 6, c0)
+    store(axes, t + 7, c1)
+    store(axes, t + 8, c2)
 
 
 @kernel
@@ -133,23 +136,36 @@ def _relative(field, row, base, constant, token):
 
 
 @kernel
+def _turned(axes, t, x, y, z, i, token):
+    """Component i of a vector in a layer's frame."""
+    return fma(load(axes, t + i, token), x, fma(load(axes, t + 3 + i, token), y, load(axes, t + 6 + i, token) * z))
+
+
+@kernel
 def _local_field(rest, modes, layer, factors, work, token):
-    """``local`` = force * (R' x - X) + strain_rate * R' v, relative to the lower section: K does not see the
-    difference."""
-    axes = work.axes
+    """``local`` = force * (R' x - X) + strain_rate * R' v, relative to the lower section: K does not see the rest."""
+    axes, frame = work.axes, 9 * layer
     force, rate = load(factors.force, 0, token), load(factors.strain_rate, 0, token)
     base = 3 * layer * modes
     for k in range(2 * modes):
         row = base + 3 * k
         constant = k == 0 or k == modes
-        x0, x1, x2 = _relative(work.position, row, base, constant, token)
-        v0, v1, v2 = _relative(work.velocity, row, base, constant, token)
+        x, y, z = _relative(work.position, row, base, constant, token)
+        u, v, w = _relative(work.velocity, row, base, constant, token)
         for i in range(3):
             still = rest[row + i] - rest[base + i] if constant else rest[row + i]
-            a, b, c = load(axes, i, token), load(axes, 3 + i, token), load(axes, 6 + i, token)
-            strain = fma(a, x0, fma(b, x1, fma(c, x2, fill(-still, axes, token))))
-            speed = fma(a, v0, fma(b, v1, c * v2))
-            store(work.local, 3 * k + i, fma(force, strain, rate * speed))
+            strain = _turned(axes, frame, x, y, z, i, token) - still
+            store(work.local, 3 * k + i, fma(force, strain, rate * _turned(axes, frame, u, v, w, i, token)))
+
+
+@kernel
+def _local_change(change, factor, modes, layer, work, token):
+    """``local`` = factor * R' change, relative to the lower section."""
+    base = 3 * layer * modes
+    for k in range(2 * modes):
+        x, y, z = _relative(change, base + 3 * k, base, k == 0 or k == modes, token)
+        for i in range(3):
+            store(work.local, 3 * k + i, factor * _turned(work.axes, 9 * layer, x, y, z, i, token))
 
 
 @kernel
@@ -165,23 +181,36 @@ def _layer_reaction(row, column, entries, modes, stiffness, first, local, reacti
 
 
 @kernel
-def _add_layer_force(axes, reaction, field, row, modes, token):
-    """Subtract R ``reaction`` from the field of a layer's stations, which starts at ``row``."""
+def _subtract_reaction(tables, samples, layer, work, field, token):
+    """Subtract R K ``local`` from a field; leaves K ``local`` in ``reaction``."""
+    modes, axes, reaction, first = tables.modes, work.axes, work.reaction, layer * tables.entries
+    _layer_reaction(
+        tables.entry_row,
+        tables.entry_column,
+        tables.entries,
+        modes,
+        samples.stiffness,
+        first,
+        work.local,
+        reaction,
+        token,
+    )
     for k in range(2 * modes):
         x, y, z = load(reaction, 3 * k, token), load(reaction, 3 * k + 1, token), load(reaction, 3 * k + 2, token)
         for i in range(3):
-            a, b, c = load(axes, 3 * i, token), load(axes, 3 * i + 1, token), load(axes, 3 * i + 2, token)
-            t = row + 3 * k + i
-            store(field, t, fnma(a, x, fnma(b, y, fnma(c, z, load(field, t, token)))))
+            t, row = 9 * layer + 3 * i, 3 * (layer * modes + k) + i
+            value = fnma(load(axes, t, token), x, load(field, row, token))
+            value = fnma(load(axes, t + 1, token), y, value)
+            store(field, row, fnma(load(axes, t + 2, token), z, value))
 
 
 @kernel
-def _dyad(axes, dyads, slot, i, j, scale, token):
+def _dyad(axes, frame, dyads, slot, i, j, scale, token):
     """``dyads``: nine values r_i r_j' by columns, times a scale; r are the columns of the frame."""
     for c in range(3):
-        factor = scale * load(axes, 3 * c + j, token)
+        factor = scale * load(axes, frame + 3 * c + j, token)
         for r in range(3):
-            store(dyads, 9 * slot + 3 * c + r, load(axes, 3 * r + i, token) * factor)
+            store(dyads, 9 * slot + 3 * c + r, load(axes, frame + 3 * r + i, token) * factor)
 
 
 @kernel
@@ -228,12 +257,12 @@ def _layer_tangent(parity, modes, stiffness, first, layer, whole, factors, work,
     """Add the tangent of a layer to the pivot of its upper station; ``whole``: set the coupling, and start the pivot of
     the lower one."""
     dyads, scale = work.dyads, load(factors.elasticity, 0, token)
-    _dyad(work.axes, dyads, 0, 0, 0, scale, token)
-    _dyad(work.axes, dyads, 1, 1, 1, scale, token)
-    _dyad(work.axes, dyads, 2, 2, 2, scale, token)
-    _dyad(work.axes, dyads, 3, 0, 2, scale, token)
-    _dyad(work.axes, dyads, 4, 1, 2, scale, token)
-    _dyad(work.axes, dyads, 5, 0, 1, scale, token)
+    _dyad(work.axes, 9 * layer, dyads, 0, 0, 0, scale, token)
+    _dyad(work.axes, 9 * layer, dyads, 1, 1, 1, scale, token)
+    _dyad(work.axes, 9 * layer, dyads, 2, 2, 2, scale, token)
+    _dyad(work.axes, 9 * layer, dyads, 3, 0, 2, scale, token)
+    _dyad(work.axes, 9 * layer, dyads, 4, 1, 2, scale, token)
+    _dyad(work.axes, 9 * layer, dyads, 5, 0, 1, scale, token)
     block = 9 * modes * modes
     upper = (layer + 1) * block
     e = first
@@ -276,29 +305,26 @@ def add_layer_mass(parity, modes, target, t, mass, entry, inertia, token):
 
 @kernel
 def layer_frame(tables, layer, work, token):
-    """Frame of a layer into ``axes``."""
+    """Frame of a layer into its ``axes``."""
     _deformation(tables.parity, tables.gradient, tables.modes, layer, work.position, work.axes, token)
-    _rotation(work.axes, token)
+    _rotation(work.axes, 9 * layer, token)
 
 
 @kernel
 def add_layer_force(tables, samples, factors, layer, work, token):
-    """Add the elastic force of a layer in its frame to ``field``; leaves ``reaction``, the force it resists in that
-    frame."""
-    modes, first = tables.modes, layer * tables.entries
-    _local_field(tables.rest, modes, layer, factors, work, token)
-    _layer_reaction(
-        tables.entry_row,
-        tables.entry_column,
-        tables.entries,
-        modes,
-        samples.stiffness,
-        first,
-        work.local,
-        work.reaction,
-        token,
-    )
-    _add_layer_force(work.axes, work.reaction, work.field, 3 * layer * modes, modes, token)
+    """Add the elastic force of a layer to ``field``; leaves in ``reaction`` what it resists in its frame."""
+    _local_field(tables.rest, tables.modes, layer, factors, work, token)
+    _subtract_reaction(tables, samples, layer, work, work.field, token)
+
+
+@kernel
+def subtract_tangent_product(tables, samples, factors, change, field, work, token):
+    """Subtract the matrix, in its factors and not as it was summed, times a change of velocity from a field."""
+    elasticity, inertia = load(factors.elasticity, 0, token), load(factors.inertia, 0, token)
+    for layer in range(tables.stations - 1):
+        _local_change(change, elasticity, tables.modes, layer, work, token)
+        _subtract_reaction(tables, samples, layer, work, field, token)
+    add_momentum(tables, samples, fill(0.0, inertia, token), inertia, change, field, token)
 
 
 @inlined
@@ -321,11 +347,9 @@ def _add_momentum(field, row, mass, velocity, v, constant, gravity, force, drag,
 
 
 @kernel
-def start_loads(tables, samples, factors, work, token):
-    """``field`` = M (force * gravity - drag * v): the right-hand side without the elastic forces."""
-    modes, parity, field, v, g = tables.modes, tables.parity, work.field, work.velocity, samples.gravity
-    force, drag = load(factors.force, 0, token), load(factors.drag, 0, token)
-    clear(field, 0, 3 * modes * tables.stations, token)
+def add_momentum(tables, samples, force, drag, velocity, field, token):
+    """Add M (force * gravity - drag * velocity) to a field."""
+    modes, parity, g = tables.modes, tables.parity, samples.gravity
     entry, coupled = 0, 0
     for station in range(tables.stations):
         base = 3 * station * modes
@@ -334,15 +358,23 @@ def start_loads(tables, samples, factors, work, token):
             for n in range(m + 1):
                 if parity[m] == parity[n]:
                     mass, column = load(samples.station_mass, entry, token), base + 3 * n
-                    _add_momentum(field, row, mass, v, column, n == 0, g, force, drag, token)
+                    _add_momentum(field, row, mass, velocity, column, n == 0, g, force, drag, token)
                     if m != n:
-                        _add_momentum(field, column, mass, v, row, m == 0, g, force, drag, token)
+                        _add_momentum(field, column, mass, velocity, row, m == 0, g, force, drag, token)
                     entry += 1
             if station + 1 == tables.stations:
                 continue
             for n in range(modes):
                 if parity[m] == parity[n]:
                     mass, column = load(samples.layer_mass, coupled, token), base + 3 * (modes + n)
-                    _add_momentum(field, row, mass, v, column, n == 0, g, force, drag, token)
-                    _add_momentum(field, column, mass, v, row, m == 0, g, force, drag, token)
+                    _add_momentum(field, row, mass, velocity, column, n == 0, g, force, drag, token)
+                    _add_momentum(field, column, mass, velocity, row, m == 0, g, force, drag, token)
                     coupled += 1
+
+
+@kernel
+def start_loads(tables, samples, factors, work, token):
+    """``field`` = M (force * gravity - drag * v): the right-hand side without the elastic forces."""
+    clear(work.field, 0, 3 * tables.modes * tables.stations, token)
+    force, drag = load(factors.force, 0, token), load(factors.drag, 0, token)
+    add_momentum(tables, samples, force, drag, work.velocity, work.field, token)

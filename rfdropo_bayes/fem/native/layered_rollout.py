@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 
 from rfdropo_bayes.fem.native.layered_assembly import Factors, Samples, Work, clear
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
-from rfdropo_bayes.fem.native.layered_step import point, solve_increment, take_step
+from rfdropo_bayes.fem.native.layered_step import point, refine_increment, solve_increment, take_step
 from rfdropo_bayes.fem.native.section_modes import LayeredTables, border_panels
 from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, inlined, kernel, load, store
 
@@ -57,6 +57,7 @@ class Schedule(NamedTuple):
     static_iterations: int  # 0 leaves out the equilibrium
     tolerance: float  # relative, of the tension problem
     regularisation: float  # relative compliance of every cable
+    refinements: int  # of every step's linear solution
 
 
 class Storage(NamedTuple):
@@ -95,11 +96,13 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         condensed=rows(9 * panels * panels),
         solution=rows(stations * size),
         field=rows(stations * size),
+        correction=rows(stations * size),
         weight=rows(3 * panels),
-        axes=rows(9),
+        axes=rows(9 * layers),
         dyads=rows(54),
         local=rows(2 * size),
         reaction=rows(2 * size),
+        pull=rows(3 * (len(tables.guide_first) - 1)),
         slack=rows(cables),
         scale=rows(cables),
         compliance=rows(cables * cables),
@@ -245,6 +248,8 @@ def compile_rollout(sources: str) -> Callable:
             rate = 1.0 / schedule.time_step if step >= 0 else 1.0
             solve_increment(tables, samples, factors, work, rate, schedule, step < 0, token)
             if step >= 0:
+                for _ in range(schedule.refinements):
+                    refine_increment(tables, samples, factors, work, token)
                 take_step(tables, work, schedule.time_step, token)
             else:
                 take_increment(tables, work, token)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.native.chain_cholesky import back_substitute, eliminate
+from rfdropo_bayes.fem.native.chain_cholesky import combine_border, eliminate, substitute_back, substitute_forward
 from rfdropo_bayes.fem.native.complementarity import solve_unilateral
 from rfdropo_bayes.fem.native.layered_assembly import (
     add_layer_mass,
@@ -10,6 +10,7 @@ from rfdropo_bayes.fem.native.layered_assembly import (
     assemble_layer,
     clear,
     start_loads,
+    subtract_tangent_product,
 )
 from rfdropo_bayes.fem.native.simd import fill, fma, inlined, kernel, load, square_root, store, where_greater
 from rfdropo_bayes.fem.native.tension_stiffening import stiffen, sum_cable_forces
@@ -31,10 +32,13 @@ def point(first, place, weight, p, field, token):
 
 
 @kernel
-def _pull(tables, g, offset, border, velocity, x, y, z, token):
-    """Add a pull on guide g to the border row at ``offset`` of every station; returns the pull times the guide's
-    velocity."""
+def _pull(tables, g, offset, work, x, y, z, token):
+    """Add a pull on guide g to the border row at ``offset`` of every station; returns it times the guide's velocity."""
+    border, velocity = work.border, work.velocity
     growth = fill(0.0, border, token)
+    store(work.pull, 3 * g, x)
+    store(work.pull, 3 * g + 1, y)
+    store(work.pull, 3 * g + 2, z)
     for k in range(tables.guide_first[g], tables.guide_first[g + 1]):
         row, w = tables.guide_place[k], fill(tables.guide_weight[k], border, token)
         t = tables.guide_slot[k] + offset
@@ -68,9 +72,9 @@ def _gather_cable(tables, c, offset, work, token):
         scale = one / segment
         dx, dy, dz = dx * scale, dy * scale, dz * scale
         if g > first:
-            growth = growth + _pull(tables, g - 1, offset, work.border, work.velocity, bx - dx, by - dy, bz - dz, token)
+            growth = growth + _pull(tables, g - 1, offset, work, bx - dx, by - dy, bz - dz, token)
         px, py, pz, bx, by, bz = gx, gy, gz, dx, dy, dz
-    return shorter, growth + _pull(tables, last - 1, offset, work.border, work.velocity, bx, by, bz, token)
+    return shorter, growth + _pull(tables, last - 1, offset, work, bx, by, bz, token)
 
 
 @kernel
@@ -163,9 +167,45 @@ def solve_increment(tables, samples, factors, work, rate, schedule, static, toke
             store(work.border, t, load(work.border, t, token) + load(work.field, station * size + k, token))
         eliminate(work.pivot, work.coupling, work.border, work.condensed, station, last, tiles, panels, token)
     _tensions(cables, panels, work, rate, schedule.tolerance, schedule.regularisation, token)
-    back_substitute(
-        work.pivot, work.coupling, work.border, work.weight, work.solution, held, stations, tiles, panels, token
-    )
+    combine_border(work.border, work.weight, work.solution, held, stations, size, panels, token)
+    substitute_back(work.pivot, work.coupling, work.solution, held, stations, tiles, token)
+
+
+@kernel
+def _subtract_cables(tables, work, field, token):
+    """Subtract J' T h from a field, after the tensions are known."""
+    for c in range(tables.cables):
+        impulse = load(work.weight, c + 1, token)
+        for g in range(tables.cable_first[c], tables.cable_first[c + 1]):
+            x, y, z = (
+                load(work.pull, 3 * g, token),
+                load(work.pull, 3 * g + 1, token),
+                load(work.pull, 3 * g + 2, token),
+            )
+            for k in range(tables.guide_first[g], tables.guide_first[g + 1]):
+                row, w = tables.guide_place[k], impulse * tables.guide_weight[k]
+                store(field, row, fma(x, w, load(field, row, token)))
+                store(field, row + 1, fma(y, w, load(field, row + 1, token)))
+                store(field, row + 2, fma(z, w, load(field, row + 2, token)))
+
+
+@kernel
+def refine_increment(tables, samples, factors, work, token):
+    """Improve ``solution`` by what the layers leave of its right-hand side, at the tensions found.
+
+    A sum of stiff layers, nearly incompressible ones above all, drowns in its rounding the small stiffness with which
+    the whole body bends. The product of each layer on its own does not.
+    """
+    size, first = 3 * tables.modes, 3 * tables.modes * tables.held
+    last = size * tables.stations
+    for row in range(last):
+        store(work.correction, row, load(work.field, row, token))
+    _subtract_cables(tables, work, work.correction, token)
+    subtract_tangent_product(tables, samples, factors, work.solution, work.correction, work, token)
+    substitute_forward(work.pivot, work.coupling, work.correction, tables.held, tables.stations, tables.modes, token)
+    substitute_back(work.pivot, work.coupling, work.correction, tables.held, tables.stations, tables.modes, token)
+    for row in range(first, last):
+        store(work.solution, row, load(work.solution, row, token) + load(work.correction, row, token))
 
 
 @kernel

@@ -34,13 +34,13 @@ def stiffen(tables, layer, work, whole, token):
     length = tables.rest[3 * (layer + 1) * modes + 2] - tables.rest[3 * layer * modes + 2]
     tension = load(work.reaction, 3 * modes + 2, token)
     for i in range(3):
-        tension = fnma(load(work.beyond, 3 * layer + i, token), load(axes, 3 * i + 2, token), tension)
+        tension = fnma(load(work.beyond, 3 * layer + i, token), load(axes, 9 * layer + 3 * i + 2, token), tension)
     spring = where_greater(tension, zero, tension, zero) / fill(length, axes, token)
     block = 9 * modes * modes
     upper = (layer + 1) * block
     for c in range(3):
         for r in range(3):
-            along = load(axes, 3 * r + 2, token) * load(axes, 3 * c + 2, token)
+            along = load(axes, 9 * layer + 3 * r + 2, token) * load(axes, 9 * layer + 3 * c + 2, token)
             value = fma(spring, fill(1.0 if r == c else 0.0, axes, token), -(spring * along))
             k = 3 * c + r
             store(work.pivot, upper + k, load(work.pivot, upper + k, token) + value)
