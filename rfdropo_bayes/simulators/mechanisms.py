@@ -25,7 +25,8 @@ class Mechanism(Protocol):
     Attributes:
         name: registry name.
         stage: one of `STAGES`, in the order in which they act on a rollout.
-        parameters: its parameters; the nominal value of each is its null value.
+        parameters: its parameters; the nominal value of each is its null value, except of those with a ``grid``. A
+            null value that is a bound makes the effect one-sided.
         cause: one line on the physical cause.
         remedy: one line on what a lab would do about it.
     """

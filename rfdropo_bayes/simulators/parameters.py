@@ -19,6 +19,8 @@ class ParameterSpec(NamedTuple):
         nominal: value used where the parameter is not inferred; a mechanism's null value.
         prior: default prior as a table, e.g. ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``.
         description: one line on its physical meaning.
+        grid: values to try, for a mechanism's parameter that has no effect while the others are null (a time constant,
+            the place of a wall): its derivative is zero there, so it cannot be screened. Empty for all others.
     """
 
     name: str
@@ -28,6 +30,7 @@ class ParameterSpec(NamedTuple):
     nominal: float
     prior: Mapping[str, Any]
     description: str
+    grid: tuple[float, ...] = ()
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
