@@ -17,13 +17,16 @@ from rfdropo_bayes.simulators.protocol import Result
 
 Batch = Mapping[str, Float[Array, " n"]]
 
+SMALLEST_CHUNK = 8
+
 
 class CalibrationProblem:
-    """Posterior over the parameters of a `TrajectoryModel`, evaluated in batches of a fixed size.
+    """Posterior over the parameters of a `TrajectoryModel`, evaluated in batches of a few sizes.
 
     Rows are time steps: horizon ``h`` means the first ``h`` rows of every recording (eq. 3 of RF-DROPO). A batch is
-    cut into chunks of ``chunk`` parameter sets, the last one padded, so that one compilation serves every batch size,
-    and the number of simulated steps is a run-time argument, so that it serves every horizon.
+    cut into chunks of at most ``chunk`` parameter sets, the last one padded to one of `chunk_sizes`, so that a few
+    compilations serve every batch size, and the number of simulated steps is a run-time argument, so that they serve
+    every horizon.
     """
 
     def __init__(self, model: TrajectoryModel, *, chunk: int = 32) -> None:
@@ -159,7 +162,16 @@ class CalibrationProblem:
         n = len(next(iter(columns.values())))
         parts = []
         for start in range(0, n, self.chunk):
-            index = np.minimum(np.arange(start, start + self.chunk), n - 1)
+            size = next(size for size in chunk_sizes(self.chunk) if size >= min(n - start, self.chunk))
+            index = np.minimum(np.arange(start, start + size), n - 1)
             parts.append(jax.device_get(evaluate({name: column[index] for name, column in columns.items()}, steps)))
         first, second = (np.concatenate([part[i] for part in parts])[:n] for i in range(2))
         return first, second
+
+
+def chunk_sizes(largest: int) -> tuple[int, ...]:
+    """Sizes that chunks are padded to, ascending: a quarter of the next, down to the lanes of one SIMD register."""
+    sizes = [largest]
+    while sizes[-1] >= 4 * SMALLEST_CHUNK:
+        sizes.append(sizes[-1] // 4)
+    return tuple(reversed(sizes))
