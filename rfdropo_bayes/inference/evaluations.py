@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +31,15 @@ class Ledger:
     rollouts: float = 0.0
     evaluations: int = 0
     excluded: Counter[str] = field(default_factory=Counter)
+
+    def record(self) -> dict[str, Any]:
+        """For a checkpoint's JSON. (`dataclasses.asdict` counts the items of a Counter instead of copying them.)"""
+        return {"rollouts": self.rollouts, "evaluations": self.evaluations, "excluded": dict(self.excluded)}
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Ledger:
+        """Inverse of `record`."""
+        return cls(record["rollouts"], record["evaluations"], Counter(record["excluded"]))
 
     def charge(self, problem: Problem, n: int, horizon: int) -> None:
         """Count ``n`` rollouts of ``horizon`` rows."""

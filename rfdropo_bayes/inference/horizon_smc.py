@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -302,7 +302,7 @@ def _pack(state: SmcState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     population = state.population
     arrays = {name: getattr(population, name) for name in ("position", "base", "rows", "log_weights")}
     meta = {name: getattr(state, name) for name in ("block", "stage", "log_evidence", "trace", "seconds", "finished")}
-    meta |= {"progress": population.progress, "scale": population.scale, "ledger": asdict(state.ledger)}
+    meta |= {"progress": population.progress, "scale": population.scale, "ledger": state.ledger.record()}
     return arrays | {"prefix_log_evidence": state.prefix_log_evidence}, meta
 
 
@@ -310,7 +310,7 @@ def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SmcState:
     population = Population(
         arrays["position"], arrays["base"], arrays["rows"], arrays["log_weights"], meta["progress"], meta["scale"]
     )
-    ledger = Ledger(meta["ledger"]["rollouts"], meta["ledger"]["evaluations"], Counter(meta["ledger"]["excluded"]))
+    ledger = Ledger.from_record(meta["ledger"])
     named = {name: meta[name] for name in ("block", "stage", "log_evidence", "trace", "seconds", "finished")}
     return SmcState(population, prefix_log_evidence=arrays["prefix_log_evidence"], ledger=ledger, **named)
 

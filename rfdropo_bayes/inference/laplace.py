@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -276,11 +275,11 @@ def _pack(climbs: Climbs) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     assert climbs.noise is not None
     arrays = {name: getattr(climbs, name) for name in ("positions", "log_density", "converged", "noise")}
     meta = {name: getattr(climbs, name) for name in ("level", "done", "trace", "seconds")}
-    return arrays, meta | {"ledger": asdict(climbs.ledger)}
+    return arrays, meta | {"ledger": climbs.ledger.record()}
 
 
 def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Climbs:
-    ledger = Ledger(meta["ledger"]["rollouts"], meta["ledger"]["evaluations"], Counter(meta["ledger"]["excluded"]))
+    ledger = Ledger.from_record(meta["ledger"])
     named = {name: meta[name] for name in ("level", "done", "trace", "seconds")}
     saved: dict[str, Any] = {**arrays, **named}
     return Climbs(ledger=ledger, **saved)

@@ -9,9 +9,8 @@ again at the FULL horizon with common random numbers, because losses at differen
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -360,9 +359,9 @@ def _choose(
 
 def _pack(state: SearchState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     arrays = {"candidates": state.candidates, "losses": state.losses}
-    return arrays, {"ledger": asdict(state.ledger), "trace": state.trace, "seconds": state.seconds}
+    return arrays, {"ledger": state.ledger.record(), "trace": state.trace, "seconds": state.seconds}
 
 
 def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SearchState:
-    ledger = Ledger(meta["ledger"]["rollouts"], meta["ledger"]["evaluations"], Counter(meta["ledger"]["excluded"]))
+    ledger = Ledger.from_record(meta["ledger"])
     return SearchState(arrays["candidates"], arrays["losses"], ledger, meta["trace"], meta["seconds"])

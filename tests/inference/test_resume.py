@@ -201,3 +201,22 @@ def test_the_log_has_a_line_per_stage_in_plain_json(tmp_path):
     lines = [json.loads(line, parse_constant=pytest.fail) for line in log.read_text().splitlines()]
     assert len(lines) == sum(1 for row in result.trace if not row.get("final"))
     assert {"time", "elapsed", "run", "horizon", "ess", "rollouts", "stage"} <= lines[0].keys()
+
+
+@pytest.mark.parametrize("method", ["laplace", "smc"])
+def test_exclusions_survive_a_checkpoint(method, tmp_path):
+    """A part of the prior diverges: its count is saved and read back."""
+
+    class PartlyDiverging(Decay):
+        def row_log_likelihood(self, values, horizon):
+            rows, _ = super().row_log_likelihood(values, horizon)
+            return rows, np.where(np.asarray(values[self.names[0]]) > middle, 0, 1)
+
+    middle = float(np.median(Decay(n_rows=20).sample_prior(KEY, 999)[Decay(n_rows=20).names[0]]))
+    problem = PartlyDiverging(n_rows=20)
+    problem.status_names = {1: "diverged"}
+    whole = methods.run(problem, method, OPTIONS[method], KEY)
+    assert whole.excluded["diverged"] > 0
+    with pytest.raises(Killed):
+        methods.run(problem, method, OPTIONS[method], KEY, checkpoint_dir=tmp_path, progress=Mortal(1))
+    same(whole, methods.run(problem, method, OPTIONS[method], KEY, checkpoint_dir=tmp_path, resume=True))
