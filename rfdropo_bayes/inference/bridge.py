@@ -1,7 +1,8 @@
 """From Laplace to the posterior: tempered SMC that starts at inflated Student-t distributions around the optima.
 
 The start is close to the posterior, so few stages are needed, all at the full horizon: an evidence with a small
-deviation for a small part of the rollouts that a start at the prior takes. It knows only modes that the climbs found.
+deviation for a small part of the rollouts that a start at the prior takes. Modes that no climb found are seen by the
+particles that start at the prior, which are few.
 """
 
 from __future__ import annotations
@@ -15,8 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
-from scipy.special import logsumexp
-from scipy.stats import multivariate_t
 
 from rfdropo_bayes.bayes.problem import Problem, Values
 from rfdropo_bayes.errors import InputError
@@ -24,9 +23,9 @@ from rfdropo_bayes.inference import horizon_smc
 from rfdropo_bayes.inference.checkpoints import open_checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import evaluate_prior
 from rfdropo_bayes.inference.gauss_newton import Laplace
-from rfdropo_bayes.inference.laplace import LaplaceConfig, find_modes, mode_values
+from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes, mode_values
+from rfdropo_bayes.inference.mixture import ModeMixture
 from rfdropo_bayes.inference.progress import Progress
-from rfdropo_bayes.inference.proposals import host_generator
 from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, exclusion_warnings
 
 
@@ -38,8 +37,9 @@ class BridgeConfig:
         climb: settings of the search for optima.
         inflation: of the Student-t's scale over the Laplace standard deviation.
         degrees: of freedom of the Student-t.
+        prior_share: of the particles that start at prior draws, for what no climb has found.
         rollouts: budget of the sampler in full-length rollouts, of all replicates together; None for no limit.
-        particles: per replicate.
+        particles: per replicate; None takes as many as the budget serves.
         replicates: independent repetitions.
         target_ess: share of effective particles kept from one target to the next.
     """
@@ -47,14 +47,17 @@ class BridgeConfig:
     climb: LaplaceConfig = field(default_factory=LaplaceConfig)
     inflation: float = 1.5
     degrees: float = 5.0
+    prior_share: float = 0.05
     rollouts: float | None = None
-    particles: int = 500
+    particles: int | None = 500
     replicates: int = 4
     target_ess: float = 0.5
 
     def __post_init__(self) -> None:
         if self.inflation < 1.0 or self.degrees <= 0.0:
             raise InputError("inflation must be at least 1 and degrees positive", where="[inference]")
+        if not 0.0 <= self.prior_share < 1.0:
+            raise InputError("prior_share must be at least 0 and below 1", where="[inference]")
 
     @property
     def sampler(self) -> horizon_smc.SmcConfig:
@@ -69,21 +72,15 @@ class BridgeConfig:
 
 
 class BridgedProblem:
-    """A problem whose "prior" is a mixture of Student-t distributions around optima of another, in its coordinates.
+    """A problem whose "prior" is a `ModeMixture` of another, in its coordinates.
 
     Its one row is ``log prior + log likelihood - log mixture``, so that its evidence is the other's.
     """
 
     def __init__(self, problem: Problem, modes: list[Laplace], config: BridgeConfig) -> None:
         self.problem = problem
-        self.degrees = config.degrees
-        self.means = np.stack([mode.mean for mode in modes])
-        self.factors = np.stack([config.inflation * np.linalg.cholesky(mode.covariance) for mode in modes])
-        evidence = np.array([mode.log_evidence for mode in modes])
-        # No found mode starts with less than 5 %: Laplace evidences of ill-shaped modes are off by nats.
-        share = np.maximum(np.exp(evidence - evidence.max()), 0.05)
-        self.log_share = np.log(share / share.sum())
-        self.names = tuple(f"u{j}" for j in range(self.means.shape[1]))
+        self.mixture = ModeMixture(problem, modes, config.inflation, config.degrees, config.prior_share)
+        self.names = tuple(f"u{j}" for j in range(self.mixture.means.shape[1]))
         self.units = dict.fromkeys(self.names, "1")
         self.bounds = dict.fromkeys(self.names, (-np.inf, np.inf))
         self.n_rows = 1
@@ -91,14 +88,8 @@ class BridgedProblem:
         self.status_names = getattr(problem, "status_names", {})
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
-        """Draws of the mixture; components get their exact shares, up to one draw."""
-        generator = host_generator(key)
-        spread = (np.arange(n) + generator.uniform()) / n
-        component = np.searchsorted(np.cumsum(np.exp(self.log_share))[:-1], spread)
-        z = generator.standard_normal((n, len(self.names)))
-        scale = generator.chisquare(self.degrees, n) / self.degrees
-        step = np.einsum("nij,nj->ni", self.factors[component], z / np.sqrt(scale)[:, None])
-        return self.from_unconstrained(self.means[component] + step)
+        """Draws of the mixture."""
+        return self.from_unconstrained(self.mixture.sample(key, n))
 
     def to_unconstrained(self, values: Values) -> Float[Any, "n d"]:
         """Columns in the order of ``names``."""
@@ -110,11 +101,7 @@ class BridgedProblem:
 
     def log_prior(self, u: Float[Any, "n d"]) -> Float[Any, " n"]:
         """Log density of the mixture."""
-        parts = [
-            share + np.atleast_1d(multivariate_t.logpdf(np.asarray(u), mean, factor @ factor.T, df=self.degrees))
-            for share, mean, factor in zip(self.log_share, self.means, self.factors, strict=True)
-        ]
-        return logsumexp(np.stack(parts), axis=0)
+        return self.mixture.log_density(u)
 
     def row_log_likelihood(self, values: Values, horizon: int) -> tuple[Float[Any, "n 1"], Int[Any, " n"]]:
         """What the mixture lacks to the posterior."""
@@ -123,7 +110,7 @@ class BridgedProblem:
             self.problem.from_unconstrained(jnp.asarray(u)), self.problem.n_rows
         )
         density = evaluate_prior(self.problem, u) + np.asarray(rows).sum(axis=1)
-        return (density - self.log_prior(u))[:, None], np.asarray(status)
+        return (density - self.mixture.log_density(u))[:, None], np.asarray(status)
 
 
 def run(
@@ -140,9 +127,25 @@ def run(
     digest = run_digest(problem, "bridge", config, key)
     checkpoint = open_checkpoint(checkpoint_dir, "bridge_climbs", digest, resume=resume)
     found = find_modes(problem, config.climb, climb_key, checkpoint=checkpoint, progress=progress)
+    return sample_from_modes(
+        problem, config, found, sample_key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress
+    )
+
+
+def sample_from_modes(
+    problem: Problem,
+    config: BridgeConfig,
+    found: Modes,
+    key: PRNGKeyArray,
+    *,
+    checkpoint_dir: Path | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> InferenceResult:
+    """Sample from around optima that are known to the posterior; the climbs' cost is part of the result's."""
     bridged = BridgedProblem(problem, found.modes, config)
     sampled = horizon_smc.run(
-        bridged, config.sampler, sample_key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress
+        bridged, config.sampler, key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress
     )
     u = np.stack([sampled.draws[name] for name in bridged.names], axis=-1)
     values = problem.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))

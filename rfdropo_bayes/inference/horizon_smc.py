@@ -32,6 +32,7 @@ from rfdropo_bayes.inference.tempering import Population, StageInfo, Tuning, ref
 PARTICLES_WITHOUT_BUDGET = 1000
 ROLLOUTS_PER_PARTICLE = 20.0
 FEWEST_PARTICLES = 50
+STARTS = ("auto", "prior", "optimum")
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class SmcConfig:
         acceptance: acceptance rate that the step size is adapted to.
         correlation: moves of a stage end once no direction is more correlated than this with its start.
         max_moves: most moves in a stage.
+        start: "prior", "optimum", or "auto": see `starts`; this module always starts at the prior.
     """
 
     rollouts: float | None = None
@@ -63,9 +65,12 @@ class SmcConfig:
     acceptance: float = 0.3
     correlation: float = 0.3
     max_moves: int = 20
+    start: str = "auto"
 
     def __post_init__(self) -> None:
         where = "[inference]"
+        if self.start not in STARTS:
+            raise InputError(f"unknown start {self.start!r}", where=where, remedy=f"one of {', '.join(STARTS)}")
         if self.kernel not in KERNELS:
             raise InputError(f"unknown kernel {self.kernel!r}", where=where, remedy=f"one of {', '.join(KERNELS)}")
         if self.spacing not in SPACINGS:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError
@@ -38,12 +38,14 @@ class LaplaceConfig:
 
     Attributes:
         starts: number of climbs.
-        screen: prior draws that the starts are the best of, judged at the first horizon.
+        screen: prior draws, judged at the first horizon: the best is the first start, the others lie apart from it
+            among the best quarter.
         blocks: horizons of a climb, doubling; short ones first, because a long recording has many local optima.
         max_steps: most steps of a climb at one horizon.
         tolerance: a climb ends when a step promises less [nat].
         jacobian: "forward", "central" or "auto".
         draws: draws from the normal approximation.
+        rollouts: budget in full-length rollouts, of which every climb gets its share; None for no limit.
     """
 
     starts: int = 4
@@ -53,13 +55,14 @@ class LaplaceConfig:
     tolerance: float = 1e-4
     jacobian: str = "auto"
     draws: int = 2000
+    rollouts: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("starts", "screen", "blocks", "max_steps", "draws"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)} is less than 1", where="[inference]")
-        if self.tolerance <= 0.0:
-            raise InputError("tolerance must be positive", where="[inference]")
+        if self.tolerance <= 0.0 or (self.rollouts is not None and self.rollouts <= 0.0):
+            raise InputError("tolerance and rollouts must be positive", where="[inference]")
         if self.jacobian not in JACOBIANS:
             raise InputError(
                 f"unknown jacobian {self.jacobian!r}", where="[inference]", remedy=f"one of {', '.join(JACOBIANS)}"
@@ -123,9 +126,8 @@ def find_modes(
             target = make_target(
                 problem, horizons[climbs.level], climbs.ledger, best, prior, config.jacobian, climbs.noise
             )
-        state, steps = maximise(
-            target, climbs.positions[climbs.done], max_steps=config.max_steps, tolerance=config.tolerance
-        )
+        allowed = _affordable_steps(problem.n_rows, config, climbs, horizons)
+        state, steps = maximise(target, climbs.positions[climbs.done], max_steps=allowed, tolerance=config.tolerance)
         climbs = _record(climbs, state, len(steps), horizons[climbs.level], target.noise)
         climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
         if climbs.done == 0:
@@ -138,13 +140,24 @@ def find_modes(
     return _collect(problem, config, climbs, prior)
 
 
+def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizons: tuple[int, ...]) -> int:
+    """Steps the present climb may take: what is left of the budget is shared among climbs by their horizons."""
+    if config.rollouts is None:
+        return config.max_steps
+    starts, d = climbs.positions.shape
+    now = horizons[climbs.level]
+    shares = now * (starts - climbs.done) + starts * sum(horizons[climbs.level + 1 :])
+    allowed = (config.rollouts - climbs.ledger.rollouts) * now / shares
+    # A Jacobian by central differences, two more rows for noise coordinates, and six dampings tried.
+    return int(np.clip(allowed * n_rows / now / (4.0 * d + 7.0), 0, config.max_steps))
+
+
 def _screen(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int) -> Climbs:
     ledger = Ledger()
     began = time.monotonic()
     u = np.asarray(problem.to_unconstrained(problem.sample_prior(key, max(config.screen, config.starts))), dtype=float)
     density = evaluate_prior(problem, u) + evaluate_rows(problem, u, horizon, ledger).sum(axis=1)
-    order = np.argsort(-density, kind="stable")[: config.starts]
-    order = order[np.isfinite(density[order])]
+    order = _spread_starts(u, density, config.starts)
     if len(order) == 0:
         reasons = ", ".join(f"{name} {count}" for name, count in sorted(ledger.excluded.items())) or "no reason given"
         raise InputError(
@@ -154,6 +167,23 @@ def _screen(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon:
         )
     seconds = time.monotonic() - began
     return Climbs(u[order], density[order], np.zeros(len(order), dtype=bool), 0, 0, None, ledger, [], seconds)
+
+
+def _spread_starts(u: Float[np.ndarray, "n d"], density: Float[np.ndarray, " n"], count: int) -> Int[np.ndarray, " k"]:
+    """The best draw, and then always the one of the best quarter that is farthest from those chosen.
+
+    The best few alone often lie together, and then all climb to one optimum of several.
+    """
+    order = np.argsort(-density, kind="stable")
+    order = order[np.isfinite(density[order])][: max(count, len(u) // 4)]
+    if len(order) == 0:
+        return order
+    scaled = u[order] / np.maximum(u.std(axis=0), 1e-300)
+    chosen = [0]
+    while len(chosen) < min(count, len(order)):
+        distance = np.linalg.norm(scaled[:, None] - scaled[chosen], axis=2).min(axis=1)
+        chosen.append(int(np.argmax(distance)))
+    return order[chosen]
 
 
 def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, noise: np.ndarray) -> Climbs:
@@ -201,7 +231,9 @@ def _collect(
     modes.sort(key=lambda mode: -mode.log_evidence)
     best = np.argmin(np.max(np.abs(climbs.positions - modes[0].mean), axis=1))
     if not climbs.converged[best]:
-        warnings.append(f"the best climb had not converged after {config.max_steps} steps; raise max_steps")
+        warnings.append(
+            "the best climb had not converged when its steps or its budget ran out; raise max_steps or rollouts"
+        )
     rivals = [mode for mode in modes[1:] if mode.log_evidence > modes[0].log_evidence - 5.0]
     if rivals:
         warnings.append(

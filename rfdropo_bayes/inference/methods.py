@@ -14,7 +14,7 @@ from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import bridge, horizon_smc, laplace, rfdropo
+from rfdropo_bayes.inference import bridge, horizon_smc, laplace, rfdropo, starts
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 
@@ -32,7 +32,7 @@ class Method(NamedTuple):
 
 
 METHODS: dict[str, Method] = {
-    "smc": Method(horizon_smc.SmcConfig, horizon_smc.run),
+    "smc": Method(horizon_smc.SmcConfig, starts.run),
     "rfdropo": Method(rfdropo.RfdropoConfig, rfdropo.run),
     "laplace": Method(laplace.LaplaceConfig, laplace.run),
     "bridge": Method(bridge.BridgeConfig, bridge.run),

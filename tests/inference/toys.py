@@ -142,6 +142,10 @@ class TwoModes(LinearGaussian):
         fit = jnp.concatenate([jnp.abs(u[:, :1]), u[:, 1:]], axis=1)[:, :horizon]
         return jax.scipy.stats.norm.logpdf(self.data[:horizon], fit, self.noise[:horizon])
 
+    def residuals(self, values, horizon):
+        u = jnp.stack([jnp.abs(values["x0"]), *(values[name] for name in self.names[1:])])
+        return (self.data[:horizon] - u[:horizon]) / self.noise[:horizon]
+
     def mode_evidence(self):
         """Log evidence of the modes x > 0 and x < 0 of the first row, together and their shares."""
         sd = np.hypot(self.sd, self.noise)

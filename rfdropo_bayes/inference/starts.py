@@ -1,0 +1,175 @@
+"""Sequential Monte Carlo from where it can be afforded: the prior, or the optima of a sharp posterior.
+
+From a prior that is thousands of times wider than the posterior the way takes dozens of stages, and a budget that is
+used up on it ends in a leap that leaves a few particles alive. A posterior that sharp is close to its Laplace
+approximation, which costs some hundred rollouts to find: the sampler then starts there, inflated, with a share of
+particles at the prior, and the evidence is as exact as before. What a start at the prior passes on its way, the
+evidence of the blocks of rows, is then taken by importance sampling around the optima of the prefixes.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference import bridge, horizon_smc
+from rfdropo_bayes.inference.checkpoints import open_checkpoint, run_digest
+from rfdropo_bayes.inference.evaluations import Ledger
+from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES, ROLLOUTS_PER_PARTICLE, SmcConfig
+from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes
+from rfdropo_bayes.inference.prefix_scores import PrefixEvidence, block_scores, prefix_evidence
+from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.result import InferenceResult
+from rfdropo_bayes.inference.schedules import block_boundaries
+from rfdropo_bayes.inference.sharpness import Way, way_from_prior
+
+CLIMBING = 0.25  # share of the budget that looking for optima may take
+SCORING = 0.05  # and the evidence of the blocks
+MARGIN = 3.0  # what real posteriors cost over the estimate, which takes them to be normal and data to be even
+WORTH_A_REPLICATE = 100  # particles
+ENOUGH = 200  # particles per replicate that a start at the prior must allow
+
+
+def run(
+    problem: Problem,
+    config: SmcConfig,
+    key: PRNGKeyArray,
+    *,
+    checkpoint_dir: Path | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+) -> InferenceResult:
+    """Sample a posterior, from the start that ``config.start`` names or that the budget allows.
+
+    Raises:
+        InputError: as `horizon_smc.run`; or a start at the optima is asked for and the problem has no residuals.
+    """
+    if config.start == "prior" or (config.start == "auto" and not _worth_climbing(problem, config)):
+        return horizon_smc.run(problem, config, key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress)
+    climb_key, way_key, sample_key = jax.random.split(key, 3)
+    climbing = LaplaceConfig(rollouts=None if config.rollouts is None else CLIMBING * config.rollouts)
+    digest = run_digest(problem, "smc_climbs", config, key)
+    checkpoint = open_checkpoint(checkpoint_dir, "smc_climbs", digest, resume=resume)
+    try:
+        found = find_modes(problem, climbing, climb_key, checkpoint=checkpoint, progress=progress)
+    except InputError:
+        if config.start == "optimum":
+            raise
+        # No screened draw had a likelihood: whether the prior excludes the data is for more particles to say.
+        return horizon_smc.run(problem, config, key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress)
+    horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
+    way = way_from_prior(problem, found.modes[0], horizons, config.target_ess, way_key)
+    left = None if config.rollouts is None else config.rollouts - found.climbs.ledger.rollouts
+    if config.start == "auto" and _affordable(way, config, left):
+        result = horizon_smc.run(
+            problem,
+            replace(config, rollouts=left),
+            sample_key,
+            checkpoint_dir=checkpoint_dir,
+            resume=resume,
+            progress=progress,
+        )
+        return _with_climbs(result, found, way)
+    assert isinstance(problem, ResidualProblem)  # or no optima would have been found
+    return _from_optima(problem, config, found, way, sample_key, checkpoint_dir, resume, progress)
+
+
+def _worth_climbing(problem: Problem, config: SmcConfig) -> bool:
+    """Without a budget a start at the prior never leaps; a small one is better spent on particles than on climbs."""
+    if not isinstance(problem, ResidualProblem) or config.rollouts is None:
+        return False
+    return config.rollouts >= 40.0 * config.replicates * max(FEWEST_PARTICLES, len(problem.names))
+
+
+def _affordable(way: Way, config: SmcConfig, left: float | None) -> bool:
+    if left is None:
+        return True
+    particles = max(config.particles or ENOUGH, FEWEST_PARTICLES)
+    return MARGIN * particles * config.replicates * way.rollouts <= left
+
+
+def _with_climbs(result: InferenceResult, found: Modes, way: Way) -> InferenceResult:
+    ledger = found.climbs.ledger
+    return replace(
+        result,
+        rollouts=result.rollouts + ledger.rollouts,
+        evaluations=result.evaluations + ledger.evaluations,
+        excluded=dict(Counter(result.excluded) + ledger.excluded),
+        seconds=result.seconds + found.climbs.seconds,
+        details=result.details | {"start": "prior", "expected_stages": way.stages, "information": way.information},
+    )
+
+
+def _from_optima(
+    problem: ResidualProblem,
+    config: SmcConfig,
+    found: Modes,
+    way: Way,
+    key: PRNGKeyArray,
+    checkpoint_dir: Path | None,
+    resume: bool,
+    progress: Progress | None,
+) -> InferenceResult:
+    sample_key, score_key = jax.random.split(key)
+    left = None if config.rollouts is None else config.rollouts - found.climbs.ledger.rollouts
+    scoring = None if left is None else SCORING * config.rollouts  # type: ignore[operator]
+    sampling = None if left is None else left - 2.0 * scoring  # type: ignore[operator]
+    settings = bridge.BridgeConfig(
+        rollouts=sampling,
+        particles=config.particles,
+        replicates=_replicates(config, sampling),
+        target_ess=config.target_ess,
+    )
+    result = bridge.sample_from_modes(
+        problem, settings, found, sample_key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress
+    )
+    prefixes, ledger = _prefixes(problem, config, found, scoring, score_key)
+    value, sd = result.log_evidence or (np.nan, np.nan)
+    whole = PrefixEvidence(problem.n_rows, value, 0.0 if np.isnan(sd) else sd, 1.0)
+    every = np.full(problem.n_rows, np.nan)
+    for prefix in (*prefixes, whole):
+        every[prefix.horizon - 1] = prefix.value
+    return replace(
+        result,
+        method="smc",
+        prefix_log_evidence=every,
+        block_scores=block_scores([*prefixes, whole]),
+        rollouts=result.rollouts + ledger.rollouts,
+        evaluations=result.evaluations + ledger.evaluations,
+        details=result.details
+        | {
+            "start": "optimum",
+            "expected_stages": way.stages,
+            "information": way.information,
+            "prefix_ess": [prefix.ess for prefix in prefixes],
+        },
+    )
+
+
+def _replicates(config: SmcConfig, budget: float | None) -> int:
+    """Those asked for; instead of a single one as many as the budget serves well, up to four, whose scatter tells."""
+    if config.replicates > 1 or budget is None:
+        return config.replicates
+    return int(np.clip(budget / (ROLLOUTS_PER_PARTICLE * (config.particles or WORTH_A_REPLICATE)), 1, 4))
+
+
+def _prefixes(
+    problem: ResidualProblem, config: SmcConfig, found: Modes, scoring: float | None, key: PRNGKeyArray
+) -> tuple[list[PrefixEvidence], Ledger]:
+    """Evidence at the ends of all blocks but the last, whose evidence is the sampler's."""
+    ledger = Ledger()
+    horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)[:-1]
+    looks = sum(horizons) / problem.n_rows
+    draws = 400 if scoring is None else int(scoring / max(looks, 1e-9))
+    if not horizons or draws < 30:
+        return [], ledger
+    assert found.climbs.noise is not None
+    best = found.modes[0]
+    return prefix_evidence(problem, best, found.climbs.noise, horizons, min(draws, 400), key, ledger), ledger
