@@ -92,13 +92,13 @@ def lengths_and_jacobian(
     return jnp.sum(jnp.where(used, length, 0.0), axis=(1, 2)), jnp.einsum("cgn,cgi->cni", guides, pull)
 
 
-def _masked_solve(
-    matrix: Float[Array, "c c"], right: Float[Array, " c"], active: Bool[Array, " c"]
-) -> Float[Array, " c"]:
-    """Solve for the active unknowns; the others are zero."""
-    pair = active[:, None] & active[None, :]
-    reduced = jnp.where(pair, matrix, jnp.eye(len(right)))
-    return jnp.where(active, jnp.linalg.solve(reduced, jnp.where(active, right, 0.0)), 0.0)
+def masked_solve(
+    matrix: Float[Array, "c c"], right: Float[Array, "c *k"], active: Bool[Array, " c"]
+) -> Float[Array, "c *k"]:
+    """Solve for the active unknowns, for one right-hand side or several columns; the others are zero."""
+    reduced = jnp.where(active[:, None] & active[None, :], matrix, jnp.eye(len(right)))
+    rows = active.reshape(-1, *[1] * (right.ndim - 1))
+    return jnp.where(rows, jnp.linalg.solve(reduced, jnp.where(rows, right, 0.0)), 0.0)
 
 
 def _active_set(
@@ -115,7 +115,7 @@ def _active_set(
     tolerance = 1e-10 * jnp.max(jnp.abs(offset))
 
     def infeasible(active: Bool[Array, " c"]) -> Bool[Array, " c"]:
-        value = _masked_solve(matrix, -offset, active)
+        value = masked_solve(matrix, -offset, active)
         slack = matrix @ value + offset
         return usable & jnp.where(active, value < -tolerance, slack < -tolerance)
 
@@ -136,6 +136,25 @@ def _active_set(
     return active, ~jnp.any(wrong)
 
 
+def _usable(diagonal: Float[Array, " c"]) -> Bool[Array, " c"]:
+    """Cables that can shorten at all."""
+    return diagonal > 1e-12 * jnp.max(diagonal)
+
+
+def pulling_cables(
+    compliance: Float[Array, "c c"], slack: Float[Array, " c"], previous: Float[Array, " c"]
+) -> tuple[Bool[Array, " c"], Float[Array, "c c"]]:
+    """Which cables pull, as in `unilateral_tensions`, and the compliance [m/N] that determines their tensions."""
+    diagonal = jnp.diagonal(compliance)
+    usable = _usable(diagonal)
+    scale = jnp.where(usable, 1.0 / jnp.sqrt(jnp.where(usable, diagonal, 1.0)), 0.0)
+    matrix = compliance * scale[:, None] * scale[None, :] + REGULARISATION * jnp.eye(len(slack))
+    active, _ = _active_set(
+        lax.stop_gradient(matrix), lax.stop_gradient(slack * scale), lax.stop_gradient(previous) > 0.0, usable
+    )
+    return active, compliance + REGULARISATION * jnp.diag(diagonal)
+
+
 def unilateral_tensions(
     compliance: Float[Array, "c c"], slack: Float[Array, " c"], previous: Float[Array, " c"]
 ) -> Tensions:
@@ -145,12 +164,12 @@ def unilateral_tensions(
     cable would have without tension. ``previous`` tensions start the active set. Differentiable given that set.
     """
     diagonal = jnp.diagonal(compliance)
-    usable = diagonal > 1e-12 * jnp.max(diagonal)
+    usable = _usable(diagonal)
     scale = jnp.where(usable, 1.0 / jnp.sqrt(jnp.where(usable, diagonal, 1.0)), 0.0)
     matrix = compliance * scale[:, None] * scale[None, :] + REGULARISATION * jnp.eye(len(slack))
     offset = slack * scale
     active, converged = _active_set(
         lax.stop_gradient(matrix), lax.stop_gradient(offset), lax.stop_gradient(previous) > 0.0, usable
     )
-    tension = scale * _masked_solve(matrix, -offset, active)
+    tension = scale * masked_solve(matrix, -offset, active)
     return Tensions(jnp.maximum(tension, 0.0), converged)

@@ -20,7 +20,7 @@ from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jaco
 from rfdropo_bayes.fem.drives import DriveLimits
 from rfdropo_bayes.fem.dynamics import LOST
 from rfdropo_bayes.fem.layered import PointMap, point_positions
-from rfdropo_bayes.fem.levels import Levels, node_levels
+from rfdropo_bayes.fem.levels import LevelMatrix, Levels, node_levels
 from rfdropo_bayes.fem.tetrahedra import (
     TetrahedralBody,
     element_rotations,
@@ -96,14 +96,10 @@ def state_at_rest(system: TetrahedralSystem) -> TetrahedralState:
     return TetrahedralState(rest, jnp.zeros_like(rest), none, none)
 
 
-def step(
-    system: TetrahedralSystem,
-    material: TetrahedralMaterial,
-    state: TetrahedralState,
-    displacement: Float[Array, " cables"],
-    time_step: float,
-) -> tuple[TetrahedralState, TetrahedralInfo]:
-    """One implicit Euler step to the commanded cable displacements [m]."""
+def linearised(
+    system: TetrahedralSystem, material: TetrahedralMaterial, state: TetrahedralState, time_step: float
+) -> tuple[LevelMatrix, Float[Array, "nodes 3"]]:
+    """Matrix A and right-hand side of a step's linear system without cables, A dv = r."""
     body, levels = system.body, system.levels
     first, shear = lame_constants(material.young_modulus, material.poisson_ratio)
     lame = first * material.stiffness_scale, shear * material.stiffness_scale
@@ -117,6 +113,19 @@ def step(
     matrix = level_systems.assemble(
         levels, body.element, time_step * lookahead * element_tangents(body, turn, lame), inertia
     )
+    return matrix, right
+
+
+def step(
+    system: TetrahedralSystem,
+    material: TetrahedralMaterial,
+    state: TetrahedralState,
+    displacement: Float[Array, " cables"],
+    time_step: float,
+) -> tuple[TetrahedralState, TetrahedralInfo]:
+    """One implicit Euler step to the commanded cable displacements [m]."""
+    levels = system.levels
+    matrix, right = linearised(system, material, state, time_step)
     length, jacobian = lengths_and_jacobian(system.cables, jnp.asarray(system.guides), state.position)
     shortening = jnp.asarray(system.rest_length) - length
     target = system.limits.apply(displacement, state.measured)
@@ -130,10 +139,10 @@ def step(
     change = solution[:, 0] - time_step * solution[:, 1:] @ tension
     velocity = state.velocity.at[levels.order].add(change.reshape(-1, 3))
     moved = TetrahedralState(state.position + time_step * velocity, velocity, tension, shortening)
-    return _accept(system, state, moved, converged)
+    return accept(system, state, moved, converged)
 
 
-def _accept(
+def accept(
     system: TetrahedralSystem, state: TetrahedralState, moved: TetrahedralState, converged: Bool[Array, ""]
 ) -> tuple[TetrahedralState, TetrahedralInfo]:
     """The new state if it is finite and near the body, else the old one at rest."""
