@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from rfdropo_bayes.bayes.forces import tension_specs
 from rfdropo_bayes.bayes.model import TrajectoryModel
-from rfdropo_bayes.bayes.noise import draw_noise, noise_specs, whiten
+from rfdropo_bayes.bayes.noise import draw_noise, noise_specs
 from rfdropo_bayes.simulators.protocol import Result
 
 Batch = Mapping[str, Float[Array, " n"]]
@@ -38,7 +39,7 @@ class CalibrationProblem:
         self.n_rows = model.recordings.time.shape[1]
         self.n_recordings = len(model.recordings.names)
         self.status_names = {int(result): result.name.lower() for result in Result}
-        noise = {spec.name for spec in noise_specs(model.noise)}
+        noise = {spec.name for spec in (*noise_specs(model.noise), *tension_specs(True))}
         self.physical_names = tuple(p.name for p in model.space.parameters if p.spec.name not in noise)
 
     @cached_property
@@ -48,12 +49,15 @@ class CalibrationProblem:
         recordings = self.model.recordings
         for array in (recordings.position, recordings.time, *recordings.line, *recordings.commands):
             digest.update(np.ascontiguousarray(array).tobytes())
+        for array in self.model.tension or ():
+            digest.update(np.ascontiguousarray(array).tobytes())
         priors = [(p.name, sorted((p.table or {}).items())) for p in self.model.space.parameters]
         rest = (
             priors,
             sorted(self.model.fixed.items()),
             self.model.noise,
             sorted(self.model.simulator.description.items()),
+            *self.model.weighed,
         )
         digest.update(repr(rest).encode())
         return digest.hexdigest()
@@ -117,13 +121,7 @@ class CalibrationProblem:
 
     def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " residual"]:
         """Whitened residuals of the first ``horizon`` rows (zero where masked); traceable, for one set of values."""
-        recordings = self.model.recordings
-        observation = self.model.simulate(values, jnp.asarray(self.steps_for(horizon)))
-        sigma, tau = self.model.noise_of(values)
-        white = jax.vmap(lambda r, line: whiten(r, sigma, tau, line)[0])(
-            recordings.position - observation.position, recordings.line
-        )
-        return white[:, :horizon].reshape(-1)
+        return self.model.residuals(values, horizon, jnp.asarray(self.steps_for(horizon)))
 
     def predict(self, values: Batch) -> tuple[Float[np.ndarray, "n recording time marker 3"], Int[np.ndarray, " n"]]:
         """Simulated marker positions [m] of every recording, without observation noise."""

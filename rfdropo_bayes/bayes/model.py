@@ -14,7 +14,15 @@ import numpyro
 import numpyro.distributions as dist
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from rfdropo_bayes.bayes.noise import Timeline, draw_noise, row_log_density, timeline
+from rfdropo_bayes.bayes.forces import (
+    TensionData,
+    Weighed,
+    tension_log_density,
+    tension_residuals,
+    weighed_log_density,
+    weighed_residuals,
+)
+from rfdropo_bayes.bayes.noise import Timeline, draw_noise, row_log_density, timeline, whiten
 from rfdropo_bayes.bayes.space import ParameterSpace
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
@@ -150,6 +158,8 @@ class TrajectoryModel:
         fixed: values of parameters that are not inferred and differ from their nominal value.
         noise: ``"white"`` or ``"ar1"``.
         recordings: data.
+        tension: measured cable tensions; None where they are not used.
+        weighed: parameters known from measurements of their own.
     """
 
     simulator: Simulator
@@ -157,6 +167,8 @@ class TrajectoryModel:
     fixed: Mapping[str, float]
     noise: str
     recordings: RecordingSet
+    tension: TensionData | None = None
+    weighed: tuple[Weighed, ...] = ()
 
     def noise_of(self, values: Values) -> tuple[Any, Any]:
         """Standard deviation [m] and correlation time [s] (None for white noise) among a set of values."""
@@ -196,7 +208,25 @@ class TrajectoryModel:
         sigma, tau = self.noise_of(values)
         residual = self.recordings.position - observation.position
         density = jax.vmap(lambda r, line: row_log_density(r, sigma, tau, line))(residual, self.recordings.line)
-        return jnp.sum(density, axis=0), jnp.max(observation.status)
+        rows = jnp.sum(density, axis=0).at[0].add(weighed_log_density(values, self.weighed))
+        if self.tension is not None:
+            rows += tension_log_density(observation.tension, {**self.fixed, **values}, self.tension)
+        return rows, jnp.max(observation.status)
+
+    def residuals(self, values: Values, horizon: int, steps: Int[Array, ""]) -> Float[Array, " residual"]:
+        """Whitened residuals of the first ``horizon`` rows, zero where masked: positions, tensions, weighed parts."""
+        observation = self.simulate(values, steps)
+        sigma, tau = self.noise_of(values)
+        white = jax.vmap(lambda r, line: whiten(r, sigma, tau, line)[0])(
+            self.recordings.position - observation.position, self.recordings.line
+        )
+        parts = [white[:, :horizon].reshape(-1)]
+        if self.tension is not None:
+            pulls, _ = tension_residuals(observation.tension, {**self.fixed, **values}, self.tension)
+            parts.append(pulls[:, :horizon].reshape(-1))
+        if self.weighed:
+            parts.append(weighed_residuals(values, self.weighed))
+        return jnp.concatenate(parts)
 
     def __call__(self, observe: bool = True) -> None:
         """The numpyro model; ``observe=False`` leaves the positions free, for predictive draws."""
@@ -212,3 +242,7 @@ class TrajectoryModel:
             )
             measured = self.recordings.position[index, :rows] if observe else None
             numpyro.sample(f"position@{name}", noise, obs=measured)
+        if observe and self.tension is not None:
+            numpyro.factor("tension", tension_log_density(observation.tension, {**self.fixed, **values}, self.tension))
+        if observe and self.weighed:
+            numpyro.factor("weighed", weighed_log_density(values, self.weighed))

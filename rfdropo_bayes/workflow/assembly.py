@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.forces import Weighed, check_weighed, gather_tension, tension_specs
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.space import build_space
@@ -51,7 +52,7 @@ def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path())
 
 def fixed_values(experiment: Experiment, simulator: RobotSimulator) -> dict[str, float]:
     """Values of [model.fixed], checked against names and hard bounds."""
-    specs = simulator.parameters + noise_specs(experiment.model.noise)
+    specs = simulator.parameters + noise_specs(experiment.model.noise) + tension_specs(experiment.model.tension)
     check_names(experiment.model.fixed, specs, where="[model.fixed]")
     by_name = {spec.name: spec for spec in specs}
     return {name: check_value(by_name[name], v, where="[model.fixed]") for name, v in experiment.model.fixed.items()}
@@ -86,15 +87,16 @@ def build_model(
     """
     table = experiment.model
     noise = noise_specs(table.noise)
+    pulls = tension_specs(table.tension)
     fixed = fixed_values(experiment, simulator)
     both = sorted(set(fixed) & set(table.priors))
     if both:
         raise InputError(f"{both[0]!r} has a prior and a fixed value", where="[model]", remedy="remove one of them")
     added = [spec.name for mechanism in simulator.mechanisms for spec in mechanism.parameters]
-    specs = simulator.parameters + noise
+    specs = simulator.parameters + noise + pulls
     given = expand_groups(table.priors, specs)
     shared = expand_groups(table.per_recording, specs)
-    defaults = [*added, *shared, *(spec.name for spec in noise)]
+    defaults = [*added, *shared, *(spec.name for spec in noise), *(spec.name for spec in pulls[:1])]
     priors = {**given, **{name: {} for name in defaults if name not in fixed and name not in given}}
     recordings = gather_recordings(simulator, trajectories)
     scopes = {
@@ -102,7 +104,10 @@ def build_model(
         for name, patterns in shared.items()
     }
     space = build_space(specs, priors, scopes, recordings.names)
-    return TrajectoryModel(simulator, space, fixed, table.noise, recordings)
+    weighed = tuple(Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed)
+    check_weighed(weighed, space.names)
+    tension = gather_tension(simulator, trajectories, recordings.time.shape[1]) if table.tension else None
+    return TrajectoryModel(simulator, space, fixed, table.noise, recordings, tension, weighed)
 
 
 def build_problem(model: TrajectoryModel) -> CalibrationProblem:

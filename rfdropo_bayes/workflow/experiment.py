@@ -21,12 +21,22 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class WeighedTable(Table):
+    """[[model.weighed]]: the sum of ``parameters`` was measured as ``value`` +- ``sd``, in their unit."""
+
+    parameters: list[str] = Field(min_length=1)
+    value: float
+    sd: float = Field(gt=0.0)
+
+
 class ModelTable(Table):
     """[model]: what is added to the robot's base simulator, and what is inferred.
 
     ``priors`` maps parameter names to prior tables (``{}`` asks for the default prior); ``fixed`` sets the values of
     parameters that are not inferred; ``per_recording`` frees a parameter in the named recordings (``"all"``, or names
-    with wildcards) instead of sharing it.
+    with wildcards) instead of sharing it. ``tension`` uses the recordings' cable tensions as data, with a relative
+    noise ``tension_noise`` that is inferred and a ``tension_gain`` that is 1 unless it has a prior; ``weighed`` lists
+    parameters, or sums of them, known from measurements of their own.
     """
 
     mechanisms: list[str] = Field(default_factory=list)
@@ -34,6 +44,8 @@ class ModelTable(Table):
     priors: dict[str, dict[str, Any]] = Field(default_factory=dict)
     fixed: dict[str, float] = Field(default_factory=dict)
     per_recording: dict[str, str | list[str]] = Field(default_factory=dict)
+    tension: bool = False
+    weighed: list[WeighedTable] = Field(default_factory=list)
 
 
 class SimulatorTable(Table):
