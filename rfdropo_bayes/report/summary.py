@@ -20,6 +20,7 @@ from rfdropo_bayes.report.coverage import coverage
 from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.headline import headline
 from rfdropo_bayes.report.identifiability import identify
+from rfdropo_bayes.report.randomisation import judge
 from rfdropo_bayes.report.scores import MILLIMETRES, ErrorFigures, MeasuredPath, score
 from rfdropo_bayes.report.tables import posterior_table
 from rfdropo_bayes.tables import parse_table
@@ -104,7 +105,8 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
         missing["log_evidence"] = f"{facts.method} computes no evidence"
     plain = _plain(summary, "", missing)
     plain["not_available"] = missing
-    plain["headline"] = headline(plain)
+    plain["randomisation"] = judge(record, plain).as_dict()
+    plain["headline"] = [*headline(plain), plain["randomisation"]["sentence"]]
     check_summary(plain, where="summary.json")
     return plain
 

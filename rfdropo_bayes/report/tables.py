@@ -89,12 +89,14 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
 
 
 def bound_reached(draws: Float[np.ndarray, " n"], info: ParameterInfo) -> str | None:
-    """The hard bound, "low" or "high", that a posterior is piled up at; None if it is not.
+    """The bound, "low" or "high", that a posterior is piled up at; None if it is not.
+
+    Bounds are the hard ones, or the ends of a uniform prior inside them.
 
     A posterior that a bound cuts off at its mode has its outer 5 % quantile within a tenth of a standard deviation of
     that bound, however wide the bounds are. Where the prior is logarithmic the comparison is in logarithms.
     """
-    low, high = info.low, info.high
+    low, high = max(info.low, info.prior.get("low", -np.inf)), min(info.high, info.prior.get("high", np.inf))
     if info.logarithmic and np.all(draws > 0):
         draws = np.log(draws)
         low = np.log(low) if low > 0 else -np.inf

@@ -1,0 +1,80 @@
+"""Whether a posterior is safe to randomise over: one ground at a time."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.posteriors import ParameterInfo
+from rfdropo_bayes.report.randomisation import judge
+from rfdropo_bayes.report.summary import build_summary
+from rfdropo_bayes.report.tables import bound_reached
+
+
+@pytest.fixture(scope="module")
+def summary(run):
+    return build_summary(run.record, run.facts)
+
+
+def clean(summary):
+    """The same run without its parameter at a bound."""
+    spotless = copy.deepcopy(summary)
+    for row in spotless["parameters"].values():
+        row["at_bound"] = False
+    spotless["warnings"] = []
+    return spotless
+
+
+def test_a_parameter_at_its_bound_asks_for_care_and_the_report_says_so(run, summary):
+    assert summary["randomisation"]["verdict"] == "with care"
+    assert "rayleigh_stiffness sits on a bound" in summary["randomisation"]["sentence"]
+    assert summary["headline"][-1] == summary["randomisation"]["sentence"]
+    assert any("Draw whole parameter sets" in sentence for sentence in summary["randomisation"]["advice"])
+    assert any(
+        "common scale of young_modulus and density" in sentence for sentence in summary["randomisation"]["advice"]
+    )
+
+
+def test_without_grounds_against_it_is_safe(run, summary):
+    safety = judge(run.record, clean(summary))
+    assert safety.verdict == "safe"
+    assert safety.reasons == []
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda s: s["coverage"].update({"0.9": 0.6}), "hold only 60 %"),
+        (lambda s: s["rmse"]["test"].update({list(s["rmse"]["test"])[-1]: 1e3}), "no better than one without physics"),
+        (lambda s: s["parameters"]["sigma"].update(r_hat=1.4), "independent runs disagree about sigma"),
+        (lambda s: s["parameters"]["sigma"].update(ess_bulk=3.0), "fewer than 100 effective draws of sigma"),
+        (lambda s: s["warnings"].append("the budget of 10 rollouts ran out at row 3"), "ran out"),
+        (lambda s: s["excluded"].update(diverged=9000), "45 % of the rollouts failed"),
+    ],
+)
+def test_every_grave_ground_makes_it_unsafe(run, summary, change, words):
+    changed = clean(summary)
+    change(changed)
+    safety = judge(run.record, changed)
+    assert safety.verdict == "unsafe"
+    assert words in safety.sentence
+
+
+def test_a_prior_that_excludes_the_data_is_said(run, summary):
+    prior = {**run.record.prior, "sigma": run.record.prior["sigma"] * 1e-3}
+    safety = judge(replace(run.record, prior=prior), clean(summary))
+    assert safety.verdict == "unsafe"
+    assert "outermost 1 % of the prior" in safety.sentence
+    assert "sigma" in safety.sentence
+
+
+def test_the_end_of_a_uniform_prior_is_a_bound_too():
+    """Exponential draws at the end of the range, far inside the hard bounds; 2000 of them leave no doubt."""
+    info = ParameterInfo("p", "-", 0.1, 0.499, {"distribution": "Uniform", "low": 0.4, "high": 0.49})
+    draws = np.random.default_rng(4).exponential(0.004, 2000)
+    assert bound_reached(0.4 + draws, info) == "low"
+    assert bound_reached(0.49 - draws, info) == "high"
+    assert bound_reached(0.44 + draws, info) is None
