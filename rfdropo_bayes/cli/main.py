@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from rfdropo_bayes import __version__
+from rfdropo_bayes.cli import inference
 from rfdropo_bayes.errors import InputError
 
 INPUT_ERROR, INTERRUPTED = 2, 3
@@ -74,6 +75,9 @@ def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a ca
     from rfdropo_bayes.report import rebuild_report
 
     typer.echo(f"report: {rebuild_report(folder)}")
+
+
+app.command()(inference.export)
 
 
 def _default_folder(experiment: Path) -> Path:

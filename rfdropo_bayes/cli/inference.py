@@ -1,0 +1,24 @@
+"""Commands around a posterior: export it, check it, compare methods."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rfdropo_bayes.errors import InputError
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a calibration has written")],
+    phi: Annotated[bool, typer.Option("--phi", help="the distribution to randomise over")] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="folder to write to; DIR by default")] = None,
+) -> None:
+    """Write the distribution to randomise over as tables with units (CSV and JSON), for other simulators."""
+    from rfdropo_bayes.workflow.export import export_phi
+
+    if not phi:
+        raise InputError("nothing to export was named", where="export", remedy="add --phi")
+    for path in export_phi(folder, out):
+        typer.echo(str(path))
