@@ -59,6 +59,32 @@ def calibrate(
 
 
 @app.command()
+def audit(
+    experiment: ExperimentFile,
+    out: OutFolder = None,
+    base: Annotated[
+        Path | None, typer.Option("--base", help="folder of an earlier calibration, to start the base model from")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="seed of the audit; that of the experiment file by default")] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Say what the simulator lacks, by name: writes audit.json, extended.toml and report.html."""
+    from rfdropo_bayes.workflow.audit import run_audit
+
+    folder = out or _default_folder(experiment)
+    found = run_audit(
+        experiment,
+        folder,
+        overrides=overrides or [],
+        base=base,
+        seed=seed,
+        report=lambda line: typer.echo(f"  {line}", err=True),
+    )
+    typer.echo(f"{found['verdict']}: {found['sentence']}")
+    typer.echo(f"audit: {folder / 'audit.json'}; extended model: {folder / 'extended.toml'}")
+
+
+@app.command()
 def simulate(experiment: ExperimentFile, out: OutFolder = None, overrides: Overrides = None) -> None:
     """Simulate the experiment's commands: writes NetCDF and CSV, prints the error against the recording as JSON."""
     from rfdropo_bayes.workflow.experiment import load_experiment

@@ -1,0 +1,158 @@
+"""What each candidate of the library does to the data, at its null value and where its shape is not known there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.audit.fit import Fit, Target
+from rfdropo_bayes.audit.score import Signature, signature, span
+from rfdropo_bayes.simulators.mechanisms import Mechanism
+
+LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)  # quantiles of the prior at which a shape is tried
+LEVELS_OF_TWO = (0.2, 0.5, 0.8)  # if there are two of them
+UNSEEN = 1e-6  # of the whitened data per prior deviation: the parameter does nothing at null
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One way a candidate may look.
+
+    Attributes:
+        candidate: its name.
+        point: coordinates of its parameters there, by index.
+        columns: whitened effect of prior-sized changes of its amplitudes.
+        amplitudes: indices of the parameters the columns belong to; empty for a secant, the effect of `point` itself.
+        mark: what of it the base parameters cannot imitate.
+    """
+
+    candidate: str
+    point: dict[int, float]
+    columns: Float[np.ndarray, "n k"]
+    amplitudes: tuple[int, ...]
+    mark: Signature
+
+    def start(self, fit: Fit) -> Float[np.ndarray, " d"]:
+        """Where a fit of this candidate starts: base parameters and amplitudes moved as the linear model says."""
+        x = fit.x.copy()
+        for index, value in self.point.items():
+            x[index] = value
+        design = np.concatenate([fit.jacobian, self.columns], axis=1)
+        ridge = np.concatenate([np.sqrt(np.diag(np.linalg.inv(fit.covariance))) * 1e-3, np.ones(self.columns.shape[1])])
+        step = np.linalg.lstsq(
+            np.concatenate([design, np.diag(ridge)]), np.concatenate([fit.residual, np.zeros(len(ridge))]), rcond=None
+        )[0]
+        x[fit.free] += np.clip(step[: len(fit.free)], -1.0, 1.0)
+        for index, value in zip(self.amplitudes, step[len(fit.free) :], strict=False):
+            x[index] += value
+        return x
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A mechanism of the library, or the simulator's own discretisation.
+
+    Attributes:
+        name: registry name.
+        indices: coordinates of its parameters.
+        mechanism: itself; None for the discretisation.
+        probes: how it may look, filled by `probe_all`.
+    """
+
+    name: str
+    indices: tuple[int, ...]
+    mechanism: Mechanism | None
+    probes: tuple[Probe, ...] = field(default_factory=tuple)
+
+
+def probe_all(target: Target, fit: Fit, candidates: Sequence[Candidate]) -> list[Probe]:
+    """Probes of every candidate at a fit of the present model, all in a few batches of rollouts.
+
+    A parameter without effect at null is a shape (a time constant, a threshold). Its prior is tried on a grid. Where
+    the shape alone changes the data, that change is the direction; else the amplitudes are differentiated there.
+    """
+    base = span(fit.jacobian)
+    open_ = [c for c in candidates if c.indices]
+    indices = [i for c in open_ for i in c.indices]
+    at_null = target.jacobian(fit.x, np.array(indices, dtype=int)) if indices else np.zeros((len(fit.residual), 0))
+    column = dict(zip(indices, at_null.T, strict=True))
+    jobs: list[tuple[Candidate, dict[int, float]]] = []
+    probes: list[Probe] = []
+    for candidate in open_:
+        shapes = _shapes(target, candidate, {i: float(np.linalg.norm(column[i])) for i in candidate.indices})
+        if not shapes:
+            columns = np.stack([column[i] for i in candidate.indices], axis=1)
+            probes.append(_probe(target, base, candidate, {}, columns, candidate.indices))
+        jobs += [(candidate, point) for point in _grid(target, candidate, shapes)]
+    return probes + _probe_grid(target, fit, base, jobs)
+
+
+def _shapes(target: Target, candidate: Candidate, size: dict[int, float]) -> list[int]:
+    """Parameters without effect at null that may have one elsewhere."""
+    coordinates = target.forward.coordinates
+    seen = [i for i in candidate.indices if size[i] >= UNSEEN]
+    unseen = [i for i in candidate.indices if size[i] < UNSEEN]
+    # Beside an amplitude that is seen, another one without effect (a tilt about gravity itself) is no shape.
+    return [i for i in unseen if not seen or not coordinates.affine[i] or coordinates.space.parameters[i].spec.grid]
+
+
+def _grid(target: Target, candidate: Candidate, shapes: Sequence[int]) -> list[dict[int, float]]:
+    coordinates = target.forward.coordinates
+    levels = LEVELS if len(shapes) < 2 else LEVELS_OF_TWO
+    values = []
+    for i in shapes:
+        given = coordinates.space.parameters[i].spec.grid
+        values.append(coordinates.encode_one(i, given) if given else coordinates.quantiles(i, levels))
+    return [dict(zip(shapes, point, strict=True)) for point in product(*values)] if shapes else []
+
+
+def _probe_grid(
+    target: Target, fit: Fit, base: np.ndarray, jobs: Sequence[tuple[Candidate, dict[int, float]]]
+) -> list[Probe]:
+    if not jobs:
+        return []
+    points = np.repeat(fit.x[None], len(jobs), axis=0)
+    for row, (_, point) in enumerate(jobs):
+        for index, value in point.items():
+            points[row, index] = value
+    residual = target.residual(points)
+    secants = np.clip(fit.residual - residual, -1e3, 1e3)
+    alone = np.linalg.norm(secants, axis=1) > UNSEEN
+    slots = [(row, i) for row, (c, p) in enumerate(jobs) if not alone[row] for i in c.indices if i not in p]
+    rows = np.array([row for row, _ in slots], dtype=int)
+    directions = np.eye(points.shape[1])[[i for _, i in slots]] if slots else np.zeros((0, points.shape[1]))
+    slopes = target.measurements.whiten(target.forward.derivatives_at(points[rows], directions), target.noise)
+    probes = []
+    for row, (candidate, point) in enumerate(jobs):
+        if alone[row]:
+            probes.append(_probe(target, base, candidate, point, secants[row][:, None], ()))
+        else:
+            amplitudes = tuple(i for i in candidate.indices if i not in point)
+            if amplitudes:
+                probes.append(_probe(target, base, candidate, point, slopes[rows == row].T, amplitudes))
+    return probes
+
+
+def _probe(
+    target: Target,
+    base: np.ndarray,
+    candidate: Candidate,
+    point: dict[int, float],
+    columns: np.ndarray,
+    amplitudes: tuple[int, ...],
+) -> Probe:
+    sign = 1 if not amplitudes else int(target.forward.coordinates.one_sided[amplitudes[0]])
+    mark = signature(base, columns, sign if columns.shape[1] == 1 else 0)
+    return Probe(candidate.name, point, columns, amplitudes, mark)
+
+
+def discretisation_probe(
+    fit: Fit, name: str, finer: Float[np.ndarray, " n"], candidate_base: Float[np.ndarray, "n rank"]
+) -> Probe:
+    """The effect of a finer mesh and time step, from the residual of the finer simulator at the same point."""
+    columns = (fit.residual - finer)[:, None]
+    return Probe(name, {}, columns, (), signature(candidate_base, columns, 1))

@@ -1,0 +1,185 @@
+"""One vector for all parameters of an audit: those of the base model, and those of every candidate at its null value.
+
+Base parameters are moved in the unconstrained space of their priors. A parameter of a candidate is measured from its
+null value in units of its prior's deviation, because a null value may lie on a hard bound, where an unconstrained
+coordinate would be infinite; a parameter that means nothing at null (a time constant) is moved unconstrained, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from rfdropo_bayes.bayes.space import Parameter, ParameterSpace
+
+MEASURED_FROM_NULL = ("Normal", "TruncatedNormal", "HalfNormal")
+PRIOR_DRAWS = 4000
+# Prior deviations from its mean at which an unconstrained coordinate ends: a logistic is flat there.
+FAR = 8.0
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Parameters as one vector x.
+
+    Attributes:
+        space: every parameter, base first; each with its prior.
+        base: how many of them belong to the base model.
+        physical: names of the simulator's parameters, the order in which rollouts want them; nominal: their values
+            where nothing else is said.
+        fixed: values that stay, by physical name.
+    """
+
+    space: ParameterSpace
+    base: int
+    physical: tuple[str, ...]
+    nominal: Mapping[str, float]
+    fixed: Mapping[str, float]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names, in the order of the vector."""
+        return self.space.names
+
+    @cached_property
+    def affine(self) -> np.ndarray:
+        """True where a coordinate is measured from its null value."""
+        return np.array(
+            [
+                i >= self.base and (p.table or {}).get("distribution") in MEASURED_FROM_NULL
+                for i, p in enumerate(self.space.parameters)
+            ]
+        )
+
+    @cached_property
+    def _draws(self) -> dict[str, np.ndarray]:
+        draws = self.space.sample(jax.random.key(0), PRIOR_DRAWS)
+        return {name: np.asarray(values, dtype=float) for name, values in draws.items()}
+
+    @cached_property
+    def _null(self) -> np.ndarray:
+        return np.array([p.spec.nominal for p in self.space.parameters], dtype=float)
+
+    @cached_property
+    def _scale(self) -> np.ndarray:
+        return np.array([_spread(p, self._draws[p.name]) for p in self.space.parameters])
+
+    @cached_property
+    def prior_mean(self) -> Float[np.ndarray, " d"]:
+        """Centre of the prior in these coordinates."""
+        return np.array([0.0 if a else float(u.mean()) for a, u in zip(self.affine, self._free_draws, strict=True)])
+
+    @cached_property
+    def prior_sd(self) -> Float[np.ndarray, " d"]:
+        """Deviation of the prior in these coordinates."""
+        return np.array([1.0 if a else float(u.std()) for a, u in zip(self.affine, self._free_draws, strict=True)])
+
+    @cached_property
+    def _free_draws(self) -> list[np.ndarray]:
+        draws = {name: jnp.asarray(values) for name, values in self._draws.items()}
+        return list(np.asarray(self.space.to_unconstrained(draws)).T)
+
+    @cached_property
+    def bounds(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+        """Lowest and highest value of each coordinate."""
+        low, high = (np.array([getattr(p.spec, side) for p in self.space.parameters]) for side in ("low", "high"))
+        lower = np.where(self.affine, (low - self._null) / self._scale, self.prior_mean - FAR * self.prior_sd)
+        upper = np.where(self.affine, (high - self._null) / self._scale, self.prior_mean + FAR * self.prior_sd)
+        return lower, upper
+
+    @cached_property
+    def one_sided(self) -> np.ndarray:
+        """+1 or -1 where the null value lies on a bound and only that sign has a meaning; else 0."""
+        lower, upper = self.bounds
+        return np.where(self.affine & (lower >= 0.0), 1, np.where(self.affine & (upper <= 0.0), -1, 0))
+
+    def quantiles(self, index: int, levels: Sequence[float]) -> Float[np.ndarray, " level"]:
+        """Quantiles of one parameter's prior, as coordinates."""
+        return self.encode_one(index, np.quantile(self._draws[self.names[index]], levels))
+
+    def encode_one(self, index: int, values: Any) -> np.ndarray:
+        """Physical values of one parameter as coordinates."""
+        if self.affine[index]:
+            return (np.asarray(values, dtype=float) - self._null[index]) / self._scale[index]
+        return np.asarray(self.space.parameters[index].transform.inv(jnp.asarray(values, dtype=float)))
+
+    @cached_property
+    def null(self) -> Float[np.ndarray, " d"]:
+        """The base model at the centre of its prior, every candidate at its null value."""
+        x = self.prior_mean.copy()
+        for i in range(self.base, len(x)):
+            low, high = np.quantile(self._draws[self.names[i]], [0.001, 0.999])
+            x[i] = 0.0 if self.affine[i] else float(self.encode_one(i, np.clip(self._null[i], low, high)))
+        return x
+
+    def values(self, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+        """Physical values."""
+        free = np.asarray(self._transformed(jnp.asarray(x)))
+        return np.where(self.affine, self._null + self._scale * x, free)
+
+    def named(self, x: Float[np.ndarray, " d"]) -> dict[str, float]:
+        """Physical values of one point by name."""
+        return dict(zip(self.names, self.values(x[None])[0].tolist(), strict=True))
+
+    def encode(self, values: Mapping[str, float]) -> Float[np.ndarray, " d"]:
+        """Coordinates of physical values; what is left out stays at `null`."""
+        x = self.null.copy()
+        for i, name in enumerate(self.names):
+            if name in values:
+                x[i] = float(self.encode_one(i, values[name]))
+        return np.clip(x, *self.bounds)
+
+    @cached_property
+    def _transformed(self) -> Any:
+        def apply(x: jax.Array) -> jax.Array:
+            found = self.space.from_unconstrained(x)
+            return jnp.stack([found[name] for name in self.names], axis=-1)
+
+        return jax.jit(apply)
+
+    def slopes(self, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+        """Derivative of each physical value with respect to its coordinate."""
+        _, free = jax.jvp(self._transformed, (jnp.asarray(x),), (jnp.ones(x.shape),))
+        return np.where(self.affine, self._scale, np.asarray(free))
+
+    def slots(self, recordings: Sequence[str]) -> Int[np.ndarray, "recording d"]:
+        """Where each coordinate goes in a recording's physical parameters; -1 for those of other recordings."""
+        index = {name: i for i, name in enumerate(self.physical)}
+        return np.array(
+            [[index[p.spec.name] if p.recording in ("", r) else -1 for p in self.space.parameters] for r in recordings]
+        )
+
+    def physical_values(
+        self, x: Float[np.ndarray, "n d"], slots: Int[np.ndarray, "recording d"]
+    ) -> Float[np.ndarray, "n recording physical"]:
+        """What the simulator is given for each recording."""
+        start = np.array([self.fixed.get(name, self.nominal[name]) for name in self.physical], dtype=float)
+        return _scattered(np.tile(start, (len(x), len(slots), 1)), self.values(x), slots)
+
+    def physical_tangents(
+        self,
+        x: Float[np.ndarray, "n d"],
+        directions: Float[np.ndarray, "n d"],
+        slots: Int[np.ndarray, "recording d"],
+    ) -> Float[np.ndarray, "n recording physical"]:
+        """Derivatives of `physical_values` along directions."""
+        zero = np.zeros((len(x), len(slots), len(self.physical)))
+        return _scattered(zero, self.slopes(x) * directions, slots)
+
+
+def _scattered(theta: np.ndarray, values: np.ndarray, slots: np.ndarray) -> np.ndarray:
+    for recording, places in enumerate(slots):
+        theta[:, recording, places[places >= 0]] = values[:, places >= 0]
+    return theta
+
+
+def _spread(parameter: Parameter, draws: np.ndarray) -> float:
+    """Scale of the prior: its own where it names one, so that a half-normal at null is a standard normal's half."""
+    return float((parameter.table or {}).get("scale", 0.0)) or float(np.std(draws)) or 1.0

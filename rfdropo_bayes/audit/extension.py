@@ -1,0 +1,192 @@
+"""Naming causes: the leading classes are refitted, the best joins the model, and the question is asked again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rfdropo_bayes.audit.candidates import Candidate, Probe, discretisation_probe, probe_all
+from rfdropo_bayes.audit.fit import Fit, Target, climb
+from rfdropo_bayes.audit.forward import Forward
+from rfdropo_bayes.audit.score import likeness, span
+from rfdropo_bayes.audit.screen import Look, Row, look
+
+DISCRETISATION = "discretisation"
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Numbers the verdict depends on, fixed in advance.
+
+    Attributes:
+        family: probability that the screen names anything where nothing is wrong.
+        class_cosine: signatures more alike than this are one class.
+        classes: leading classes that are refitted; members: candidates refitted in all.
+        effects: most mechanisms that are added.
+        evidence: log Bayes factor a mechanism must bring to be added.
+        bootstraps: simulated data sets behind every p-value.
+        base_passes, extended_passes: p-values of the joint test from which a model is let pass.
+        explained, significant: shares of the discrepancy for "explained" and for "partly explained".
+    """
+
+    family: float = 0.02
+    class_cosine: float = 0.95
+    classes: int = 4
+    members: int = 8
+    effects: int = 3
+    evidence: float = 3.0
+    bootstraps: int = 999
+    base_passes: float = 0.01
+    extended_passes: float = 0.05
+    explained: float = 0.8
+    significant: float = 0.2
+
+
+@dataclass(frozen=True)
+class Step:
+    """One mechanism that joined the model.
+
+    Attributes:
+        name: of the mechanism.
+        members: its equivalence class, itself first.
+        before: the look at the model without it.
+        fit: of the model with it.
+        log_bayes_factor: of the model with against that without it, by Laplace.
+        refits: log Bayes factors of all candidates that were refitted at this step.
+    """
+
+    name: str
+    members: tuple[str, ...]
+    before: Look
+    fit: Fit
+    log_bayes_factor: float
+    refits: dict[str, float]
+
+
+@dataclass
+class Inquiry:
+    """The question put to a data set: which of the candidates does the base model lack?
+
+    Attributes:
+        target: data, noise and simulator; every candidate is in the simulator, at its null value.
+        candidates: that may be named.
+        rules: see `Rules`.
+        seed: of all bootstraps.
+        finer: the simulator on a finer mesh and time step, for the candidate `DISCRETISATION`; None without it.
+        report: called with a line of words as the inquiry goes on.
+    """
+
+    target: Target
+    candidates: Sequence[Candidate]
+    rules: Rules
+    seed: int
+    finer: Forward | None = None
+    report: Callable[[str], None] = lambda line: None
+    looks: list[Look] = field(default_factory=list)
+
+    def look_at(self, fit: Fit, without: Sequence[str] = ()) -> tuple[Look, list[Probe]]:
+        """Test a fit and screen the candidates that are not in it."""
+        free = [c for c in self.candidates if c.name not in without]
+        names = [c.name for c in free]
+        probes = probe_all(self.target, fit, free)
+        if self.finer is not None and DISCRETISATION not in without:
+            finer = replace(self.target, forward=self.finer).residual(fit.x[None])[0]
+            probes.append(discretisation_probe(fit, DISCRETISATION, finer, span(fit.jacobian)))
+            names.append(DISCRETISATION)
+        found = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps)
+        return found, probes
+
+    def name_causes(self, base: Fit) -> tuple[list[Step], Look]:
+        """Forward-stepwise extension: the steps taken, and the look at the final model."""
+        steps: list[Step] = []
+        fit = base
+        while True:
+            named = [step.name for step in steps]
+            found, _ = self.look_at(fit, named)
+            if not steps and found.omnibus.p > self.rules.base_passes:
+                return steps, found
+            self.report(f"joint test p = {found.omnibus.p:.3g}; first: {found.rows[0].name if found.rows else 'none'}")
+            if len(steps) >= self.rules.effects or found.omnibus.p > self.rules.extended_passes:
+                return steps, found
+            step = self._extend(found, named)
+            if step is None:
+                return steps, found
+            steps.append(step)
+            fit = step.fit
+            if len(steps) > 1:
+                steps = self._reconsider(base, steps)
+                fit = steps[-1].fit
+
+    def _extend(self, found: Look, named: Sequence[str]) -> Step | None:
+        """Refit the leading classes and add the best of them, if it is worth it."""
+        significant = [row for row in found.rows if row.adjusted_p <= self.rules.family and row.probe is not None]
+        chosen = self._leading(significant)
+        refits: dict[str, float] = {}
+        fits: dict[str, Fit] = {}
+        for row in chosen:
+            fits[row.name] = self._refit(found.fit, row)
+            refits[row.name] = fits[row.name].log_evidence - found.fit.log_evidence
+            self.report(f"refit with {row.name}: log Bayes factor {refits[row.name]:.1f}")
+        if not refits or max(refits.values()) < self.rules.evidence:
+            return None
+        best = max(refits, key=lambda name: refits[name])
+        members = self._class_of(found.row(best), significant)
+        return Step(best, members, found, fits[best], refits[best], refits)
+
+    def _leading(self, significant: Sequence[Row]) -> list[Row]:
+        """The best candidates of the leading classes, and further members of these while there is room."""
+        heads: list[Row] = []
+        rest: list[Row] = []
+        for row in significant:
+            assert row.probe is not None
+            alike = any(likeness(row.probe.mark, h.probe.mark) > self.rules.class_cosine for h in heads if h.probe)
+            if not alike and len(heads) < self.rules.classes:
+                heads.append(row)
+            elif alike:
+                rest.append(row)
+        return [*heads, *rest][: self.rules.members]
+
+    def _class_of(self, best: Row, significant: Sequence[Row]) -> tuple[str, ...]:
+        assert best.probe is not None
+        alike = [
+            row.name
+            for row in significant
+            if row.name != best.name
+            and row.probe is not None
+            and likeness(best.probe.mark, row.probe.mark) > self.rules.class_cosine
+        ]
+        return (best.name, *alike)
+
+    def _refit(self, fit: Fit, row: Row) -> Fit:
+        assert row.probe is not None
+        if row.name == DISCRETISATION:
+            assert self.finer is not None
+            return climb(replace(self.target, forward=self.finer), fit.x, fit.free)
+        candidate = next(c for c in self.candidates if c.name == row.name)
+        free = np.array([*fit.free, *candidate.indices], dtype=int)
+        low, high = self.target.forward.coordinates.bounds
+        start = np.clip(row.probe.start(fit), low, high)
+        return climb(self.target, start, free)
+
+    def _reconsider(self, base: Fit, steps: list[Step]) -> list[Step]:
+        """With the last mechanism in the model, was the first one named rightly? Take it out and ask again."""
+        first, last = steps[0], steps[-1]
+        if DISCRETISATION in (first.name, last.name) or len(steps) > 2:
+            return steps
+        candidate = next(c for c in self.candidates if c.name == last.name)
+        indices = np.array([*base.free, *candidate.indices], dtype=int)
+        start = last.fit.x.copy()
+        others = np.setdiff1d(last.fit.free, indices)
+        start[others] = self.target.forward.coordinates.null[others]
+        alone = climb(self.target, start, indices)
+        found, _ = self.look_at(alone, [last.name])
+        again = self._extend(found, [last.name])
+        if again is None or again.name in (first.name, *first.members) or again.name == DISCRETISATION:
+            return steps
+        if again.fit.log_evidence < last.fit.log_evidence + 1.0:
+            return steps
+        self.report(f"with {last.name} in the model, {again.name} takes the place of {first.name}")
+        renewed = replace(last, before=first.before, fit=alone, log_bayes_factor=alone.log_evidence - base.log_evidence)
+        return [renewed, again]

@@ -1,0 +1,127 @@
+"""Posterior modes of the base model and its extensions by Gauss-Newton within bounds, with Laplace's evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.optimize import least_squares
+from scipy.stats import norm
+
+from rfdropo_bayes.audit.forward import Forward
+from rfdropo_bayes.audit.measurements import Measurements
+from rfdropo_bayes.audit.noise import NoiseModel
+
+STARTS, SCREENED = 3, 48
+FAILED = 1e6  # whitened residual of a rollout that did not end well: no step is ever taken there
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A mode and the normal approximation around it.
+
+    Attributes:
+        x: coordinates of all parameters.
+        free: which of them were fitted.
+        residual: whitened, without the prior's rows.
+        jacobian: of the whitened prediction with respect to the free coordinates.
+        covariance: of the free coordinates, prior included.
+        log_evidence: Laplace's, up to the noise's normaliser, which all models under one noise share.
+    """
+
+    x: Float[np.ndarray, " d"]
+    free: Int[np.ndarray, " free"]
+    residual: Float[np.ndarray, " n"]
+    jacobian: Float[np.ndarray, "n free"]
+    covariance: Float[np.ndarray, "free free"]
+    log_evidence: float
+
+    def draws(self, rng: np.random.Generator, count: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Draws of all coordinates, folded back at the bounds."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        z = rng.standard_normal((count, len(self.free))) * np.sqrt(np.maximum(values, 0.0))
+        points = np.repeat(self.x[None], count, axis=0)
+        points[:, self.free] += z @ vectors.T
+        points = np.where(points < low, 2 * low - points, np.where(points > high, 2 * high - points, points))
+        return np.clip(points, low, high)
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is fitted: measurements under a noise, by a simulator."""
+
+    forward: Forward
+    measurements: Measurements
+    noise: NoiseModel
+
+    def residual(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n m"]:
+        """Whitened residuals, measured less simulated, of a batch of points."""
+        position, fine = self.forward.positions(points)
+        white = self.measurements.whiten(self.measurements.position - position, self.noise)
+        return np.where(fine[:, None], white, FAILED)
+
+    def jacobian(self, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]) -> Float[np.ndarray, "m free"]:
+        """Derivatives of the whitened prediction."""
+        directions = np.eye(len(x))[free]
+        return self.measurements.whiten(self.forward.derivatives(x, directions), self.noise).T
+
+
+def climb(
+    target: Target, start: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"], *, evaluations: int = 40
+) -> Fit:
+    """Posterior mode over the free coordinates from one start, the others held."""
+    coordinates = target.forward.coordinates
+    low, high = (bound[free] for bound in coordinates.bounds)
+    mean, sd = coordinates.prior_mean[free], coordinates.prior_sd[free]
+
+    def place(z: np.ndarray) -> np.ndarray:
+        x = start.copy()
+        x[free] = z
+        return x
+
+    def residual(z: np.ndarray) -> np.ndarray:
+        return np.concatenate([target.residual(place(z)[None])[0], (z - mean) / sd])
+
+    def jacobian(z: np.ndarray) -> np.ndarray:
+        return np.concatenate([-target.jacobian(place(z), free), np.diag(1.0 / sd)])
+
+    inside = np.clip(start[free], low + 1e-9 * (high - low), high - 1e-9 * (high - low))
+    found = least_squares(
+        residual, inside, jacobian, bounds=(low, high), x_scale=sd, ftol=1e-7, xtol=1e-7, gtol=1e-9,
+        max_nfev=evaluations,
+    )  # fmt: skip
+    return at_point(target, place(found.x), free)
+
+
+def at_point(target: Target, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]) -> Fit:
+    """The normal approximation around a point that is taken for the mode."""
+    coordinates = target.forward.coordinates
+    low, high = (bound[free] for bound in coordinates.bounds)
+    mean, sd = coordinates.prior_mean[free], coordinates.prior_sd[free]
+    residual, jacobian = target.residual(x[None])[0], target.jacobian(x, free)
+    precision = jacobian.T @ jacobian + np.diag(1.0 / sd**2)
+    covariance = np.linalg.inv(precision)
+    z = (x[free] - mean) / sd
+    log_prior = float(np.sum(-0.5 * z**2 - np.log(sd)))  # the 2 pi cancel against those of the integral
+    spread = np.sqrt(np.diag(covariance))
+    # Where a prior ends at a bound, it is higher by what lies beyond, and only part of the peak is inside.
+    beyond = np.log(norm.cdf((high - mean) / sd) - norm.cdf((low - mean) / sd))
+    inside = np.log(np.maximum(norm.cdf((high - x[free]) / spread) - norm.cdf((low - x[free]) / spread), 1e-12))
+    evidence = -0.5 * float(residual @ residual) + log_prior + 0.5 * float(np.linalg.slogdet(covariance)[1])
+    return Fit(x, free, residual, jacobian, covariance, evidence + float(np.sum(inside - beyond)))
+
+
+def fit_base(
+    target: Target, free: Int[np.ndarray, " free"], rng: np.random.Generator, start: np.ndarray | None = None
+) -> Fit:
+    """Posterior mode of the base model: climbs from a given start, or from the best of some prior draws."""
+    coordinates = target.forward.coordinates
+    if start is not None:
+        return climb(target, start, free)
+    points = np.repeat(coordinates.null[None], SCREENED, axis=0)
+    points[1:, free] += coordinates.prior_sd[free] * rng.standard_normal((SCREENED - 1, len(free)))
+    points = np.clip(points, *coordinates.bounds)
+    cost = np.sum(target.residual(points) ** 2, axis=1)
+    best = [climb(target, points[index], free) for index in np.argsort(cost, kind="stable")[:STARTS]]
+    return max(best, key=lambda fit: fit.log_evidence)

@@ -1,0 +1,180 @@
+"""Rollouts and their derivatives in batches of one shape, so that two compilations serve a whole audit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.audit.coordinates import Coordinates
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.protocol import Result, Simulator
+
+# Lanes of one call, the last of a batch padded: few for a single point, many for a Jacobian.
+WIDTHS = (8, 32)
+
+Thetas = Float[np.ndarray, "lane physical"]
+Points = Float[np.ndarray, "n d"]
+Series = Float[np.ndarray, "... recording time channel"]
+
+
+class Lanes:
+    """A simulator behind two compiled functions of a fixed number of lanes.
+
+    Args:
+        simulator: with the base model's mechanisms and every candidate at its null value.
+        marker_index: which of its markers are measured.
+    """
+
+    def __init__(self, simulator: Simulator, marker_index: np.ndarray) -> None:
+        self.simulator = simulator
+        self.marker_index = marker_index
+        self.physical = tuple(spec.name for spec in simulator.parameters)
+
+    def _observe(self, theta: jax.Array, commands: Commands) -> tuple[jax.Array, jax.Array]:
+        values = dict(zip(self.physical, theta, strict=True))
+        steps = jnp.asarray(commands.step.shape[0])
+        observation = self.simulator.rollout(values, commands, steps)
+        position = observation.position[:, self.marker_index]
+        return position.reshape(position.shape[0], -1), observation.status
+
+    @cached_property
+    def _rolled(self) -> Any:
+        return jax.jit(jax.vmap(self._observe))
+
+    @cached_property
+    def _derived(self) -> Any:
+        def one(theta: jax.Array, tangent: jax.Array, commands: Commands) -> jax.Array:
+            return jax.jvp(lambda t: self._observe(t, commands)[0], (theta,), (tangent,))[1]
+
+        return jax.jit(jax.vmap(one))
+
+    def roll(self, theta: Thetas, commands: Commands, lane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Marker coordinates of each set of parameters under the commands of its lane, and result codes."""
+        parts = self._chunks(self._rolled, commands, lane, theta)
+        position, status = (np.concatenate([part[i] for part in parts])[: len(lane)] for i in range(2))
+        return position, status
+
+    def differentiate(self, theta: Thetas, tangent: Thetas, commands: Commands, lane: np.ndarray) -> np.ndarray:
+        """Derivatives of the marker coordinates along tangents."""
+        return np.concatenate(self._chunks(self._derived, commands, lane, theta, tangent))[: len(lane)]
+
+    def _chunks(self, function: Any, commands: Commands, lane: np.ndarray, *arrays: np.ndarray) -> list[Any]:
+        parts, start = [], 0
+        while start < len(lane):
+            width = WIDTHS[0] if len(lane) - start <= WIDTHS[0] else WIDTHS[1]
+            index = np.minimum(np.arange(start, start + width), len(lane) - 1)
+            chosen = Commands(*(np.asarray(part)[lane[index]] for part in commands))
+            parts.append(jax.device_get(function(*(a[index] for a in arrays), chosen)))
+            start += width
+        return parts
+
+
+class RoutedLanes(Lanes):
+    """Two simulators of one model: a fast one for all that it can do, another for rollouts with further candidates.
+
+    Args:
+        fast: lanes of the simulator without these candidates.
+        slow: lanes of the simulator with all.
+        null: physical values at which the further candidates do nothing.
+    """
+
+    def __init__(self, fast: Lanes, slow: Lanes, null: Mapping[str, float]) -> None:
+        super().__init__(slow.simulator, slow.marker_index)
+        self.fast, self.slow = fast, slow
+        self._kept = np.array([self.physical.index(name) for name in fast.physical])
+        self._further = np.setdiff1d(np.arange(len(self.physical)), self._kept)
+        self._null = np.array([null[self.physical[i]] for i in self._further])
+
+    def _needs_slow(self, theta: np.ndarray) -> np.ndarray:
+        return ~np.isclose(theta[:, self._further], self._null, rtol=1e-6, atol=1e-12).all(axis=1)
+
+    def roll(self, theta: Thetas, commands: Commands, lane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `Lanes.roll`."""
+        slow = self._needs_slow(theta)
+        parts = [
+            (~slow, self.fast, theta[:, self._kept]),
+            (slow, self.slow, theta),
+        ]
+        found = [(mask, *lanes.roll(t[mask], commands, lane[mask])) for mask, lanes, t in parts if mask.any()]
+        position = np.zeros((len(lane), *found[0][1].shape[1:]))
+        status = np.zeros(len(lane), dtype=int)
+        for mask, own, codes in found:
+            position[mask], status[mask] = own, codes
+        return position, status
+
+    def differentiate(self, theta: Thetas, tangent: Thetas, commands: Commands, lane: np.ndarray) -> np.ndarray:
+        """See `Lanes.differentiate`."""
+        slow = self._needs_slow(theta) | np.any(tangent[:, self._further] != 0.0, axis=1)
+        found = []
+        for mask, lanes, kept in ((~slow, self.fast, self._kept), (slow, self.slow, slice(None))):
+            if mask.any():
+                own = lanes.differentiate(theta[mask][:, kept], tangent[mask][:, kept], commands, lane[mask])
+                found.append((mask, own))
+        derivative = np.zeros((len(lane), *found[0][1].shape[1:]))
+        for mask, own in found:
+            derivative[mask] = own
+        return derivative
+
+
+class Forward:
+    """Simulated marker coordinates of a set of recordings as functions of the audit's coordinates.
+
+    Args:
+        lanes: the simulator.
+        coordinates: what a point means.
+        commands: of the recordings, stacked.
+        chosen: which of these are simulated, by name.
+    """
+
+    def __init__(self, lanes: Lanes, coordinates: Coordinates, commands: Commands, chosen: Mapping[str, int]) -> None:
+        self.lanes = lanes
+        self.coordinates = coordinates
+        self.commands = Commands(*(np.asarray(part)[list(chosen.values())] for part in commands))
+        self.slots = coordinates.slots(list(chosen))
+        self.count = len(chosen)
+        self.rollouts = 0
+
+    def positions(self, points: Points) -> tuple[Series, np.ndarray]:
+        """Marker coordinates [m] of every recording, and True where all its rollouts ended well."""
+        points = np.atleast_2d(points)
+        theta, lane = self._lanes_of(points)
+        position, status = self.lanes.roll(theta, self.commands, lane)
+        self.rollouts += len(lane)
+        fine = (status == Result.OK) & np.isfinite(position).all(axis=(1, 2))
+        return position.reshape(len(points), self.count, *position.shape[1:]), fine.reshape(len(points), -1).all(axis=1)
+
+    def position(self, point: Float[np.ndarray, " d"]) -> Series:
+        """Marker coordinates at one point.
+
+        Raises:
+            InputError: a rollout there did not end well.
+        """
+        position, fine = self.positions(point[None])
+        if not fine[0]:
+            raise InputError("a rollout at the optimum did not end well", where="audit", remedy=Result.DIVERGED.remedy)
+        return position[0]
+
+    def derivatives(self, point: Float[np.ndarray, " d"], directions: Points) -> Series:
+        """Derivative of the marker coordinates along each direction; one-sided where a mechanism is so at null."""
+        return self.derivatives_at(np.repeat(point[None], len(directions), axis=0), directions)
+
+    def derivatives_at(self, points: Points, directions: Points) -> Series:
+        """The same with a point of its own for every direction."""
+        if len(points) == 0:
+            return np.zeros((0, self.count, self.commands.sample_step.shape[1], 3 * len(self.lanes.marker_index)))
+        theta, lane = self._lanes_of(points)
+        tangent = self.coordinates.physical_tangents(points, directions, self.slots).reshape(theta.shape)
+        found = self.lanes.differentiate(theta, tangent, self.commands, lane)
+        self.rollouts += 3 * len(lane)
+        return np.nan_to_num(found).reshape(len(points), self.count, *found.shape[1:])
+
+    def _lanes_of(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
+        theta = self.coordinates.physical_values(points, self.slots)
+        return theta.reshape(-1, theta.shape[-1]), np.tile(np.arange(self.count), len(points))

@@ -1,0 +1,201 @@
+"""What an extension is worth on trajectories that no fit has seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.fft import dct
+from scipy.special import logsumexp
+from scipy.stats import norm
+
+from rfdropo_bayes.audit.noise import STATED, NoiseModel
+
+DIFFERENCE_FROM = 6  # trajectories below which an ELPD difference has no standard error worth stating
+RESAMPLES = 2000
+BANDS = 12
+LEVELS = (0.5, 0.9)
+
+
+class Prediction(NamedTuple):
+    """Simulated marker coordinates of unseen trajectories under draws of one model, without noise."""
+
+    draws: Float[np.ndarray, "draw trajectory time channel"]
+
+    @property
+    def mean(self) -> Float[np.ndarray, "trajectory time channel"]:
+        """Mean over the draws."""
+        return self.draws.mean(axis=0)
+
+
+class Unseen(NamedTuple):
+    """Measured trajectories that no fit has seen; ``valid`` where a value may be used."""
+
+    position: Float[np.ndarray, "trajectory time channel"]
+    valid: np.ndarray
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Base model against extended model, on unseen trajectories.
+
+    Attributes:
+        rmse_base, rmse_extended: root mean square distance of a marker [m].
+        elpd_difference: log predictive density of the extended model less that of the base, summed over trajectories;
+            its standard error only from `DIFFERENCE_FROM` trajectories up.
+        coverage: share of measurements in the extended model's central intervals.
+        explained: share of the base model's discrepancy that the extension takes away; interval: its 90 % interval.
+        floor: the noise's root mean square distance of a marker [m].
+        trajectories: how many.
+    """
+
+    rmse_base: float
+    rmse_extended: float
+    elpd_difference: float
+    elpd_difference_se: float | None
+    coverage: dict[float, float]
+    explained: float
+    interval: tuple[float, float]
+    floor: float
+    trajectories: int
+
+
+def measure_gain(
+    unseen: Unseen,
+    base: Prediction,
+    extended: Prediction,
+    noise: NoiseModel,
+    pattern: Float[np.ndarray, "group time channel"],
+    rng: np.random.Generator,
+) -> Gain:
+    """Compare two models.
+
+    Args:
+        unseen: measurements.
+        base, extended: predictions.
+        noise: of the measurements.
+        pattern: what the base model leaves where it was fitted, whitened: it says where to look for the discrepancy,
+            in frequency and over the channels.
+    """
+    first, second = (np.where(unseen.valid, unseen.position - p.mean, 0.0) for p in (base, extended))
+    markers = max(unseen.valid.sum() / 3.0, 1.0)
+    own = [_elpd(unseen, p, noise) for p in (base, extended)]
+    difference = own[1] - own[0]
+    count = len(difference)
+    explained, interval = explained_fraction(unseen, first, second, noise, pattern, rng)
+    return Gain(
+        rmse_base=float(np.sqrt(np.sum(first**2) / markers)),
+        rmse_extended=float(np.sqrt(np.sum(second**2) / markers)),
+        elpd_difference=float(difference.sum()),
+        elpd_difference_se=float(np.sqrt(count) * difference.std(ddof=1)) if count >= DIFFERENCE_FROM else None,
+        coverage=_coverage(unseen, extended, noise),
+        explained=explained,
+        interval=interval,
+        floor=noise_distance(noise),
+        trajectories=count,
+    )
+
+
+def noise_distance(noise: NoiseModel) -> float:
+    """Root mean square distance of a marker that the noise alone makes [m]."""
+    return float(np.sqrt(3.0 * np.mean(noise.scale**2)))
+
+
+def _elpd(unseen: Unseen, prediction: Prediction, noise: NoiseModel) -> Float[np.ndarray, " trajectory"]:
+    """Log predictive density of each trajectory, up to the noise's normaliser."""
+    residual = np.where(unseen.valid, unseen.position - prediction.draws, 0.0)
+    white = noise.whiten(residual, np.broadcast_to(unseen.valid, residual.shape))
+    return logsumexp(-0.5 * np.sum(white**2, axis=(-2, -1)), axis=0) - np.log(len(residual))
+
+
+def _coverage(unseen: Unseen, prediction: Prediction, noise: NoiseModel) -> dict[float, float]:
+    spread = np.sqrt(prediction.draws.var(axis=0) + noise.scale**2)
+    z = (
+        np.abs(unseen.position - prediction.mean)[unseen.valid]
+        / np.broadcast_to(spread, unseen.valid.shape)[unseen.valid]
+    )
+    return {level: float(np.mean(z < norm.ppf(0.5 + level / 2))) for level in LEVELS}
+
+
+def explained_fraction(
+    unseen: Unseen,
+    base: Float[np.ndarray, "trajectory time channel"],
+    extended: Float[np.ndarray, "trajectory time channel"],
+    noise: NoiseModel,
+    pattern: Float[np.ndarray, "group time channel"],
+    rng: np.random.Generator,
+) -> tuple[float, tuple[float, float]]:
+    """``1 - (ext^2 - noise^2) / (base^2 - noise^2)`` with its 90 % interval.
+
+    The mean squares are taken frequency by frequency and pattern by pattern (cosine transform in time, principal
+    components over the channels), each weighted by the share of discrepancy in what the base model leaves on the
+    FITTED data there (a Wiener filter): where there is nothing but noise, noise is not counted. The interval holds the
+    scatter of noise and trajectories (bootstrap over trajectories) and the uncertainty of the noise's own size.
+    """
+    axes = _components(pattern, unseen.valid.shape[-1])
+    spectrum = _noise_power(noise, base.shape[1])
+    weight = _wiener(pattern @ axes, base.shape[1])[None] * spectrum[None, :, None]
+    usable = np.maximum(unseen.valid.mean(axis=(1, 2)), 1e-9)
+
+    def energies(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        cosines = dct(noise.whiten(residual, unseen.valid) @ axes, axis=1, norm="ortho")
+        return np.sum(weight * cosines**2, axis=(1, 2)), usable * np.sum(weight)
+
+    first, floor = energies(base)
+    second, _ = energies(extended)
+    point = _fraction(first.sum(), second.sum(), floor.sum(), 1.0)
+    chosen = rng.integers(len(first), size=(RESAMPLES, len(first)))
+    # Few trajectories scatter more than a bootstrap of them shows: noise is drawn for each as well.
+    sizes = 1.0 + rng.standard_normal(RESAMPLES) * _floor_error(noise)
+    scatter = rng.standard_normal((RESAMPLES, len(first))) * np.sqrt(2.0 * np.sum(weight**2) * usable)
+    within = scatter.sum(axis=1) if len(first) < DIFFERENCE_FROM else 0.0
+    drawn = _fraction(
+        first[chosen].sum(axis=1) + within, second[chosen].sum(axis=1) + within, floor[chosen].sum(axis=1), sizes
+    )
+    return float(point), (float(np.quantile(drawn, 0.05)), float(np.quantile(drawn, 0.95)))
+
+
+def _fraction(base: np.ndarray, extended: np.ndarray, floor: np.ndarray, size: np.ndarray | float) -> np.ndarray:
+    left = np.maximum(extended - size * floor, 0.0)
+    # Less than the noise's own uncertainty is no discrepancy to be explained.
+    return 1.0 - left / np.maximum(base - size * floor, 1e-3 * floor)
+
+
+def _floor_error(noise: NoiseModel) -> float:
+    """Relative standard error of the noise's power."""
+    if noise.source == STATED or not np.isfinite(noise.freedom):
+        return 0.0
+    memory = noise.autocorrelation[1] if noise.order else 0.0
+    long_run = 2.0 * np.sqrt(max(1.0 - memory**2, 0.0)) / (1.0 - memory) if noise.order else 0.0
+    return float(np.sqrt((2.0 + long_run**2) / noise.freedom))
+
+
+def _components(pattern: np.ndarray, channels: int) -> Float[np.ndarray, "channel channel"]:
+    flat = pattern.reshape(-1, channels)
+    return np.linalg.eigh(flat.T @ flat)[1]
+
+
+def _noise_power(noise: NoiseModel, rows: int) -> Float[np.ndarray, " row"]:
+    """Power of the noise at the frequencies of the cosine transform, in units of its variance."""
+    coefficients, deviation = noise.predictors
+    angle = np.pi * np.arange(rows) / rows
+    lags = np.arange(1, noise.order + 1)
+    transfer = 1.0 - np.exp(-1j * np.outer(angle, lags)) @ coefficients[-1][: noise.order]
+    return deviation[-1] ** 2 / np.abs(transfer) ** 2
+
+
+def _wiener(pattern: Float[np.ndarray, "group time component"], rows: int) -> Float[np.ndarray, "row component"]:
+    """Share of discrepancy in each band of frequencies and component, from residuals of unit noise."""
+    power = np.mean(dct(pattern, axis=1, norm="ortho") ** 2, axis=0)
+    place = np.arange(len(power)) / len(power)
+    edges = np.concatenate([[0.0], np.geomspace(1.5 / len(power), 1.0, BANDS)])
+    band = np.clip(np.searchsorted(edges, place, side="right") - 1, 0, BANDS - 1)
+    excess = np.zeros_like(power)
+    for index in range(BANDS):
+        if (band == index).any():
+            excess[band == index] = np.maximum(power[band == index].mean(axis=0) - 1.0, 0.0)
+    share = excess / (excess + 1.0)
+    at = np.minimum((np.arange(rows) / rows * len(power)).astype(int), len(power) - 1)
+    return share[at]

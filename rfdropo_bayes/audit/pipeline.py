@@ -1,0 +1,279 @@
+"""The audit from data to verdict: show, name, extend, measure."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.audit.candidates import Candidate
+from rfdropo_bayes.audit.coordinates import Coordinates
+from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step
+from rfdropo_bayes.audit.fit import Fit, Target, climb, fit_base
+from rfdropo_bayes.audit.forward import Forward, Lanes
+from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
+from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
+from rfdropo_bayes.audit.noise import RESIDUALS, NoiseModel
+from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
+from rfdropo_bayes.audit.screen import Look
+from rfdropo_bayes.audit.verdict import decide
+from rfdropo_bayes.bayes.model import RecordingSet
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.simulators.commands import Commands
+
+DRAWS = 60
+FIRST_GUESS = 1e-3  # [m] of white noise, until something better is known
+HELD_OUT_ROWS = 0.6  # of a single recording, which is all that is fitted of it when the rest is to be predicted
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is audited.
+
+    Attributes:
+        lanes: simulator with the base model's mechanisms, and every candidate at its null value.
+        finer: the same on a finer mesh and time step, with the commands on its own clock; None without.
+        coordinates: of all parameters.
+        recordings: all of them, fitted ones first.
+        trajectories: the fitted ones.
+        candidates: that may be named.
+        stated_noise: from the experiment file, used where nothing was repeated; None without.
+        start: values of base parameters to start from, of an earlier calibration; None for a search.
+        rules, seed: see `Rules`.
+    """
+
+    lanes: Lanes
+    finer: tuple[Lanes, Commands] | None
+    coordinates: Coordinates
+    recordings: RecordingSet
+    trajectories: Sequence[Trajectory]
+    candidates: Sequence[Candidate]
+    stated_noise: NoiseModel | None
+    start: dict[str, float] | None
+    rules: Rules
+    seed: int
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What an audit found; see the attributes' own classes.
+
+    ``looks`` are the looks at the base model and after each step; ``stages`` the explained fraction after each step.
+    """
+
+    verdict: str
+    question: Question
+    target: Target
+    base: Fit
+    steps: list[Step]
+    looks: list[Look]
+    gain: Gain | None
+    stages: list[float]
+    held_out: str
+    remainder: Remainder
+    predictions: tuple[Prediction, Prediction] | None
+    unseen: Unseen | None
+    draws: Float[np.ndarray, "draw d"]
+    rollouts: int
+    seconds: float
+
+    @property
+    def extended(self) -> Fit:
+        """The last model."""
+        return self.steps[-1].fit if self.steps else self.base
+
+
+def audit(question: Question, report: Callable[[str], None] = lambda line: None) -> Answer:
+    """Run the audit. Same question, same answer.
+
+    Raises:
+        InputError: rollouts at the optimum do not end well.
+    """
+    began = time.monotonic()
+    rng = np.random.default_rng(question.seed)
+    target, base = _base_model(question, rng)
+    report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.order})")
+    finer = None
+    if question.finer is not None:
+        finer = _forward(question, True, target.measurements)
+    inquiry = Inquiry(target, question.candidates, question.rules, question.seed, finer, report)
+    steps, last = inquiry.name_causes(base)
+    looks = [*(step.before for step in steps), last]
+    extended = steps[-1].fit if steps else base
+    gain, stages, held_out, predictions, unseen = _measured(question, target, inquiry, base, steps, rng)
+    final = _final_p(question, target, extended, inquiry, steps, last)
+    verdict = decide(
+        question.rules, looks[0].omnibus.p, final if steps else None, [len(s.members) for s in steps], gain
+    )
+    low, high = question.coordinates.bounds
+    return Answer(
+        verdict,
+        question,
+        target,
+        base,
+        steps,
+        looks,
+        gain,
+        stages,
+        held_out,
+        describe_remainder(target.measurements, extended.residual, target.noise),
+        predictions,
+        unseen,
+        extended.draws(np.random.default_rng([question.seed, 5]), 1000, low, high),
+        target.forward.rollouts + (finer.rollouts if finer else 0),
+        time.monotonic() - began,
+    )
+
+
+def _forward(question: Question, finer: bool, measurements: Measurements) -> Forward:
+    chosen = {name: group[0] for name, group in zip(measurements.names, measurements.members, strict=True)}
+    return _simulated(question, finer, chosen)
+
+
+def _simulated(question: Question, finer: bool, chosen: dict[str, int]) -> Forward:
+    """Some of the recordings, on the simulator itself or on the finer one."""
+    lanes, commands = question.lanes, question.recordings.commands
+    if finer and question.finer is not None:
+        lanes, commands = question.finer
+    return Forward(lanes, question.coordinates, commands, chosen)
+
+
+def _base_model(question: Question, rng: np.random.Generator) -> tuple[Target, Fit]:
+    """Noise and base fit; where the noise is estimated from residuals, the two in turn."""
+    coordinates = question.coordinates
+    per_recording = any(p.recording for p in coordinates.space.parameters)
+    count = len(question.trajectories)
+    fitted = _subset(question.recordings, count)
+    measurements = gather_measurements(fitted, question.trajectories, join=not per_recording)
+    forward = _forward(question, False, measurements)
+    free = np.arange(coordinates.base)
+    start = None if question.start is None else coordinates.encode(question.start)
+    if measurements.has_repeats or question.stated_noise is not None:
+        noise = question.stated_noise
+        if noise is None or measurements.has_repeats:
+            noise = measurements.noise(measurements.single, 0)
+        target = Target(forward, measurements, noise)
+        return target, fit_base(target, free, rng, start)
+    white = NoiseModel(np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf)
+    target = Target(forward, measurements, white)
+    fit = fit_base(target, free, rng, start)
+    for _ in range(2):
+        target = replace(target, noise=_residual_noise(target, fit))
+        fit = climb(target, fit.x, free)
+    return target, fit
+
+
+def _residual_noise(target: Target, fit: Fit) -> NoiseModel:
+    """An autoregression fitted to what a model leaves of every recording."""
+    predicted = target.forward.position(fit.x)
+    single = np.array(target.measurements.single)
+    for group, position in zip(target.measurements.members, predicted, strict=True):
+        single[list(group)] -= position
+    return target.measurements.noise(np.where(target.measurements.single_valid, single, 0.0), len(fit.free))
+
+
+def _subset(recordings: RecordingSet, count: int) -> RecordingSet:
+    """The first recordings only."""
+    return replace(
+        recordings,
+        names=recordings.names[:count],
+        time=recordings.time[:count],
+        rows=recordings.rows[:count],
+        position=recordings.position[:count],
+        line=type(recordings.line)(*(part[:count] for part in recordings.line)),
+        commands=Commands(*(part[:count] for part in recordings.commands)),
+    )
+
+
+def _final_p(
+    question: Question, target: Target, extended: Fit, inquiry: Inquiry, steps: Sequence[Step], last: Look
+) -> float:
+    """p-value of the extended model; noise that was taken from the base model's residuals is estimated anew."""
+    if not steps or target.noise.source != RESIDUALS:
+        return last.omnibus.p
+    renewed = replace(target, noise=_residual_noise(target, extended))
+    again = replace(inquiry, target=renewed)
+    fit = climb(renewed, extended.x, extended.free)
+    found, _ = again.look_at(fit, [step.name for step in steps])
+    return found.omnibus.p
+
+
+def _predict(forward: Forward, fit: Fit, seed: Sequence[int]) -> Prediction:
+    """Predictions under the normal approximation, linear around the mode: along a ridge that the data leave free, such
+    as the common scale of stiffness and mass, a draw would lie far from where the approximation holds."""
+    centre = forward.position(fit.x)
+    slopes = forward.derivatives(fit.x, np.eye(len(fit.x))[fit.free])
+    z = np.random.default_rng(seed).multivariate_normal(np.zeros(len(fit.free)), fit.covariance, DRAWS, method="eigh")
+    z -= z.mean(axis=0)
+    return Prediction(centre + np.tensordot(z, slopes, axes=1))
+
+
+def _measured(
+    question: Question, target: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step], rng: np.random.Generator
+) -> tuple[Gain | None, list[float], str, tuple[Prediction, Prediction] | None, Unseen | None]:
+    """Gain on the test recordings, or on fitted ones that are left out in turn."""
+    if not steps:
+        return None, [], "", None, None
+    count, every = len(question.trajectories), len(question.recordings.names)
+    pattern = base.residual.reshape(target.measurements.position.shape)
+    fits = [base, *(step.fit for step in steps)]
+    names = ["", *(step.name for step in steps)]
+    if every > count:
+        held_out = "test recordings"
+        unseen = _unseen(question.recordings, range(count, every))
+        tested = {question.recordings.names[i]: i for i in range(count, every)}
+        predictions = [
+            _predict(_simulated(question, DISCRETISATION in names[: i + 1], tested), fit, [question.seed, 3])
+            for i, fit in enumerate(fits)
+        ]
+    else:
+        held_out, unseen, predictions = _left_out(question, target, inquiry, fits, names)
+    gains = [
+        measure_gain(unseen, predictions[0], later, target.noise, pattern, np.random.default_rng([question.seed, 4]))
+        for later in predictions[1:]
+    ]
+    return gains[-1], [gain.explained for gain in gains], held_out, (predictions[0], predictions[-1]), unseen
+
+
+def _unseen(recordings: RecordingSet, chosen: Sequence[int]) -> Unseen:
+    index = list(chosen)
+    position = recordings.position[index]
+    valid = np.repeat(np.asarray(recordings.line.valid)[index], 3, axis=-1)
+    return Unseen(position.reshape(*position.shape[:2], -1), valid)
+
+
+def _left_out(
+    question: Question, target: Target, inquiry: Inquiry, fits: Sequence[Fit], names: Sequence[str]
+) -> tuple[str, Unseen, list[Prediction]]:
+    """Predict each group of repeats from the others; of a single one, its later rows from its earlier ones."""
+    measured = target.measurements
+    groups = len(measured.members)
+    if groups > 1:
+        held_out = "fitted recordings, each left out in turn"
+        masks = [np.arange(groups)[:, None, None] == g for g in range(groups)]
+    else:
+        held_out = "the later rows of the only recording"
+        rows = measured.position.shape[1]
+        masks = [np.arange(rows)[None, :, None] >= HELD_OUT_ROWS * measured.valid[0].any(axis=1).sum()]
+    parts: list[list[np.ndarray]] = [[] for _ in fits]
+    for mask in masks:
+        mask = np.broadcast_to(mask, measured.position.shape)
+        kept = replace(measured, count=np.where(mask, 0.0, measured.count))
+        for i, fit in enumerate(fits):
+            forward = target.forward
+            if DISCRETISATION in names[: i + 1] and inquiry.finer is not None:
+                forward = inquiry.finer
+            refitted = climb(Target(forward, kept, target.noise), fit.x, fit.free, evaluations=15)
+            parts[i].append(_predict(forward, refitted, [question.seed, 3]).draws)
+    draws = min(len(part) for row in parts for part in row)
+    predictions = []
+    for row in parts:
+        joined = np.zeros((draws, *measured.position.shape))
+        for mask, part in zip(masks, row, strict=True):
+            joined = np.where(mask, part[:draws], joined)
+        predictions.append(Prediction(joined))
+    valid = measured.valid & np.any(np.broadcast_arrays(*masks, measured.valid)[:-1], axis=0)
+    return held_out, Unseen(measured.position, valid), predictions

@@ -1,0 +1,162 @@
+"""An audit as plain values: the content of audit.json."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.audit.extension import DISCRETISATION, Step
+from rfdropo_bayes.audit.gain import LEVELS, noise_distance
+from rfdropo_bayes.audit.noise import REPEATS
+from rfdropo_bayes.audit.pipeline import Answer
+from rfdropo_bayes.audit.score import likeness
+from rfdropo_bayes.audit.screen import Look, Row
+from rfdropo_bayes.audit.sentence import sentence
+from rfdropo_bayes.audit.verdict import NO_DISCREPANCY
+
+SCHEMA_VERSION = 1
+MILLIMETRES = 1e3
+
+
+def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_experiment: Any) -> dict[str, Any]:
+    """Everything an audit found, in the names that /audit.json/ promises; lengths in mm where a name says so."""
+    findings = [_finding(answer, step, stage) for step, stage in zip(answer.steps, _shares(answer), strict=True)]
+    gain, noise = answer.gain, answer.target.noise
+    base_rms = _rms(answer, answer.base.residual)
+    return {
+        "verdict": answer.verdict,
+        "sentence": sentence(answer, findings),
+        "findings": findings,
+        "candidates": _candidates(answer),
+        "omnibus": [{"after": n, **_omnibus(look)} for n, look in enumerate(answer.looks)],
+        "gain": None
+        if gain is None
+        else {
+            "rmse_base_mm": MILLIMETRES * gain.rmse_base,
+            "rmse_extended_mm": MILLIMETRES * gain.rmse_extended,
+            "elpd_difference": gain.elpd_difference,
+            "elpd_difference_se": gain.elpd_difference_se,
+            "explained_fraction": gain.explained,
+            "explained_fraction_interval": list(gain.interval),
+            "test_trajectories": gain.trajectories,
+            "measured_on": answer.held_out,
+        },
+        "coverage": {} if gain is None else {f"{level:g}": gain.coverage[level] for level in LEVELS},
+        "noise_floor_mm": MILLIMETRES * noise_distance(noise) if noise.source == REPEATS else None,
+        "noise": {
+            "source": noise.source,
+            "order": noise.order,
+            "autocorrelation": noise.autocorrelation.tolist(),
+            "standard_deviation_mm": (MILLIMETRES * noise.scale).tolist(),
+        },
+        "residual_in_noise_deviations": base_rms,
+        "remainder": {
+            "amplitude_mm": MILLIMETRES * answer.remainder.amplitude,
+            "length_scale_s": answer.remainder.memory,
+            "log_likelihood_ratio": answer.remainder.log_likelihood_ratio,
+        },
+        "base_parameters": _parameters(answer, answer.base.free, answer.base.x),
+        "next_experiment": None if answer.verdict == NO_DISCREPANCY else next_experiment,
+        "rollouts": answer.rollouts,
+        "seconds": round(answer.seconds, 2),
+        "seed": answer.question.seed,
+        "versions": versions,
+        "data_sha256": data_sha256,
+        "schema_version": SCHEMA_VERSION,
+    }
+
+
+def _rms(answer: Answer, white: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(white[answer.target.measurements.valid.reshape(-1)] ** 2)))
+
+
+def _shares(answer: Answer) -> list[float | None]:
+    """Explained fraction that each step brought."""
+    if not answer.stages:
+        return [None] * len(answer.steps)
+    return [float(v) for v in np.diff([0.0, *answer.stages])]
+
+
+def _finding(answer: Answer, step: Step, share: float | None) -> dict[str, Any]:
+    only = len(answer.steps) == 1 and answer.gain is not None
+    row = step.before.row(step.name)
+    mechanism = next((c.mechanism for c in answer.question.candidates if c.name == step.name), None)
+    parameters: dict[str, Any] = {}
+    if step.name != DISCRETISATION:
+        indices = next(c.indices for c in answer.question.candidates if c.name == step.name)
+        parameters = _drawn_parameters(answer, indices)
+    return {
+        "mechanism": step.name,
+        "equivalence_class": list(step.members),
+        "parameters": parameters,
+        "cause": getattr(mechanism, "cause", "the mesh or the time step of the simulator is too coarse"),
+        "remedy": getattr(mechanism, "remedy", "raise [simulator] refine and shorten its time_step"),
+        "explained_fraction": share,
+        "explained_fraction_interval": list(answer.gain.interval) if only and answer.gain else None,
+        "adjusted_p": row.adjusted_p,
+        "log_bayes_factor": step.log_bayes_factor,
+        "refits": step.refits,
+    }
+
+
+def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any]:
+    """Posterior of parameters in physical units, from the extended model's normal approximation."""
+    coordinates = answer.question.coordinates
+    values = coordinates.values(answer.draws)
+    found = {}
+    for i in indices:
+        column = values[:, i]
+        found[coordinates.names[i]] = {
+            "mean": float(column.mean()),
+            "sd": float(column.std()),
+            "q05": float(np.quantile(column, 0.05)),
+            "q95": float(np.quantile(column, 0.95)),
+            "unit": coordinates.space.parameters[i].spec.unit,
+        }
+    return found
+
+
+def _parameters(answer: Answer, free: np.ndarray, x: np.ndarray) -> dict[str, float]:
+    named = answer.question.coordinates.named(x)
+    return {answer.question.coordinates.names[i]: named[answer.question.coordinates.names[i]] for i in free}
+
+
+def _omnibus(look: Look) -> dict[str, Any]:
+    return {"p": look.omnibus.p, "tests": look.omnibus.single, "blocks": look.omnibus.blocks.tolist()}
+
+
+def _candidates(answer: Answer) -> list[dict[str, Any]]:
+    """Every candidate as the screen of the base model saw it, best first."""
+    first = answer.looks[0]
+    refits = answer.steps[0].refits if answer.steps else {}
+    return [_candidate(answer, row, first, refits.get(row.name)) for row in first.rows]
+
+
+def _candidate(answer: Answer, row: Row, look: Look, refit: float | None) -> dict[str, Any]:
+    coordinates = answer.question.coordinates
+    alike: list[tuple[float, str]] = []
+    at: dict[str, float] = {}
+    if row.probe is not None:
+        alike = [
+            (round(likeness(row.probe.mark, other.probe.mark), 4), other.name)
+            for other in look.rows
+            if other is not row and other.probe is not None
+        ]
+        point = answer.base.x.copy()
+        for index, value in row.probe.point.items():
+            point[index] = value
+        named = coordinates.named(point)
+        at = {coordinates.names[i]: named[coordinates.names[i]] for i in row.probe.point}
+    return {
+        "mechanism": row.name,
+        "visible": row.probe is not None,
+        "statistic": row.lm,
+        "degrees_of_freedom": row.rank,
+        "p": row.p,
+        "adjusted_p": row.adjusted_p,
+        "tried_at": at,
+        "log_bayes_factor": refit,
+        "named": any(step.name == row.name for step in answer.steps),
+        "cosines": [{"mechanism": name, "cosine": cosine} for cosine, name in sorted(alike, reverse=True)[:6]],
+    }

@@ -1,0 +1,92 @@
+"""Efficient score statistics: what a direction explains of the residual that the base parameters cannot.
+
+With whitened residual r and base Jacobian J at the optimum, a candidate's directions J_m leave
+S = (I - J (J'J)^-1 J') J_m, and LM = r'S (S'S)^-1 S'r is chi-squared with the rank of S as its degrees of freedom where
+the base model is right (Rao's score test). A single direction with a known sign counts on that side only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import chi2
+
+RANK_TOLERANCE = 1e-5  # of the largest singular value: what base parameters are taken to span
+VISIBLE = 1.0  # a candidate of the size its prior expects must move the whitened data by so much in all
+
+
+@dataclass(frozen=True)
+class Signature:
+    """What a candidate does to the whitened data, less what the base model can do.
+
+    Attributes:
+        basis: orthonormal columns of S; empty where no effect is visible.
+        sign: +1 if only the positive side of its single direction has a meaning; else 0.
+    """
+
+    basis: Float[np.ndarray, "n rank"]
+    sign: int
+
+    @property
+    def rank(self) -> int:
+        """Directions that can be seen."""
+        return self.basis.shape[1]
+
+
+def span(jacobian: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n rank"]:
+    """Orthonormal basis of what the columns span, each column counted in its own unit."""
+    size = np.linalg.norm(jacobian, axis=0)
+    columns = jacobian[:, size > 0] / size[size > 0]
+    if columns.shape[1] == 0:
+        return np.zeros((len(jacobian), 0))
+    left, values, _ = np.linalg.svd(columns, full_matrices=False)
+    return left[:, values > RANK_TOLERANCE * values[0]]
+
+
+def project_out(base: Float[np.ndarray, "n rank"], columns: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+    """Columns less their part in the span of an orthonormal basis."""
+    left = columns - base @ (base.T @ columns)
+    return left - base @ (base.T @ left)  # twice, so that rounding leaves nothing either
+
+
+def signature(base: Float[np.ndarray, "n rank"], columns: Float[np.ndarray, "n k"], sign: int = 0) -> Signature:
+    """The visible part of a candidate's directions, each column being what a prior-sized effect does."""
+    left = project_out(base, columns)
+    if left.shape[1] == 1:
+        size = float(np.linalg.norm(left))
+        return Signature(left / size, sign) if size > VISIBLE else Signature(left[:, :0], 0)
+    vectors, values, _ = np.linalg.svd(left, full_matrices=False)
+    return Signature(vectors[:, values > max(VISIBLE, 1e-3 * values[0])], 0)
+
+
+def statistic(mark: Signature, residual: Float[np.ndarray, "*batch n"]) -> tuple[np.ndarray, np.ndarray]:
+    """LM and minus the logarithm of its p-value under the base model, of one or many residuals."""
+    score = residual @ mark.basis
+    lm = np.sum(score**2, axis=-1)
+    if mark.rank == 0:
+        return lm, np.zeros_like(lm)
+    surprise = -chi2.logsf(lm, mark.rank)
+    if mark.sign:
+        right = mark.sign * score[..., 0] > 0
+        lm, surprise = np.where(right, lm, 0.0), np.where(right, surprise + np.log(2.0), 0.0)
+    return lm, surprise
+
+
+def likeness(first: Signature, second: Signature) -> float:
+    """Smallest cosine of the principal angles: 1 where the smaller signature lies within the larger one."""
+    if first.rank == 0 or second.rank == 0:
+        return 0.0
+    if first.sign and second.sign:
+        return float(first.sign * second.sign * (first.basis[:, 0] @ second.basis[:, 0]))
+    return float(np.linalg.svd(first.basis.T @ second.basis, compute_uv=False)[-1])
+
+
+def classes(marks: list[Signature], limit: float) -> list[list[int]]:
+    """For each signature those that cannot be told from it: likeness above ``limit``, itself first."""
+    found = []
+    for i, mark in enumerate(marks):
+        others = [j for j, other in enumerate(marks) if j != i and likeness(mark, other) > limit]
+        found.append([i, *others])
+    return found

@@ -1,0 +1,111 @@
+"""One look at a model: is anything wrong with it, and which candidates say what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.audit.bootstrap import null_residuals, tail
+from rfdropo_bayes.audit.candidates import Probe
+from rfdropo_bayes.audit.fit import Fit, Target
+from rfdropo_bayes.audit.omnibus import Omnibus, block_means, joint_test, statistics
+from rfdropo_bayes.audit.score import span, statistic
+
+CHUNK_NUMBERS = 2e7  # of simulated residuals in memory at a time
+DIRECTED = "candidates"
+
+
+@dataclass(frozen=True)
+class Row:
+    """What the screen says of one candidate.
+
+    Attributes:
+        name: registry name.
+        probe: its best probe; None where no effect of it is visible.
+        lm: score statistic of that probe; rank: its degrees of freedom.
+        p: of that probe alone.
+        adjusted_p: probability that, were the model right, any probe of any candidate surprised as much.
+        score: LM - rank log n, by which candidates are ranked.
+    """
+
+    name: str
+    probe: Probe | None
+    lm: float
+    rank: int
+    p: float
+    adjusted_p: float
+    score: float
+
+
+@dataclass(frozen=True)
+class Look:
+    """A model, the joint test of its residuals, and the screen of what it might lack (best first)."""
+
+    fit: Fit
+    omnibus: Omnibus
+    rows: tuple[Row, ...]
+
+    def row(self, name: str) -> Row:
+        """That of one candidate."""
+        return next(row for row in self.rows if row.name == name)
+
+
+def look(target: Target, fit: Fit, probes: Sequence[Probe], names: Sequence[str], seed: Any, bootstraps: int) -> Look:
+    """Test a fitted model and screen candidates against it, calibrated by parametric bootstrap.
+
+    Args:
+        target: data and noise.
+        fit: of the model.
+        probes: of all candidates.
+        names: of all candidates, those without a probe among them.
+        seed: of the bootstrap.
+        bootstraps: simulated data sets.
+    """
+    base = span(fit.jacobian)
+    seen = [probe for probe in probes if probe.mark.rank > 0]
+    observed, surprises = _statistics(target, fit.residual[None], seen)
+    simulated, reference = _simulated(target, base, seen, np.random.default_rng(seed), bootstraps)
+    most = reference.max(axis=1) if seen else np.zeros(bootstraps)
+    observed[DIRECTED] = surprises.max(axis=1) if seen else np.zeros(1)
+    simulated[DIRECTED] = most
+    white = fit.residual.reshape(target.measurements.position.shape)
+    blocks = np.nanmean(block_means(white) ** 2, axis=(0, 2))
+    test = joint_test({name: float(value[0]) for name, value in observed.items()}, simulated, blocks)
+    rows = [_row(name, seen, surprises[0], most, fit) for name in names]
+    return Look(fit, test, tuple(sorted(rows, key=lambda row: -row.score)))
+
+
+def _row(name: str, seen: Sequence[Probe], surprises: np.ndarray, most: np.ndarray, fit: Fit) -> Row:
+    own = [i for i, probe in enumerate(seen) if probe.candidate == name]
+    if not own:
+        return Row(name, None, 0.0, 0, 1.0, 1.0, -np.inf)
+    best = max(own, key=lambda i: surprises[i])
+    probe = seen[best]
+    lm = float(statistic(probe.mark, fit.residual)[0])
+    score = lm - probe.mark.rank * np.log(len(fit.residual))
+    return Row(name, probe, lm, probe.mark.rank, float(np.exp(-surprises[best])), tail(surprises[best], most), score)
+
+
+def _statistics(
+    target: Target, residuals: Float[np.ndarray, "count n"], probes: Sequence[Probe]
+) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "count probe"]]:
+    shape = target.measurements.position.shape
+    found = statistics(residuals.reshape(len(residuals), *shape))
+    surprises = [statistic(probe.mark, residuals)[1] for probe in probes]
+    return found, np.stack(surprises, axis=1) if probes else np.zeros((len(residuals), 0))
+
+
+def _simulated(
+    target: Target, base: np.ndarray, probes: Sequence[Probe], rng: np.random.Generator, count: int
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    chunk = max(1, min(count, int(CHUNK_NUMBERS / base.shape[0])))
+    parts: list[tuple[Mapping[str, np.ndarray], np.ndarray]] = []
+    for start in range(0, count, chunk):
+        residuals = null_residuals(target.measurements, target.noise, base, rng, min(chunk, count - start))
+        parts.append(_statistics(target, residuals, probes))
+    joined = {name: np.concatenate([part[0][name] for part in parts]) for name in parts[0][0]}
+    return joined, np.concatenate([part[1] for part in parts])

@@ -1,0 +1,85 @@
+"""The audit in a sentence that a lab can act on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rfdropo_bayes.audit.extension import DISCRETISATION
+from rfdropo_bayes.audit.gain import noise_distance
+from rfdropo_bayes.audit.noise import REPEATS, STATED
+from rfdropo_bayes.audit.pipeline import Answer
+from rfdropo_bayes.audit.verdict import EXPLAINED, NO_DISCREPANCY, UNEXPLAINED
+
+MOST_EXCLUDED = 3
+CLEARLY_WORSE = 10.0  # nats
+
+
+def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
+    """What was found, how much of the discrepancy it explains, what is excluded, what remains."""
+    if answer.verdict == NO_DISCREPANCY:
+        return (
+            f"No discrepancy: what the base model leaves is noise as far as these data can tell "
+            f"(joint test p = {answer.looks[0].omnibus.p:.2g}{_assumption(answer)})."
+        )
+    if not findings:
+        tail = f"what remains has a standard deviation of {1e3 * answer.remainder.amplitude:.2g} mm"
+        return f"Something is wrong with the base model, and no candidate of the library says what: {tail}."
+    named = " and ".join(_named(finding) for finding in findings)
+    gain = answer.gain
+    if gain is None:
+        return f"{named}; how much it explains could not be measured."
+    low, high = (100.0 * min(max(x, 0.0), 1.0) for x in gain.interval)
+    share = f"{100 * max(gain.explained, 0.0):.0f} % [{low:.0f}, {high:.0f}] of the discrepancy"
+    if answer.verdict == UNEXPLAINED:
+        head = f"Unexplained: the best of the library, {named}, explains only {share}"
+    elif answer.verdict in (EXPLAINED, "equivalent"):
+        head = f"{named} explain{'s' if len(findings) == 1 else ''} {share}"
+    else:
+        head = f"The best of the library, {named}, explains {share}, but not all: something else is at work"
+    return f"{head}{_excluded(answer)}; {_remains(answer)}{_assumption(answer)}."
+
+
+def _named(finding: dict[str, Any]) -> str:
+    name = finding["mechanism"].replace("_", " ")
+    if finding["mechanism"] == DISCRETISATION:
+        return "the coarse mesh or time step"
+    sizes = ", ".join(_size(p, row) for p, row in list(finding["parameters"].items())[:4])
+    others = [other.replace("_", " ") for other in finding["equivalence_class"][1:]]
+    alike = f" (not to be told from {', '.join(others)} by these data)" if others else ""
+    return f"{name} ({sizes}){alike}"
+
+
+def _size(name: str, row: dict[str, Any]) -> str:
+    unit = "" if row["unit"] == "-" else f" {row['unit']}"
+    return f"{name.replace('_', ' ')} {row['mean']:.3g} \u00b1 {row['sd']:.2g}{unit}"
+
+
+def _excluded(answer: Answer) -> str:
+    """Candidates that were refitted in the first step and are much less likely."""
+    step = answer.steps[0]
+    worse = [
+        name.replace("_", " ")
+        for name, value in step.refits.items()
+        if name not in step.members
+        and value < step.log_bayes_factor - CLEARLY_WORSE
+        and all(name != other.name for other in answer.steps)
+    ]
+    return f"; {', '.join(worse[:MOST_EXCLUDED])} excluded" if worse else ""
+
+
+def _remains(answer: Answer) -> str:
+    assert answer.gain is not None
+    remain = f"{1e3 * answer.gain.rmse_extended:.2g} mm remain"
+    if answer.target.noise.source == REPEATS:
+        return f"{remain}, {1e3 * noise_distance(answer.target.noise):.2g} mm of it noise"
+    return remain
+
+
+def _assumption(answer: Answer) -> str:
+    source = answer.target.noise.source
+    if source == REPEATS:
+        return ""
+    if source == STATED:
+        return "; the noise is what the experiment file states"
+    return "; without repeats the noise is an assumption, an autoregression fitted to the residuals themselves"

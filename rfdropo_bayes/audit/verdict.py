@@ -1,0 +1,44 @@
+"""The verdict by stated rules, and a sentence a lab can act on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rfdropo_bayes.audit.extension import Rules
+from rfdropo_bayes.audit.gain import Gain
+
+NO_DISCREPANCY, EXPLAINED, EQUIVALENT, PARTLY, UNEXPLAINED = (
+    "no_discrepancy",
+    "explained",
+    "equivalent",
+    "partly_explained",
+    "unexplained",
+)
+
+
+def decide(rules: Rules, base_p: float, extended_p: float | None, class_sizes: Sequence[int], gain: Gain | None) -> str:
+    """Apply the rules.
+
+    - no_discrepancy: the base model passes the joint test (p > .01);
+    - unexplained: it does not, and no candidate is significant, or all together explain at most 20 %;
+    - explained: the extended model passes (p > .05) and the lower bound of the explained fraction exceeds 80 %;
+      equivalent where a named class has several members;
+    - partly_explained: a significant gain, but one of these fails.
+
+    Args:
+        rules: the numbers above.
+        base_p, extended_p: p-values of the joint tests; None without an extension.
+        class_sizes: members of each named class.
+        gain: on unseen trajectories; None where it could not be measured.
+    """
+    if base_p > rules.base_passes:
+        return NO_DISCREPANCY
+    if not class_sizes or extended_p is None:
+        return UNEXPLAINED
+    if gain is None:
+        return PARTLY
+    if gain.explained <= rules.significant:
+        return UNEXPLAINED
+    if extended_p > rules.extended_passes and gain.interval[0] > rules.explained:
+        return EQUIVALENT if max(class_sizes) > 1 else EXPLAINED
+    return PARTLY

@@ -1,0 +1,238 @@
+"""``rfdropo audit``: what the simulator lacks, by name; audit.json, extended.toml and report.html."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.audit.candidates import Candidate
+from rfdropo_bayes.audit.coordinates import Coordinates
+from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
+from rfdropo_bayes.audit.forward import Lanes
+from rfdropo_bayes.audit.noise import STATED, NoiseModel
+from rfdropo_bayes.audit.pipeline import Answer, Question, audit
+from rfdropo_bayes.audit.record import record
+from rfdropo_bayes.bayes.model import gather_recordings
+from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.space import ParameterSpace, build_space
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms import REGISTRY
+from rfdropo_bayes.report import software_versions
+from rfdropo_bayes.report.summary import combined_hash
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.workflow.assembly import (
+    build_simulator,
+    expand_groups,
+    find_robot,
+    fixed_values,
+    load_data,
+)
+from rfdropo_bayes.workflow.experiment import Experiment, describe, load_experiment, matching
+from rfdropo_bayes.workflow.files import output_folder
+
+AUDIT, EXTENDED = "audit.json", "extended.toml"
+FINER = 2
+
+
+def run_audit(
+    path: Path,
+    out: Path,
+    *,
+    overrides: Sequence[str] = (),
+    base: Path | None = None,
+    seed: int | None = None,
+    report: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """Audit an experiment and write what was found.
+
+    Args:
+        path: the experiment file; its ``fit`` recordings are fitted and screened, its ``test`` recordings measure the
+            gain.
+        out: folder to write to.
+        overrides: assignments that replace entries of the file.
+        base: folder of an earlier calibration, from whose optimum the base model starts.
+        seed: of the audit; that of the file by default.
+        report: called with a line of words now and then.
+
+    Returns:
+        the content of audit.json.
+
+    Raises:
+        InputError: bad input, before anything long has started.
+    """
+    experiment, tables = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    fitted, tested = (load_data(experiment, folder, role) for role in ("fit", "test"))
+    chosen = experiment.seed if seed is None else seed
+    question = build_question(experiment, folder, fitted, tested, chosen, start=_start(base))
+    out = output_folder(out)
+    answer = audit(question, report)
+    content = record(
+        answer,
+        versions=software_versions(),
+        data_sha256=combined_hash([trajectory.sha256 for trajectory in [*fitted, *tested]]),
+        next_experiment=None,
+    )
+    (out / AUDIT).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    (out / EXTENDED).write_text(describe(extended_tables(tables, answer, folder)), encoding="utf-8")
+    return content
+
+
+def build_question(
+    experiment: Experiment,
+    folder: Path,
+    fitted: Sequence[Trajectory],
+    tested: Sequence[Trajectory],
+    seed: int,
+    *,
+    start: dict[str, float] | None = None,
+) -> Question:
+    """The experiment's base model with every candidate of the library in it, at its null value."""
+    robot = find_robot(experiment, folder)
+    names = [name for name in REGISTRY if name not in experiment.model.mechanisms]
+    simulator = build_simulator(_with(experiment, names), robot, folder)
+    trajectories = [*fitted, *tested]
+    recordings = gather_recordings(simulator, trajectories)
+    space, base = _space(experiment, simulator, names, recordings.names[: len(fitted)])
+    physical = tuple(spec.name for spec in simulator.parameters)
+    known = fixed_values(experiment, simulator)
+    coordinates = Coordinates(
+        space,
+        base,
+        physical,
+        {spec.name: spec.nominal for spec in simulator.parameters},
+        {name: value for name, value in known.items() if name in physical},
+    )
+    index = {p.spec.name: i for i, p in enumerate(space.parameters)}
+    candidates = [
+        Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m)
+        for m in simulator.mechanisms
+        if m.name in names
+    ]
+    marker_index = recordings.marker_index
+    return Question(
+        Lanes(simulator, marker_index),
+        _finer_lanes(experiment, names, robot, folder, trajectories),
+        coordinates,
+        recordings,
+        list(fitted),
+        candidates,
+        _stated(experiment, recordings.position.shape[2], fitted[0]),
+        start,
+        Rules(),
+        seed,
+    )
+
+
+def _with(experiment: Experiment, names: Sequence[str], **simulator: Any) -> Experiment:
+    """The experiment with more mechanisms, and other entries of [simulator]."""
+    model = experiment.model.model_copy(update={"mechanisms": [*experiment.model.mechanisms, *names]})
+    return experiment.model_copy(
+        update={"model": model, "simulator": experiment.simulator.model_copy(update=simulator)}
+    )
+
+
+def _finer_lanes(
+    experiment: Experiment, names: Sequence[str], robot: Robot, folder: Path, trajectories: Sequence[Trajectory]
+) -> tuple[Lanes, Commands] | None:
+    """Twice the layers and half the time step; only bodies of layers can be refined."""
+    table = experiment.simulator
+    if table.body != "layered":
+        return None
+    step = (table.time_step or robot.time_step_s) / FINER
+    finer = _with(experiment, names, refine=min(FINER * table.refine, 16), time_step=step)
+    simulator = build_simulator(finer, robot, folder)
+    recordings = gather_recordings(simulator, trajectories)
+    return Lanes(simulator, recordings.marker_index), recordings.commands
+
+
+def _space(
+    experiment: Experiment, simulator: RobotSimulator, names: Sequence[str], fitted: Sequence[str]
+) -> tuple[ParameterSpace, int]:
+    """Base parameters, then those of the candidates, each with a prior; and how many are base parameters."""
+    table = experiment.model
+    noise = {spec.name for spec in noise_specs(table.noise)}
+    fixed = fixed_values(experiment, simulator)
+    specs = simulator.parameters
+    added = {spec.name for m in simulator.mechanisms if m.name in names for spec in m.parameters}
+    own = [spec.name for m in simulator.mechanisms if m.name not in names for spec in m.parameters]
+    given = expand_groups({k: v for k, v in table.priors.items() if k not in noise}, specs)
+    shared = expand_groups(table.per_recording, specs)
+    defaults = [name for name in [*own, *shared] if name not in fixed and name not in given]
+    priors = {**given, **{name: {} for name in defaults}}
+    priors = {name: entry for name, entry in priors.items() if name not in added}
+    scopes = {
+        name: matching(fitted, patterns, where=f"[model.per_recording] {name}") for name, patterns in shared.items()
+    }
+    base = build_space(specs, priors, scopes, fitted)
+    taken = {p.spec.name for p in base.parameters} | set(fixed)
+    extra = {name: table.priors.get(name, {}) for name in [s.name for s in specs if s.name in added - taken]}
+    whole = build_space(specs, {**priors, **extra}, scopes, fitted)
+    return whole, len(base.parameters)
+
+
+def _stated(experiment: Experiment, markers: int, first: Trajectory) -> NoiseModel | None:
+    """The noise that the experiment file states, for recordings without repeats."""
+    noise = experiment.noise
+    if noise is None or noise.standard_deviation == 0.0:
+        return None
+    step = float(first.dataset.attrs["sample_time"])
+    memory = [] if noise.correlation_time is None else [float(np.exp(-step / noise.correlation_time))]
+    return NoiseModel(np.full(3 * markers, noise.standard_deviation), np.array([1.0, *memory]), STATED, np.inf)
+
+
+def _start(base: Path | None) -> dict[str, float] | None:
+    """Posterior means of an earlier calibration."""
+    if base is None:
+        return None
+    path = Path(base) / "summary.json"
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        rows = summary["parameters"]
+        return {name: float(row["mean"]) for name, row in rows.items()}
+    except (OSError, ValueError, KeyError, TypeError):
+        raise InputError(
+            "is not the folder of a finished calibration", where=str(base), remedy="run rfdropo calibrate first"
+        ) from None
+
+
+def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path) -> dict[str, Any]:
+    """The experiment file with the named mechanisms in its model, for ``rfdropo calibrate``."""
+    extended = copy.deepcopy(tables)
+    model = extended.setdefault("model", {})
+    simulator = extended.setdefault("simulator", {})
+    for step in answer.steps:
+        if step.name == DISCRETISATION:
+            assert answer.question.finer is not None
+            simulator["refine"] = FINER * int(simulator.get("refine", 1))
+            simulator["time_step"] = answer.question.finer[0].simulator.description["time_step_s"]
+        else:
+            model["mechanisms"] = [*model.get("mechanisms", []), step.name]
+            candidate = next(c for c in answer.question.candidates if c.name == step.name)
+            fixed = model.get("fixed", {})
+            for spec in candidate.mechanism.parameters if candidate.mechanism else ():
+                if spec.name not in fixed:
+                    model.setdefault("priors", {}).setdefault(spec.name, dict(spec.prior))
+    data = extended.get("data", {})
+    robot = folder / str(extended.get("robot", ""))
+    if robot.suffix == ".toml" and robot.is_file():
+        extended["robot"] = str(robot)
+    for role in ("fit", "test"):
+        data[role] = [_placed(entry, folder) for entry in data.get(role, [])]
+    return extended
+
+
+def _placed(entry: Any, folder: Path) -> Any:
+    """A recording's path such that it is found from another folder, too."""
+    if isinstance(entry, dict):
+        return {k: _placed(v, folder) if k in ("observations", "commands") else v for k, v in entry.items()}
+    beside = folder / str(entry)
+    return str(beside) if list(folder.glob(str(entry))) or beside.is_file() else entry
