@@ -49,27 +49,33 @@ class Marker(Table):
     point_m: Vector
 
 
+OBJECT = ("cube_mass", "friction", "cube_side", "cube_x", "cube_y", "cube_z", "cube_yaw")
+"""Parameters of a cube on a plate."""
+
+
 class PushScene(Table):
-    """A cube on a horizontal plate, for pushing.
+    """A cube on a plate across gravity, for pushing.
 
     Attributes:
-        cube_side_m: edge of the cube.
-        cube_position_m: centre of the cube at the start.
         plate_height_m: coordinate of the plate's top against gravity.
-        contact_distance_m: distance at which surfaces touch, as far as the scene counts it.
-        parameters: ``cube_mass`` and ``friction``.
+        contact_distance_m: distance that surfaces keep from each other.
+        parameters: mass [kg], Coulomb friction, edge [m], and the pose at the start: centre [m] and turn about the
+            vertical [rad] from where the edges are parallel to the axes.
     """
 
-    cube_side_m: Positive
-    cube_position_m: Vector
     plate_height_m: float
     contact_distance_m: float = Field(ge=0.0)
     parameters: dict[Name, Parameter]
 
     @model_validator(mode="after")
     def _consistent(self) -> PushScene:
-        if set(self.parameters) != {"cube_mass", "friction"}:
-            raise ValueError("the parameters of an object are cube_mass and friction")
+        if set(self.parameters) != set(OBJECT):
+            raise ValueError(f"the parameters of an object are {', '.join(OBJECT)}")
+        for name in ("cube_mass", "cube_side"):
+            if self.parameters[name].low <= 0:
+                raise ValueError(f"the bounds of {name} let it be zero or negative")
+        if self.parameters["friction"].low < 0:
+            raise ValueError("the bounds of friction let it be negative")
         return self
 
 

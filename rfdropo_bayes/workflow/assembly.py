@@ -21,7 +21,7 @@ from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
-from rfdropo_bayes.workflow.engines import build_engine, build_mesh_engine
+from rfdropo_bayes.workflow.engines import build_engine, build_mesh_engine, build_push_simulator
 from rfdropo_bayes.workflow.experiment import Experiment, matching
 
 Entry = TypeVar("Entry")
@@ -36,6 +36,9 @@ def find_robot(experiment: Experiment, folder: Path) -> Robot:
 def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path()) -> RobotSimulator:
     """Robot, body, engine and mechanisms; ``folder`` is that of the experiment file, for the mesh of a body."""
     table = experiment.simulator
+    if table.push:
+        alone = experiment.model_copy(update={"simulator": table.model_copy(update={"push": False})})
+        return build_push_simulator(table, build_simulator(alone, robot, folder))
     time_step = table.time_step or robot.time_step_s
     mechanisms = mechanisms_named(experiment.model.mechanisms)
     if table.body == "tetrahedra" and table.tetrahedra is not None:

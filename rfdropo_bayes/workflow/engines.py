@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import logging
+
 import jax
 
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.compiled import CompiledEngine
 from rfdropo_bayes.simulators.mesh_body import MeshAssembly
 from rfdropo_bayes.simulators.mesh_engines import CompiledMeshEngine, MeshEngine, ReferenceMeshEngine
+from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
+from rfdropo_bayes.simulators.push_engines import MeshPushEngine
+from rfdropo_bayes.simulators.pushing import PushSimulator, push_table
 from rfdropo_bayes.simulators.reference import ReferenceEngine
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Assembly, Discretisation, Engine
 from rfdropo_bayes.workflow.experiment import SimulatorTable
 
@@ -29,3 +36,19 @@ def build_mesh_engine(table: SimulatorTable, assembly: MeshAssembly, time_step: 
     if table.engine == "jax":
         return ReferenceMeshEngine(assembly, time_step)
     return CompiledMeshEngine(assembly, time_step, table.precision, table.threads)
+
+
+def build_push_simulator(table: SimulatorTable, trunk: RobotSimulator) -> PushSimulator:
+    """The trunk with the robot's cube and plate before it.
+
+    Contacts run on the JAX engine; where [simulator] asks for another, this says so.
+
+    Raises:
+        InputError: a robot without a cube.
+    """
+    push_table(trunk.robot)
+    if table.engine == "numba" or table.precision == "float32":
+        logging.getLogger("rfdropo_bayes").warning("contacts run on the JAX engine, in double precision")
+    if not isinstance(trunk, MeshTrunkSimulator):
+        raise InputError("a cube needs a mesh", where="[simulator] push", remedy='set body = "tetrahedra"')
+    return PushSimulator(trunk, MeshPushEngine(trunk))

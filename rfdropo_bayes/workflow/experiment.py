@@ -52,10 +52,12 @@ class SimulatorTable(Table):
     """[simulator]: body, engine and discretisation; what is left out is the robot's own.
 
     ``body`` is made of the layers of the robot's section profile (``nodes_across``, ``refine``) or of the mesh that
-    ``tetrahedra`` describes. An experiment may describe both; the body that is not chosen has no effect.
+    ``tetrahedra`` describes. An experiment may describe both; the body that is not chosen has no effect. ``push`` puts
+    the robot's cube and plate before the trunk.
     """
 
     body: Literal["layered", "tetrahedra"] = "layered"
+    push: bool = False
     tetrahedra: TetrahedraTable | None = None
     engine: Literal["auto", "jax", "numba"] = "auto"
     precision: Literal["float64", "float32"] = "float64"

@@ -25,6 +25,8 @@ from rfdropo_bayes.workflow.files import output_folder
 
 # Number that the first marker's column carries in each source.
 FIRST_COLUMN = {"sofa-csv": 0, "optitrack-csv": 1, "asl-csv": 1}
+CUBE_COLUMNS = tuple(f"cube_{name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))
+"""Of the cube's pose, as in SOFA's and OptiTrack's recordings."""
 
 
 def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str, Any]:
@@ -35,6 +37,7 @@ def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str,
 
     Returns:
         per recording: result code, files, and the error against the measurement [mm]; and that over all recordings.
+        Where a cube is simulated, also how far its centre is from the measured one [mm] and its orientation [deg].
 
     Raises:
         InputError: bad input, or a rollout that did not end well.
@@ -58,7 +61,8 @@ def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str,
         if result is Result.DIVERGED:
             raise InputError(f"the rollout of {source.name} diverged", where="simulate", remedy=result.remedy)
         stem = "trajectory" if len(sources) == 1 else source.name
-        simulated = _as_trajectory(source, position, markers, simulator, experiment, values, index)
+        pose = None if observation.object_pose is None else np.asarray(observation.object_pose)
+        simulated = _as_trajectory(source, position, pose, markers, simulator, experiment, values, index)
         simulated.save(out / f"{stem}.nc")
         _table(source, simulated).to_csv(out / f"{stem}.csv", index=False, float_format="%.6f")
         distances.append(_distance(source, position, markers))
@@ -67,6 +71,8 @@ def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str,
             "files": [str(out / f"{stem}.nc"), str(out / f"{stem}.csv")],
             "error_mm": _errors([distances[-1]]) if experiment.data else None,
         }
+        if pose is not None and source.object_pose is not None:
+            report["recordings"][source.name]["object_error"] = _object_errors(pose, source.object_pose)
     report["error_mm"] = _errors(distances) if experiment.data else None
     (out / "simulation.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return report
@@ -116,6 +122,7 @@ def _known_markers(names: Sequence[str], simulator: RobotSimulator) -> list[str]
 def _as_trajectory(
     source: Trajectory,
     position: Float[np.ndarray, "time marker 3"],
+    pose: Float[np.ndarray, "time 7"] | None,
     markers: Sequence[str],
     simulator: RobotSimulator,
     experiment: Experiment,
@@ -138,6 +145,7 @@ def _as_trajectory(
         format="netcdf",
         time=source.time,
         position=position,
+        object_pose=pose,
         command_time=source.command_time,
         command=source.command,
         command_unit=source.command_unit,
@@ -155,13 +163,16 @@ def _noise(table: NoiseTable, key: PRNGKeyArray, time: Float[np.ndarray, " time"
 
 
 def _table(source: Trajectory, simulated: Trajectory) -> pd.DataFrame:
-    """Time [s], command, markers [mm]: one row per recorded time."""
+    """Time [s], markers [mm] and the cube's pose, if there is one [mm, -]: one row per recorded time."""
     first = FIRST_COLUMN.get(source.dataset.attrs["format"])
     columns: dict[str, np.ndarray] = {"time": simulated.time}
     for i, marker in enumerate(simulated.marker_names):
         for j, axis in enumerate("xyz"):
             name = f"{marker}_{axis}" if first is None else f"{axis}{first + i}"
             columns[name] = 1e3 * simulated.position[:, i, j]
+    if simulated.object_pose is not None:
+        pose = simulated.object_pose * np.array([1e3] * 3 + [1.0] * 4)
+        columns |= dict(zip(CUBE_COLUMNS, pose.T, strict=True))
     return pd.DataFrame(columns)
 
 
@@ -180,4 +191,17 @@ def _errors(distances: Sequence[np.ndarray]) -> dict[str, float]:
         "mean": float(np.nanmean(every)),
         "max": float(np.nanmax(every)),
         "rms_last_marker": float(np.sqrt(np.nanmean(last**2))),
+    }
+
+
+def _object_errors(
+    pose: Float[np.ndarray, "time 7"], measured: Float[np.ndarray, "time 7"]
+) -> dict[str, dict[str, float]]:
+    """Distance of the cube's centre [mm] and angle between the orientations [deg]: mean, largest and last."""
+    distance = 1e3 * np.linalg.norm(pose[:, :3] - measured[:, :3], axis=1)
+    cosine = np.abs(np.sum(pose[:, 3:] * measured[:, 3:], axis=1))
+    angle = np.degrees(2.0 * np.arccos(np.clip(cosine / np.linalg.norm(measured[:, 3:], axis=1), 0.0, 1.0)))
+    return {
+        name: {"mean": float(np.nanmean(error)), "max": float(np.nanmax(error)), "last": float(error[-1])}
+        for name, error in (("position_mm", distance), ("orientation_deg", angle))
     }

@@ -1,0 +1,179 @@
+"""A trunk that pushes a cube on a plate, whatever body and engine move the trunk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, NamedTuple, Protocol
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.pushing import PushScene, push_scene
+from rfdropo_bayes.fem.rigid_body import Cube, CubeState, cube_at, solid_gyration_radius
+from rfdropo_bayes.robots import PushScene as PushTable
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.commands import Commands, sample
+from rfdropo_bayes.simulators.mechanisms import Mechanism
+from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.protocol import Observation, Result
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
+
+BANDS_PER_METRE = 230.0
+"""Bands of the surface along the axis that each may touch once: about four to a vertebra of the trunk."""
+
+
+class CubeInputs(NamedTuple):
+    """The cube of one rollout."""
+
+    cube: Cube
+    friction: Float[Array, ""]
+    start: CubeState
+
+
+class PushMotion(NamedTuple):
+    """What an engine returns: rows are time steps, row 0 is the initial state."""
+
+    position: Float[Array, "row marker 3"]
+    tension: Float[Array, "row cable"]
+    pose: Float[Array, "row 7"]  # of the cube: centre [m] and unit quaternion (x, y, z, w)
+    diverged: Bool[Array, ""]
+    cables_converged: Bool[Array, ""]
+    contacts_converged: Bool[Array, ""]
+
+
+class PushEngine(Protocol):
+    """Computes the motion of a trunk and a cube.
+
+    Attributes:
+        lanes: how many rollouts it likes to be given at once.
+    """
+
+    lanes: ClassVar[int]
+
+    def describe(self) -> dict[str, object]:
+        """Name and precision, for the record."""
+
+    def motion(self, simulator: MeshTrunkSimulator, values: Values, commands: Commands, cube: CubeInputs) -> PushMotion:
+        """Roll out the trunk that ``simulator`` describes."""
+
+
+def push_table(robot: Robot) -> PushTable:
+    """The robot's cube and plate.
+
+    Raises:
+        InputError: the robot has none.
+    """
+    if robot.push is None:
+        raise InputError(
+            f"robot {robot.name!r} has no cube to push", where="[simulator] push", remedy="use push = false"
+        )
+    return robot.push
+
+
+def plate_normal(robot: Robot) -> Float[np.ndarray, "3"]:
+    """Unit vector against gravity, out of the plate."""
+    return -robot.gravity / np.linalg.norm(robot.gravity)
+
+
+def scene_of(robot: Robot, surface: PointMap, rest: Float[np.ndarray, "nodes 3"]) -> PushScene:
+    """Cube and plate of a robot whose surface points are bound to nodes at ``rest`` [m]."""
+    table = push_table(robot)
+    height = np.einsum("pk,pk->p", surface.weight, rest[surface.node, 2])
+    return push_scene(
+        surface,
+        height,
+        round(BANDS_PER_METRE * float(np.ptp(height))),
+        plate_normal=plate_normal(robot),
+        plate_height=table.plate_height_m,
+        contact_distance=table.contact_distance_m,
+    )
+
+
+@dataclass(frozen=True)
+class PushSimulator(RobotSimulator):
+    """A trunk and a cube on a plate, behind the `Simulator` protocol; the cube starts at rest where it is put.
+
+    Attributes:
+        trunk: the same trunk without cube: its commands, material and measurement are these.
+        engine: what computes the motion of both.
+    """
+
+    trunk: MeshTrunkSimulator
+    engine: PushEngine
+
+    @property
+    def robot(self) -> Robot:  # type: ignore[override]
+        """That of the trunk."""
+        return self.trunk.robot
+
+    @property
+    def mechanisms(self) -> Sequence[Mechanism]:  # type: ignore[override]
+        """Those of the trunk."""
+        return self.trunk.mechanisms
+
+    @property
+    def lanes(self) -> int:
+        """Those of the engine."""
+        return self.engine.lanes
+
+    @property
+    def description(self) -> dict[str, object]:
+        """As the trunk's, with the engine that computes the contacts."""
+        return {**self.trunk.description, **self.engine.describe(), "object": "cube"}
+
+    @cached_property
+    def parameters(self) -> tuple[ParameterSpec, ...]:  # type: ignore[override]
+        """Parameters of the trunk, then those of the cube."""
+        return self.trunk.parameters + tuple(
+            ParameterSpec(name, p.unit, p.low, p.high, p.nominal, p.prior, p.description)
+            for name, p in push_table(self.robot).parameters.items()
+        )
+
+    def commands(
+        self,
+        time: Float[np.ndarray, " command"],
+        value: Float[np.ndarray, "command channel"],
+        initial: Float[np.ndarray, " channel"],
+        observation_time: Float[np.ndarray, " time"],
+    ) -> Commands:
+        """Recorded commands on the trunk's clock."""
+        return self.trunk.commands(time, value, initial, observation_time)
+
+    def cube(self, values: Values) -> CubeInputs:
+        """The cube for these values."""
+        side = jnp.asarray(values["cube_side"], float)
+        centre = jnp.stack([jnp.asarray(values[f"cube_{axis}"], float) for axis in "xyz"])
+        return CubeInputs(
+            Cube(jnp.asarray(values["cube_mass"], float), side, solid_gyration_radius(side)),
+            jnp.asarray(values["friction"], float),
+            cube_at(centre, values["cube_yaw"], plate_normal(self.robot)),
+        )
+
+    def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
+        """Simulate from the initial state to the last observation; all steps are computed, whatever ``steps`` says.
+
+        Raises:
+            InputError: a name that is not a parameter of this simulator.
+        """
+        values = self.complete(parameters)
+        own = {spec.name: values[spec.name] for spec in self.trunk.parameters}
+        motion = self.engine.motion(self.trunk, own, commands, self.cube(values))
+        status = jnp.where(
+            motion.diverged,
+            int(Result.DIVERGED),
+            jnp.where(
+                ~motion.cables_converged,
+                int(Result.CABLE_LIMIT),
+                jnp.where(motion.contacts_converged, int(Result.OK), int(Result.CONTACT_NOT_CONVERGED)),
+            ),
+        )
+        pose = sample(motion.pose, commands)
+        pose = pose.at[:, 3:].divide(jnp.linalg.norm(pose[:, 3:], axis=1, keepdims=True))
+        position = self.trunk.measured(own, sample(motion.position, commands))
+        return Observation(position, sample(motion.tension, commands), pose, status)

@@ -1,0 +1,130 @@
+"""A trunk that pushes a cube, on a bar of few tetrahedra: rest, reaction, gaps, result codes."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.pushing import LYING, PUSHING, RESTING, cube_rows, find_contacts, trunk_rows
+from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots.meshes import read_tetrahedra
+from rfdropo_bayes.simulators import Result, Simulator
+from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
+from rfdropo_bayes.simulators.mesh_engines import CompiledMeshEngine
+from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
+from rfdropo_bayes.simulators.push_engines import MeshPushEngine
+from rfdropo_bayes.simulators.pushing import PushSimulator, push_table
+
+TIME_STEP, HALF = 0.01, 0.0175
+SOFA = load_robot("trunk_sofa_mesh")
+PLATE = -0.075
+"""[m] The bar bends less than SOFA's trunk: a plate that it reaches."""
+ROBOT = SOFA.model_copy(update={"push": SOFA.push.model_copy(update={"plate_height_m": PLATE})})
+REST_HEIGHT = PLATE + HALF + 0.005
+
+
+SOFT = {"young_modulus": 2e5}
+
+
+@pytest.fixture(scope="module")
+def trunk(bar_mesh) -> MeshTrunkSimulator:
+    options = TetrahedraTable(mesh="bar.vtk", unit="mm", clamp_height=0.02, frames="edges", masses="equal")
+    assembly = assemble_mesh(ROBOT, read_tetrahedra(bar_mesh, "mm"), options)
+    return MeshTrunkSimulator(ROBOT, CompiledMeshEngine(assembly, TIME_STEP), assembly, options, TIME_STEP)
+
+
+@pytest.fixture(scope="module")
+def pushing(trunk) -> PushSimulator:
+    return PushSimulator(trunk, MeshPushEngine(trunk))
+
+
+@pytest.fixture(scope="module")
+def commands(trunk):
+    """Half a second of pulling the long cable at -y, slowly."""
+    rows = 10
+    value = np.zeros((rows, 8))
+    value[:, 2] = 4e-3 * np.arange(1, rows + 1)
+    return trunk.commands(0.05 * np.arange(rows), value, np.zeros(8), 0.05 * np.arange(rows + 1))
+
+
+@pytest.fixture(scope="module")
+def rollout(pushing, commands):
+    """The simulation, compiled once for all values of the cube."""
+    names = ("young_modulus", "cube_mass", "friction", "cube_x", "cube_y", "cube_yaw")
+    nominal = {spec.name: float(spec.nominal) for spec in pushing.parameters} | SOFT
+    run = jax.jit(lambda values: pushing.rollout(values, commands))
+    return lambda **changes: run({name: jnp.asarray(changes.get(name, nominal[name])) for name in names})
+
+
+def test_it_is_a_simulator_with_the_cubes_parameters(pushing, trunk):
+    assert isinstance(pushing, Simulator)
+    names = {spec.name for spec in pushing.parameters} - {spec.name for spec in trunk.parameters}
+    assert names == {"cube_mass", "friction", "cube_side", "cube_x", "cube_y", "cube_z", "cube_yaw"}
+    with pytest.raises(InputError, match="unknown parameter"):
+        pushing.rollout({"cube_weight": jnp.asarray(1.0)}, None)
+
+
+def test_the_cube_comes_to_rest_and_a_trunk_that_does_not_touch_it_moves_as_without(rollout, trunk, commands):
+    aside = rollout(young_modulus=4.5e6, cube_x=0.25, cube_y=-0.03, cube_yaw=0.5)
+    pose = np.asarray(aside.object_pose)
+    np.testing.assert_allclose(pose[1, 1], -0.03 - 14.681e-3, atol=5e-7)  # as in SOFA's recordings
+    np.testing.assert_allclose(pose[-1, :3], [0.25, REST_HEIGHT, 0.1], atol=1e-6)
+    np.testing.assert_allclose(pose[-1, 3:], [0.0, np.sin(0.25), 0.0, np.cos(0.25)], atol=1e-6)
+    alone = trunk.rollout({}, commands)
+    np.testing.assert_allclose(aside.position, alone.position, atol=1e-9)
+    assert int(aside.status) == Result.OK
+
+
+def test_the_trunk_pushes_the_cube_and_the_cube_holds_the_trunk(rollout, trunk, commands):
+    """A cube beside the trunk's path that is heavy and rough resists more than a light and smooth one."""
+    beside = {"cube_x": -0.02, "cube_y": REST_HEIGHT}
+    alone = np.asarray(trunk.rollout(SOFT, commands).position)
+    light, heavy = rollout(**beside, cube_mass=0.02, friction=0.05), rollout(**beside, cube_mass=5.0, friction=0.9)
+    assert int(light.status) == int(heavy.status) == Result.OK
+    lifted = np.asarray(heavy.position)[-1, :, 1] - alone[-1, :, 1]
+    assert lifted.max() > 2e-3
+    moved = [float(jnp.linalg.norm(found.object_pose[-1, :3] - found.object_pose[0, :3])) for found in (light, heavy)]
+    assert moved[0] > 2.0 * moved[1]
+    assert np.asarray(light.object_pose)[:, 1].min() > REST_HEIGHT - 1e-5
+
+
+def test_touching_surfaces_keep_their_distance(pushing, rollout):
+    """The trunk lies on the cube: no point comes nearer than the contact distance, beyond the step's linearisation."""
+    found = rollout(cube_mass=5.0, friction=0.9, cube_y=REST_HEIGHT)
+    centre = np.asarray(found.object_pose)[-1, :3]
+    markers = np.asarray(found.position)[-1]
+    over = (np.abs(markers[:, 0] - centre[0]) < 0.015) & (np.abs(markers[:, 2] - centre[2]) < 0.015)
+    assert over.any()
+    assert markers[over, 1].min() > centre[1] + HALF + 0.005 + 0.009  # the bar's half width is 13 mm
+
+
+def test_contacts_act_equally_on_both_sides(pushing, trunk):
+    """Every row pushes trunk and cube with opposite forces at one place: momentum is kept, angular momentum too."""
+    scene, rest = pushing.engine.scene, jnp.asarray(trunk.assembly.system.body.rest)
+    cube, _, start = pushing.cube(pushing.complete({"cube_y": jnp.asarray(-0.035), "cube_yaw": jnp.asarray(0.3)}))
+    touch = find_contacts(scene, cube, start, rest)
+    on_trunk, on_cube = np.asarray(trunk_rows(touch, len(rest))), np.asarray(cube_rows(touch))
+    pushing_rows = slice(3 * RESTING, 3 * (RESTING + PUSHING))
+    np.testing.assert_allclose(on_trunk[: 3 * PUSHING].sum(axis=1), -on_cube[pushing_rows, :3], atol=1e-12)
+    assert len(on_trunk) == 3 * (PUSHING + LYING)
+    assert np.abs(on_cube[3 * (RESTING + PUSHING) :]).max() == 0.0
+    arms = np.asarray(rest) - np.asarray(start.position)
+    torque = np.cross(arms[None], on_trunk[: 3 * PUSHING]).sum(axis=1)
+    gap = np.asarray(touch.gap)[RESTING : RESTING + PUSHING] + scene.contact_distance
+    apart = gap.repeat(3)[:, None] * np.cross(
+        np.asarray(touch.frame)[RESTING : RESTING + PUSHING, :1].repeat(3, axis=1).reshape(-1, 3),
+        on_trunk[: 3 * PUSHING].sum(axis=1),
+    )
+    np.testing.assert_allclose(torque, -on_cube[pushing_rows, 3:] + apart, atol=1e-12)
+
+
+def test_lost_and_unsolved_rollouts_say_so(rollout):
+    assert int(rollout(cube_mass=float("nan")).status) == Result.DIVERGED
+
+
+def test_a_robot_without_a_cube_is_refused():
+    with pytest.raises(InputError, match="no cube to push"):
+        push_table(load_robot("smooth_arm"))
