@@ -17,10 +17,12 @@ from rfdropo_bayes.fem.dynamics import (  # noqa: E402
     System,
     material,
     prepare,
+    remembering,
     state_at_rest,
     step,
     without_cables,
 )
+from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Memory, Viscoelasticity, Wall  # noqa: E402
 from rfdropo_bayes.fem.energies import Energies, energies, linear_momentum, total_mass  # noqa: E402
 from rfdropo_bayes.fem.equilibrium import EquilibriumInfo, static_equilibrium  # noqa: E402
 from rfdropo_bayes.fem.layered import (  # noqa: E402
@@ -37,17 +39,22 @@ from rfdropo_bayes.fem.layered import (  # noqa: E402
 from rfdropo_bayes.fem.rollouts import Rollout, simulate, simulate_prefix  # noqa: E402
 
 __all__ = [
+    "BendingLaw",
+    "BodyEffects",
     "CableLayout",
     "Energies",
     "EquilibriumInfo",
     "LayeredBody",
     "Material",
+    "Memory",
     "PointMap",
     "Prepared",
     "Rollout",
     "State",
     "StepInfo",
     "System",
+    "Viscoelasticity",
+    "Wall",
     "attach",
     "cable_layout",
     "energies",
@@ -56,6 +63,7 @@ __all__ = [
     "point_positions",
     "prepare",
     "profile_body",
+    "remembering",
     "rest_positions",
     "simulate",
     "simulate_prefix",

@@ -49,14 +49,10 @@ def local_displacement(
 
 
 def internal_force(
-    stiffness: Float[Array, "layers dofs dofs"],
-    frame: Float[Array, "layers 3 3"],
-    displacement: Float[Array, "layers dofs"],
+    frame: Float[Array, "layers 3 3"], resistance: Float[Array, "layers dofs"]
 ) -> Float[Array, "stations nodes 3"]:
-    """Elastic force [N] on the nodes of every station."""
-    layers = len(frame)
-    local = jnp.einsum("lij,lj->li", stiffness, displacement).reshape(layers, -1, 3)
-    force = -jnp.einsum("lij,lnj->lni", frame, local)
+    """Elastic force [N] on the nodes of every station, from what each layer resists in its own frame."""
+    force = -jnp.einsum("lij,lnj->lni", frame, resistance.reshape(len(frame), -1, 3))
     half = force.shape[1] // 2
     none = jnp.zeros((1, half, 3))
     return jnp.concatenate([force[:, :half], none]) + jnp.concatenate([none, force[:, half:]])

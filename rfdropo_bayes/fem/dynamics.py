@@ -3,9 +3,9 @@
     A dv = h (f(x) + M g + f_ext - (h + b) K v - a M v) - h J' T,    A = (1 + h a) M + h (h + b) K,    x += h (v + dv)
 
 with Rayleigh damping a M + b K, the corotational tangent K, cable Jacobian J = dl/dx and tensions T >= 0 (Baraff and
-Witkin 1998; the same linearised step as SOFA's EulerImplicitSolver). Everything is a pure function of arrays: batch
-with ``jax.vmap``, differentiate with ``jax.jvp`` or ``jax.grad``. A ``System`` is static and is closed over, never
-traced.
+Witkin 1998; the same linearised step as SOFA's EulerImplicitSolver). What ``effects`` add is implicit in the same way:
+their force, linearised, at the end of the step. Everything is a pure function of arrays: batch with ``jax.vmap``,
+differentiate with ``jax.jvp`` or ``jax.grad``. A ``System`` is static and is closed over, never traced.
 """
 
 from __future__ import annotations
@@ -13,16 +13,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem import corotational, layered
-from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, multiply, solve
-from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian, unilateral_tensions
+from rfdropo_bayes.fem.bending_law import Sections, moments, sections
+from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, multiply
+from rfdropo_bayes.fem.cable_friction import Slip, slip_problem, slipped, start_slip
+from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian
+from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
 from rfdropo_bayes.fem.layered import LayeredBody
-
-Scalar = Float[Array, ""] | float
+from rfdropo_bayes.fem.pulling import CableSolution, Pull, constrained_increment
+from rfdropo_bayes.fem.surroundings import SectionLoad, section_load
 
 POISSON_LIMIT = 0.499
 """Larger Poisson ratios are taken as this one: the displacement element has no incompressible limit."""
@@ -49,6 +53,7 @@ class Material(NamedTuple):
     gravity: Float[Array, "3"]  # [m/s2]
     stiffness_scale: Float[Array, " layers"]  # factor on the stiffness of each layer
     point_mass: Float[Array, " stations"]  # lumped, in equal parts, on the nodes of each station [kg]
+    effects: BodyEffects = BodyEffects()
 
 
 class Prepared(NamedTuple):
@@ -65,6 +70,8 @@ class Prepared(NamedTuple):
     rest: Float[Array, "layers nodes2 3"]  # node positions at rest, by layer [m]
     guides: Float[Array, "cables guides nodes"]
     rest_length: Float[Array, " cables"]  # cable lengths of the undeformed body [m]
+    effects: BodyEffects
+    sections: Sections | None  # where the body has a bending law
 
 
 class State(NamedTuple):
@@ -73,6 +80,7 @@ class State(NamedTuple):
     position: Float[Array, "nodes 3"]  # [m]
     velocity: Float[Array, "nodes 3"]  # [m/s]
     tension: Float[Array, " cables"]  # [N]
+    memory: Memory = Memory()  # of the effects; see ``remembering``
 
 
 class StepInfo(NamedTuple):
@@ -131,6 +139,8 @@ def prepare(system: System, material: Material) -> Prepared:
     rest = jnp.asarray(layered.rest_positions(body))
     guides = jnp.asarray(guide_matrix(system.cables, body.nodes))
     weight = multiply(mass, jnp.broadcast_to(material.gravity, (len(body.station), section, 3)))
+    bends = material.effects.bending is not None
+    rotations = sections(body, material.young_modulus, poisson_ratio, material.stiffness_scale) if bends else None
     return Prepared(
         stiffness=stiffness,
         packed=corotational.pack(stiffness),
@@ -143,6 +153,8 @@ def prepare(system: System, material: Material) -> Prepared:
         rest=jnp.asarray(layered.rest_layers(body)),
         guides=guides,
         rest_length=lengths_and_jacobian(system.cables, guides, rest)[0],
+        effects=material.effects,
+        sections=rotations,
     )
 
 
@@ -161,10 +173,18 @@ def frames_and_displacements(
     return frame, corotational.local_displacement(frame, layers, prepared.rest)
 
 
-def elastic_force(system: System, prepared: Prepared, position: Float[Array, "nodes 3"]) -> Float[Array, "nodes 3"]:
-    """Force [N] of the deformed body on its nodes."""
-    frame, displacement = frames_and_displacements(system, prepared, position)
-    return corotational.internal_force(prepared.stiffness, frame, displacement).reshape(-1, 3)
+def resistance(
+    prepared: Prepared, local: Float[Array, "layers dofs"]
+) -> tuple[Float[Array, "layers dofs"], Float[Array, "layers 9 pairs"]]:
+    """What every layer resists [N] at a displacement in its frame, and its tangent, packed: elasticity and bending
+    law."""
+    force = jnp.einsum("lij,lj->li", prepared.stiffness, local)
+    if prepared.effects.bending is None or prepared.sections is None:
+        return force, prepared.packed
+    moment, slope = moments(prepared.effects.bending, prepared.sections, local)
+    rotation = prepared.sections.rotation
+    added = jnp.einsum("lia,lij,ljb->lab", rotation, slope, rotation)
+    return force + jnp.einsum("lia,li->la", rotation, moment), prepared.packed + corotational.pack(added)
 
 
 def mass_times(system: System, prepared: Prepared, field: Float[Array, "nodes 3"]) -> Float[Array, "nodes 3"]:
@@ -177,34 +197,90 @@ def _with_axes(mass: BlockTridiagonal) -> BlockTridiagonal:
     return BlockTridiagonal(*(jnp.kron(block, jnp.eye(3)) for block in mass))
 
 
-def constrained_increment(
+def section_means(system: System, field: Float[Array, "nodes 3"]) -> Float[Array, "stations 3"]:
+    """Mean of a nodal field over the nodes of every station."""
+    return jnp.mean(field.reshape(len(system.body.station), -1, 3), axis=1)
+
+
+def shared(system: System, force: Float[Array, "stations 3"]) -> Float[Array, "nodes 3"]:
+    """Forces on sections in equal parts on their nodes."""
+    return jnp.repeat(force / system.body.section_nodes, system.body.section_nodes, axis=0)
+
+
+def with_section_matrix(
+    system: System, matrix: BlockTridiagonal, added: Float[Array, "stations 3 3"]
+) -> BlockTridiagonal:
+    """Add matrices that act on the mean motion of every section."""
+    nodes = system.body.section_nodes
+    blocks = jax.vmap(lambda part: jnp.kron(jnp.full((nodes, nodes), 1.0 / nodes**2), part))(added)
+    return BlockTridiagonal(matrix.diagonal + blocks, matrix.lower)
+
+
+def remembering(system: System, prepared: Prepared, state: State) -> State:
+    """The state with the memory that the effects start from: clock at zero, branches relaxed, friction not mobilised.
+
+    A memory that is there is kept.
+    """
+    effects, memory = prepared.effects, state.memory
+    if jax.tree.leaves(memory):
+        return state
+    if effects.softening_rate is not None:
+        memory = memory._replace(clock=jnp.zeros(()))
+    if effects.viscoelasticity is not None:
+        memory = memory._replace(branch=frames_and_displacements(system, prepared, state.position)[1])
+    friction = start_slip(system.cables, effects, state.tension)
+    return state._replace(memory=memory._replace(slip=friction.slip, segment=friction.segment))
+
+
+class _Elastic(NamedTuple):
+    """Elastic forces of a step: what acts at its start, and how that changes to its end."""
+
+    force: Float[Array, "nodes 3"]
+    tangent: BlockTridiagonal
+    lookahead: Scalar  # [s] times the tangent times the velocity is the change of force
+    memory: Memory
+
+
+def _elastic(system: System, prepared: Prepared, state: State, time_step: Scalar) -> _Elastic:
+    """Elastic force with what viscoelasticity and softening make of it.
+
+    The strain q of a Prony branch's dashpot follows q' = (u - q) / tau by implicit Euler, so that its force at the end
+    of a step is gamma K (u - q) with gamma = fraction tau / (tau + h) and q of the start (Simo and Hughes 1998,
+    Computational Inelasticity, ch. 10).
+    """
+    frame, local = frames_and_displacements(system, prepared, state.position)
+    force, packed = resistance(prepared, local)
+    memory, gain = state.memory, jnp.zeros(())
+    viscous, rate = prepared.effects.viscoelasticity, prepared.effects.softening_rate
+    if viscous is not None and memory.branch is not None:
+        share = time_step / (viscous.time + time_step)
+        branch = memory.branch + share * (local - memory.branch)
+        gain = gain + viscous.fraction * (1.0 - share)
+        force = force + gain * jnp.einsum("lij,lj->li", prepared.stiffness, local - branch)
+        memory = memory._replace(branch=branch)
+    if rate is not None and memory.clock is not None:
+        clock = memory.clock + time_step
+        left = jnp.exp(-rate * clock)
+        force, packed, memory = left * force, left * packed, memory._replace(clock=clock)
+    tangent = corotational.tangent(packed, frame)
+    force = corotational.internal_force(frame, force).reshape(-1, 3)
+    return _Elastic(force, tangent, time_step * (1.0 + gain) + prepared.rayleigh_stiffness, memory)
+
+
+def _surround(
     system: System,
+    load: SectionLoad | None,
     matrix: BlockTridiagonal,
     right: Float[Array, "nodes 3"],
-    jacobian: Float[Array, "cables nodes 3"],
-    slack: Float[Array, " cables"],
-    previous: Float[Array, " cables"],
-) -> tuple[Float[Array, "nodes 3"], Float[Array, " cables"], Bool[Array, ""]]:
-    """Solve A u = r - J' T with T >= 0 complementary to slack - J u >= 0; u is zero on the clamped stations.
-
-    Returns:
-        the increment u (nodes, 3), the tensions, and whether the cable problem was solved.
-    """
-    held, stations = system.clamped_stations, len(system.body.station)
-    cables = len(slack)
-    columns = jnp.concatenate([right[None], jacobian]).reshape(1 + cables, stations, -1)[:, held:]
-    columns = jnp.moveaxis(columns, 0, 2)
-    solution = solve(BlockTridiagonal(matrix.diagonal[held:], matrix.lower[held:]), columns)
-    free, response = solution[..., 0], solution[..., 1:]
-    converged = jnp.array(True)
-    tension = jnp.zeros(0)
-    if cables:
-        compliance = jnp.einsum("sbc,sbd->cd", columns[..., 1:], response)
-        remaining = slack - jnp.einsum("sbc,sb->c", columns[..., 1:], free)
-        tension, converged = unilateral_tensions(compliance, remaining, previous)
-        free = free - response @ tension
-    increment = jnp.concatenate([jnp.zeros((held, free.shape[1])), free])
-    return increment.reshape(-1, 3), tension, converged
+    velocity: Float[Array, "stations 3"],
+    time_step: Scalar,
+) -> tuple[BlockTridiagonal, Float[Array, "nodes 3"]]:
+    """Matrix and right-hand side of a step with the loads on its sections."""
+    if load is None:
+        return matrix, right
+    force = load.force - time_step * jnp.einsum("sij,sj->si", load.stiffness, velocity)
+    added = time_step * load.damping + time_step**2 * load.stiffness
+    return with_section_matrix(system, matrix, added), right + time_step * shared(system, force)
 
 
 def step(
@@ -218,28 +294,52 @@ def step(
     """One implicit Euler step to the commanded cable displacements [m] (pull > 0) at its end.
 
     ``external_force`` [N] acts on the nodes throughout the step. A step that is not finite leaves the body where it
-    was, at rest and without tension, and says so: a batch goes on.
+    was, at rest and without tension, and says so: a batch goes on. Where the material has effects with a memory, the
+    state comes from ``remembering``.
     """
-    frame, local = frames_and_displacements(system, prepared, state.position)
-    force = corotational.internal_force(prepared.stiffness, frame, local).reshape(-1, 3)
-    tangent = corotational.tangent(prepared.packed, frame)
+    elastic = _elastic(system, prepared, state, time_step)
     stations = len(system.body.station)
-    damping = time_step + prepared.rayleigh_stiffness
-    strained = multiply(tangent, state.velocity.reshape(stations, -1, 1)).reshape(-1, 3)
+    strained = multiply(elastic.tangent, state.velocity.reshape(stations, -1, 1)).reshape(-1, 3)
     dragged = prepared.rayleigh_mass * mass_times(system, prepared, state.velocity)
-    right = time_step * (force + prepared.weight + external_force - damping * strained - dragged)
+    load = prepared.weight + external_force
+    right = time_step * (elastic.force + load - elastic.lookahead * strained - dragged)
+    inertia, elasticity = 1.0 + time_step * prepared.rayleigh_mass, time_step * elastic.lookahead
     mass = _with_axes(prepared.mass)
-    inertia, elasticity = 1.0 + time_step * prepared.rayleigh_mass, time_step * damping
-    matrix = BlockTridiagonal(*(inertia * m + elasticity * k for m, k in zip(mass, tangent, strict=True)))
+    matrix = BlockTridiagonal(*(inertia * m + elasticity * k for m, k in zip(mass, elastic.tangent, strict=True)))
+    centre, drift = section_means(system, state.position), section_means(system, state.velocity)
+    around = section_load(system.body, prepared.effects, centre, drift)
+    matrix, right = _surround(system, around, matrix, right, drift, time_step)
+    solution, slip = _pulled(system, prepared, state, matrix, right, displacement, time_step)
+    velocity = state.velocity + solution.increment
+    memory, tension = elastic.memory, solution.tension / time_step
+    if slip is not None:
+        share, segment = slipped(system.cables, slip, solution.mobilised, tension)
+        memory = memory._replace(slip=share, segment=segment)
+    moved = State(state.position + time_step * velocity, velocity, tension, memory)
+    return accept(system, prepared, state, moved, solution.converged)
+
+
+def _pulled(
+    system: System,
+    prepared: Prepared,
+    state: State,
+    matrix: BlockTridiagonal,
+    right: Float[Array, "nodes 3"],
+    displacement: Float[Array, " cables"],
+    time_step: Scalar,
+) -> tuple[CableSolution, Slip | None]:
+    """The velocity's increment with the cables at their commanded displacements at the end of the step."""
     length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, state.position)
     moving = jnp.einsum("cni,ni->c", jacobian, state.velocity)
     slack = (prepared.rest_length - displacement - length) / time_step - moving
-    change, impulse, converged = constrained_increment(
-        system, matrix, right, jacobian, slack, state.tension * time_step
-    )
-    velocity = state.velocity + change
-    moved = State(state.position + time_step * velocity, velocity, impulse / time_step)
-    return accept(system, prepared, state, moved, converged)
+    compliance = prepared.effects.cable_compliance
+    give = 0.0 if compliance is None else compliance / time_step**2
+    pull = Pull(jacobian, slack, state.tension * time_step, give)
+    slip = None
+    mobilised, segment = state.memory.slip, state.memory.segment
+    if mobilised is not None and segment is not None:
+        slip = slip_problem(system.cables, prepared.effects, mobilised, segment, prepared.guides, state.position)
+    return constrained_increment(system.clamped_stations, matrix, right, pull, slip, state.velocity, time_step), slip
 
 
 def accept(
@@ -249,6 +349,6 @@ def accept(
     reach = LOST * (system.body.station[-1] - system.body.station[0])
     away = jnp.max(jnp.abs(layered.layer_positions(system.body, moved.position) - prepared.rest))
     fine = (away < reach) & jnp.all(jnp.isfinite(moved.velocity)) & jnp.all(jnp.isfinite(moved.tension))
-    stopped = State(state.position, jnp.zeros_like(state.velocity), jnp.zeros_like(state.tension))
-    kept = State(*(jnp.where(fine, new, old) for new, old in zip(moved, stopped, strict=True)))
+    stopped = State(state.position, jnp.zeros_like(state.velocity), jnp.zeros_like(state.tension), state.memory)
+    kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), moved, stopped)
     return kept, StepInfo(diverged=~fine, cables_converged=converged | ~fine)

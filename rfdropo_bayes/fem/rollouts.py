@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rfdropo_bayes.fem.dynamics import Prepared, Scalar, State, System, step
+from rfdropo_bayes.fem.dynamics import Prepared, State, System, remembering, step
+from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.layered import PointMap, point_positions
 
 
@@ -67,7 +68,7 @@ def simulate(
         progress = _advance(system, prepared, progress, commands, time_step, external_force)
         return progress, (point_positions(points, progress.state.position), progress.state.tension)
 
-    start = _Progress(state, jnp.array(False), jnp.array(True))
+    start = _Progress(remembering(system, prepared, state), jnp.array(False), jnp.array(True))
     last, (position, tension) = lax.scan(row, start, displacement)
     return Rollout(position, tension, *last)
 
@@ -94,7 +95,7 @@ def simulate_prefix(
         here = point_positions(points, progress.state.position)
         return progress, position.at[index].set(here), tension.at[index].set(progress.state.tension)
 
-    start = _Progress(state, jnp.array(False), jnp.array(True))
+    start = _Progress(remembering(system, prepared, state), jnp.array(False), jnp.array(True))
     empty = jnp.zeros((rows, len(points.node), 3)), jnp.zeros((rows, len(state.tension)))
     last, position, tension = lax.fori_loop(0, jnp.minimum(horizon, rows), row, (start, *empty))
     return Rollout(position, tension, *last)

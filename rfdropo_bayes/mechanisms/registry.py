@@ -7,7 +7,16 @@ from collections.abc import Iterable
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms.actuation import ActuatorLag, CommandDelay, CommandGain
 from rfdropo_bayes.mechanisms.body import BaseTilt, Payload, StiffnessGradient
+from rfdropo_bayes.mechanisms.friction import CableCompliance, CapstanFriction, CoulombFriction
+from rfdropo_bayes.mechanisms.material_laws import (
+    BendingStiffening,
+    BendTwistCoupling,
+    PlaneAnisotropy,
+    Softening,
+    ViscoelasticBranch,
+)
 from rfdropo_bayes.mechanisms.sensing import CameraRotation, CameraScale
+from rfdropo_bayes.mechanisms.surroundings import QuadraticDrag, WallContact
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.parameters import nearest
 
@@ -20,6 +29,16 @@ REGISTRY: dict[str, type] = {
         Payload,
         StiffnessGradient,
         BaseTilt,
+        CoulombFriction,
+        CapstanFriction,
+        CableCompliance,
+        ViscoelasticBranch,
+        BendingStiffening,
+        PlaneAnisotropy,
+        BendTwistCoupling,
+        Softening,
+        QuadraticDrag,
+        WallContact,
         CameraRotation,
         CameraScale,
     )

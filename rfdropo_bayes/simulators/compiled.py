@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import ClassVar, Literal
 
 import jax
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.fem import Material
+from rfdropo_bayes.fem import BodyEffects, Material
 from rfdropo_bayes.fem.native.layered import NativeLayered
 from rfdropo_bayes.simulators.differences import (
     ACCELERATION,
@@ -23,15 +24,31 @@ from rfdropo_bayes.simulators.differences import (
     incompressibility_margin,
     with_differences,
 )
+from rfdropo_bayes.simulators.reference import ReferenceEngine
 from rfdropo_bayes.simulators.trunk import Assembly, Motion
 
 Inputs = tuple[Material, Float[Array, " cable"], Float[Array, "step cable"]]
+
+COMPILED_EFFECTS: frozenset[str] = frozenset()
+"""Effects of the body that the compiled engine knows; with any other, rollouts run on the reference engine."""
+
+
+def effects_lacking(effects: BodyEffects) -> tuple[str, ...]:
+    """Names of the effects that are present and that the compiled engine does not know."""
+    given = (name for name, value in effects._asdict().items() if value is not None)
+    return tuple(name for name in given if name not in COMPILED_EFFECTS)
+
+
+@cache
+def _say_once(lacking: tuple[str, ...]) -> None:
+    names = ", ".join(name.replace("_", " ") for name in lacking)
+    logging.getLogger(__name__).warning("rollouts with %s run on the JAX engine, which is slower", names)
 
 
 def input_sizes(inputs: Inputs) -> Inputs:
     """Sizes that perturbations of the inputs are relative to."""
     material, start, displacement = inputs
-    magnitudes = Material(*(jnp.abs(value) + 1e-12 for value in material))._replace(
+    magnitudes = jax.tree.map(lambda value: jnp.abs(value) + 1e-12, material)._replace(
         poisson_ratio=incompressibility_margin(material.poisson_ratio),
         gravity=jnp.full_like(material.gravity, ACCELERATION),
         point_mass=jnp.full_like(material.point_mass, MASS),
@@ -81,7 +98,17 @@ class CompiledEngine:
         displacement: Float[Array, "step cable"],
         steps: Int[Array, ""] | None,
     ) -> Motion:
-        """See `Engine.motion`. Derivatives are central differences along each tangent, two rollouts per direction."""
+        """See `Engine.motion`.
+
+        Derivatives are central differences along each tangent, two rollouts per direction. With effects of the body
+        that this engine does not know, the reference engine computes rollouts and derivatives.
+        """
+        lacking = effects_lacking(material.effects)
+        if lacking:
+            _say_once(lacking)
+            return ReferenceEngine(self.assembly, self.time_step, self.from_equilibrium).motion(
+                material, start, displacement, steps
+            )
         limit = jnp.asarray(displacement.shape[0] if steps is None else steps, jnp.float64)
         return self._differentiable((material, start, displacement), limit)
 
@@ -106,7 +133,7 @@ class CompiledEngine:
         """Flatten whatever batch axes vmap has added, roll out, and restore them."""
         batch = displacement.shape[:-2]
         count = int(np.prod(batch))
-        flat = Material(*(flattened(np.asarray(value), len(batch), count) for value in material))
+        flat = jax.tree.map(lambda value: flattened(np.asarray(value), len(batch), count), material)
         found = self._native.rollout(
             flat,
             flattened(np.asarray(displacement), len(batch), count),

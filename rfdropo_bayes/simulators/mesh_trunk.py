@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import LayeredBody, Material
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial
 from rfdropo_bayes.robots import Robot
@@ -131,6 +132,11 @@ class MeshTrunkSimulator(RobotSimulator):
         for mechanism in self.mechanisms:
             if isinstance(mechanism, BodyMechanism):
                 material = mechanism.embody(values, material, layers)
+                if material.effects.present:
+                    raise InputError(
+                        f"the mechanism {mechanism.name!r} acts on layered bodies only", where="[model] mechanisms",
+                        remedy='remove it, or set body = "layered" under [simulator]',
+                    )  # fmt: skip
         assembly = self.assembly
         trunk_mass = material.density * self.robot.body.volume_m3
         return TetrahedralMaterial(

@@ -132,6 +132,8 @@ class NativeLayered:
             "start": _cable_rows(start, cables, "start"),
             "displacement": displacement.reshape(-1, displacement.shape[-2] * cables),
         }
+        if material.effects.present:
+            raise InputError("effects of the body", where="rollout", remedy="use the reference engine")
         batch = self._batch(material, state)
         steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
         settling = 0 if start is None else ITERATIONS
@@ -153,7 +155,8 @@ class NativeLayered:
         """Parameters, initial states and commands in the precision of the kernels."""
         layers = self._tables.stations - 1
         width = {"gravity": (3,), "stiffness_scale": (layers,), "point_mass": (layers + 1,)}
-        values = {name: np.asarray(value, dtype=float) for name, value in material._asdict().items()}
+        given = {name: value for name, value in material._asdict().items() if name != "effects"}
+        values = {name: np.asarray(value, dtype=float) for name, value in given.items()}
         sizes = {len(value) for name, value in values.items() if value.ndim > len(width.get(name, ()))}
         sizes |= {len(value) for value in state.values()}
         count = max(sizes)

@@ -1,0 +1,174 @@
+"""Friction of cables in their guides: Coulomb's with a constant force, and the capstan's.
+
+At guide j the tension drops from T_j to T_j+1 = T_j - D_j where the cable slides towards its drive, and rises where it
+slides away. Coulomb: D = F z. Capstan: D = mu theta (T_j + T_j+1) / 2 z, with the wrap angle theta of the current
+shape; for full sliding that is (2 - mu theta) / (2 + mu theta), the exponential to third order in mu theta of a guide.
+
+z in [-1, 1] is the share of the friction that is mobilised: a Prandtl element, dz = slip / PRESLIDING until it slides.
+It sticks at rest and holds its force there. The end of a step is implicit in z, by a few exchanges between what sticks
+and what slides. Guides next to each other share one z, in at most ``RUNS`` runs a cable; the slip of a run is weighted
+as its friction is, which makes the condensed problem symmetric and the friction dissipate.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from rfdropo_bayes.fem.cables import CableLayout, Tensions, unilateral_tensions
+from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
+
+RUNS = 4
+"""Runs of neighbouring guides of a cable that slide as one, at most."""
+PRESLIDING = 1e-4
+"""Slip [m] that mobilises all of the friction."""
+EXCHANGES = 3
+"""Exchanges between sticking and sliding runs in a step."""
+FADING = 0.1
+"""Coulomb's friction fades where the tension [N] falls below this: a slack cable presses on nothing."""
+STRAIGHT = 1e-6
+"""Smallest wrap angle [rad]; keeps its derivative finite where the cable runs straight."""
+
+
+class Slip(NamedTuple):
+    """Friction of one step before its size is known; runs of every kind and cable, flattened."""
+
+    pattern: Float[Array, "runs nodes 3"]  # minus the slip's derivative by the node positions
+    strength: Float[Array, " runs"]  # friction force [N] if all of it is mobilised
+    drop: Float[Array, "kinds cables guides"]  # the same at each guide
+    mobilised: Float[Array, " runs"]  # z at the start of the step
+
+
+def run_members(layout: CableLayout) -> Bool[np.ndarray, "cables cable_runs guides"]:
+    """Which guides belong to which run of their cable; the last guide of a cable, where it is tied, to none."""
+    cables, guides = layout.guide_used.shape
+    members = np.zeros((cables, RUNS, guides), dtype=bool)
+    for cable, used in enumerate(layout.guide_used):
+        for run, part in enumerate(np.array_split(np.arange(int(used.sum()) - 1), RUNS)):
+            members[cable, run, part] = True
+    return members
+
+
+def directions(
+    layout: CableLayout, guides: Float[Array, "cables guides nodes"], position: Float[Array, "nodes 3"]
+) -> Float[Array, "cables guides 3"]:
+    """Unit vectors from the point before to each guide; zero where unused."""
+    guided = jnp.einsum("cgn,ni->cgi", guides, position)
+    points = jnp.concatenate([jnp.asarray(layout.anchor)[:, None, :], guided], axis=1)
+    used = layout.guide_used[..., None]
+    segment = jnp.where(used, points[:, 1:] - points[:, :-1], np.array([1.0, 0.0, 0.0]))
+    return jnp.where(used, segment / jnp.sqrt(jnp.sum(segment**2, axis=-1, keepdims=True)), 0.0)
+
+
+def wrap_angles(direction: Float[Array, "cables guides 3"]) -> Float[Array, "cables guides"]:
+    """Angle [rad] by which a cable turns at each guide; meaningless at its last. 3e-5 short at 60 degrees."""
+    following = jnp.concatenate([direction[:, 1:], direction[:, -1:]], axis=1)
+    square = jnp.sum((following - direction) ** 2, axis=-1) + STRAIGHT**2
+    series = 1.0 + square * (1 / 24 + square * (3 / 640 + square * (5 / 7168 + square * 35 / 294912)))
+    return jnp.sqrt(square) * series
+
+
+def start_slip(layout: CableLayout, effects: BodyEffects, tension: Float[Array, " cables"]) -> Memory:
+    """Memory of cables whose friction is not mobilised yet."""
+    kinds = len(_coefficients(effects))
+    if not kinds:
+        return Memory()
+    cables, guides = layout.guide_used.shape
+    return Memory(slip=jnp.zeros((kinds, cables, RUNS)), segment=jnp.repeat(tension[:, None], guides, axis=1))
+
+
+def _coefficients(effects: BodyEffects) -> list[Scalar]:
+    return [value for value in (effects.coulomb_friction, effects.capstan_friction) if value is not None]
+
+
+def slip_problem(
+    layout: CableLayout,
+    effects: BodyEffects,
+    mobilised: Float[Array, "kinds cables cable_runs"],
+    segment: Float[Array, "cables guides"],
+    guides: Float[Array, "cables guides nodes"],
+    position: Float[Array, "nodes 3"],
+) -> Slip:
+    """Friction of a step from the shape at its start, the friction mobilised then, and the tension in front of every
+    guide [N]."""
+    members = run_members(layout)
+    direction = directions(layout, guides, position)
+    middle = 0.5 * (segment + jnp.concatenate([segment[:, 1:], segment[:, -1:]], axis=1))
+    weights = []
+    if effects.coulomb_friction is not None:
+        weights.append(middle / (middle + FADING))
+    if effects.capstan_friction is not None:
+        weights.append(middle * wrap_angles(direction))
+    weight = jnp.stack(weights)[:, :, None, :] * members
+    whole = jnp.sum(weight, axis=-1)
+    share = weight / jnp.where(whole > 0.0, whole, 1.0)[..., None]
+    beyond = jnp.cumsum(share, axis=-1)
+    following = jnp.concatenate([direction[:, 1:], jnp.zeros_like(direction[:, :1])], axis=1)
+    pull = (beyond - share)[..., None] * direction[:, None] - beyond[..., None] * following[:, None]
+    pull = pull * layout.guide_used[:, None, :, None]
+    pattern = jnp.einsum("cgn,kcrgi->kcrni", guides, pull)
+    coefficient = jnp.stack([jnp.asarray(value, dtype=float) for value in _coefficients(effects)])
+    return Slip(
+        pattern=pattern.reshape(-1, *pattern.shape[-2:]),
+        strength=(coefficient[:, None, None] * whole).ravel(),
+        drop=coefficient[:, None, None] * jnp.sum(weight, axis=2),
+        mobilised=mobilised.ravel(),
+    )
+
+
+def tensions_with_friction(
+    compliance: Float[Array, "n n"],
+    slack: Float[Array, " cables"],
+    slip: Slip,
+    free_slip: Float[Array, " runs"],
+    previous: Float[Array, " cables"],
+    time_step: Scalar,
+) -> tuple[Tensions, Float[Array, " runs"]]:
+    """Impulses of the cables' drives and of the friction at the end of a step.
+
+    Args:
+        compliance: of cables, then runs: velocity along one row per impulse along another.
+        slack: velocity [m/s] left to every cable without any impulse.
+        slip: friction of the step.
+        free_slip: slip [m] of every run during the step without any impulse.
+        previous: impulses of the cables, which start the active set.
+        time_step: [s].
+
+    Returns:
+        the cables' impulses [N s], and the mobilised friction of every run.
+    """
+    cables, runs = len(slack), len(free_slip)
+    drives, across, among = compliance[:cables, :cables], compliance[:cables, cables:], compliance[cables:, cables:]
+    impulse = time_step * slip.strength
+    trial = slip.mobilised + lax.stop_gradient(free_slip) / PRESLIDING
+
+    for _ in range(EXCHANGES):
+        sticking = jnp.abs(lax.stop_gradient(trial)) < 1.0
+        follows = jnp.where(sticking, time_step / PRESLIDING, 0.0)
+        fixed = jnp.where(sticking, slip.mobilised + free_slip / PRESLIDING, jnp.sign(lax.stop_gradient(trial)))
+        # z = fixed + follows * (across' t - among (impulse z)): linear in the cables' impulses t.
+        matrix = jnp.eye(runs) + follows[:, None] * among * impulse[None, :]
+        solved = jnp.linalg.solve(matrix, jnp.concatenate([fixed[:, None], follows[:, None] * across.T], axis=1))
+        held, answer = impulse * solved[:, 0], impulse[:, None] * solved[:, 1:]
+        previous = unilateral_tensions(drives - across @ answer, slack - across @ held, previous).tension
+        share = solved[:, 0] + solved[:, 1:] @ previous
+        motion = free_slip + time_step * (across.T @ previous - among @ (impulse * share))
+        trial = slip.mobilised + motion / PRESLIDING
+    share = jnp.clip(share, -1.0, 1.0)
+    return unilateral_tensions(drives, slack - across @ (impulse * share), previous), share
+
+
+def slipped(
+    layout: CableLayout, slip: Slip, share: Float[Array, " runs"], tension: Float[Array, " cables"]
+) -> tuple[Float[Array, "kinds cables cable_runs"], Float[Array, "cables guides"]]:
+    """Mobilised friction and the tension in front of every guide, after a step."""
+    members = run_members(layout)
+    kinds = len(slip.drop)
+    share = share.reshape(kinds, len(members), RUNS)
+    drop = jnp.sum(slip.drop * jnp.einsum("kcr,crg->kcg", share, members), axis=0)
+    before = jnp.cumsum(drop, axis=1) - drop
+    return share, jnp.maximum(tension[:, None] - before, 0.0)

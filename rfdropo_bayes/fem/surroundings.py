@@ -1,0 +1,81 @@
+"""What surrounds a body and acts on its sections as wholes: the drag of a fluid, and a wall.
+
+Both act on the mean motion of a section, with their derivatives by place and velocity, for the implicit step.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.fem.effects import BodyEffects, Scalar, Wall
+from rfdropo_bayes.fem.layered import LayeredBody
+
+STILL = 1e-6
+"""Speed [m/s] below which drag is linear."""
+WALL_SOFTNESS = 1e-3
+"""A wall takes hold over this depth [m] on both sides of its plane, with a continuous derivative."""
+
+
+class SectionLoad(NamedTuple):
+    """Force on every section, its stiffness (minus the derivative by place) and its damping (by velocity)."""
+
+    force: Float[Array, "stations 3"]  # [N]
+    stiffness: Float[Array, "stations 3 3"]  # [N/m]
+    damping: Float[Array, "stations 3 3"]  # [N s/m]
+
+
+def tributary_lengths(body: LayeredBody) -> Float[np.ndarray, " stations"]:
+    """Length of the body [m] that each station stands for."""
+    half = np.diff(body.station) / 2.0
+    return np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])
+
+
+def drag_areas(body: LayeredBody) -> Float[np.ndarray, " stations"]:
+    """Width times length [m2] that each station stands for."""
+    return tributary_lengths(body) * np.sum(body.half_width, axis=1)
+
+
+def _contact(depth: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Force of a one-sided spring of unit stiffness and its derivative: zero, then quadratic, then linear."""
+    into = jnp.clip(depth + WALL_SOFTNESS, 0.0, 2.0 * WALL_SOFTNESS)
+    slope = into / (2.0 * WALL_SOFTNESS)
+    return 0.5 * slope * into + jnp.maximum(depth - WALL_SOFTNESS, 0.0), slope
+
+
+def _wall_load(body: LayeredBody, wall: Wall, centre: Float[Array, "stations 3"]) -> SectionLoad:
+    azimuth = jnp.asarray(wall.azimuth)
+    normal = jnp.stack([jnp.cos(azimuth), jnp.sin(azimuth), jnp.zeros_like(azimuth)])
+    force, slope = _contact(centre @ normal - wall.distance)
+    stiffness = wall.stiffness * jnp.asarray(tributary_lengths(body))
+    return SectionLoad(
+        force=-(stiffness * force)[:, None] * normal,
+        stiffness=(stiffness * slope)[:, None, None] * normal[:, None] * normal[None, :],
+        damping=jnp.zeros((len(centre), 3, 3)),
+    )
+
+
+def _drag_load(body: LayeredBody, drag: Scalar, velocity: Float[Array, "stations 3"]) -> SectionLoad:
+    """Drag -c A |v| v with the speed of the step's start and the velocity of its end: it never adds energy."""
+    speed = jnp.sqrt(jnp.sum(velocity**2, axis=1) + STILL**2)
+    factor = drag * jnp.asarray(drag_areas(body)) * speed
+    return SectionLoad(
+        force=-factor[:, None] * velocity,
+        stiffness=jnp.zeros((len(velocity), 3, 3)),
+        damping=factor[:, None, None] * jnp.eye(3),
+    )
+
+
+def section_load(
+    body: LayeredBody, effects: BodyEffects, centre: Float[Array, "stations 3"], velocity: Float[Array, "stations 3"]
+) -> SectionLoad | None:
+    """Load on the sections whose nodes have this mean place [m] and velocity [m/s]; None if nothing surrounds them."""
+    loads = []
+    if effects.wall is not None:
+        loads.append(_wall_load(body, effects.wall, centre))
+    if effects.drag is not None:
+        loads.append(_drag_load(body, effects.drag, velocity))
+    return SectionLoad(*(sum(parts) for parts in zip(*loads, strict=True))) if loads else None

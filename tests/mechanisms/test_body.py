@@ -1,0 +1,66 @@
+"""Body mechanisms: null values through the active path, and derivatives there, on a trunk that moves."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rfdropo_bayes.mechanisms import REGISTRY
+from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.simulators.mechanisms import BodyMechanism
+from rfdropo_bayes.simulators.reference import ReferenceEngine
+from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
+
+BODY = sorted(name for name, kind in REGISTRY.items() if isinstance(kind(), BodyMechanism))
+PLACED = {"wall_distance": 0.005, "prony_time": 0.3}  # where they are felt
+UNSEEN = {"base_tilt_y"}  # turns gravity about itself, as the arm's is along y
+STEP = {"coulomb_friction": 1e-7, "cable_compliance": 1e-9}  # of a difference; 1e-5 for others
+
+
+def simulator(*names: str) -> TrunkSimulator:
+    robot = load_robot("smooth_arm")
+    discretisation = Discretisation(0.02)
+    assembly = assemble(robot, discretisation)
+    engine = ReferenceEngine(assembly, 0.02, True)
+    return TrunkSimulator(robot, engine, assembly, discretisation, tuple(REGISTRY[name]() for name in names))
+
+
+def recorded(trunk: TrunkSimulator):
+    clock = np.arange(0.0, 0.6, 0.1)
+    value = 0.012 * np.column_stack([np.sin(8 * clock + phase) for phase in range(len(trunk.channel_names))])
+    return trunk.commands(clock, value, np.zeros(value.shape[1]), np.arange(0.1, 0.61, 0.1))
+
+
+def test_all_at_once_null_values_and_derivatives():
+    """Every mechanism of the body present in one simulator: null values change nothing, derivatives are differences."""
+    base, extended = simulator(), simulator(*BODY)
+    commands = recorded(base)
+    names = [spec.name for name in BODY for spec in REGISTRY[name].parameters]
+    free = [spec.name for name in BODY for spec in REGISTRY[name].parameters if not spec.grid]
+
+    def position(values):
+        return extended.rollout(PLACED | dict(zip(free, values, strict=True)), commands).position
+
+    expected = jax.jit(lambda: base.rollout({}, commands))()
+    null = jnp.zeros(len(free))
+    run = jax.jit(jax.vmap(position))
+    assert set(PLACED) <= set(names)
+    slope = np.asarray(jax.jit(jax.jacfwd(position))(null))
+    steps = np.array([STEP.get(name, 1e-5) for name in free])
+    found = np.asarray(run(jnp.concatenate([null[None], jnp.diag(steps)])))
+    np.testing.assert_allclose(found[0], expected.position, rtol=0.0, atol=1e-12)
+    assert int(expected.status) == 0
+    for i, name in enumerate(free):
+        difference = (found[1 + i] - found[0]) / steps[i]
+        largest = np.abs(difference).max()
+        assert (largest > 0.0) == (name not in UNSEEN), name
+        np.testing.assert_allclose(slope[..., i], difference, rtol=0.0, atol=2e-2 * largest, err_msg=name)
+
+
+@pytest.mark.parametrize("name", BODY)
+def test_parameters_state_their_null_value(name):
+    for spec in REGISTRY[name].parameters:
+        assert spec.nominal == 0.0 or spec.grid
+        assert all(spec.low < value < spec.high for value in spec.grid)
