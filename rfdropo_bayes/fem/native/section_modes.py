@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from rfdropo_bayes.fem.cable_twist import twist_arms
 from rfdropo_bayes.fem.cables import CableLayout
 from rfdropo_bayes.fem.dynamics import LOST, System
 from rfdropo_bayes.fem.layered import PointMap, centre_gradient, rest_positions
@@ -51,11 +52,13 @@ class LayeredTables(NamedTuple):
     guide_slot: Int[np.ndarray, " entries"]  # of border row 0
     anchor: Float[np.ndarray, "cables 3"]
     rest_length: Float[np.ndarray, " cables"]
+    twist_arm: Float[np.ndarray, "layers cables"]  # r^2 / L [m]
     point_first: Int[np.ndarray, " points_1"]
     point_place: Int[np.ndarray, " entries"]
     point_weight: Float[np.ndarray, " entries"]
     reach: float  # a node farther from its rest position has been lost [m]
     held: int
+    across: int  # modes along x, and along y
     modes: int
     stations: int
     entries: int
@@ -166,11 +169,13 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
         rest=np.linalg.solve(shape, rest.reshape(layers + 1, modes, 3)).ravel(),
         **_guides(system.cables, shape),
         rest_length=_rest_lengths(system.cables, rest),
+        twist_arm=twist_arms(body, system.cables),
         point_first=point_first,
         point_place=point_place,
         point_weight=point_weight,
         reach=float(LOST * (body.station[-1] - body.station[0])),
         held=int(system.clamped_stations),
+        across=body.nodes_across,
         modes=modes,
         stations=layers + 1,
         entries=len(entries),

@@ -1,4 +1,4 @@
-"""Geometric stiffness of layers in tension, for the iteration to static equilibrium; see ``fem.equilibrium``."""
+"""Geometric stiffness of layers in tension and of taut cables, for the iteration to static equilibrium; see ``fem.equilibrium``."""
 
 from __future__ import annotations
 
@@ -47,3 +47,46 @@ def stiffen(tables, layer, work, whole, token):
             if whole:
                 store(work.pivot, upper - block + k, load(work.pivot, upper - block + k, token) + value)
                 store(work.coupling, upper + k, load(work.coupling, upper + k, token) - value)
+
+
+@kernel
+def _add_dyad(matrix, t, scale, axes, a, i, b, j, token):
+    """Add the dyad of two columns of a layer's axes to the tile at ``t``."""
+    for c in range(3):
+        right = scale * load(axes, b + 3 * c + j, token)
+        for r in range(3):
+            k = t + 3 * c + r
+            store(matrix, k, fma(load(axes, a + 3 * r + i, token), right, load(matrix, k, token)))
+
+
+@kernel
+def stiffen_twist(tables, layer, work, whole, token):
+    """Add T r^2 / L of all cables against the twist of a layer; see ``fem.cable_twist``.
+
+    The twist of a face is half of q_x . e_y / h_x - q_y . e_x / h_y, where q_x and q_y are its modes linear in x and y
+    and h their values at rest.
+    """
+    modes, across, axes, a = tables.modes, tables.across, work.axes, 9 * layer
+    stiffness = fill(0.0, axes, token)
+    for c in range(tables.cables):
+        arm = fill(tables.twist_arm[layer * tables.cables + c], axes, token)
+        stiffness = fma(arm, load(work.tension, c, token), stiffness)
+    low, high = 3 * layer * modes, 3 * (layer + 1) * modes
+    x0, y0 = 0.5 / tables.rest[low + 3], 0.5 / tables.rest[low + 3 * across + 1]
+    x1, y1 = 0.5 / tables.rest[high + 3], 0.5 / tables.rest[high + 3 * across + 1]
+    size, block = 3 * modes, 9 * modes * modes
+    upper = (layer + 1) * block
+    xx, xy = 3 * (size + 3), 3 * (size + 3 * across)
+    yx, yy = 3 * (across * size + 3), 3 * (across * size + 3 * across)
+    _add_dyad(work.pivot, upper + xx, stiffness * x1 * x1, axes, a, 1, a, 1, token)
+    _add_dyad(work.pivot, upper + yx, -(stiffness * y1 * x1), axes, a, 0, a, 1, token)
+    _add_dyad(work.pivot, upper + yy, stiffness * y1 * y1, axes, a, 0, a, 0, token)
+    if whole:
+        lower = upper - block
+        _add_dyad(work.pivot, lower + xx, stiffness * x0 * x0, axes, a, 1, a, 1, token)
+        _add_dyad(work.pivot, lower + yx, -(stiffness * y0 * x0), axes, a, 0, a, 1, token)
+        _add_dyad(work.pivot, lower + yy, stiffness * y0 * y0, axes, a, 0, a, 0, token)
+        _add_dyad(work.coupling, upper + xx, -(stiffness * x0 * x1), axes, a, 1, a, 1, token)
+        _add_dyad(work.coupling, upper + xy, stiffness * x0 * y1, axes, a, 1, a, 0, token)
+        _add_dyad(work.coupling, upper + yx, stiffness * y0 * x1, axes, a, 0, a, 1, token)
+        _add_dyad(work.coupling, upper + yy, -(stiffness * y0 * y1), axes, a, 0, a, 0, token)
