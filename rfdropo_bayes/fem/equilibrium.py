@@ -19,10 +19,15 @@ from rfdropo_bayes.fem.dynamics import (
     State,
     System,
     accept,
-    constrained_increment,
     frames_and_displacements,
+    resistance,
+    section_means,
+    shared,
     state_at_rest,
+    with_section_matrix,
 )
+from rfdropo_bayes.fem.pulling import Pull, constrained_increment
+from rfdropo_bayes.fem.surroundings import section_load
 
 ITERATIONS = 60
 TOLERANCE = 1e-6
@@ -78,23 +83,29 @@ def _layer_tension(
 
 
 class _Forces(NamedTuple):
-    frame: Float[Array, "layers 3 3"]
-    elastic: Float[Array, "nodes 3"]
+    body: Float[Array, "nodes 3"]  # of the body and of what surrounds it
+    tangent: BlockTridiagonal
     cable: Float[Array, "nodes 3"]
-    layer_tension: Float[Array, " layers"]
     length: Float[Array, " cables"]
     jacobian: Float[Array, "cables nodes 3"]
 
 
 def _forces(system: System, prepared: Prepared, iterate: _Iterate) -> _Forces:
-    """Forces of the body and of its cables in the current shape."""
+    """Forces of the body and of its cables in the current shape, and the tangent of the former."""
     frame, local = frames_and_displacements(system, prepared, iterate.position)
-    elastic = corotational.internal_force(prepared.stiffness, frame, local).reshape(-1, 3)
+    local_force, packed = resistance(prepared, local)
+    body = corotational.internal_force(frame, local_force).reshape(-1, 3)
     length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, iterate.position)
     cable = -jnp.einsum("cni,c->ni", jacobian, iterate.tension)
-    local_force = jnp.einsum("lij,lj->li", prepared.stiffness, local)
-    tension = _layer_tension(system, local_force, cable, frame)
-    return _Forces(frame, elastic, cable, tension, length, jacobian)
+    stiffening = _tension_stiffening(system, frame, _layer_tension(system, local_force, cable, frame))
+    twist = twist_stiffening(system.body, system.cables, frame, iterate.tension)
+    tangent = jax.tree.map(lambda *parts: sum(parts), corotational.tangent(packed, frame), stiffening, twist)
+    centre = section_means(system, iterate.position)
+    around = section_load(system.body, prepared.effects, centre, jnp.zeros_like(centre))
+    if around is not None:
+        body = body + shared(system, around.force)
+        tangent = with_section_matrix(system, tangent, around.stiffness)
+    return _Forces(body, tangent, cable, length, jacobian)
 
 
 def static_equilibrium(
@@ -109,20 +120,19 @@ def static_equilibrium(
     Newton's method with the corotational tangent from the undeformed body. The increments are limited in length, and
     relaxed more whenever two in a row point against each other, which makes soft bodies far from straight converge too.
     A fixed number of iterations, so that both modes of differentiation work. Needs at least one clamped station.
+    Cables enter without friction, and what flows has relaxed.
     """
     load = prepared.weight + external_force
     longest = LONGEST_STEP * (system.body.station[-1] - system.body.station[0])
+    compliance = prepared.effects.cable_compliance
+    give = 0.0 if compliance is None else compliance
 
     def iterate(current: _Iterate, _: None) -> tuple[_Iterate, Bool[Array, ""]]:
         forces = _forces(system, prepared, current)
-        stiffening = _tension_stiffening(system, forces.frame, forces.layer_tension)
-        twist = twist_stiffening(system.body, system.cables, forces.frame, current.tension)
-        elastic = corotational.tangent(prepared.packed, forces.frame)
-        tangent = jax.tree.map(lambda *parts: sum(parts), elastic, stiffening, twist)
         slack = prepared.rest_length - displacement - forces.length
-        increment, tension, converged = constrained_increment(
-            system, tangent, forces.elastic + load, forces.jacobian, slack, current.tension
-        )
+        pull = Pull(forces.jacobian, slack, current.tension, give)
+        solution = constrained_increment(system.clamped_stations, forces.tangent, forces.body + load, pull)
+        increment, tension, converged = solution.increment, solution.tension, solution.converged
         now, before = lax.stop_gradient((increment, current.increment))
         along = jnp.sum(now * before)
         opposed = along < -0.3 * jnp.sqrt(jnp.sum(now**2) * jnp.sum(before**2))
@@ -134,7 +144,7 @@ def static_equilibrium(
     first = _Iterate(start.position, start.tension, jnp.zeros_like(start.position), jnp.array(1.0))
     last, solved = lax.scan(iterate, first, None, length=iterations)
     forces = _forces(system, prepared, last)
-    unbalanced = (forces.elastic + forces.cable + load)[system.clamped_stations * system.body.section_nodes :]
+    unbalanced = (forces.body + forces.cable + load)[system.clamped_stations * system.body.section_nodes :]
     loads = jnp.sum(jnp.abs(load)) + jnp.sum(last.tension)
     residual = jnp.max(jnp.abs(unbalanced)) / jnp.maximum(loads, 1e-300)
     moved = State(last.position, jnp.zeros_like(last.position), last.tension)

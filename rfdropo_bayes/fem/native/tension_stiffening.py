@@ -1,4 +1,4 @@
-"""Geometric stiffness of layers in tension and of taut cables, for the iteration to static equilibrium; see ``fem.equilibrium``."""
+"""Geometric stiffness of layers in tension and of taut cables, for the iteration to equilibrium; `fem.equilibrium`."""
 
 from __future__ import annotations
 
