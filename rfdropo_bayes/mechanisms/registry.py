@@ -1,12 +1,29 @@
-"""All mechanisms by name. To add one: write its class in the module of its stage, and one line here."""
+"""All mechanisms by name. To add one: write its class in a module of its own, and one line here.
+
+A mechanism may also live in a user's code: ``"package.module:ClassName"``, or ``"file.py:ClassName"`` beside the
+experiment file, stands wherever a registry name does; see docs/mechanisms.md.
+"""
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms.actuation import ActuatorLag, CommandDelay, CommandGain
+from rfdropo_bayes.mechanisms.backlash import Backlash
 from rfdropo_bayes.mechanisms.body import BaseTilt, Payload, StiffnessGradient
+from rfdropo_bayes.mechanisms.cable_gain import CableGain
+from rfdropo_bayes.mechanisms.cable_slack import CableSlack
+from rfdropo_bayes.mechanisms.camera_drift import CameraDrift
+from rfdropo_bayes.mechanisms.camera_offset import CameraOffset
+from rfdropo_bayes.mechanisms.clock_offset import ClockOffset
+from rfdropo_bayes.mechanisms.drive_creep import DriveCreep
+from rfdropo_bayes.mechanisms.drive_drift import DriveDrift
+from rfdropo_bayes.mechanisms.end_stop import EndStop
 from rfdropo_bayes.mechanisms.friction import CableCompliance, CapstanFriction, CoulombFriction
 from rfdropo_bayes.mechanisms.material_laws import (
     BendingStiffening,
@@ -15,8 +32,12 @@ from rfdropo_bayes.mechanisms.material_laws import (
     Softening,
     ViscoelasticBranch,
 )
+from rfdropo_bayes.mechanisms.rate_limit import RateLimit
 from rfdropo_bayes.mechanisms.sensing import CameraRotation, CameraScale
+from rfdropo_bayes.mechanisms.sensor_lag import SensorLag
+from rfdropo_bayes.mechanisms.spool_growth import SpoolGrowth
 from rfdropo_bayes.mechanisms.surroundings import QuadraticDrag, WallContact
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.parameters import nearest
 
@@ -26,6 +47,14 @@ REGISTRY: dict[str, type] = {
         CommandDelay,
         ActuatorLag,
         CommandGain,
+        CableGain,
+        CableSlack,
+        Backlash,
+        EndStop,
+        RateLimit,
+        SpoolGrowth,
+        DriveCreep,
+        DriveDrift,
         Payload,
         StiffnessGradient,
         BaseTilt,
@@ -41,15 +70,61 @@ REGISTRY: dict[str, type] = {
         WallContact,
         CameraRotation,
         CameraScale,
+        CameraOffset,
+        CameraDrift,
+        SensorLag,
+        ClockOffset,
     )
 }
 
 
-def mechanisms_named(names: Iterable[str], *, where: str = "[model] mechanisms") -> tuple[Mechanism, ...]:
-    """The mechanisms of an experiment file, in its order; InputError for an unknown name."""
+def mechanisms_named(
+    names: Iterable[str],
+    robot: Robot | None = None,
+    *,
+    folder: Path = Path(),
+    where: str = "[model] mechanisms",
+) -> tuple[Mechanism, ...]:
+    """The mechanisms of an experiment file, in its order.
+
+    Args:
+        names: of the registry, or ``module:ClassName`` of a user's own.
+        robot: that they are for; one with parameters per cable (a class method ``for_robot``) is made for it.
+        folder: that files of a user's own are relative to.
+        where: the names stand, for messages.
+
+    Raises:
+        InputError: an unknown name, or a module or class that cannot be imported or is no mechanism.
+    """
     chosen = []
     for name in names:
-        if name not in REGISTRY:
+        kind = _imported(name, folder, where) if ":" in name else REGISTRY.get(name)
+        if kind is None:
             raise InputError(f"unknown mechanism {name!r}", where=where, remedy=nearest(name, REGISTRY))
-        chosen.append(REGISTRY[name]())
+        chosen.append(kind.for_robot(robot) if robot is not None and hasattr(kind, "for_robot") else kind())
     return tuple(chosen)
+
+
+def _imported(name: str, folder: Path, where: str) -> Any:
+    """The class that ``module:ClassName`` or ``file.py:ClassName`` stands for."""
+    source, _, attribute = name.rpartition(":")
+    try:
+        if source.endswith(".py"):
+            spec = importlib.util.spec_from_file_location(Path(source).stem, Path(folder) / source)
+            assert spec is not None
+            assert spec.loader is not None
+            module = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(module)
+        else:
+            module = importlib.import_module(source)
+        kind = getattr(module, attribute)
+    except (ImportError, OSError, AttributeError, ValueError) as error:
+        raise InputError(
+            f"cannot import the mechanism {name!r} ({error})",
+            where=where,
+            remedy="give module:ClassName of an installed module, or file.py:ClassName beside the experiment file",
+        ) from None
+    lacking = [key for key in ("name", "stage", "cause", "remedy") if not hasattr(kind, key)]
+    if lacking:
+        raise InputError(f"{name!r} is no mechanism: it lacks {', '.join(lacking)}", where=where)
+    return kind

@@ -148,6 +148,11 @@ def _pad(array: np.ndarray, length: int) -> np.ndarray:
     return np.concatenate([array, np.repeat(array[-1:], length - len(array), axis=0)])
 
 
+def observed_at(commands: Commands, time_step: float) -> Float[Array, " time"]:
+    """When the observations were made [s], on the simulator's clock."""
+    return time_step * (commands.sample_step + commands.sample_fraction)
+
+
 def sample(series: Float[Array, "steps ..."], commands: Commands) -> Float[Array, "time ..."]:
     """Read a per-step series (row 0 = initial state) at the observation times, linearly within a step."""
     import jax.numpy as jnp

@@ -64,6 +64,16 @@ class SensingMechanism(Mechanism, Protocol):
         """Return the measured marker positions [m], given the true ones."""
 
 
+@runtime_checkable
+class TimedSensingMechanism(Mechanism, Protocol):
+    """Acts on what is measured, with a memory or a clock of its own."""
+
+    def sense_over_time(
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
+    ) -> Float[Array, "time marker 3"]:
+        """Return the measured marker positions [m], given the true ones and when they are seen [s]."""
+
+
 def check_mechanisms(mechanisms: Iterable[Mechanism]) -> tuple[Mechanism, ...]:
     """Return the mechanisms as a tuple; InputError if one stands twice or two share a parameter."""
     chosen = tuple(mechanisms)

@@ -14,7 +14,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import LayeredBody, Material
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.commands import Commands, animated_on_grid, commands_on_grid, sample
+from rfdropo_bayes.simulators.commands import Commands, animated_on_grid, commands_on_grid, observed_at, sample
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms
 from rfdropo_bayes.simulators.mesh_body import MeshAssembly, TetrahedraTable
 from rfdropo_bayes.simulators.mesh_engines import MeshEngine
@@ -102,7 +102,7 @@ class MeshTrunkSimulator(RobotSimulator):
             int(Result.DIVERGED),
             jnp.where(motion.cables_converged, int(Result.OK), int(Result.CABLE_LIMIT)),
         )
-        position = self.measured(values, sample(motion.position, commands))
+        position = self.measured(values, sample(motion.position, commands), observed_at(commands, self.time_step))
         return Observation(position, sample(motion.tension, commands), None, status)
 
     def displacements(self, values: Values, commands: Commands) -> Float[Array, "step cable"]:

@@ -17,7 +17,7 @@ from rfdropo_bayes.fem.pushing import PushScene, push_scene
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState, cube_at, solid_gyration_radius
 from rfdropo_bayes.robots import PushScene as PushTable
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.commands import Commands, sample
+from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -175,5 +175,7 @@ class PushSimulator(RobotSimulator):
         )
         pose = sample(motion.pose, commands)
         pose = pose.at[:, 3:].divide(jnp.linalg.norm(pose[:, 3:], axis=1, keepdims=True))
-        position = self.trunk.measured(own, sample(motion.position, commands))
+        position = self.trunk.measured(
+            own, sample(motion.position, commands), observed_at(commands, self.trunk.time_step)
+        )
         return Observation(position, sample(motion.tension, commands), pose, status)

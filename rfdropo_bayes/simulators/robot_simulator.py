@@ -12,7 +12,12 @@ from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands
-from rfdropo_bayes.simulators.mechanisms import ActuationMechanism, Mechanism, SensingMechanism
+from rfdropo_bayes.simulators.mechanisms import (
+    ActuationMechanism,
+    Mechanism,
+    SensingMechanism,
+    TimedSensingMechanism,
+)
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
 from rfdropo_bayes.simulators.protocol import Observation
 
@@ -118,9 +123,16 @@ class RobotSimulator:
         pretension = self.pretension(values)
         return initial + pretension, levels + pretension
 
-    def measured(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
-        """Marker positions as they are measured [m], given the true ones."""
+    def measured(
+        self,
+        values: Values,
+        position: Float[Array, "time marker 3"],
+        time: Float[Array, " time"],
+    ) -> Float[Array, "time marker 3"]:
+        """Marker positions as they are measured [m], given the true ones and when they are seen [s]."""
         for mechanism in self.mechanisms:
             if isinstance(mechanism, SensingMechanism):
                 position = mechanism.sense(values, position)
+            elif isinstance(mechanism, TimedSensingMechanism):
+                position = mechanism.sense_over_time(values, position, time)
         return position + jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])

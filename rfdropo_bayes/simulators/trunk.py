@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, cable_layout, profile_body
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, sample
+from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
@@ -175,7 +175,8 @@ class TrunkSimulator(RobotSimulator):
             int(Result.DIVERGED),
             jnp.where(motion.imbalance > EQUILIBRIUM_TOLERANCE, int(Result.NOT_IN_EQUILIBRIUM), int(Result.OK)),
         )
-        position = self.measured(values, sample(motion.position, commands))
+        seen = observed_at(commands, self.discretisation.time_step)
+        position = self.measured(values, sample(motion.position, commands), seen)
         return Observation(position, sample(motion.tension, commands), None, status)
 
     def material(self, values: Values) -> Material:

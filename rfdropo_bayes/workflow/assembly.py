@@ -40,7 +40,7 @@ def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path())
         alone = experiment.model_copy(update={"simulator": table.model_copy(update={"push": False})})
         return build_push_simulator(table, build_simulator(alone, robot, folder))
     time_step = table.time_step or robot.time_step_s
-    mechanisms = mechanisms_named(experiment.model.mechanisms)
+    mechanisms = mechanisms_named(experiment.model.mechanisms, robot, folder=folder)
     if table.body == "tetrahedra" and table.tetrahedra is not None:
         options = table.tetrahedra
         mesh = read_tetrahedra(find_data_file(options.mesh, folder), options.unit)

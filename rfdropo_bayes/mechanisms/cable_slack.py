@@ -1,0 +1,36 @@
+"""Cables that are slack at zero command."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+
+class CableSlack:
+    """The first part of every pull only takes up slack (a dead zone around zero); none at null."""
+
+    name = "cable_slack"
+    stage = "actuation"
+    cause = "cables that are not taut at zero command, or a dead zone of the drives"
+    remedy = "tension the cables until each just moves the body, and set zero there"
+    parameters = (
+        ParameterSpec(
+            "cable_slack",
+            "m or rad",
+            0.0,
+            0.1,
+            0.0,
+            {"distribution": "HalfNormal", "scale": 0.001},
+            "command that is lost before a cable is taut",
+        ),
+    )
+
+    def actuate(
+        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
+    ) -> Float[Array, "step channel"]:
+        """Shrink the command towards zero by the slack."""
+        slack = values["cable_slack"]
+        return jnp.where(command > slack, command - slack, jnp.where(command < -slack, command + slack, 0.0))

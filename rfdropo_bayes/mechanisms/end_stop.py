@@ -1,0 +1,38 @@
+"""A drive that cannot go as far as it is told."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+
+class EndStop:
+    """Commands beyond a limit are cut off on either side; the limit is infinite, its inverse zero, at null."""
+
+    name = "end_stop"
+    stage = "actuation"
+    cause = "a mechanical end stop, a software limit or the largest torque of a drive"
+    remedy = "read the drives' limits and their measured positions where the command is largest"
+    parameters = (
+        ParameterSpec(
+            "inverse_travel_limit",
+            "1/m or 1/rad",
+            0.0,
+            1e5,
+            0.0,
+            {"distribution": "HalfNormal", "scale": 100.0},
+            "one over the largest command that is carried out",
+            grid=(5.0, 15.0, 30.0, 55.0, 60.0, 70.0, 85.0, 110.0, 150.0, 250.0),
+        ),
+    )
+
+    def actuate(
+        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
+    ) -> Float[Array, "step channel"]:
+        """Cut the command off at the limit."""
+        inverse = values["inverse_travel_limit"]
+        limit = jnp.sign(command) / jnp.maximum(inverse, 1e-12)
+        return jnp.where(jnp.abs(command) * inverse > 1.0, limit, command)

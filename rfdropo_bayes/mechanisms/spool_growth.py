@@ -1,0 +1,34 @@
+"""A spool whose radius changes with what is wound on it."""
+
+from __future__ import annotations
+
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+
+class SpoolGrowth:
+    """Displacement grows with the square of the command, ``u (1 + k u)``; k is zero at null."""
+
+    name = "spool_growth"
+    stage = "actuation"
+    cause = "cable wound in layers, a conical spool, or a lever whose arm changes with its angle"
+    remedy = "measure the travel of a cable turn by turn; use a grooved spool of one layer"
+    parameters = (
+        ParameterSpec(
+            "spool_growth",
+            "1/m or 1/rad",
+            -1e3,
+            1e3,
+            0.0,
+            {"distribution": "Normal", "loc": 0.0, "scale": 5.0},
+            "relative change of the displacement per command",
+        ),
+    )
+
+    def actuate(
+        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
+    ) -> Float[Array, "step channel"]:
+        """Add the square of the command, from zero command on."""
+        return command + values["spool_growth"] * (command**2 - initial**2)

@@ -1,0 +1,128 @@
+"""Mechanisms of drives and cameras: null values through the active code path, derivatives there, closed forms."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
+from rfdropo_bayes.robots import load_robot
+
+STEP = 0.01
+TIME = jnp.asarray(np.cumsum(np.concatenate([[0.0], np.random.default_rng(0).uniform(0.04, 0.06, 79)])))
+COMMAND = jnp.stack([0.01 * jnp.sin(jnp.arange(80) / 9.0), 0.008 * (1 - jnp.cos(jnp.arange(80) / 13.0))], axis=1)
+START = jnp.zeros(2)
+POSITION = jnp.asarray(np.random.default_rng(1).normal(size=(80, 4, 3)).cumsum(axis=0)) * 1e-3
+
+DRIVES = (
+    "backlash",
+    "cable_gain",
+    "cable_slack",
+    "drive_creep",
+    "drive_drift",
+    "end_stop",
+    "rate_limit",
+    "spool_growth",
+)
+CAMERAS = ("camera_drift", "camera_offset", "clock_offset", "sensor_lag")
+
+
+def applied(name: str, values: dict):
+    mechanism = REGISTRY[name]()
+    values = {spec.name: jnp.asarray(spec.nominal) for spec in mechanism.parameters} | values
+    if name in DRIVES:
+        return mechanism.actuate(values, COMMAND, START, STEP)
+    if hasattr(mechanism, "sense"):
+        return mechanism.sense(values, POSITION)
+    return mechanism.sense_over_time(values, POSITION, TIME)
+
+
+@pytest.mark.parametrize("name", [*DRIVES, *CAMERAS])
+def test_the_null_value_is_the_base_simulator(name):
+    base = COMMAND if name in DRIVES else POSITION
+    np.testing.assert_allclose(applied(name, {}), base, rtol=0, atol=1e-17)
+
+
+@pytest.mark.parametrize("name", [*DRIVES, *CAMERAS])
+def test_the_derivative_at_null_is_the_one_sided_difference(name):
+    """Thresholds that nothing reaches have none: their grid is tried instead."""
+    for spec in REGISTRY[name]().parameters:
+        slope = jax.jacfwd(lambda value, spec=spec: applied(name, {spec.name: value}))(spec.nominal)
+        assert np.isfinite(slope).all()
+        step = 1e-7
+        ahead = applied(name, {spec.name: jnp.asarray(spec.nominal + step)})
+        difference = (ahead - applied(name, {spec.name: jnp.asarray(spec.nominal)})) / step
+        np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=2e-5)
+        if not spec.grid and not spec.name.startswith("cable_gain_error"):
+            assert np.abs(slope).max() > 0
+
+
+def test_play_follows_by_half_its_width():
+    """A ramp up by 1 and down again: the cable lags by the half play, and stands still for the whole of it."""
+    ramp = jnp.concatenate([jnp.linspace(0, 1, 101), jnp.linspace(1, 0, 101)[1:]])[:, None]
+    moved = REGISTRY["backlash"]().actuate({"backlash": jnp.asarray(0.1)}, ramp, jnp.zeros(1), STEP)[:, 0]
+    np.testing.assert_allclose(moved[20:101], ramp[20:101, 0] - 0.1, atol=1e-12)
+    np.testing.assert_allclose(moved[101:120], 0.9, atol=1e-12)
+    np.testing.assert_allclose(moved[125:], ramp[125:, 0] + 0.1, atol=1e-12)
+
+
+def test_an_end_stop_cuts_and_a_rate_limit_slows():
+    cut = applied("end_stop", {"inverse_travel_limit": jnp.asarray(200.0)})
+    np.testing.assert_allclose(cut, np.clip(COMMAND, -0.005, 0.005), atol=1e-15)
+    slow = applied("rate_limit", {"inverse_speed_limit": jnp.asarray(15.0)})
+    assert np.abs(np.diff(slow, axis=0)).max() <= STEP / 15.0 + 1e-12
+    np.testing.assert_allclose(slow[:, 1], COMMAND[:, 1], atol=1e-15)  # never faster than 0.062 m/s
+
+
+def test_gains_of_cables_sum_to_zero():
+    errors = {f"cable_gain_error_{k + 1}": jnp.asarray(v) for k, v in enumerate((0.3, 0.1))}
+    np.testing.assert_allclose(applied("cable_gain", errors), COMMAND * jnp.array([1.1, 0.9]), atol=1e-15)
+    (mechanism,) = mechanisms_named(["cable_gain"], load_robot("smooth_arm"))
+    assert [spec.name for spec in mechanism.parameters] == [
+        f"cable_gain_error_{channel}" for channel in ("up", "left", "down", "right")
+    ]
+
+
+def test_a_held_command_creeps_exponentially():
+    """Backward Euler: the loss is g (1 - (1 + dt / tau)^-k)."""
+    held = jnp.full((60, 1), 0.01)
+    values = {"drive_creep": jnp.asarray(0.2), "drive_creep_time": jnp.asarray(0.3)}
+    crept = REGISTRY["drive_creep"]().actuate(values, held, jnp.zeros(1), STEP)[:, 0]
+    k = np.arange(1, 61)
+    np.testing.assert_allclose(crept, 0.01 * (1 - 0.2 * (1 - (1 + STEP / 0.3) ** -k.astype(float))), rtol=1e-12)
+
+
+def test_a_lagging_camera_answers_a_ramp_in_closed_form():
+    """tau y' = t - y from 0: y = t - tau (1 - exp(-t / tau))."""
+    ramp = jnp.broadcast_to(TIME[:, None, None], (80, 1, 3))
+    seen = REGISTRY["sensor_lag"]().sense_over_time({"sensor_lag": jnp.asarray(0.2)}, ramp, TIME)
+    np.testing.assert_allclose(seen[:, 0, 0], TIME - 0.2 * (1 - np.exp(-TIME / 0.2)), atol=1e-12)
+
+
+def test_a_clock_offset_shifts_straight_motion():
+    ramp = jnp.broadcast_to(TIME[:, None, None], (80, 1, 3))
+    for offset in (-0.07, 0.07):
+        seen = REGISTRY["clock_offset"]().sense_over_time({"clock_offset": jnp.asarray(offset)}, ramp, TIME)
+        np.testing.assert_allclose(seen[3:-3, 0, 0], TIME[3:-3] - offset, atol=1e-12)
+
+
+OWN = """
+from rfdropo_bayes.mechanisms.actuation import CommandGain
+class Half(CommandGain):
+    name = "half"
+class Nothing:
+    pass
+"""
+
+
+def test_a_mechanism_of_the_users_own_is_found_beside_the_experiment(tmp_path):
+    (tmp_path / "mine.py").write_text(OWN)
+    (mechanism,) = mechanisms_named(["mine.py:Half"], folder=tmp_path)
+    assert mechanism.name == "half"
+    assert mechanisms_named(["rfdropo_bayes.mechanisms.backlash:Backlash"])[0].name == "backlash"
+    for wrong in ("mine.py:None_", "other.py:Half", "no.such:Thing", "mine.py:Nothing"):
+        with pytest.raises(InputError):
+            mechanisms_named([wrong], folder=tmp_path)
