@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.forces import tension_specs
-from rfdropo_bayes.bayes.model import TrajectoryModel
+from rfdropo_bayes.bayes.model import Measured, TrajectoryModel
 from rfdropo_bayes.bayes.noise import draw_noise, noise_specs
 from rfdropo_bayes.simulators.protocol import Result
 
@@ -32,6 +34,8 @@ class CalibrationProblem:
 
     def __init__(self, model: TrajectoryModel, *, chunk: int = 32) -> None:
         self.model = model
+        self.measured = model.measured
+        self.jacobian = "auto"
         self.chunk = chunk
         self.names = model.space.names
         self.units = {p.name: p.spec.unit for p in model.space.parameters}
@@ -47,9 +51,8 @@ class CalibrationProblem:
         """Digest of data, parameters and simulator: a checkpoint belongs to the problem it was made for."""
         digest = hashlib.sha256()
         recordings = self.model.recordings
-        for array in (recordings.position, recordings.time, *recordings.line, *recordings.commands):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        for array in self.model.tension or ():
+        data = [array for array in self.measured if array is not None]
+        for array in (*data, recordings.time, *recordings.line, *recordings.commands):
             digest.update(np.ascontiguousarray(array).tobytes())
         priors = [(p.name, sorted((p.table or {}).items())) for p in self.model.space.parameters]
         rest = (
@@ -94,7 +97,7 @@ class CalibrationProblem:
         Returns:
             rows, minus infinity throughout where the rollout did not end well, and the `Result` code of each set.
         """
-        rows, status = self._chunked(self._rows, values, horizon)
+        rows, status = self._chunked(self._rows, values, horizon, self.measured)
         rows = rows[:, :horizon]
         finite = np.isfinite(rows).all(axis=1)
         status = np.where((status == Result.OK) & ~finite, Result.DIVERGED, status)
@@ -111,7 +114,7 @@ class CalibrationProblem:
     @cached_property
     def observed(self) -> Float[np.ndarray, "n_rows feature"]:
         """Measured marker coordinates [m], laid out like `rollouts`."""
-        return np.moveaxis(self.model.recordings.position, 0, 1).reshape(self.n_rows, -1)
+        return np.moveaxis(np.asarray(self.measured.position), 0, 1).reshape(self.n_rows, -1)
 
     @cached_property
     def observed_mask(self) -> np.ndarray:
@@ -121,18 +124,42 @@ class CalibrationProblem:
 
     def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " residual"]:
         """Whitened residuals of the first ``horizon`` rows (zero where masked); traceable, for one set of values."""
-        return self.model.residuals(values, horizon, jnp.asarray(self.steps_for(horizon)))
+        white = self.model.residuals(values, jnp.asarray(self.steps_for(horizon)), self.measured)
+        return jnp.concatenate(
+            [part[0] for part in _flat([None if part is None else part[None] for part in white], horizon)]
+        )
+
+    def residual_batch(self, values: Batch, horizon: int) -> Float[np.ndarray, "n residual"]:
+        """`residuals` of many sets of values at once, in compiled chunks."""
+        white = self._chunked(self._white, values, horizon, self.measured)
+        return np.concatenate(_flat(white, horizon), axis=1)
+
+    def with_measured(self, measured: Measured) -> CalibrationProblem:
+        """The same problem with other data, which shares all that has been compiled.
+
+        Its Jacobians are taken by differences of compiled rollouts: a derivative of its own would be compiled for it.
+        """
+        other = copy.copy(self)
+        for derived in ("fingerprint", "observed"):
+            other.__dict__.pop(derived, None)
+        other.measured, other.jacobian = measured, "central"
+        return other
 
     def predict(self, values: Batch) -> tuple[Float[np.ndarray, "n recording time marker 3"], Int[np.ndarray, " n"]]:
         """Simulated marker positions [m] of every recording, without observation noise."""
         return self._chunked(self._positions, values, self.n_rows)
+
+    def observe(self, values: Batch) -> tuple[np.ndarray, np.ndarray, Int[np.ndarray, " n"]]:
+        """Marker positions (n, recording, time, marker, 3) [m], tensions (n, recording, time, cable) [N] and status."""
+        position, tension, status = self._chunked(self._observations, values, self.n_rows)
+        return position, tension, status
 
     def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
         """A realisation of the observation noise [m] for every set of values."""
         time = self.model.recordings.time
         markers = self.model.recordings.position.shape[2]
 
-        def noise(key: PRNGKeyArray, values: Batch) -> Array:
+        def noise(key: PRNGKeyArray, values: Mapping[str, Array]) -> Array:
             sigma, tau = self.model.noise_of(values)
             keys = jax.random.split(key, self.n_recordings)
             return jax.vmap(lambda k, t: draw_noise(k, t, markers, sigma, tau))(keys, time)
@@ -143,17 +170,29 @@ class CalibrationProblem:
 
     @cached_property
     def _rows(self) -> Callable:
-        return jax.jit(jax.vmap(self.model.row_log_likelihood, in_axes=(0, None)))
+        return jax.jit(jax.vmap(self.model.row_log_likelihood, in_axes=(0, None, None)))
+
+    @cached_property
+    def _white(self) -> Callable:
+        return jax.jit(jax.vmap(self.model.residuals, in_axes=(0, None, None)))
 
     @cached_property
     def _positions(self) -> Callable:
-        def positions(values: Batch, steps: Int[Array, ""]) -> tuple[Array, Array]:
+        def positions(values: Mapping[str, Array], steps: Int[Array, ""]) -> tuple[Array, Array]:
             observation = self.model.simulate(values, steps)
             return observation.position, jnp.max(observation.status)
 
         return jax.jit(jax.vmap(positions, in_axes=(0, None)))
 
-    def _chunked(self, evaluate: Callable, values: Batch, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+    @cached_property
+    def _observations(self) -> Callable:
+        def observations(values: Mapping[str, Array], steps: Int[Array, ""]) -> tuple[Array, Array, Array]:
+            observation = self.model.simulate(values, steps)
+            return observation.position, observation.tension, jnp.max(observation.status)
+
+        return jax.jit(jax.vmap(observations, in_axes=(0, None)))
+
+    def _chunked(self, evaluate: Callable, values: Batch, horizon: int, *rest: Any) -> tuple[Any, ...]:
         """Evaluate a batch chunk by chunk; the padding of the last chunk repeats its last set and is dropped."""
         steps = jnp.asarray(self.steps_for(horizon))
         columns = {name: np.asarray(values[name], dtype=float) for name in self.names}
@@ -162,9 +201,16 @@ class CalibrationProblem:
         for start in range(0, n, self.chunk):
             size = next(size for size in chunk_sizes(self.chunk) if size >= min(n - start, self.chunk))
             index = np.minimum(np.arange(start, start + size), n - 1)
-            parts.append(jax.device_get(evaluate({name: column[index] for name, column in columns.items()}, steps)))
-        first, second = (np.concatenate([part[i] for part in parts])[:n] for i in range(2))
-        return first, second
+            chunk = {name: column[index] for name, column in columns.items()}
+            parts.append(jax.device_get(evaluate(chunk, steps, *rest)))
+        return tuple(None if column[0] is None else np.concatenate(column)[:n] for column in zip(*parts, strict=True))
+
+
+def _flat(white: Sequence[Any], horizon: int) -> list[Any]:
+    """Residuals by rollout, cut to the horizon where they have a time axis, and flattened."""
+    positions, pulled, weighed = white
+    cut = [part[:, :, :horizon] for part in (positions, pulled) if part is not None]
+    return [part.reshape(len(part), -1) for part in (*cut, weighed) if part is not None]
 
 
 def chunk_sizes(largest: int) -> tuple[int, ...]:

@@ -50,8 +50,8 @@ class TensionData(NamedTuple):
         cables: which of the simulator's cables were measured.
     """
 
-    measured: Float[np.ndarray, "recording time cable"]
-    scale: Float[np.ndarray, "recording time cable"]
+    measured: Float[Any, "recording time cable"]
+    scale: Float[Any, "recording time cable"]
     valid: Bool[np.ndarray, "recording time cable"]
     cables: Int[np.ndarray, " cable"]
 
@@ -105,11 +105,14 @@ def gather_tension(simulator: Simulator, trajectories: Sequence[Trajectory], len
         valid.append(np.pad(known, missing))
     if any(column != columns[0] for column in columns):
         raise InputError("the recordings measure different cables", where="[model] tension", remedy="use one set")
-    scales = [_reading_size(tension, known) for tension, known in zip(measured, valid, strict=True)]
+    scales = [reading_size(tension, known) for tension, known in zip(measured, valid, strict=True)]
     return TensionData(np.stack(measured), np.stack(scales), np.stack(valid), np.array(columns[0]))
 
 
-def _reading_size(tension: np.ndarray, known: np.ndarray) -> np.ndarray:
+def reading_size(
+    tension: Float[np.ndarray, "time cable"], known: Bool[np.ndarray, "time cable"]
+) -> Float[np.ndarray, "time cable"]:
+    """Size of each reading that its relative error applies to [N]."""
     size = float(np.sqrt(np.mean(tension[known] ** 2))) if known.any() else 0.0
     return np.maximum(np.abs(tension), SMALLEST_READING * size if size > 0.0 else 1.0)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,21 @@ from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.simulators.protocol import Observation, Simulator
 
 Values = Mapping[str, Float[Array, "..."]]
+
+
+class Measured(NamedTuple):
+    """The numbers that were measured, apart from when and where: another set of them is another data set.
+
+    Attributes:
+        position: marker positions [m]; zero where masked.
+        tension: cable tensions [N], and the size of a reading that its relative error applies to [N]; or None.
+        weighed: values of the weighed parts.
+    """
+
+    position: Float[Any, "recording time marker 3"]
+    tension: Float[Any, "recording time cable"] | None
+    reading: Float[Any, "recording time cable"] | None
+    weighed: Float[Any, " weighed"]
 
 
 class TrajectoryNoise(dist.Distribution):
@@ -200,33 +215,55 @@ class TrajectoryModel:
         observed = jax.vmap(lambda v, c: self.simulator.rollout(v, c, steps))(stacked, self.recordings.commands)
         return observed._replace(position=observed.position[:, :, self.recordings.marker_index])
 
+    @cached_property
+    def measured(self) -> Measured:
+        """What was measured."""
+        tension, reading = (None, None) if self.tension is None else (self.tension.measured, self.tension.scale)
+        weighed = np.array([entry.value for entry in self.weighed])
+        return Measured(np.asarray(self.recordings.position), tension, reading, weighed)
+
     def row_log_likelihood(
-        self, values: Values, steps: Int[Array, ""] | None = None
+        self, values: Values, steps: Int[Array, ""] | None = None, measured: Measured | None = None
     ) -> tuple[Float[Array, " time"], Int[Array, ""]]:
-        """Log density of each row given those before it, summed over recordings, and the worst result code."""
+        """Log density of each row given those before it, summed over recordings, and the worst result code.
+
+        ``measured`` puts other data in the place of the model's own.
+        """
+        data = self.measured if measured is None else measured
         observation = self.simulate(values, steps)
         sigma, tau = self.noise_of(values)
-        residual = self.recordings.position - observation.position
+        residual = data.position - observation.position
         density = jax.vmap(lambda r, line: row_log_density(r, sigma, tau, line))(residual, self.recordings.line)
-        rows = jnp.sum(density, axis=0).at[0].add(weighed_log_density(values, self.weighed))
+        weighed = [entry._replace(value=value) for entry, value in zip(self.weighed, data.weighed, strict=True)]
+        rows = jnp.sum(density, axis=0).at[0].add(weighed_log_density(values, weighed))
         if self.tension is not None:
-            rows += tension_log_density(observation.tension, {**self.fixed, **values}, self.tension)
+            pulls = self._pulls(data)
+            rows += tension_log_density(observation.tension, {**self.fixed, **values}, pulls)
         return rows, jnp.max(observation.status)
 
-    def residuals(self, values: Values, horizon: int, steps: Int[Array, ""]) -> Float[Array, " residual"]:
-        """Whitened residuals of the first ``horizon`` rows, zero where masked: positions, tensions, weighed parts."""
+    def residuals(
+        self, values: Values, steps: Int[Array, ""], measured: Measured | None = None
+    ) -> tuple[Array, Array | None, Array | None]:
+        """Whitened residuals, zero where masked: positions (recording, time, marker, 3), tensions (recording, time,
+        cable), weighed parts; None for what there is not."""
+        data = self.measured if measured is None else measured
         observation = self.simulate(values, steps)
         sigma, tau = self.noise_of(values)
         white = jax.vmap(lambda r, line: whiten(r, sigma, tau, line)[0])(
-            self.recordings.position - observation.position, self.recordings.line
+            data.position - observation.position, self.recordings.line
         )
-        parts = [white[:, :horizon].reshape(-1)]
+        pulled = weighed = None
         if self.tension is not None:
-            pulls, _ = tension_residuals(observation.tension, {**self.fixed, **values}, self.tension)
-            parts.append(pulls[:, :horizon].reshape(-1))
+            pulls = self._pulls(data)
+            pulled, _ = tension_residuals(observation.tension, {**self.fixed, **values}, pulls)
         if self.weighed:
-            parts.append(weighed_residuals(values, self.weighed))
-        return jnp.concatenate(parts)
+            entries = [entry._replace(value=value) for entry, value in zip(self.weighed, data.weighed, strict=True)]
+            weighed = weighed_residuals(values, entries)
+        return white, pulled, weighed
+
+    def _pulls(self, data: Measured) -> TensionData:
+        assert self.tension is not None
+        return TensionData(data.tension, data.reading, self.tension.valid, self.tension.cables)
 
     def __call__(self, observe: bool = True) -> None:
         """The numpyro model; ``observe=False`` leaves the positions free, for predictive draws."""

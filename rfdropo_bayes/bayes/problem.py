@@ -63,7 +63,11 @@ class Problem(Protocol):
 
 @runtime_checkable
 class ResidualProblem(Problem, Protocol):
-    """A problem whose log likelihood is a sum of squares, as Gauss-Newton wants it."""
+    """A problem whose log likelihood is a sum of squares, as Gauss-Newton wants it.
+
+    It may also have ``residual_batch(values, horizon)``, the residuals of many sets of values, and ``jacobian``, the
+    way its Jacobians are to be taken ("auto", "forward" or "central").
+    """
 
     def residuals(self, values: Mapping[str, Float[Any, ""]], horizon: int) -> Float[Any, " m"]:
         """Whitened residuals r of the first ``horizon`` rows for ONE set of values.

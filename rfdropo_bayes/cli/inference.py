@@ -22,3 +22,12 @@ def export(
         raise InputError("nothing to export was named", where="export", remedy="add --phi")
     for path in export_phi(folder, out):
         typer.echo(str(path))
+
+
+def check(path: Path, out: Path, name: str, datasets: int, overrides: list[str], resume: bool) -> None:
+    """Run a check of an experiment's method and say what it found."""
+    from rfdropo_bayes.workflow.check import run_check
+
+    found = run_check(path, out, name, datasets=datasets, overrides=overrides, resume=resume)
+    typer.echo(found["sentence"])
+    typer.echo(f"details: {out / f'{name}.json'}")

@@ -48,12 +48,19 @@ def calibrate(
     experiment: ExperimentFile,
     out: OutFolder = None,
     resume: Annotated[bool, typer.Option(help="go on from the checkpoint of an interrupted run")] = False,
+    check: Annotated[
+        str | None, typer.Option(help="sbc: instead of fitting, check the method on simulated data")
+    ] = None,
+    datasets: Annotated[int, typer.Option(help="number of data sets of a check")] = 200,
     overrides: Overrides = None,
 ) -> None:
     """Fit the simulator to recordings: writes posterior.nc, summary.json and report.html."""
     from rfdropo_bayes.workflow.calibration import run_calibration
 
     folder = out or _default_folder(experiment)
+    if check is not None:
+        inference.check(experiment, folder, check, datasets, overrides or [], resume)
+        return
     report = run_calibration(experiment, folder, overrides=overrides or [], resume=resume)
     typer.echo(f"report: {report}")
 

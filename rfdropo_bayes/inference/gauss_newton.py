@@ -23,6 +23,7 @@ from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 
 DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order one
+BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
 
 
 class Target(NamedTuple):
@@ -143,19 +144,27 @@ def _make_linearise(
         values = problem.from_unconstrained(u[None])
         return problem.residuals({name: value[0] for name, value in values.items()}, horizon)
 
-    batched = jax.jit(jax.vmap(residuals)) if _works(lambda f, u: f(u), residuals, u) else None
+    if jacobian == "auto":
+        jacobian = getattr(problem, "jacobian", "auto")
+    in_batches = getattr(problem, "residual_batch", None) if jacobian == "central" else None
+    width = BATCH_DIFFERENCE if in_batches else DIFFERENCE
+    batched = None
+    if in_batches is None and _works(lambda f, u: f(u), residuals, u):
+        batched = jax.jit(jax.vmap(residuals))
 
     def at(points: np.ndarray) -> np.ndarray:
+        if in_batches:
+            return np.asarray(in_batches(problem.from_unconstrained(jnp.asarray(points)), horizon))
         if batched:
             return np.asarray(batched(jnp.asarray(points)))
         return np.stack([np.asarray(residuals(jnp.asarray(point))) for point in points])
 
     def differences(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ledger.charge(problem, 2 * len(u) + 1, horizon)
-        steps = DIFFERENCE * np.eye(len(u))
+        steps = width * np.eye(len(u))
         values = at(np.concatenate([u[None], u + steps, u - steps]))
         upper, lower = values[1 : len(u) + 1], values[len(u) + 1 :]
-        return values[0], (upper - lower).T / (2.0 * DIFFERENCE)
+        return values[0], (upper - lower).T / (2.0 * width)
 
     @jax.jit
     def both(u: Array) -> tuple[Array, Array]:

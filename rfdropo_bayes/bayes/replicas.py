@@ -1,0 +1,44 @@
+"""Data sets that a model makes itself: simulated from known parameters, with the noise that it assumes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.forces import TENSION_GAIN, TENSION_NOISE, reading_size
+from rfdropo_bayes.bayes.model import Measured
+
+
+def simulated_data(problem: CalibrationProblem, truth: Mapping[str, float], key: PRNGKeyArray) -> Measured | None:
+    """What would be measured if ``truth`` held, at the times, markers and faults of the problem's own data.
+
+    Returns:
+        None where the rollout does not end well.
+    """
+    position_key, tension_key, weighed_key = jax.random.split(key, 3)
+    batch = {name: jnp.array([truth[name]]) for name in problem.names}
+    position, tension, status = problem.observe(batch)
+    if status[0] != 0:
+        return None
+    model = problem.model
+    valid = model.recordings.line.valid[..., None]
+    measured = np.where(valid, position[0] + problem.draw_noise(position_key, batch)[0], 0.0)
+    read = size = None
+    if model.tension is not None:
+        known = {**model.fixed, **truth}
+        error = known[TENSION_NOISE.name] * np.asarray(jax.random.normal(tension_key, model.tension.measured.shape))
+        clean = known.get(TENSION_GAIN.name, TENSION_GAIN.nominal) * tension[0][..., model.tension.cables]
+        known_readings = model.tension.valid
+        sizes = [reading_size(t, v) for t, v in zip(clean, known_readings, strict=True)]
+        read = np.where(known_readings, clean + error * np.stack(sizes), 0.0)
+        size = np.stack([reading_size(t, v) for t, v in zip(read, known_readings, strict=True)])
+    normal = np.asarray(jax.random.normal(weighed_key, (len(model.weighed),)))
+    weighed = np.array(
+        [sum(truth[n] for n in entry.parameters) + entry.sd * z for entry, z in zip(model.weighed, normal, strict=True)]
+    )
+    return Measured(measured, read, size, weighed)

@@ -1,0 +1,95 @@
+"""``rfdropo calibrate --check sbc``: is the method calibrated for this experiment's robot, commands and priors?"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.replicas import simulated_data
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference import sbc
+from rfdropo_bayes.inference.methods import make_config
+from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
+from rfdropo_bayes.workflow.calibration import inference_options
+from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.workflow.files import output_folder
+
+CHECKS = ("sbc",)
+MOST_FAILURES = 100
+
+
+def run_check(
+    path: Path,
+    out: Path,
+    check: str,
+    *,
+    datasets: int = 200,
+    overrides: Sequence[str] = (),
+    resume: bool = False,
+) -> dict[str, Any]:
+    """Check the experiment's method on data simulated from its own prior at its own commands and times.
+
+    Writes ``sbc.json`` and, while it runs, ``sbc.jsonl`` with one line per data set.
+
+    Returns:
+        the content of ``sbc.json``.
+
+    Raises:
+        InputError: bad input, an unknown check, or a prior that hardly ever gives a rollout that ends well.
+    """
+    if check not in CHECKS:
+        raise InputError(f"unknown check {check!r}", where="--check", remedy=f"one of {', '.join(CHECKS)}")
+    experiment, _ = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
+    problem = build_problem(build_model(experiment, simulator, load_data(experiment, folder, "fit")))
+    options = inference_options(experiment)
+    make_config(experiment.inference.method, options)
+    out = output_folder(out)
+    with Progress("sbc", show=None, log=out / "log.jsonl") as progress:
+        found = sbc.calibrate(
+            problem,
+            lambda key: simulate_data_set(problem, key),
+            experiment.inference.method,
+            options,
+            jax.random.key(experiment.seed),
+            datasets,
+            log=out / "sbc.jsonl",
+            resume=resume,
+            progress=progress,
+        )
+    content = {
+        **found.as_dict(),
+        "method": experiment.inference.method,
+        "options": options,
+        "seed": experiment.seed,
+        "robot": experiment.robot,
+        "simulator": simulator.description,
+    }
+    (out / "sbc.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return content
+
+
+def simulate_data_set(
+    problem: CalibrationProblem, key: PRNGKeyArray
+) -> tuple[dict[str, float], CalibrationProblem, int]:
+    """A truth from the prior whose rollout ends well, the problem with data simulated from it, and failures before."""
+    for failed in range(MOST_FAILURES):
+        truth_key, noise_key = jax.random.split(jax.random.fold_in(key, failed))
+        truth = {name: float(np.asarray(column)[0]) for name, column in problem.sample_prior(truth_key, 1).items()}
+        measured = simulated_data(problem, truth, noise_key)
+        if measured is not None:
+            return truth, problem.with_measured(measured), failed
+    raise InputError(
+        f"none of {MOST_FAILURES} prior draws gives a rollout that ends well",
+        where="[model.priors]",
+        remedy="narrow the priors to parameters that the simulator can handle",
+    )
