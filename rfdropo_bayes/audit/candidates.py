@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -54,19 +54,19 @@ class Probe:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A mechanism of the library, or the simulator's own discretisation.
+    """A mechanism that may be named.
 
     Attributes:
         name: registry name.
         indices: coordinates of its parameters.
-        mechanism: itself; None for the discretisation.
-        probes: how it may look, filled by `probe_all`.
+        mechanism: itself.
+        source: what an experiment file calls it.
     """
 
     name: str
     indices: tuple[int, ...]
-    mechanism: Mechanism | None
-    probes: tuple[Probe, ...] = field(default_factory=tuple)
+    mechanism: Mechanism
+    source: str
 
 
 def probe_all(target: Target, fit: Fit, candidates: Sequence[Candidate]) -> list[Probe]:

@@ -146,7 +146,9 @@ class Inquiry:
                 heads.append(row)
             elif alike:
                 rest.append(row)
-        return [*heads, *rest][: self.rules.members]
+        chosen = [*heads, *rest][: self.rules.members]
+        # A refit on a finer mesh costs as much as all others: only where it could win.
+        return [row for row in chosen if row.name != DISCRETISATION or row.lm > 0.5 * chosen[0].lm]
 
     def _class_of(self, best: Row, significant: Sequence[Row]) -> tuple[str, ...]:
         assert best.probe is not None

@@ -16,8 +16,8 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
-# Lanes of one call, the last of a batch padded: few for a single point, many for a Jacobian.
-WIDTHS = (8, 32)
+# Few lanes for a single point, many for a Jacobian; an engine that gains nothing by many compiles only once.
+WIDTHS, NARROW = (8, 32), (8, 8)
 
 Thetas = Float[np.ndarray, "lane physical"]
 Points = Float[np.ndarray, "n d"]
@@ -30,11 +30,13 @@ class Lanes:
     Args:
         simulator: with the base model's mechanisms and every candidate at its null value.
         marker_index: which of its markers are measured.
+        widths: lanes of one call, few and many; the last call of a batch is padded.
     """
 
-    def __init__(self, simulator: Simulator, marker_index: np.ndarray) -> None:
+    def __init__(self, simulator: Simulator, marker_index: np.ndarray, widths: tuple[int, int] = WIDTHS) -> None:
         self.simulator = simulator
         self.marker_index = marker_index
+        self.widths = widths
         self.physical = tuple(spec.name for spec in simulator.parameters)
 
     def _observe(self, theta: jax.Array, commands: Commands) -> tuple[jax.Array, jax.Array]:
@@ -68,7 +70,7 @@ class Lanes:
     def _chunks(self, function: Any, commands: Commands, lane: np.ndarray, *arrays: np.ndarray) -> list[Any]:
         parts, start = [], 0
         while start < len(lane):
-            width = WIDTHS[0] if len(lane) - start <= WIDTHS[0] else WIDTHS[1]
+            width = self.widths[len(lane) - start > self.widths[0]]
             index = np.minimum(np.arange(start, start + width), len(lane) - 1)
             chosen = Commands(*(np.asarray(part)[lane[index]] for part in commands))
             parts.append(jax.device_get(function(*(a[index] for a in arrays), chosen)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
-from rfdropo_bayes.audit.forward import Lanes
+from rfdropo_bayes.audit.forward import NARROW, Lanes, RoutedLanes
 from rfdropo_bayes.audit.noise import STATED, NoiseModel
 from rfdropo_bayes.audit.pipeline import Answer, Question, audit
 from rfdropo_bayes.audit.record import record
@@ -27,7 +28,11 @@ from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.summary import combined_hash
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.compiled import CompiledEngine, effects_lacking
+from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism
+from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.simulators.trunk import TrunkSimulator
 from rfdropo_bayes.workflow.assembly import (
     build_simulator,
     expand_groups,
@@ -97,11 +102,12 @@ def build_question(
 ) -> Question:
     """The experiment's base model with every candidate of the library in it, at its null value."""
     robot = find_robot(experiment, folder)
-    names = [name for name in REGISTRY if name not in experiment.model.mechanisms]
+    names = candidate_names(experiment)
     simulator = build_simulator(_with(experiment, names), robot, folder)
     trajectories = [*fitted, *tested]
     recordings = gather_recordings(simulator, trajectories)
-    space, base = _space(experiment, simulator, names, recordings.names[: len(fitted)])
+    added = simulator.mechanisms[len(experiment.model.mechanisms) :]
+    space, base = _space(experiment, simulator, added, recordings.names[: len(fitted)])
     physical = tuple(spec.name for spec in simulator.parameters)
     known = fixed_values(experiment, simulator)
     coordinates = Coordinates(
@@ -113,57 +119,99 @@ def build_question(
     )
     index = {p.spec.name: i for i, p in enumerate(space.parameters)}
     candidates = [
-        Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m)
-        for m in simulator.mechanisms
-        if m.name in names
+        Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
+        for name, m in zip(names, added, strict=True)
     ]
-    marker_index = recordings.marker_index
+
+    def lanes(changed: Experiment) -> tuple[Lanes, Commands]:
+        return _lanes(changed, names, robot, folder, trajectories, coordinates)
+
+    finer = _finer(experiment, robot)
     return Question(
-        Lanes(simulator, marker_index),
-        _finer_lanes(experiment, names, robot, folder, trajectories),
+        lanes(experiment)[0],
+        None if finer is None else lanes(finer),
         coordinates,
         recordings,
         list(fitted),
         candidates,
         _stated(experiment, recordings.position.shape[2], fitted[0]),
         start,
-        Rules(),
+        Rules(bootstraps=experiment.audit.bootstraps),
         seed,
     )
 
 
-def _with(experiment: Experiment, names: Sequence[str], **simulator: Any) -> Experiment:
-    """The experiment with more mechanisms, and other entries of [simulator]."""
+def candidate_names(experiment: Experiment) -> list[str]:
+    """What is tried: the registry and the experiment's own, less what is in the model or excluded.
+
+    Raises:
+        InputError: a name to exclude that is not tried.
+    """
+    table = experiment.audit
+    check = [name for name in table.exclude if name not in [*REGISTRY, *table.candidates]]
+    if check:
+        raise InputError(f"unknown mechanism {check[0]!r}", where="[audit] exclude", remedy=nearest(check[0], REGISTRY))
+    tried = [*REGISTRY, *(name for name in table.candidates if name not in REGISTRY)]
+    return [name for name in tried if name not in experiment.model.mechanisms and name not in table.exclude]
+
+
+def _with(experiment: Experiment, names: Sequence[str]) -> Experiment:
+    """The experiment with more mechanisms."""
     model = experiment.model.model_copy(update={"mechanisms": [*experiment.model.mechanisms, *names]})
-    return experiment.model_copy(
-        update={"model": model, "simulator": experiment.simulator.model_copy(update=simulator)}
-    )
+    return experiment.model_copy(update={"model": model})
 
 
-def _finer_lanes(
-    experiment: Experiment, names: Sequence[str], robot: Robot, folder: Path, trajectories: Sequence[Trajectory]
-) -> tuple[Lanes, Commands] | None:
-    """Twice the layers and half the time step; only bodies of layers can be refined."""
+def _lanes(
+    experiment: Experiment,
+    names: Sequence[str],
+    robot: Robot,
+    folder: Path,
+    trajectories: Sequence[Trajectory],
+    coordinates: Coordinates,
+) -> tuple[Lanes, Commands]:
+    """The simulator with all candidates; those that the compiled engine lacks get an engine of their own."""
+    whole = build_simulator(_with(experiment, names), robot, folder)
+    recordings = gather_recordings(whole, trajectories)
+    slow = {m.name for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _lacking(whole, m)}
+    added = whole.mechanisms[len(experiment.model.mechanisms) :]
+    kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
+    if len(kept) == len(names):
+        return Lanes(whole, recordings.marker_index), recordings.commands
+    fast = Lanes(build_simulator(_with(experiment, kept), robot, folder), recordings.marker_index)
+    null = dict(coordinates.nominal) | dict(coordinates.fixed) | coordinates.named(coordinates.null)
+    routed = RoutedLanes(fast, Lanes(whole, recordings.marker_index, NARROW), null)
+    return routed, recordings.commands
+
+
+def _lacking(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
+    """Whether a mechanism acts on the body in a way that the compiled engine does not know."""
+    if not isinstance(mechanism, BodyMechanism) or not isinstance(simulator.engine, CompiledEngine):
+        return False
+    values = simulator.complete({})
+    plain = replace(simulator, mechanisms=()).material(values)
+    return bool(effects_lacking(mechanism.embody(values, plain, simulator.assembly.system.body).effects))
+
+
+def _finer(experiment: Experiment, robot: Robot) -> Experiment | None:
+    """The experiment with twice the layers and half the time step; only bodies of layers can be refined."""
     table = experiment.simulator
     if table.body != "layered":
         return None
     step = (table.time_step or robot.time_step_s) / FINER
-    finer = _with(experiment, names, refine=min(FINER * table.refine, 16), time_step=step)
-    simulator = build_simulator(finer, robot, folder)
-    recordings = gather_recordings(simulator, trajectories)
-    return Lanes(simulator, recordings.marker_index), recordings.commands
+    changed = table.model_copy(update={"refine": min(FINER * table.refine, 16), "time_step": step})
+    return experiment.model_copy(update={"simulator": changed})
 
 
 def _space(
-    experiment: Experiment, simulator: RobotSimulator, names: Sequence[str], fitted: Sequence[str]
+    experiment: Experiment, simulator: RobotSimulator, candidates: Sequence[Mechanism], fitted: Sequence[str]
 ) -> tuple[ParameterSpace, int]:
     """Base parameters, then those of the candidates, each with a prior; and how many are base parameters."""
     table = experiment.model
     noise = {spec.name for spec in noise_specs(table.noise)}
     fixed = fixed_values(experiment, simulator)
     specs = simulator.parameters
-    added = {spec.name for m in simulator.mechanisms if m.name in names for spec in m.parameters}
-    own = [spec.name for m in simulator.mechanisms if m.name not in names for spec in m.parameters]
+    added = {spec.name for m in candidates for spec in m.parameters}
+    own = [spec.name for m in simulator.mechanisms if m not in candidates for spec in m.parameters]
     given = expand_groups({k: v for k, v in table.priors.items() if k not in noise}, specs)
     shared = expand_groups(table.per_recording, specs)
     defaults = [name for name in [*own, *shared] if name not in fixed and name not in given]
@@ -215,8 +263,8 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path) -> dic
             simulator["refine"] = FINER * int(simulator.get("refine", 1))
             simulator["time_step"] = answer.question.finer[0].simulator.description["time_step_s"]
         else:
-            model["mechanisms"] = [*model.get("mechanisms", []), step.name]
             candidate = next(c for c in answer.question.candidates if c.name == step.name)
+            model["mechanisms"] = [*model.get("mechanisms", []), _found_again(candidate.source, folder)]
             fixed = model.get("fixed", {})
             for spec in candidate.mechanism.parameters if candidate.mechanism else ():
                 if spec.name not in fixed:
@@ -228,6 +276,11 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path) -> dic
     for role in ("fit", "test"):
         data[role] = [_placed(entry, folder) for entry in data.get(role, [])]
     return extended
+
+
+def _found_again(source: str, folder: Path) -> str:
+    """A candidate's name such that it is found from another folder, too."""
+    return str(folder / source) if ".py:" in source else source
 
 
 def _placed(entry: Any, folder: Path) -> Any:

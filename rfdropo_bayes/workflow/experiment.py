@@ -115,6 +115,15 @@ class NoiseTable(Table):
     correlation_time: float | None = Field(default=None, gt=0.0)
 
 
+class AuditTable(Table):
+    """[audit]: ``candidates`` are tried beside the registry's mechanisms, e.g. ``"mine.py:MyMechanism"``; those in
+    ``exclude`` are not. ``bootstraps`` is how many simulated data sets its p-values rest on."""
+
+    candidates: list[str] = Field(default_factory=list)
+    exclude: list[str] = Field(default_factory=list)
+    bootstraps: int = Field(default=999, ge=199)
+
+
 class Experiment(Table):
     """An experiment as read from its file; see `load_experiment`."""
 
@@ -127,6 +136,7 @@ class Experiment(Table):
     model: ModelTable = Field(default_factory=ModelTable)
     simulator: SimulatorTable = Field(default_factory=SimulatorTable)
     inference: InferenceTable = Field(default_factory=InferenceTable)
+    audit: AuditTable = Field(default_factory=AuditTable)
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experiment, dict[str, Any]]:
