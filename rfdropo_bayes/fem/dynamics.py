@@ -283,6 +283,37 @@ def _surround(
     return with_section_matrix(system, matrix, added), right + time_step * shared(system, force)
 
 
+class Linear(NamedTuple):
+    """A step's linear system A dv = r without cables, and what the effects remember after the step."""
+
+    matrix: BlockTridiagonal
+    right: Float[Array, "nodes 3"]
+    memory: Memory
+
+
+def linearised(
+    system: System,
+    prepared: Prepared,
+    state: State,
+    time_step: Scalar,
+    external_force: Float[Array, "nodes 3"] | float = 0.0,
+) -> Linear:
+    """Linearise the body, its effects and its surroundings about the start of a step."""
+    elastic = _elastic(system, prepared, state, time_step)
+    stations = len(system.body.station)
+    strained = multiply(elastic.tangent, state.velocity.reshape(stations, -1, 1)).reshape(-1, 3)
+    dragged = prepared.rayleigh_mass * mass_times(system, prepared, state.velocity)
+    load = prepared.weight + external_force
+    right = time_step * (elastic.force + load - elastic.lookahead * strained - dragged)
+    inertia, elasticity = 1.0 + time_step * prepared.rayleigh_mass, time_step * elastic.lookahead
+    mass = _with_axes(prepared.mass)
+    matrix = BlockTridiagonal(*(inertia * m + elasticity * k for m, k in zip(mass, elastic.tangent, strict=True)))
+    centre, drift = section_means(system, state.position), section_means(system, state.velocity)
+    around = section_load(system.body, prepared.effects, centre, drift)
+    matrix, right = _surround(system, around, matrix, right, drift, time_step)
+    return Linear(matrix, right, elastic.memory)
+
+
 def step(
     system: System,
     prepared: Prepared,
@@ -297,21 +328,10 @@ def step(
     was, at rest and without tension, and says so: a batch goes on. Where the material has effects with a memory, the
     state comes from ``remembering``.
     """
-    elastic = _elastic(system, prepared, state, time_step)
-    stations = len(system.body.station)
-    strained = multiply(elastic.tangent, state.velocity.reshape(stations, -1, 1)).reshape(-1, 3)
-    dragged = prepared.rayleigh_mass * mass_times(system, prepared, state.velocity)
-    load = prepared.weight + external_force
-    right = time_step * (elastic.force + load - elastic.lookahead * strained - dragged)
-    inertia, elasticity = 1.0 + time_step * prepared.rayleigh_mass, time_step * elastic.lookahead
-    mass = _with_axes(prepared.mass)
-    matrix = BlockTridiagonal(*(inertia * m + elasticity * k for m, k in zip(mass, elastic.tangent, strict=True)))
-    centre, drift = section_means(system, state.position), section_means(system, state.velocity)
-    around = section_load(system.body, prepared.effects, centre, drift)
-    matrix, right = _surround(system, around, matrix, right, drift, time_step)
+    matrix, right, memory = linearised(system, prepared, state, time_step, external_force)
     solution, slip = _pulled(system, prepared, state, matrix, right, displacement, time_step)
     velocity = state.velocity + solution.increment
-    memory, tension = elastic.memory, solution.tension / time_step
+    tension = solution.tension / time_step
     if slip is not None:
         share, segment = slipped(system.cables, slip, solution.mobilised, tension)
         memory = memory._replace(slip=share, segment=segment)

@@ -61,6 +61,36 @@ class Pushed(NamedTuple):
     cables_converged: Bool[Array, ""]
 
 
+class PushStatus(NamedTuple):
+    """How the steps of a rollout went."""
+
+    diverged: Bool[Array, ""]
+    cables_converged: Bool[Array, ""]
+    contacts_converged: Bool[Array, ""]
+
+    @classmethod
+    def fine(cls) -> PushStatus:
+        """Before the first step."""
+        return cls(jnp.array(False), jnp.array(True), jnp.array(True))
+
+    def joined(self, other: PushStatus) -> PushStatus:
+        """Of both stretches together."""
+        return PushStatus(
+            self.diverged | other.diverged,
+            self.cables_converged & other.cables_converged,
+            self.contacts_converged & other.contacts_converged,
+        )
+
+
+class PushRollout(NamedTuple):
+    """Recorded motion; a diverged rollout stays finite, but its rows from then on mean nothing."""
+
+    position: Float[Array, "rows points 3"]  # [m]
+    tension: Float[Array, "rows cables"]  # [N]
+    pose: Float[Array, "rows 7"]  # of the cube: centre [m] and unit quaternion (x, y, z, w)
+    status: PushStatus
+
+
 def push_scene(
     surface: PointMap,
     height: Float[np.ndarray, " points"],

@@ -7,12 +7,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from rfdropo_bayes.fem import levels as level_systems
 from rfdropo_bayes.fem.cables import lengths_and_jacobian
 from rfdropo_bayes.fem.layered import PointMap, point_positions
-from rfdropo_bayes.fem.pushing import PushScene, find_contacts, push, trunk_rows
+from rfdropo_bayes.fem.pushing import PushRollout, PushScene, PushStatus, find_contacts, push, trunk_rows
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState, free_twist
 from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
 from rfdropo_bayes.fem.tetrahedral_dynamics import (
@@ -29,23 +29,6 @@ class PushState(NamedTuple):
 
     body: TetrahedralState
     cube: CubeState
-
-
-class PushStatus(NamedTuple):
-    """How the steps went."""
-
-    diverged: Bool[Array, ""]
-    cables_converged: Bool[Array, ""]
-    contacts_converged: Bool[Array, ""]
-
-
-class PushRollout(NamedTuple):
-    """Recorded motion; a diverged rollout stays finite, but its rows from then on mean nothing."""
-
-    position: Float[Array, "rows points 3"]  # [m]
-    tension: Float[Array, "rows cables"]  # [N]
-    pose: Float[Array, "rows 7"]  # of the cube: centre [m] and unit quaternion (x, y, z, w)
-    status: PushStatus
 
 
 def surface_points(body: TetrahedralBody) -> PointMap:
@@ -116,11 +99,7 @@ def simulate(
     def one(carry, commanded):
         state, status = carry
         state, new = step(system, scene, material, cube, friction, state, commanded, time_step)
-        return (state, PushStatus(
-            status.diverged | new.diverged,
-            status.cables_converged & new.cables_converged,
-            status.contacts_converged & new.contacts_converged,
-        )), None  # fmt: skip
+        return (state, status.joined(new)), None
 
     def row(carry, commands):
         carry, _ = lax.scan(one, carry, commands)
@@ -128,6 +107,5 @@ def simulate(
         pose = jnp.concatenate([solid.position, solid.orientation])
         return carry, (point_positions(points, body.position), body.tension, pose)
 
-    start = state, PushStatus(jnp.array(False), jnp.array(True), jnp.array(True))
-    (_, status), (position, tension, pose) = lax.scan(row, start, displacement)
+    (_, status), (position, tension, pose) = lax.scan(row, (state, PushStatus.fine()), displacement)
     return PushRollout(position, tension, pose, status)

@@ -1,4 +1,4 @@
-"""Engines for a trunk that pushes a cube, in JAX."""
+"""Engines for a trunk that pushes a cube, in JAX: double precision, on whatever device JAX finds."""
 
 from __future__ import annotations
 
@@ -8,20 +8,46 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
-from rfdropo_bayes.fem import point_positions
-from rfdropo_bayes.fem.pushing import PushScene
-from rfdropo_bayes.fem.tetrahedral_dynamics import state_at_rest
-from rfdropo_bayes.fem.tetrahedral_pushing import PushState, simulate, surface_points
+from rfdropo_bayes.fem import layered_pushing, point_positions, prepare, state_at_rest, tetrahedral_pushing
+from rfdropo_bayes.fem import static_equilibrium as find_equilibrium
+from rfdropo_bayes.fem.layered import PointMap, rest_positions
+from rfdropo_bayes.fem.pushing import PushRollout, PushScene
+from rfdropo_bayes.fem.tetrahedral_dynamics import state_at_rest as mesh_at_rest
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
-from rfdropo_bayes.simulators.pushing import CubeInputs, PushMotion, scene_of
+from rfdropo_bayes.simulators.pushing import CubeInputs, PushMotion, bands_along, scene_of
 from rfdropo_bayes.simulators.robot_simulator import Values
+from rfdropo_bayes.simulators.trunk import TrunkSimulator
+
+
+def _describe() -> dict[str, object]:
+    return {"engine": "jax", "precision": "float64", "device": jax.devices()[0].platform}
+
+
+def _motion(
+    markers: PointMap,
+    position: Float[Array, "nodes 3"],
+    tension: Float[Array, " cables"],
+    cube: CubeInputs,
+    rollout: PushRollout,
+    imbalance: Float[Array, ""],
+) -> PushMotion:
+    """The initial state before the rollout's rows."""
+    pose = jnp.concatenate([cube.start.position, cube.start.orientation])
+    return PushMotion(
+        jnp.concatenate([point_positions(markers, position)[None], rollout.position]),
+        jnp.concatenate([tension[None], rollout.tension]),
+        jnp.concatenate([pose[None], rollout.pose]),
+        *rollout.status,
+        imbalance,
+    )
 
 
 @dataclass(frozen=True)
 class MeshPushEngine:
-    """A body of tetrahedra and a cube, in double precision, on whatever device JAX finds.
+    """A body of tetrahedra and a cube.
 
     Attributes:
         trunk: whose mesh, cables and markers it moves.
@@ -30,32 +56,72 @@ class MeshPushEngine:
     trunk: MeshTrunkSimulator
     lanes: ClassVar[int] = 16
 
+    @property
+    def time_step(self) -> float:
+        """That of the trunk."""
+        return self.trunk.time_step
+
     @cached_property
     def scene(self) -> PushScene:
         """Cube, plate and the trunk's surface."""
         body = self.trunk.assembly.system.body
-        return scene_of(self.trunk.robot, surface_points(body), body.rest)
+        return scene_of(self.trunk.robot, tetrahedral_pushing.surface_points(body), body.rest)
 
     def describe(self) -> dict[str, object]:
         """Name and precision."""
-        return {"engine": "jax", "precision": "float64", "device": jax.devices()[0].platform}
+        return _describe()
 
-    def motion(self, simulator: MeshTrunkSimulator, values: Values, commands: Commands, cube: CubeInputs) -> PushMotion:
+    def motion(self, values: Values, commands: Commands, cube: CubeInputs) -> PushMotion:
         """See `PushEngine.motion`."""
-        system, markers = simulator.assembly.system, simulator.assembly.markers
-        displacement = simulator.displacements(values, commands)[:, None, :]
-        start = PushState(state_at_rest(system), cube.start)
-        rollout = simulate(
-            system, self.scene, simulator.material(values), cube.cube, cube.friction, start, displacement,
-            simulator.time_step, markers,
+        system, markers = self.trunk.assembly.system, self.trunk.assembly.markers
+        displacement = self.trunk.displacements(values, commands)[:, None, :]
+        state = mesh_at_rest(system)
+        rollout = tetrahedral_pushing.simulate(
+            system, self.scene, self.trunk.material(values), cube.cube, cube.friction,
+            tetrahedral_pushing.PushState(state, cube.start), displacement, self.time_step, markers,
         )  # fmt: skip
-        first = point_positions(markers, start.body.position)
-        pose = jnp.concatenate([cube.start.position, cube.start.orientation])
-        return PushMotion(
-            jnp.concatenate([first[None], rollout.position]),
-            jnp.concatenate([start.body.tension[None], rollout.tension]),
-            jnp.concatenate([pose[None], rollout.pose]),
-            rollout.status.diverged,
-            rollout.status.cables_converged,
-            rollout.status.contacts_converged,
-        )
+        return _motion(markers, state.position, state.tension, cube, rollout, jnp.zeros(()))
+
+
+@dataclass(frozen=True)
+class LayeredPushEngine:
+    """A layered body and a cube. The body's outline, without its notches, is what touches.
+
+    Attributes:
+        trunk: whose layers, cables and markers it moves.
+    """
+
+    trunk: TrunkSimulator
+    lanes: ClassVar[int] = 64
+
+    @property
+    def time_step(self) -> float:
+        """That of the trunk."""
+        return self.trunk.discretisation.time_step
+
+    @cached_property
+    def scene(self) -> PushScene:
+        """Cube, plate and the trunk's outline."""
+        body = self.trunk.assembly.system.body
+        rings = bands_along(float(body.station[-1] - body.station[0])) + 1
+        outline = layered_pushing.outline_points(body, body.half_width, rings)
+        return scene_of(self.trunk.robot, outline, rest_positions(body))
+
+    def describe(self) -> dict[str, object]:
+        """Name and precision."""
+        return _describe()
+
+    def motion(self, values: Values, commands: Commands, cube: CubeInputs) -> PushMotion:
+        """See `PushEngine.motion`."""
+        system, markers = self.trunk.assembly.system, self.trunk.assembly.markers
+        prepared = prepare(system, self.trunk.material(values))
+        start, displacement = self.trunk.wound(values, commands, self.time_step)
+        state, imbalance = state_at_rest(system), jnp.zeros(())
+        if self.trunk.robot.initial_state == "equilibrium":
+            state, found = find_equilibrium(system, prepared, start)
+            imbalance = found.residual
+        rollout = layered_pushing.simulate(
+            system, prepared, self.scene, cube.cube, cube.friction,
+            layered_pushing.LayeredPushState(state, cube.start), displacement[:, None, :], self.time_step, markers,
+        )  # fmt: skip
+        return _motion(markers, state.position, state.tension, cube, rollout, imbalance)

@@ -23,6 +23,7 @@ from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
+from rfdropo_bayes.simulators.trunk import EQUILIBRIUM_TOLERANCE, TrunkSimulator
 
 BANDS_PER_METRE = 230.0
 """Bands of the surface along the axis that each may touch once: about four to a vertebra of the trunk."""
@@ -45,6 +46,7 @@ class PushMotion(NamedTuple):
     diverged: Bool[Array, ""]
     cables_converged: Bool[Array, ""]
     contacts_converged: Bool[Array, ""]
+    imbalance: Float[Array, ""]  # relative unbalanced force of the initial equilibrium; 0 for a start at rest
 
 
 class PushEngine(Protocol):
@@ -56,11 +58,19 @@ class PushEngine(Protocol):
 
     lanes: ClassVar[int]
 
+    @property
+    def trunk(self) -> TrunkSimulator | MeshTrunkSimulator:
+        """The trunk without cube: its body, commands and material."""
+
+    @property
+    def time_step(self) -> float:
+        """Time step of the simulation [s]."""
+
     def describe(self) -> dict[str, object]:
         """Name and precision, for the record."""
 
-    def motion(self, simulator: MeshTrunkSimulator, values: Values, commands: Commands, cube: CubeInputs) -> PushMotion:
-        """Roll out the trunk that ``simulator`` describes."""
+    def motion(self, values: Values, commands: Commands, cube: CubeInputs) -> PushMotion:
+        """Roll out with these parameters of the trunk."""
 
 
 def push_table(robot: Robot) -> PushTable:
@@ -76,6 +86,11 @@ def push_table(robot: Robot) -> PushTable:
     return robot.push
 
 
+def bands_along(length: float) -> int:
+    """Number of bands of a surface of that length [m]."""
+    return round(BANDS_PER_METRE * length)
+
+
 def plate_normal(robot: Robot) -> Float[np.ndarray, "3"]:
     """Unit vector against gravity, out of the plate."""
     return -robot.gravity / np.linalg.norm(robot.gravity)
@@ -88,7 +103,7 @@ def scene_of(robot: Robot, surface: PointMap, rest: Float[np.ndarray, "nodes 3"]
     return push_scene(
         surface,
         height,
-        round(BANDS_PER_METRE * float(np.ptp(height))),
+        bands_along(float(np.ptp(height))),
         plate_normal=plate_normal(robot),
         plate_height=table.plate_height_m,
         contact_distance=table.contact_distance_m,
@@ -100,12 +115,16 @@ class PushSimulator(RobotSimulator):
     """A trunk and a cube on a plate, behind the `Simulator` protocol; the cube starts at rest where it is put.
 
     Attributes:
-        trunk: the same trunk without cube: its commands, material and measurement are these.
-        engine: what computes the motion of both.
+        engine: what computes the motion of both, and the trunk without cube, whose commands, material and measurement
+            are these.
     """
 
-    trunk: MeshTrunkSimulator
     engine: PushEngine
+
+    @property
+    def trunk(self) -> TrunkSimulator | MeshTrunkSimulator:
+        """The trunk without cube."""
+        return self.engine.trunk
 
     @property
     def robot(self) -> Robot:  # type: ignore[override]
@@ -163,19 +182,23 @@ class PushSimulator(RobotSimulator):
         """
         values = self.complete(parameters)
         own = {spec.name: values[spec.name] for spec in self.trunk.parameters}
-        motion = self.engine.motion(self.trunk, own, commands, self.cube(values))
+        motion = self.engine.motion(own, commands, self.cube(values))
         status = jnp.where(
             motion.diverged,
             int(Result.DIVERGED),
             jnp.where(
                 ~motion.cables_converged,
                 int(Result.CABLE_LIMIT),
-                jnp.where(motion.contacts_converged, int(Result.OK), int(Result.CONTACT_NOT_CONVERGED)),
+                jnp.where(
+                    motion.imbalance > EQUILIBRIUM_TOLERANCE,
+                    int(Result.NOT_IN_EQUILIBRIUM),
+                    jnp.where(motion.contacts_converged, int(Result.OK), int(Result.CONTACT_NOT_CONVERGED)),
+                ),
             ),
         )
         pose = sample(motion.pose, commands)
         pose = pose.at[:, 3:].divide(jnp.linalg.norm(pose[:, 3:], axis=1, keepdims=True))
         position = self.trunk.measured(
-            own, sample(motion.position, commands), observed_at(commands, self.trunk.time_step)
+            own, sample(motion.position, commands), observed_at(commands, self.engine.time_step)
         )
         return Observation(position, sample(motion.tension, commands), pose, status)

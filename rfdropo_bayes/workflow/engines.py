@@ -11,11 +11,11 @@ from rfdropo_bayes.simulators.compiled import CompiledEngine
 from rfdropo_bayes.simulators.mesh_body import MeshAssembly
 from rfdropo_bayes.simulators.mesh_engines import CompiledMeshEngine, MeshEngine, ReferenceMeshEngine
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
-from rfdropo_bayes.simulators.push_engines import MeshPushEngine
+from rfdropo_bayes.simulators.push_engines import LayeredPushEngine, MeshPushEngine
 from rfdropo_bayes.simulators.pushing import PushSimulator, push_table
 from rfdropo_bayes.simulators.reference import ReferenceEngine
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
-from rfdropo_bayes.simulators.trunk import Assembly, Discretisation, Engine
+from rfdropo_bayes.simulators.trunk import Assembly, Discretisation, Engine, TrunkSimulator
 from rfdropo_bayes.workflow.experiment import SimulatorTable
 
 
@@ -44,11 +44,13 @@ def build_push_simulator(table: SimulatorTable, trunk: RobotSimulator) -> PushSi
     Contacts run on the JAX engine; where [simulator] asks for another, this says so.
 
     Raises:
-        InputError: a robot without a cube.
+        InputError: a robot without a cube, or a trunk of another kind.
     """
     push_table(trunk.robot)
     if table.engine == "numba" or table.precision == "float32":
         logging.getLogger("rfdropo_bayes").warning("contacts run on the JAX engine, in double precision")
-    if not isinstance(trunk, MeshTrunkSimulator):
-        raise InputError("a cube needs a mesh", where="[simulator] push", remedy='set body = "tetrahedra"')
-    return PushSimulator(trunk, MeshPushEngine(trunk))
+    if isinstance(trunk, MeshTrunkSimulator):
+        return PushSimulator(MeshPushEngine(trunk))
+    if isinstance(trunk, TrunkSimulator):
+        return PushSimulator(LayeredPushEngine(trunk))
+    raise InputError("no contacts for this kind of trunk", where="[simulator] push", remedy="use push = false")

@@ -12,11 +12,13 @@ from rfdropo_bayes.fem.pushing import LYING, PUSHING, RESTING, cube_rows, find_c
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators import Result, Simulator
+from rfdropo_bayes.simulators.compiled import CompiledEngine
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
 from rfdropo_bayes.simulators.mesh_engines import CompiledMeshEngine
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
-from rfdropo_bayes.simulators.push_engines import MeshPushEngine
+from rfdropo_bayes.simulators.push_engines import LayeredPushEngine, MeshPushEngine
 from rfdropo_bayes.simulators.pushing import PushSimulator, push_table
+from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
 TIME_STEP, HALF = 0.01, 0.0175
 SOFA = load_robot("trunk_sofa_mesh")
@@ -38,7 +40,7 @@ def trunk(bar_mesh) -> MeshTrunkSimulator:
 
 @pytest.fixture(scope="module")
 def pushing(trunk) -> PushSimulator:
-    return PushSimulator(trunk, MeshPushEngine(trunk))
+    return PushSimulator(MeshPushEngine(trunk))
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +121,31 @@ def test_contacts_act_equally_on_both_sides(pushing, trunk):
         on_trunk[: 3 * PUSHING].sum(axis=1),
     )
     np.testing.assert_allclose(torque, -on_cube[pushing_rows, 3:] + apart, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_layered_body_pushes_too():
+    """The same robot as layers, softened: it lies on a heavy cube that its outline keeps at a distance."""
+    discretisation = Discretisation(TIME_STEP)
+    assembly = assemble(ROBOT, discretisation)
+    trunk = TrunkSimulator(ROBOT, CompiledEngine(assembly, TIME_STEP, False), assembly, discretisation)
+    pushing = PushSimulator(LayeredPushEngine(trunk))
+    rows = 8
+    value = np.zeros((rows, 8))
+    value[:, 2] = 3e-3 * np.arange(1, rows + 1)
+    commands = trunk.commands(0.05 * np.arange(rows), value, np.zeros(8), 0.05 * np.arange(rows + 1))
+    run = jax.jit(lambda values: pushing.rollout(values, commands))
+    scene = {"cube_mass": 5.0, "friction": 0.9, "cube_y": REST_HEIGHT, "young_modulus": 4.5e6}
+    aside, below = (run({name: jnp.asarray(v) for name, v in (scene | {"cube_x": x}).items()}) for x in (0.25, 0.0))
+    alone = trunk.rollout({}, commands)
+    assert int(aside.status) == int(below.status) == Result.OK
+    before = np.asarray(alone.position)[..., 1].min(axis=1) > PLATE + 0.025
+    assert before.sum() >= 3
+    np.testing.assert_allclose(aside.position[before], alone.position[before], atol=1e-9)
+    lifted = np.asarray(below.position)[-1, :, 1] - np.asarray(alone.position)[-1, :, 1]
+    assert lifted.max() > 2e-3
+    near = np.abs(np.asarray(below.position)[-1, :, 2] - 0.1) < 0.012
+    assert np.asarray(below.position)[-1, near, 1].min() > REST_HEIGHT + HALF + 0.005 + 0.006
 
 
 def test_lost_and_unsolved_rollouts_say_so(rollout):
