@@ -1,10 +1,13 @@
 """Rollouts per second of both engines, 100 solves each: a uniform bar, and the notched trunk behind its simulator.
 
-    python benchmarks/rollouts.py [--json FILE] [--seconds S] [--batch N]
+    python benchmarks/rollouts.py [--json FILE] [--seconds S] [--batch N] [--peers]
 
 The bar has 20 layers of 4 nodes and 8 cables; it is timed at the engine. The trunk is timed as inference calls it,
 through commands, limits and markers. Parameters differ from rollout to rollout. Compilation is not counted; the best of
 the repeats is. The JAX engine uses as many processors as XLA likes; the Numba engine is timed on one thread and on all.
+
+With `--peers`, MuJoCo's flex and PyElastica follow on the same bar, one rollout of a second at a time, where they are
+installed.
 
 The last column is how far the tip of the bar, held at one end, sags under its own weight, against the heavy elastica.
 """
@@ -23,6 +26,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import peers
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.robots import load_robot
@@ -168,6 +172,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file to write the table to")
     parser.add_argument("--seconds", type=float, default=5.0, help="time spent on each row")
     parser.add_argument("--batch", type=int, default=512, help="rollouts in a batch")
+    parser.add_argument("--peers", action="store_true", help="other simulators too, where they are installed")
     options = parser.parse_args()
     print(f"{SOLVES} solves a rollout, {os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}")
     print(f"{'body':12}{'engine':8}{'precision':11}{'threads':>8}", end="")
@@ -182,9 +187,11 @@ def main() -> None:
             f"{row['rollouts_per_second']:12.1f}{row['first_call_s']:10.1f} s{row['failed']:8d}{sag:>9}",
             flush=True,
         )
+    others = peers.settle_all() if options.peers else []
     if options.json:
         machine = {"processors": os.cpu_count(), "machine": platform.machine(), "python": platform.python_version()}
         table = {"solves": SOLVES, "machine": machine, "load": os.getloadavg(), "rows": rows, "schema_version": 1}
+        table["peers"] = [peer._asdict() | {"rollouts_per_second": peer.rollouts_per_second} for peer in others]
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(table, indent=2) + "\n")
 
