@@ -3,7 +3,8 @@
     A dv = h (f(x) + M g + f_ext - (h + b) K v - a M v) - h J' T,    A = (1 + h a) M + h (h + b) K,    x += h (v + dv)
 
 with Rayleigh damping a M + b K, the corotational tangent K, cable Jacobian J = dl/dx and tensions T >= 0 (Baraff and
-Witkin 1998; the same linearised step as SOFA's EulerImplicitSolver). What ``effects`` add is implicit in the same way:
+Witkin 1998; the same linearised step as SOFA's EulerImplicitSolver). What taut cables hold against twist is implicit
+too: at the necks of a notched trunk it exceeds the body's own stiffness, and steps that leave it out swing. What ``effects`` add is implicit in the same way:
 their force, linearised, at the end of the step. Everything is a pure function of arrays: batch with ``jax.vmap``,
 differentiate with ``jax.jvp`` or ``jax.grad``. A ``System`` is static and is closed over, never traced.
 """
@@ -22,6 +23,7 @@ from rfdropo_bayes.fem import corotational, layered
 from rfdropo_bayes.fem.bending_law import Sections, moments, sections
 from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, multiply
 from rfdropo_bayes.fem.cable_friction import Slip, slip_problem, slipped, start_slip
+from rfdropo_bayes.fem.cable_twist import twist_stiffening
 from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
 from rfdropo_bayes.fem.layered import LayeredBody
@@ -235,6 +237,7 @@ def remembering(system: System, prepared: Prepared, state: State) -> State:
 class _Elastic(NamedTuple):
     """Elastic forces of a step: what acts at its start, and how that changes to its end."""
 
+    frame: Float[Array, "layers 3 3"]
     force: Float[Array, "nodes 3"]
     tangent: BlockTridiagonal
     lookahead: Scalar  # [s] times the tangent times the velocity is the change of force
@@ -264,7 +267,7 @@ def _elastic(system: System, prepared: Prepared, state: State, time_step: Scalar
         force, packed, memory = left * force, left * packed, memory._replace(clock=clock)
     tangent = corotational.tangent(packed, frame)
     force = corotational.internal_force(frame, force).reshape(-1, 3)
-    return _Elastic(force, tangent, time_step * (1.0 + gain) + prepared.rayleigh_stiffness, memory)
+    return _Elastic(frame, force, tangent, time_step * (1.0 + gain) + prepared.rayleigh_stiffness, memory)
 
 
 def _surround(
@@ -308,6 +311,9 @@ def linearised(
     inertia, elasticity = 1.0 + time_step * prepared.rayleigh_mass, time_step * elastic.lookahead
     mass = _with_axes(prepared.mass)
     matrix = BlockTridiagonal(*(inertia * m + elasticity * k for m, k in zip(mass, elastic.tangent, strict=True)))
+    twist = twist_stiffening(system.body, system.cables, elastic.frame, time_step**2 * state.tension)
+    matrix = BlockTridiagonal(*(m + k for m, k in zip(matrix, twist, strict=True)))
+    right = right - multiply(twist, state.velocity.reshape(stations, -1, 1)).reshape(-1, 3)
     centre, drift = section_means(system, state.position), section_means(system, state.velocity)
     around = section_load(system.body, prepared.effects, centre, drift)
     matrix, right = _surround(system, around, matrix, right, drift, time_step)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, inlined, kernel, load, store
+from rfdropo_bayes.fem.native.tension_stiffening import resist_twist
 
 POLAR_ITERATIONS = 6
 
@@ -74,6 +75,7 @@ class Work(NamedTuple):
     relaxation: Float[np.ndarray, "1 lanes"]
     beyond: Float[np.ndarray, "layers3 lanes"]  # force of the cables on the stations beyond each layer
     imbalance: Float[np.ndarray, "1 lanes"]
+    twist: Float[np.ndarray, "layers lanes"]  # of the cables against the twist of each layer, in the matrix
 
 
 @kernel
@@ -324,6 +326,7 @@ def subtract_tangent_product(tables, samples, factors, change, field, work, toke
     for layer in range(tables.stations - 1):
         _local_change(change, elasticity, tables.modes, layer, work, token)
         _subtract_reaction(tables, samples, layer, work, field, token)
+        resist_twist(tables, layer, change, field, work, token)
     add_momentum(tables, samples, fill(0.0, inertia, token), inertia, change, field, token)
 
 

@@ -118,6 +118,7 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         relaxation=rows(1),
         beyond=rows(3 * layers),
         imbalance=rows(1),
+        twist=rows(layers),
     )
     return Storage(samples, Factors(*(rows(1) for _ in Factors._fields)), work)
 

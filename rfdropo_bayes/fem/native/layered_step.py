@@ -13,7 +13,7 @@ from rfdropo_bayes.fem.native.layered_assembly import (
     subtract_tangent_product,
 )
 from rfdropo_bayes.fem.native.simd import fill, fma, inlined, kernel, load, square_root, store, where_greater
-from rfdropo_bayes.fem.native.tension_stiffening import stiffen, stiffen_twist, sum_cable_forces
+from rfdropo_bayes.fem.native.tension_stiffening import resist_twist, stiffen, stiffen_twist, sum_cable_forces
 
 LARGEST = 1e30
 """Tensions beyond this [N] are not finite."""
@@ -157,7 +157,8 @@ def solve_increment(tables, samples, factors, work, rate, schedule, static, toke
             assemble_layer(tables, samples, factors, station - 1, work, not last, token)
             if static:
                 stiffen(tables, station - 1, work, not last, token)
-                stiffen_twist(tables, station - 1, work, not last, token)
+            stiffen_twist(tables, station - 1, rate, work, not last, token)
+            resist_twist(tables, station - 1, work.velocity, work.field, work, token)
         entry, t = station * tables.pairs, station * block
         add_station_mass(tables.parity, tiles, work.pivot, t, samples.station_mass, entry, inertia, token)
         if not last:

@@ -60,8 +60,8 @@ def _add_dyad(matrix, t, scale, axes, a, i, b, j, token):
 
 
 @kernel
-def stiffen_twist(tables, layer, work, whole, token):
-    """Add T r^2 / L of all cables against the twist of a layer; see ``fem.cable_twist``.
+def stiffen_twist(tables, layer, rate, work, whole, token):
+    """Add T r^2 / L of all cables against the twist of a layer, over ``rate`` squared; see ``fem.cable_twist``.
 
     The twist of a face is half of q_x . e_y / h_x - q_y . e_x / h_y, where q_x and q_y are its modes linear in x and y
     and h their values at rest.
@@ -71,6 +71,8 @@ def stiffen_twist(tables, layer, work, whole, token):
     for c in range(tables.cables):
         arm = fill(tables.twist_arm[layer * tables.cables + c], axes, token)
         stiffness = fma(arm, load(work.tension, c, token), stiffness)
+    stiffness = stiffness * fill(1.0 / (rate * rate), axes, token)
+    store(work.twist, layer, stiffness)
     low, high = 3 * layer * modes, 3 * (layer + 1) * modes
     x0, y0 = 0.5 / tables.rest[low + 3], 0.5 / tables.rest[low + 3 * across + 1]
     x1, y1 = 0.5 / tables.rest[high + 3], 0.5 / tables.rest[high + 3 * across + 1]
@@ -90,3 +92,26 @@ def stiffen_twist(tables, layer, work, whole, token):
         _add_dyad(work.coupling, upper + xy, stiffness * x0 * y1, axes, a, 1, a, 0, token)
         _add_dyad(work.coupling, upper + yx, stiffness * y0 * x1, axes, a, 0, a, 1, token)
         _add_dyad(work.coupling, upper + yy, -(stiffness * y0 * y1), axes, a, 0, a, 0, token)
+
+
+@kernel
+def resist_twist(tables, layer, change, field, work, token):
+    """Subtract what the cables put against the twist of a layer, its stiffness in ``twist``, times a change."""
+    modes, axes, a = tables.modes, work.axes, 9 * layer
+    low, high = 3 * layer * modes, 3 * (layer + 1) * modes
+    x, y = 3, 3 * tables.across
+    x0, y0 = fill(0.5 / tables.rest[low + x], axes, token), fill(0.5 / tables.rest[low + y + 1], axes, token)
+    x1, y1 = fill(0.5 / tables.rest[high + x], axes, token), fill(0.5 / tables.rest[high + y + 1], axes, token)
+    twist = fill(0.0, axes, token)
+    for i in range(3):
+        along_x = x1 * load(change, high + x + i, token) - x0 * load(change, low + x + i, token)
+        along_y = y1 * load(change, high + y + i, token) - y0 * load(change, low + y + i, token)
+        twist = fma(load(axes, a + 3 * i + 1, token), along_x, twist)
+        twist = fnma(load(axes, a + 3 * i, token), along_y, twist)
+    moment = load(work.twist, layer, token) * twist
+    for i in range(3):
+        first, second = moment * load(axes, a + 3 * i, token), moment * load(axes, a + 3 * i + 1, token)
+        store(field, high + x + i, fnma(second, x1, load(field, high + x + i, token)))
+        store(field, low + x + i, fma(second, x0, load(field, low + x + i, token)))
+        store(field, high + y + i, fma(first, y1, load(field, high + y + i, token)))
+        store(field, low + y + i, fnma(first, y0, load(field, low + y + i, token)))
