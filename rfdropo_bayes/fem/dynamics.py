@@ -4,9 +4,10 @@
 
 with Rayleigh damping a M + b K, the corotational tangent K, cable Jacobian J = dl/dx and tensions T >= 0 (Baraff and
 Witkin 1998; the same linearised step as SOFA's EulerImplicitSolver). What taut cables hold against twist is implicit
-too: at the necks of a notched trunk it exceeds the body's own stiffness, and steps that leave it out swing. What ``effects`` add is implicit in the same way:
-their force, linearised, at the end of the step. Everything is a pure function of arrays: batch with ``jax.vmap``,
-differentiate with ``jax.jvp`` or ``jax.grad``. A ``System`` is static and is closed over, never traced.
+too: at the necks of a notched trunk it exceeds the body's own stiffness, and steps that leave it out swing. What
+``effects`` add is implicit in the same way: their force, linearised, at the end of the step. Everything is a pure
+function of arrays: batch with ``jax.vmap``, differentiate with ``jax.jvp`` or ``jax.grad``. A ``System`` is static and
+is closed over, never traced.
 """
 
 from __future__ import annotations
