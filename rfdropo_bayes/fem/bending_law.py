@@ -36,20 +36,31 @@ def section_rotations(body: LayeredBody) -> Float[np.ndarray, "layers 3 dofs"]:
     return weight.reshape(len(rest), 3, -1)
 
 
+def section_areas(body: LayeredBody) -> Float[np.ndarray, "layers 3"]:
+    """Rotational stiffness of every layer about x, about y and in twist, per modulus [m3]."""
+    area = np.column_stack([body.bending_moment_area[:, ::-1], body.torsion_constant])
+    return area / np.diff(body.station)[:, None]
+
+
+def relative_curvature(body: LayeredBody) -> Float[np.ndarray, " layers"]:
+    """Squared bend of the whole body [rad2] per squared bend of a layer, by the layer's share of the compliance.
+
+    Where a uniform moment bends the body by one radian in all, this times the layer's squared bend is one, whatever
+    its section.
+    """
+    area = section_areas(body)
+    bend = 1.0 / np.sqrt(area[:, 0] * area[:, 1])
+    return (np.sum(bend) / bend) ** 2
+
+
 def sections(
     body: LayeredBody, young_modulus: Scalar, poisson_ratio: Scalar, scale: Float[Array, " layers"]
 ) -> Sections:
-    """Rotational stiffness of the layers of a body.
-
-    The bend of a layer counts by its share of the body's compliance: where a uniform moment bends the body by one
-    radian in all, every layer has the same ``curvature`` times its squared bend, one, whatever its section.
-    """
-    length = np.diff(body.station)
+    """Rotational stiffness of the layers of a body."""
     shear_modulus = young_modulus / (2.0 * (1.0 + poisson_ratio))
     modulus = jnp.stack([jnp.asarray(young_modulus)] * 2 + [jnp.asarray(shear_modulus)])
-    area = np.column_stack([body.bending_moment_area[:, ::-1], body.torsion_constant]) / length[:, None]
-    bend = 1.0 / np.sqrt(area[:, 0] * area[:, 1])
-    return Sections(section_rotations(body), scale[:, None] * area * modulus, (np.sum(bend) / bend) ** 2)
+    stiffness = scale[:, None] * section_areas(body) * modulus
+    return Sections(section_rotations(body), stiffness, relative_curvature(body))
 
 
 def _coupling(law: BendingLaw) -> Float[Array, "3 3"]:

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.fem import BodyEffects, Material
+from rfdropo_bayes.fem import BendingLaw, BodyEffects, Material, Viscoelasticity, Wall
+from rfdropo_bayes.fem.native.effect_rows import COMPILED_EFFECTS
 from rfdropo_bayes.fem.native.layered import NativeLayered
 from rfdropo_bayes.simulators.differences import (
     ACCELERATION,
@@ -29,12 +30,20 @@ from rfdropo_bayes.simulators.trunk import Assembly, Motion
 
 Inputs = tuple[Material, Float[Array, " cable"], Float[Array, "step cable"]]
 
-COMPILED_EFFECTS: frozenset[str] = frozenset()
-"""Effects of the body that the compiled engine knows; with any other, rollouts run on the reference engine."""
+EFFECT_SIZES = BodyEffects(
+    bending=BendingLaw(0.2, 0.2, 0.1, 0.1, 0.1),
+    viscoelasticity=Viscoelasticity(0.3, 0.3),
+    softening_rate=0.01,
+    drag=100.0,
+    wall=Wall(1e3, 0.01, 0.1),
+    cable_compliance=1e-4,
+)
+"""Sizes of effects, whose null values are zero; units as in ``BodyEffects``."""
 
 
 def effects_lacking(effects: BodyEffects) -> tuple[str, ...]:
-    """Names of the effects that are present and that the compiled engine does not know."""
+    """Names of the effects that are present and that the compiled engine does not know: with any of them, rollouts run
+    on the reference engine."""
     given = (name for name, value in effects._asdict().items() if value is not None)
     return tuple(name for name in given if name not in COMPILED_EFFECTS)
 
@@ -48,12 +57,17 @@ def _say_once(lacking: tuple[str, ...]) -> None:
 def input_sizes(inputs: Inputs) -> Inputs:
     """Sizes that perturbations of the inputs are relative to."""
     material, start, displacement = inputs
+    effects = [
+        None if value is None else jax.tree.map(jnp.asarray, size)
+        for value, size in zip(material.effects, EFFECT_SIZES, strict=True)
+    ]
     magnitudes = jax.tree.map(lambda value: jnp.abs(value) + 1e-12, material)._replace(
         poisson_ratio=incompressibility_margin(material.poisson_ratio),
         gravity=jnp.full_like(material.gravity, ACCELERATION),
         point_mass=jnp.full_like(material.point_mass, MASS),
         rayleigh_mass=jnp.abs(material.rayleigh_mass) + MASS_DAMPING,
         rayleigh_stiffness=jnp.abs(material.rayleigh_stiffness) + STIFFNESS_DAMPING,
+        effects=BodyEffects(*effects),
     )
     return magnitudes, jnp.full_like(start, LENGTH), jnp.full_like(displacement, LENGTH)
 

@@ -22,6 +22,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
 from rfdropo_bayes.fem.equilibrium import ITERATIONS
 from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.native.effect_rows import COMPILED_EFFECTS, effect_flags, effect_rows, law_rows
 from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, Storage, compile_rollout, storage
 from rfdropo_bayes.fem.native.section_modes import layered_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
@@ -132,8 +133,6 @@ class NativeLayered:
             "start": _cable_rows(start, cables, "start"),
             "displacement": displacement.reshape(-1, displacement.shape[-2] * cables),
         }
-        if material.effects.present:
-            raise InputError("effects of the body", where="rollout", remedy="use the reference engine")
         batch = self._batch(material, state)
         steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
         settling = 0 if start is None else ITERATIONS
@@ -155,7 +154,11 @@ class NativeLayered:
         """Parameters, initial states and commands in the precision of the kernels."""
         layers = self._tables.stations - 1
         width = {"gravity": (3,), "stiffness_scale": (layers,), "point_mass": (layers + 1,)}
-        given = {name: value for name, value in material._asdict().items() if name != "effects"}
+        given, effects = material._asdict(), material.effects
+        del given["effects"]
+        lacking = [name for name, value in effects._asdict().items() if value is not None]
+        if set(lacking) - COMPILED_EFFECTS:
+            raise InputError(f"unknown to this engine: {', '.join(lacking)}", where="material")
         values = {name: np.asarray(value, dtype=float) for name, value in given.items()}
         sizes = {len(value) for name, value in values.items() if value.ndim > len(width.get(name, ()))}
         sizes |= {len(value) for value in state.values()}
@@ -178,11 +181,13 @@ class NativeLayered:
             "gravity": rows["gravity"],
             "layer_scale": rows["stiffness_scale"],
             "point_mass": rows["point_mass"],
+            "law": law_rows(effects, self.system.body, modulus, shear, rows["stiffness_scale"]),
+            "effects": effect_rows(effects, count, self.time_step),
             **state,
         }
         arrays = {name: np.ascontiguousarray(array, dtype=self.dtype) for name, array in arrays.items()}
         pitches = {f"{name}_pitch": value.shape[1] if len(value) > 1 else 0 for name, value in state.items()}
-        return Batch(**arrays, count=count, **pitches)
+        return Batch(**arrays, present=effect_flags(effects), count=count, **pitches)
 
     def _run(self, batch: Batch, schedule: Schedule, output: Output) -> None:
         """All lane blocks, in this thread or in several."""

@@ -2,80 +2,26 @@
 `section_modes`.
 
 The physics is that of ``fem.dynamics``. A time step and an iteration for static equilibrium differ in a few factors
-only, held in `Factors`. ``tables``, ``samples``, ``factors`` and ``work`` are records of addresses.
+only, held in ``factors``. ``tables``, ``samples``, ``factors`` and ``work`` are records of addresses; see
+`layered_records`.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import numpy as np
-from jaxtyping import Float
-
+from rfdropo_bayes.fem.native.layered_effects import (
+    BENDING,
+    BRANCH,
+    SURROUNDED,
+    add_bending_law,
+    add_branch,
+    add_law_tangent,
+    subtract_law_product,
+    subtract_surroundings_product,
+)
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, inlined, kernel, load, store
 from rfdropo_bayes.fem.native.tension_stiffening import resist_twist
 
 POLAR_ITERATIONS = 6
-
-
-class Samples(NamedTuple):
-    """Rollout parameters of one lane block; the last axis is the lane."""
-
-    moduli: Float[np.ndarray, "3 lanes"]  # lambda, mu, 2 lambda mu / (lambda + 2 mu) [Pa]
-    density: Float[np.ndarray, "1 lanes"]
-    layer_scale: Float[np.ndarray, "layers lanes"]
-    point_mass: Float[np.ndarray, "stations lanes"]
-    stiffness: Float[np.ndarray, "layer_entries lanes"]
-    station_mass: Float[np.ndarray, "station_pairs lanes"]
-    layer_mass: Float[np.ndarray, "layer_coupled lanes"]
-    gravity: Float[np.ndarray, "3 lanes"]
-    damping: Float[np.ndarray, "2 lanes"]  # Rayleigh, of mass and of stiffness
-
-
-class Factors(NamedTuple):
-    """What makes a solve a time step or a static iteration; (1, lanes) each."""
-
-    elasticity: Float[np.ndarray, "1 lanes"]  # of K in the matrix
-    inertia: Float[np.ndarray, "1 lanes"]  # of M in the matrix
-    force: Float[np.ndarray, "1 lanes"]  # of the elastic force and of the weight in the right-hand side
-    strain_rate: Float[np.ndarray, "1 lanes"]  # of -K v there
-    drag: Float[np.ndarray, "1 lanes"]  # of -M v there
-
-
-class Work(NamedTuple):
-    """State and scratch of one lane block; the last axis is the lane."""
-
-    position: Float[np.ndarray, "values lanes"]
-    velocity: Float[np.ndarray, "values lanes"]
-    pivot: Float[np.ndarray, "station_block lanes"]
-    coupling: Float[np.ndarray, "station_block lanes"]
-    border: Float[np.ndarray, "station_frame lanes"]
-    condensed: Float[np.ndarray, "frame2 lanes"]
-    solution: Float[np.ndarray, "values lanes"]
-    field: Float[np.ndarray, "values lanes"]  # right-hand side without cables
-    correction: Float[np.ndarray, "values lanes"]
-    weight: Float[np.ndarray, "rows lanes"]
-    axes: Float[np.ndarray, "layers9 lanes"]  # frame of every layer, row-major
-    dyads: Float[np.ndarray, "54 lanes"]  # products of its columns
-    local: Float[np.ndarray, "layer_values lanes"]
-    reaction: Float[np.ndarray, "layer_values lanes"]
-    pull: Float[np.ndarray, "guides3 lanes"]  # of a cable with unit tension on the body
-    slack: Float[np.ndarray, "cables lanes"]
-    scale: Float[np.ndarray, "cables lanes"]
-    compliance: Float[np.ndarray, "cables2 lanes"]
-    active: Float[np.ndarray, "cables lanes"]
-    tension: Float[np.ndarray, "cables lanes"]
-    pivoting: Float[np.ndarray, "scratch lanes"]
-    commanded: Float[np.ndarray, "cables lanes"]
-    unsolved: Float[np.ndarray, "1 lanes"]  # 1 where the tensions were not found
-    lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken
-    failed: Float[np.ndarray, "1 lanes"]  # 1 once tensions were not found
-    points: Float[np.ndarray, "point_values lanes"]
-    before: Float[np.ndarray, "values lanes"]  # static iteration: the increment before
-    relaxation: Float[np.ndarray, "1 lanes"]
-    beyond: Float[np.ndarray, "layers3 lanes"]  # force of the cables on the stations beyond each layer
-    imbalance: Float[np.ndarray, "1 lanes"]
-    twist: Float[np.ndarray, "layers lanes"]  # of the cables against the twist of each layer, in the matrix
 
 
 @kernel
@@ -145,9 +91,9 @@ def _turned(axes, t, x, y, z, i, token):
 
 @kernel
 def _local_field(rest, modes, layer, factors, work, token):
-    """``local`` = force * (R' x - X) + strain_rate * R' v, relative to the lower section: K does not see the rest."""
+    """``local`` = strain * (R' x - X) + strain_rate * R' v, relative to the lower section: K does not see the rest."""
     axes, frame = work.axes, 9 * layer
-    force, rate = load(factors.force, 0, token), load(factors.strain_rate, 0, token)
+    force, rate = load(factors.strain, 0, token), load(factors.strain_rate, 0, token)
     base = 3 * layer * modes
     for k in range(2 * modes):
         row = base + 3 * k
@@ -314,8 +260,12 @@ def layer_frame(tables, layer, work, token):
 
 @kernel
 def add_layer_force(tables, samples, factors, layer, work, token):
-    """Add the elastic force of a layer to ``field``; leaves in ``reaction`` what it resists in its frame."""
+    """Add the elastic force of a layer to ``field``; leaves in ``reaction`` what its section resists in its frame."""
     _local_field(tables.rest, tables.modes, layer, factors, work, token)
+    if samples.present[BRANCH]:
+        add_branch(tables, factors, layer, work, token)
+    if samples.present[BENDING]:
+        add_bending_law(tables, samples, factors, layer, work, token)
     _subtract_reaction(tables, samples, layer, work, work.field, token)
 
 
@@ -327,7 +277,11 @@ def subtract_tangent_product(tables, samples, factors, change, field, work, toke
         _local_change(change, elasticity, tables.modes, layer, work, token)
         _subtract_reaction(tables, samples, layer, work, field, token)
         resist_twist(tables, layer, change, field, work, token)
+        if samples.present[BENDING]:
+            subtract_law_product(tables, layer, elasticity, change, field, work, token)
     add_momentum(tables, samples, fill(0.0, inertia, token), inertia, change, field, token)
+    if samples.present[SURROUNDED]:
+        subtract_surroundings_product(tables, samples, change, field, work, token)
 
 
 @inlined
@@ -337,6 +291,8 @@ def assemble_layer(tables, samples, factors, layer, work, whole, token):
     add_layer_force(tables, samples, factors, layer, work, token)
     first = layer * tables.entries
     _layer_tangent(tables.parity, tables.modes, samples.stiffness, first, layer, whole, factors, work, token)
+    if samples.present[BENDING]:
+        add_law_tangent(tables, factors, layer, work, whole, token)
 
 
 @kernel

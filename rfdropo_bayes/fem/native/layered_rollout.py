@@ -7,9 +7,11 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
-from rfdropo_bayes.fem.native.layered_assembly import Factors, Samples, Work, clear
+from rfdropo_bayes.fem.native.layered_assembly import clear
+from rfdropo_bayes.fem.native.layered_effects import DECAY, GAIN, GIVE, LAW, SHARE
+from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
 from rfdropo_bayes.fem.native.layered_step import point, refine_increment, solve_increment, take_step
 from rfdropo_bayes.fem.native.section_modes import LayeredTables, border_panels
@@ -26,6 +28,9 @@ class Batch(NamedTuple):
     gravity: Float[np.ndarray, "batch 3"]
     layer_scale: Float[np.ndarray, "batch layers"]
     point_mass: Float[np.ndarray, "batch stations"]
+    law: Float[np.ndarray, "batch layer_rows"]
+    effects: Float[np.ndarray, "batch rows"]
+    present: Int[np.ndarray, " flags"]
     position: Float[np.ndarray, "rows values"]  # initial, in section modes
     tension: Float[np.ndarray, "rows cables"]  # initial
     start: Float[np.ndarray, "rows cables"]  # displacements of the initial equilibrium
@@ -86,6 +91,9 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         layer_mass=rows(tables.layer_mass.size),
         gravity=rows(3),
         damping=rows(2),
+        law=rows(LAW * layers),
+        effects=rows(GIVE + 1),
+        present=np.zeros(3, dtype=np.int64),
     )
     work = Work(
         position=rows(stations * size),
@@ -119,6 +127,10 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         beyond=rows(3 * layers),
         imbalance=rows(1),
         twist=rows(layers),
+        softness=rows(1),
+        branch=rows(layers * 2 * size),
+        slope=rows(6 * layers),
+        around=rows(2 * stations),
     )
     return Storage(samples, Factors(*(rows(1) for _ in Factors._fields)), work)
 
@@ -166,26 +178,40 @@ def _start(tables, batch, samples, work, first, token):
     layers = tables.stations - 1
     _fill_lanes(batch.layer_scale, layers, 0, layers, first, count, samples.layer_scale, token)
     _fill_lanes(batch.point_mass, layers + 1, 0, layers + 1, first, count, samples.point_mass, token)
+    _fill_lanes(batch.law, LAW * layers, 0, LAW * layers, first, count, samples.law, token)
+    _fill_lanes(batch.effects, GIVE + 1, 0, GIVE + 1, first, count, samples.effects, token)
+    for flag in range(3):
+        samples.present[flag] = batch.present[flag]
     _fill_lanes(batch.position, batch.position_pitch, 0, values, first, count, work.position, token)
     _fill_lanes(batch.tension, batch.tension_pitch, 0, tables.cables, first, count, work.tension, token)
     _prepare(tables, samples, token)
     clear(work.velocity, 0, values, token)
+    clear(work.branch, 0, 6 * tables.modes * layers, token)
     clear(work.solution, 0, values, token)
     clear(work.lost, 0, 1, token)
     clear(work.failed, 0, 1, token)
     clear(work.imbalance, 0, 1, token)
+    store(work.softness, 0, fill(1.0, work.softness, token))
 
 
 @inlined
-def _step_factors(samples, factors, length, token):
-    """Factors of an implicit Euler step."""
+def _step_factors(samples, factors, work, length, first, token):
+    """Factors of an implicit Euler step; ``first``: the dashpots of the Prony branches start without tension."""
     time_step, drag = fill(length, samples.damping, token), load(samples.damping, 0, token)
-    lookahead = time_step + load(samples.damping, 1, token)
-    store(factors.elasticity, 0, time_step * lookahead)
-    store(factors.inertia, 0, fma(time_step, drag, fill(1.0, drag, token)))
+    one, gain = fill(1.0, drag, token), load(samples.effects, GAIN, token)
+    softness = load(work.softness, 0, token) * load(samples.effects, DECAY, token)
+    store(work.softness, 0, softness)
+    lookahead = time_step * (one + gain) + load(samples.damping, 1, token)
+    store(factors.elasticity, 0, time_step * lookahead * softness)
+    store(factors.inertia, 0, fma(time_step, drag, one))
     store(factors.force, 0, time_step)
-    store(factors.strain_rate, 0, time_step * lookahead)
+    store(factors.strain, 0, time_step * softness)
+    store(factors.strain_rate, 0, time_step * lookahead * softness)
     store(factors.drag, 0, time_step * drag)
+    store(factors.fluid, 0, time_step)
+    store(factors.branch, 0, time_step * softness * gain)
+    store(factors.share, 0, one if first else load(samples.effects, SHARE, token))
+    store(factors.give, 0, load(samples.effects, GIVE, token) / (time_step * time_step))
 
 
 @kernel
@@ -214,14 +240,6 @@ def _finish(work, output, first, count, token):
         output.residual[first + lane] = work.imbalance[lane]
 
 
-@inlined
-def _start_motion(tables, samples, factors, work, schedule, token):
-    """End of the static iterations, if there were any."""
-    if schedule.static_iterations > 0:
-        finish_settling(tables, samples, factors, work, token)
-    _step_factors(samples, factors, schedule.time_step, token)
-
-
 def compile_rollout(sources: str) -> Callable:
     """The kernel of one lane block; ``sources``, a digest of the kernels' sources, is part of the key it is cached
     under."""
@@ -233,17 +251,18 @@ def compile_rollout(sources: str) -> Callable:
         samples, factors, work = addresses(samples), addresses(factors), addresses(work)
         count, cables, static_iterations = batch.count, tables.cables, schedule.static_iterations
         _start(tables, batch, samples, work, first, token)
-        start_settling(tables, factors, work, token)
+        start_settling(tables, samples, factors, work, token)
         _fill_lanes(batch.start, batch.start_pitch, 0, cables, first, count, work.commanded, token)
         # Static iterations come first. They and the steps share one call, which would else be compiled twice.
         for step in range(-static_iterations, schedule.steps + 1):
-            if step == 0:
-                _start_motion(tables, samples, factors, work, schedule, token)
+            if step == 0 and static_iterations > 0:
+                finish_settling(tables, samples, factors, work, token)
             if step >= 0:
                 if step % schedule.stride == 0:
                     _record(tables, work, output, step // schedule.stride, first, count, token)
                 if step == schedule.steps:
                     break
+                _step_factors(samples, factors, work, schedule.time_step, step == 0, token)
                 pitch, offset = batch.displacement_pitch, step * cables
                 _fill_lanes(batch.displacement, pitch, offset, cables, first, count, work.commanded, token)
             rate = 1.0 / schedule.time_step if step >= 0 else 1.0

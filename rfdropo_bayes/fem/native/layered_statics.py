@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rfdropo_bayes.fem.equilibrium import LONGEST_STEP, SMALLEST_RELAXATION
 from rfdropo_bayes.fem.native.layered_assembly import add_layer_force, clear, layer_frame, start_loads
+from rfdropo_bayes.fem.native.layered_effects import GIVE, SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.layered_step import gather_cables, near
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, inlined, kernel, load, square_root, store, where_greater
 
@@ -96,6 +97,9 @@ def _imbalance(tables, samples, factors, work, token):
                 loads = loads + _size(_node_force(tables, work.field, station, node, i, token), zero)
     for c in range(tables.cables):
         loads = loads + load(work.tension, c, token)
+    if samples.present[SURROUNDED]:
+        for station in range(tables.stations):
+            add_surroundings(tables, samples, factors, station, work, token)
     for layer in range(tables.stations - 1):
         layer_frame(tables, layer, work, token)
         add_layer_force(tables, samples, factors, layer, work, token)
@@ -110,14 +114,19 @@ def _imbalance(tables, samples, factors, work, token):
 
 
 @inlined
-def start_settling(tables, factors, work, token):
+def start_settling(tables, samples, factors, work, token):
     """Make the solves those of a static iteration."""
     one, zero = fill(1.0, factors.force, token), fill(0.0, factors.force, token)
     store(factors.elasticity, 0, one)
     store(factors.inertia, 0, zero)
     store(factors.force, 0, one)
+    store(factors.strain, 0, one)
     store(factors.strain_rate, 0, zero)
     store(factors.drag, 0, zero)
+    store(factors.fluid, 0, zero)
+    store(factors.branch, 0, zero)
+    store(factors.share, 0, zero)
+    store(factors.give, 0, load(samples.effects, GIVE, token))
     clear(work.before, 0, 3 * tables.modes * tables.stations, token)
     store(work.relaxation, 0, one)
 

@@ -12,6 +12,7 @@ from rfdropo_bayes.fem.native.layered_assembly import (
     start_loads,
     subtract_tangent_product,
 )
+from rfdropo_bayes.fem.native.layered_effects import SURROUNDED, add_surroundings, stretch_cables
 from rfdropo_bayes.fem.native.simd import fill, fma, inlined, kernel, load, square_root, store, where_greater
 from rfdropo_bayes.fem.native.tension_stiffening import resist_twist, stiffen, stiffen_twist, sum_cable_forces
 
@@ -164,10 +165,13 @@ def solve_increment(tables, samples, factors, work, rate, schedule, static, toke
         if not last:
             entry = (station - 1) * tables.coupled
             add_layer_mass(tables.parity, tiles, work.coupling, t, samples.layer_mass, entry, inertia, token)
+        if samples.present[SURROUNDED]:
+            add_surroundings(tables, samples, factors, station, work, token)
         for k in range(size):
             t = station * frame + 3 * k
             store(work.border, t, load(work.border, t, token) + load(work.field, station * size + k, token))
         eliminate(work.pivot, work.coupling, work.border, work.condensed, station, last, tiles, panels, token)
+    stretch_cables(cables, panels, factors, work, token)
     _tensions(cables, panels, work, rate, schedule.tolerance, schedule.regularisation, token)
     combine_border(work.border, work.weight, work.solution, held, stations, size, panels, token)
     substitute_back(work.pivot, work.coupling, work.solution, held, stations, tiles, token)

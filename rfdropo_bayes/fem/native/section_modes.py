@@ -18,6 +18,7 @@ from rfdropo_bayes.fem.cables import CableLayout
 from rfdropo_bayes.fem.dynamics import LOST, System
 from rfdropo_bayes.fem.layered import PointMap, centre_gradient, rest_positions
 from rfdropo_bayes.fem.native.layer_moduli import layer_moduli, layer_volume
+from rfdropo_bayes.fem.surroundings import drag_areas, tributary_lengths
 
 # Entries (row, column) of a block of two modes, by the parity (bit 0: odd in x, bit 1: odd in y) in which the modes
 # differ.
@@ -53,6 +54,8 @@ class LayeredTables(NamedTuple):
     anchor: Float[np.ndarray, "cables 3"]
     rest_length: Float[np.ndarray, " cables"]
     twist_arm: Float[np.ndarray, "layers cables"]  # r^2 / L [m]
+    section_length: Float[np.ndarray, " stations"]  # of the body that a station stands for [m]
+    section_area: Float[np.ndarray, " stations"]  # that times the body's width [m2]
     point_first: Int[np.ndarray, " points_1"]
     point_place: Int[np.ndarray, " entries"]
     point_weight: Float[np.ndarray, " entries"]
@@ -170,6 +173,8 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
         **_guides(system.cables, shape),
         rest_length=_rest_lengths(system.cables, rest),
         twist_arm=twist_arms(body, system.cables),
+        section_length=tributary_lengths(body),
+        section_area=drag_areas(body),
         point_first=point_first,
         point_place=point_place,
         point_weight=point_weight,

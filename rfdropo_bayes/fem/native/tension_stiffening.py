@@ -50,7 +50,7 @@ def stiffen(tables, layer, work, whole, token):
 
 
 @kernel
-def _add_dyad(matrix, t, scale, axes, a, i, b, j, token):
+def add_dyad(matrix, t, scale, axes, a, i, b, j, token):
     """Add the dyad of two columns of a layer's axes to the tile at ``t``."""
     for c in range(3):
         right = scale * load(axes, b + 3 * c + j, token)
@@ -80,18 +80,18 @@ def stiffen_twist(tables, layer, rate, work, whole, token):
     upper = (layer + 1) * block
     xx, xy = 3 * (size + 3), 3 * (size + 3 * across)
     yx, yy = 3 * (across * size + 3), 3 * (across * size + 3 * across)
-    _add_dyad(work.pivot, upper + xx, stiffness * x1 * x1, axes, a, 1, a, 1, token)
-    _add_dyad(work.pivot, upper + yx, -(stiffness * y1 * x1), axes, a, 0, a, 1, token)
-    _add_dyad(work.pivot, upper + yy, stiffness * y1 * y1, axes, a, 0, a, 0, token)
+    add_dyad(work.pivot, upper + xx, stiffness * x1 * x1, axes, a, 1, a, 1, token)
+    add_dyad(work.pivot, upper + yx, -(stiffness * y1 * x1), axes, a, 0, a, 1, token)
+    add_dyad(work.pivot, upper + yy, stiffness * y1 * y1, axes, a, 0, a, 0, token)
     if whole:
         lower = upper - block
-        _add_dyad(work.pivot, lower + xx, stiffness * x0 * x0, axes, a, 1, a, 1, token)
-        _add_dyad(work.pivot, lower + yx, -(stiffness * y0 * x0), axes, a, 0, a, 1, token)
-        _add_dyad(work.pivot, lower + yy, stiffness * y0 * y0, axes, a, 0, a, 0, token)
-        _add_dyad(work.coupling, upper + xx, -(stiffness * x0 * x1), axes, a, 1, a, 1, token)
-        _add_dyad(work.coupling, upper + xy, stiffness * x0 * y1, axes, a, 1, a, 0, token)
-        _add_dyad(work.coupling, upper + yx, stiffness * y0 * x1, axes, a, 0, a, 1, token)
-        _add_dyad(work.coupling, upper + yy, -(stiffness * y0 * y1), axes, a, 0, a, 0, token)
+        add_dyad(work.pivot, lower + xx, stiffness * x0 * x0, axes, a, 1, a, 1, token)
+        add_dyad(work.pivot, lower + yx, -(stiffness * y0 * x0), axes, a, 0, a, 1, token)
+        add_dyad(work.pivot, lower + yy, stiffness * y0 * y0, axes, a, 0, a, 0, token)
+        add_dyad(work.coupling, upper + xx, -(stiffness * x0 * x1), axes, a, 1, a, 1, token)
+        add_dyad(work.coupling, upper + xy, stiffness * x0 * y1, axes, a, 1, a, 0, token)
+        add_dyad(work.coupling, upper + yx, stiffness * y0 * x1, axes, a, 0, a, 1, token)
+        add_dyad(work.coupling, upper + yy, -(stiffness * y0 * y1), axes, a, 0, a, 0, token)
 
 
 @kernel

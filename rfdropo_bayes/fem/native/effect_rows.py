@@ -1,0 +1,91 @@
+"""Effects of the body as the rows of numbers that the kernels of ``layered_effects`` read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import ArrayLike, Float, Int
+
+from rfdropo_bayes.fem.bending_law import relative_curvature, section_areas
+from rfdropo_bayes.fem.effects import BodyEffects
+from rfdropo_bayes.fem.layered import LayeredBody
+from rfdropo_bayes.fem.native.layered_effects import (
+    BENDING,
+    BRANCH,
+    DECAY,
+    DISTANCE,
+    DRAG,
+    GAIN,
+    GIVE,
+    LAW,
+    NORMAL_X,
+    NORMAL_Y,
+    SHARE,
+    SURROUNDED,
+    WALL,
+)
+
+COMPILED_EFFECTS = frozenset({"bending", "viscoelasticity", "softening_rate", "drag", "wall", "cable_compliance"})
+"""Names of the effects that the kernels know."""
+
+
+def _each(function: Callable[[float], float], values: ArrayLike, count: int) -> Float[np.ndarray, " batch"]:
+    """A function of each number on its own: NumPy's own depend in the last bit on where in an array a number stands."""
+    return np.array([function(float(value)) for value in np.broadcast_to(values, count)])
+
+
+def effect_rows(effects: BodyEffects, count: int, time_step: float) -> Float[np.ndarray, "batch rows"]:
+    """Numbers of the effects beside the bending law, null where there are none."""
+    rows = np.zeros((count, GIVE + 1))
+    rows[:, DECAY] = 1.0
+    if effects.viscoelasticity is not None:
+        fraction, time = (np.asarray(value, float) for value in effects.viscoelasticity)
+        rows[:, SHARE] = time_step / (time + time_step)
+        rows[:, GAIN] = fraction * (1.0 - rows[:, SHARE])
+    if effects.softening_rate is not None:
+        rows[:, DECAY] = _each(lambda rate: math.exp(-rate * time_step), effects.softening_rate, count)
+    if effects.drag is not None:
+        rows[:, DRAG] = effects.drag
+    if effects.wall is not None:
+        rows[:, WALL], rows[:, DISTANCE] = effects.wall.stiffness, effects.wall.distance
+        rows[:, NORMAL_X] = _each(math.cos, effects.wall.azimuth, count)
+        rows[:, NORMAL_Y] = _each(math.sin, effects.wall.azimuth, count)
+    if effects.cable_compliance is not None:
+        rows[:, GIVE] = effects.cable_compliance
+    return rows
+
+
+def law_rows(
+    effects: BodyEffects,
+    body: LayeredBody,
+    young_modulus: Float[np.ndarray, " batch"],
+    shear_modulus: Float[np.ndarray, " batch"],
+    layer_scale: Float[np.ndarray, "batch layers"],
+) -> Float[np.ndarray, "batch layer_rows"]:
+    """The bending law of every layer; see ``fem.bending_law.moments``."""
+    law = effects.bending
+    rows = np.zeros((*layer_scale.shape, LAW))
+    if law is None:
+        return rows.reshape(len(rows), -1)
+    modulus = np.stack([young_modulus, young_modulus, shear_modulus], axis=1)
+    stiffness = layer_scale[:, :, None] * section_areas(body) * modulus[:, None, :]
+    root = np.sqrt(stiffness)
+    stiffening, anisotropy, cross, twist_x, twist_y = (np.broadcast_to(value, len(rows))[:, None] for value in law)
+    about_x, about_y = (_each(math.expm1, sign * anisotropy[:, 0], len(rows))[:, None] for sign in (-0.5, 0.5))
+    entries = ((0, 0, about_x), (0, 1, cross), (0, 2, twist_x), (1, 1, about_y), (1, 2, twist_y))
+    for k, (i, j, value) in enumerate(entries):
+        rows[:, :, k] = value * root[:, :, i] * root[:, :, j]
+    rows[:, :, 6:8] = stiffness[:, :, :2]
+    rows[:, :, 8] = stiffening * relative_curvature(body) / (root[:, :, 0] * root[:, :, 1])
+    return rows.reshape(len(rows), -1)
+
+
+def effect_flags(effects: BodyEffects) -> Int[np.ndarray, " flags"]:
+    """Which effects a batch has, as far as they are skipped where it has not."""
+    flags = np.zeros(3, dtype=np.int64)
+    flags[BENDING] = effects.bending is not None
+    flags[BRANCH] = effects.viscoelasticity is not None
+    flags[SURROUNDED] = effects.drag is not None or effects.wall is not None
+    return flags

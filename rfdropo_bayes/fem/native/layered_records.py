@@ -1,0 +1,80 @@
+"""What one lane block of layered bodies works on: its parameters, the factors of a solve, its state and scratch."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+class Samples(NamedTuple):
+    """Rollout parameters of one lane block; the last axis is the lane."""
+
+    moduli: Float[np.ndarray, "3 lanes"]  # lambda, mu, 2 lambda mu / (lambda + 2 mu) [Pa]
+    density: Float[np.ndarray, "1 lanes"]
+    layer_scale: Float[np.ndarray, "layers lanes"]
+    point_mass: Float[np.ndarray, "stations lanes"]
+    stiffness: Float[np.ndarray, "layer_entries lanes"]
+    station_mass: Float[np.ndarray, "station_pairs lanes"]
+    layer_mass: Float[np.ndarray, "layer_coupled lanes"]
+    gravity: Float[np.ndarray, "3 lanes"]
+    damping: Float[np.ndarray, "2 lanes"]  # Rayleigh, of mass and of stiffness
+    law: Float[np.ndarray, "layer_rows lanes"]
+    effects: Float[np.ndarray, "rows lanes"]
+    present: Int[np.ndarray, " flags"]  # which effects the batch has; the same for all lanes
+
+
+class Factors(NamedTuple):
+    """What makes a solve a time step or a static iteration; (1, lanes) each."""
+
+    elasticity: Float[np.ndarray, "1 lanes"]  # of K in the matrix
+    inertia: Float[np.ndarray, "1 lanes"]  # of M in the matrix
+    force: Float[np.ndarray, "1 lanes"]  # of the weight and of the surroundings in the right-hand side
+    strain: Float[np.ndarray, "1 lanes"]  # of the elastic force there
+    strain_rate: Float[np.ndarray, "1 lanes"]  # of -K v there
+    drag: Float[np.ndarray, "1 lanes"]  # of -M v there
+    fluid: Float[np.ndarray, "1 lanes"]  # of the fluid's drag, there and in the matrix
+    branch: Float[np.ndarray, "1 lanes"]  # of the elastic force of the Prony branch
+    share: Float[np.ndarray, "1 lanes"]  # of its strain that its dashpot follows
+    give: Float[np.ndarray, "1 lanes"]  # of the cables, as the tension problem counts it
+
+
+class Work(NamedTuple):
+    """State and scratch of one lane block; the last axis is the lane."""
+
+    position: Float[np.ndarray, "values lanes"]
+    velocity: Float[np.ndarray, "values lanes"]
+    pivot: Float[np.ndarray, "station_block lanes"]
+    coupling: Float[np.ndarray, "station_block lanes"]
+    border: Float[np.ndarray, "station_frame lanes"]
+    condensed: Float[np.ndarray, "frame2 lanes"]
+    solution: Float[np.ndarray, "values lanes"]
+    field: Float[np.ndarray, "values lanes"]  # right-hand side without cables
+    correction: Float[np.ndarray, "values lanes"]
+    weight: Float[np.ndarray, "rows lanes"]
+    axes: Float[np.ndarray, "layers9 lanes"]  # frame of every layer, row-major
+    dyads: Float[np.ndarray, "54 lanes"]  # products of its columns
+    local: Float[np.ndarray, "layer_values lanes"]
+    reaction: Float[np.ndarray, "layer_values lanes"]
+    pull: Float[np.ndarray, "guides3 lanes"]  # of a cable with unit tension on the body
+    slack: Float[np.ndarray, "cables lanes"]
+    scale: Float[np.ndarray, "cables lanes"]
+    compliance: Float[np.ndarray, "cables2 lanes"]
+    active: Float[np.ndarray, "cables lanes"]
+    tension: Float[np.ndarray, "cables lanes"]
+    pivoting: Float[np.ndarray, "scratch lanes"]
+    commanded: Float[np.ndarray, "cables lanes"]
+    unsolved: Float[np.ndarray, "1 lanes"]  # 1 where the tensions were not found
+    lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken
+    failed: Float[np.ndarray, "1 lanes"]  # 1 once tensions were not found
+    points: Float[np.ndarray, "point_values lanes"]
+    before: Float[np.ndarray, "values lanes"]  # static iteration: the increment before
+    relaxation: Float[np.ndarray, "1 lanes"]
+    beyond: Float[np.ndarray, "layers3 lanes"]  # force of the cables on the stations beyond each layer
+    imbalance: Float[np.ndarray, "1 lanes"]
+    twist: Float[np.ndarray, "layers lanes"]  # of the cables against the twist of each layer, in the matrix
+    softness: Float[np.ndarray, "1 lanes"]  # what time has left of the moduli
+    branch: Float[np.ndarray, "layer_values lanes"]  # strain of the dashpots, as displacements
+    slope: Float[np.ndarray, "layers6 lanes"]  # derivatives of the bending law's moments
+    around: Float[np.ndarray, "stations2 lanes"]  # wall and fluid in the matrix
