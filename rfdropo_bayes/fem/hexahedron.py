@@ -56,6 +56,19 @@ def elasticity(young_modulus: Float[Array, ""], poisson_ratio: Float[Array, ""])
     return lame * volumetric + shear * np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 
 
+def sectional_elasticity(young_modulus: Float[Array, ""], poisson_ratio: Float[Array, ""]) -> Float[Array, "6 6"]:
+    """Stiffness [Pa] of sections in plane stress that neither resist nor follow stretch along z; order as above.
+
+    E along z, E / (1 - nu^2) with nu times that across in the plane of the section, and the shear modulus.
+    """
+    shear = young_modulus / (2.0 * (1.0 + poisson_ratio))
+    plane = young_modulus / (1.0 - poisson_ratio**2)
+    diagonal = jnp.stack([plane, plane, jnp.asarray(young_modulus), shear, shear, shear])
+    coupling = np.zeros((6, 6))
+    coupling[0, 1] = coupling[1, 0] = 1.0
+    return jnp.diag(diagonal) + poisson_ratio * plane * coupling
+
+
 def _strain_operator(gradient: Float[Array, "point function 3"]) -> Float[Array, "point 6 functions3"]:
     """Engineering strain of displacement functions from their gradients."""
     points, functions, _ = gradient.shape
@@ -68,6 +81,11 @@ def _strain_operator(gradient: Float[Array, "point function 3"]) -> Float[Array,
 def stiffness(
     coordinates: Float[Array, "8 3"], young_modulus: Float[Array, ""], poisson_ratio: Float[Array, ""]
 ) -> Float[Array, "24 24"]:
+    """Stiffness [N/m] of one isotropic element; see `elastic_stiffness`."""
+    return elastic_stiffness(coordinates, elasticity(young_modulus, poisson_ratio))
+
+
+def elastic_stiffness(coordinates: Float[Array, "8 3"], moduli: Float[Array, "6 6"]) -> Float[Array, "24 24"]:
     """Stiffness [N/m] of one element, its nine incompatible modes condensed; any non-degenerate coordinates [m]."""
     local = shape_gradients(GAUSS_POINTS)
     jacobian = jnp.einsum("gna,nb->gab", local, coordinates)
@@ -81,7 +99,7 @@ def stiffness(
     modes = -2.0 * GAUSS_POINTS[:, :, None] * np.eye(3)
     scaled = jnp.einsum("ab,gnb->gna", centre_inverse, modes) * (centre_volume / volume)[:, None, None]
     incompatible = _strain_operator(scaled)
-    stress = elasticity(young_modulus, poisson_ratio) * volume[:, None, None]
+    stress = moduli * volume[:, None, None]
     regular = jnp.einsum("gik,gij,gjl->kl", compatible, stress, compatible)
     coupling = jnp.einsum("gik,gij,gjl->kl", incompatible, stress, compatible)
     internal = jnp.einsum("gik,gij,gjl->kl", incompatible, stress, incompatible)

@@ -5,6 +5,10 @@ the section's ratio of bending to axial stiffness, a = sqrt(3 I / A), and modulu
 actual nodes through the bilinear interpolation that evaluates their field at the corners of the box. Linear fields pass
 through that map unchanged, so rigid motions stay free of strain. A rank-one term on the twist then sets the torsional
 stiffness.
+
+A solid bar contracts sideways as it stretches. Where the section jumps from layer to layer, as at the notches of a
+trunk, each layer's own contraction would pull its neighbours' nodes about and stiffen the body, which the profile's
+true section does not. ``sectional`` bodies leave that coupling out.
 """
 
 from __future__ import annotations
@@ -34,6 +38,7 @@ class LayeredBody(NamedTuple):
     torsion_constant: Float[np.ndarray, " layers"]  # GJ / G [m4]
     mass_area: Float[np.ndarray, " layers"]  # volume per length [m2]
     mass_moment_area: Float[np.ndarray, "layers 2"]  # rotary inertia per density and length [m4]
+    sectional: bool = False  # elasticity of sections that do not contract as they stretch, see `sectional_elasticity`
 
     @property
     def section_nodes(self) -> int:
@@ -89,6 +94,7 @@ def profile_body(
     mass_area: np.ndarray,
     mass_moment_area: np.ndarray,
     nodes_across: int = 2,
+    sectional: bool = False,
 ) -> LayeredBody:
     """Body with the given effective section in every layer; fields and units as in ``LayeredBody``.
 
@@ -119,6 +125,7 @@ def profile_body(
         torsion_constant=checked("torsion_constant", torsion_constant, layers),
         mass_area=checked("mass_area", mass_area, layers),
         mass_moment_area=checked("mass_moment_area", mass_moment_area, layers, 2),
+        sectional=bool(sectional),
     )
 
 
@@ -225,7 +232,9 @@ def layer_stiffness(
     """
     box, factor = virtual_box(body.axial_area, body.bending_moment_area)
     corners = _box_corners(body, box)
-    hexahedra = jax.vmap(hexahedron.stiffness, (0, None, None))(jnp.asarray(corners), young_modulus, poisson_ratio)
+    elastic = hexahedron.sectional_elasticity if body.sectional else hexahedron.elasticity
+    moduli = elastic(young_modulus, poisson_ratio)
+    hexahedra = jax.vmap(hexahedron.elastic_stiffness, (0, None))(jnp.asarray(corners), moduli)
     hexahedra = (hexahedra * factor[:, None, None]).reshape(len(corners), 8, 3, 8, 3)
     maps = box_maps(body, box)
     stiffness = jnp.einsum("lcan,laibj,lcbm->lnimj", maps, hexahedra, maps)

@@ -45,8 +45,8 @@ class Body(Table):
         mass_moment_area_m4: rotary inertia per density and length, ordered like ``bending_moment_area_m4``.
         reference_poisson_ratio: Poisson ratio that the profile holds for.
         poisson_stiffening: how the stiffness of each layer depends on Poisson's ratio: three coefficients per layer,
-            of `poisson_terms`. Wide vertebrae keep a neck from contracting, and linear tetrahedra lock. Empty: it does
-            not.
+            of `poisson_terms`. Wide vertebrae keep a neck from contracting, and linear tetrahedra lock. With these, the
+            layers themselves do not contract as they stretch. Empty: a solid of the profile's sections.
         volume_m3: volume of the whole body, clamped part included: what the trunk mass is divided by.
         point_masses: rigid parts on top of the body's own mass.
     """
@@ -96,7 +96,7 @@ class Body(Table):
         """Volume of all layers [m3]; the rest of ``volume_m3`` is held by the clamp."""
         return float(np.sum(np.diff(self.station_m) * np.array(self.mass_area_m2)))
 
-    def arrays(self) -> dict[str, np.ndarray | int]:
+    def arrays(self) -> dict[str, np.ndarray | int | bool]:
         """The fields of a layered body for the finite-element engine, in SI units."""
         return {
             "station": np.array(self.station_m),
@@ -107,6 +107,7 @@ class Body(Table):
             "torsion_constant": np.array(self.torsion_constant_m4),
             "mass_area": np.array(self.mass_area_m2),
             "mass_moment_area": np.array(self.mass_moment_area_m4),
+            "sectional": bool(self.poisson_stiffening),
         }
 
     def stiffness_scale(self, poisson_ratio: Any) -> Any:

@@ -165,7 +165,7 @@ class Robot(Table):
         """Names of the markers."""
         return tuple(marker.name for marker in self.markers)
 
-    def layered_arrays(self) -> dict[str, np.ndarray | int]:
+    def layered_arrays(self) -> dict[str, np.ndarray | int | bool]:
         """The fields of the finite-element engine's layered body: ``LayeredBody(**robot.layered_arrays())``."""
         return self.body.arrays()
 

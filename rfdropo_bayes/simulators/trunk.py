@@ -78,7 +78,7 @@ def assemble(robot: Robot, discretisation: Discretisation) -> Assembly:
     return Assembly(system, attach(body, robot.marker_points()), station_of)
 
 
-def refined_body(arrays: Mapping[str, np.ndarray | int], refine: int, nodes_across: int) -> LayeredBody:
+def refined_body(arrays: Mapping[str, np.ndarray | int | bool], refine: int, nodes_across: int) -> LayeredBody:
     """The body with every layer cut into ``refine`` equal layers of the same section."""
     station, half_width = np.asarray(arrays["station"]), np.asarray(arrays["half_width"])
     at = np.arange((len(station) - 1) * refine + 1) / refine
@@ -86,12 +86,13 @@ def refined_body(arrays: Mapping[str, np.ndarray | int], refine: int, nodes_acro
     sections = {
         name: np.repeat(np.asarray(value), refine, axis=0)
         for name, value in arrays.items()
-        if name not in ("station", "half_width", "nodes_across")
+        if name not in ("station", "half_width", "nodes_across", "sectional")
     }
     return profile_body(
         station=np.interp(at, rows, station),
         half_width=np.stack([np.interp(at, rows, half_width[:, i]) for i in range(2)], axis=1),
         nodes_across=nodes_across,
+        sectional=bool(arrays["sectional"]),
         **sections,
     )
 
@@ -184,6 +185,7 @@ class TrunkSimulator(RobotSimulator):
         body = self.assembly.system.body
         stations = len(body.station)
         masses = jnp.asarray(self.robot.point_masses(values))
+        scale = self.robot.stiffness_scale(values["poisson_ratio"])
         material = Material(
             young_modulus=values["young_modulus"],
             poisson_ratio=values["poisson_ratio"],
@@ -191,7 +193,7 @@ class TrunkSimulator(RobotSimulator):
             rayleigh_mass=values["rayleigh_mass"],
             rayleigh_stiffness=values["rayleigh_stiffness"],
             gravity=jnp.asarray(self.robot.gravity),
-            stiffness_scale=jnp.ones(stations - 1),
+            stiffness_scale=jnp.repeat(jnp.asarray(scale), self.discretisation.refine),
             point_mass=jnp.zeros(stations).at[self.assembly.station_of].set(masses),
         )
         for mechanism in self.mechanisms:

@@ -14,7 +14,7 @@ from rfdropo_bayes.fem.native.section_modes import BLOCK_ENTRIES, block_pairs, s
 RATIOS = (-0.3, 0.0, 0.3, 0.499)
 
 
-def tapered_body(nodes_across: int) -> layered.LayeredBody:
+def tapered_body(nodes_across: int, sectional: bool = False) -> layered.LayeredBody:
     """Three layers with nothing in common."""
     return layered.profile_body(
         station=np.array([0.0, 0.01, 0.024, 0.031]),
@@ -25,14 +25,15 @@ def tapered_body(nodes_across: int) -> layered.LayeredBody:
         mass_area=np.array([5e-4, 3e-4, 2e-4]),
         mass_moment_area=np.array([[2e-8, 3e-8], [1e-8, 2e-8], [3e-9, 8e-9]]),
         nodes_across=nodes_across,
+        sectional=sectional,
     )
 
 
-def moduli(poisson_ratio: float) -> np.ndarray:
-    """lambda, mu and 2 lambda mu / (lambda + 2 mu) for a unit Young modulus."""
+def moduli(poisson_ratio: float, sectional: bool = False) -> np.ndarray:
+    """lambda, or that of Young in a sectional body, mu and 2 lambda mu / (lambda + 2 mu) for a unit Young modulus."""
     shear = 0.5 / (1.0 + poisson_ratio)
     lame = 2.0 * shear * poisson_ratio / (1.0 - 2.0 * poisson_ratio)
-    return np.array([lame, shear, 2.0 * lame * shear / (lame + 2.0 * shear)])
+    return np.array([1.0 if sectional else lame, shear, 2.0 * lame * shear / (lame + 2.0 * shear)])
 
 
 @pytest.mark.parametrize("poisson_ratio", RATIOS)
@@ -47,14 +48,15 @@ def test_box_stiffness_is_that_of_the_integrated_element(poisson_ratio):
         np.testing.assert_allclose(mass, np.asarray(hexahedron.mass(corners)), rtol=1e-13)
 
 
+@pytest.mark.parametrize("sectional", [False, True])
 @pytest.mark.parametrize("nodes_across", [2, 3])
-def test_layers_are_linear_in_three_moduli(nodes_across):
+def test_layers_are_linear_in_three_moduli(nodes_across, sectional):
     """Stiffness and mass of layers against the reference, torsion constant included."""
-    body = tapered_body(nodes_across)
+    body = tapered_body(nodes_across, sectional)
     dofs = 6 * nodes_across**2
     integrate = jax.jit(lambda ratio: layered.layer_stiffness(body, jnp.asarray(1.0), ratio))
     for poisson_ratio in RATIOS:
-        found = np.einsum("p,p...->...", moduli(poisson_ratio), layer_moduli(body)).reshape(3, dofs, dofs)
+        found = np.einsum("p,p...->...", moduli(poisson_ratio, sectional), layer_moduli(body)).reshape(3, dofs, dofs)
         expected = np.asarray(integrate(poisson_ratio))
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=2e-13 * np.abs(expected).max())
     np.testing.assert_allclose(layer_volume(body), layered.layer_mass(body), rtol=0.0, atol=1e-20)

@@ -174,8 +174,9 @@ class NativeLayered:
         modulus, ratio = rows["young_modulus"], np.minimum(rows["poisson_ratio"], POISSON_LIMIT)
         shear = modulus / (2.0 * (1.0 + ratio))
         lame = 2.0 * shear * ratio / (1.0 - 2.0 * ratio)
+        first = modulus if self.system.body.sectional else lame
         arrays = {
-            "moduli": np.stack([lame, shear, 2.0 * lame * shear / (lame + 2.0 * shear)], axis=1),
+            "moduli": np.stack([first, shear, 2.0 * lame * shear / (lame + 2.0 * shear)], axis=1),
             "density": rows["density"][:, None],
             "damping": np.stack([rows["rayleigh_mass"], rows["rayleigh_stiffness"]], axis=1),
             "gravity": rows["gravity"],

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 class Samples(NamedTuple):
     """Rollout parameters of one lane block; the last axis is the lane."""
 
-    moduli: Float[np.ndarray, "3 lanes"]  # lambda, mu, 2 lambda mu / (lambda + 2 mu) [Pa]
+    moduli: Float[np.ndarray, "3 lanes"]  # [Pa], see ``layer_moduli``
     density: Float[np.ndarray, "1 lanes"]
     layer_scale: Float[np.ndarray, "layers lanes"]
     point_mass: Float[np.ndarray, "stations lanes"]

@@ -38,7 +38,7 @@ class LayeredTables(NamedTuple):
     shape: Float[np.ndarray, "nodes modes"]  # value of every mode at the nodes of a section
     inverse: Float[np.ndarray, "modes nodes"]
     square: Float[np.ndarray, " modes"]  # sum over the nodes
-    stiffness: Float[np.ndarray, "layers entries 3"]  # per lambda, mu and 2 lambda mu / (lambda + 2 mu) [m]
+    stiffness: Float[np.ndarray, "layers entries 3"]  # per modulus of ``layer_moduli`` [m]
     entry_row: Int[np.ndarray, " entries"]  # of a layer's 6 modes values, in the order of ``stiffness``
     entry_column: Int[np.ndarray, " entries"]
     station_mass: Float[np.ndarray, "stations pairs"]  # per density, of the pairs of equal parity [m3]
