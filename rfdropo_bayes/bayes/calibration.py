@@ -81,6 +81,15 @@ class CalibrationProblem:
         """Log prior density in the unconstrained space."""
         return self.model.space.log_prior_unconstrained(u)
 
+    @cached_property
+    def prior_derivatives(self) -> tuple[Callable, Callable]:
+        """Gradient and Hessian of the log prior at one unconstrained point."""
+
+        def single(u: Array) -> Array:
+            return self.log_prior(u[None])[0]
+
+        return jax.jit(jax.grad(single)), jax.jit(jax.hessian(single))
+
     def steps_for(self, horizon: int) -> int:
         """Time steps to simulate so that the first ``horizon`` rows of every recording are there."""
         commands = self.model.recordings.commands
@@ -111,6 +120,23 @@ class CalibrationProblem:
         position = np.moveaxis(position, 1, 2)[:, :horizon]
         return position.reshape(len(position), horizon, -1), status
 
+    def noisy_rollouts(
+        self, key: PRNGKeyArray, values: Batch
+    ) -> tuple[Float[np.ndarray, "n n_rows feature"], Int[np.ndarray, " n"]]:
+        """`rollouts` of all rows with a realisation of the observation noise [m]."""
+        clean, status = self.rollouts(values, self.n_rows)
+        noise = np.moveaxis(self.draw_noise(key, values), 1, 2)
+        return clean + noise.reshape(clean.shape), status
+
+    @cached_property
+    def actions(self) -> Float[np.ndarray, "n_rows channel"]:
+        """Commands in force at each row, of all recordings side by side."""
+        commands = self.model.recordings.commands
+        initial = np.asarray(commands.initial)[:, None]
+        level = np.concatenate([initial, np.asarray(commands.step)], axis=1)
+        index = np.minimum(np.asarray(commands.sample_step), level.shape[1] - 1)
+        return np.concatenate([steps[rows] for steps, rows in zip(level, index, strict=True)], axis=1)
+
     @cached_property
     def observed(self) -> Float[np.ndarray, "n_rows feature"]:
         """Measured marker coordinates [m], laid out like `rollouts`."""
@@ -139,6 +165,8 @@ class CalibrationProblem:
 
         Its Jacobians are taken by differences of compiled rollouts: a derivative of its own would be compiled for it.
         """
+        for shared in ("_rows", "_white", "_positions", "_observations", "prior_derivatives", "actions"):
+            getattr(self, shared)  # made before the copy, so that all copies have the same compiled functions
         other = copy.copy(self)
         for derived in ("fingerprint", "observed"):
             other.__dict__.pop(derived, None)

@@ -65,8 +65,9 @@ class Problem(Protocol):
 class ResidualProblem(Problem, Protocol):
     """A problem whose log likelihood is a sum of squares, as Gauss-Newton wants it.
 
-    It may also have ``residual_batch(values, horizon)``, the residuals of many sets of values, and ``jacobian``, the
-    way its Jacobians are to be taken ("auto", "forward" or "central").
+    It may also have ``prior_derivatives``, compiled gradient and Hessian of the log prior; ``residual_batch(values,
+    horizon)``, the residuals of many sets of values; and ``jacobian``, the way its Jacobians are to be taken ("auto",
+    "forward" or "central").
     """
 
     def residuals(self, values: Mapping[str, Float[Any, ""]], horizon: int) -> Float[Any, " m"]:
@@ -87,7 +88,9 @@ class RolloutProblem(Problem, Protocol):
         observed_mask: True where ``observed`` may be used.
 
     It may also have ``physical_names: tuple[str, ...]``, the parameters that a rollout depends on (all of ``names``
-    where it is missing); the others, such as the noise scale, are passed at their prior median.
+    where it is missing); the others, such as the noise scale, are passed at their prior median. Methods that learn from
+    simulations use ``noisy_rollouts(key, values)``, rollouts of all rows with observation noise, and ``actions``
+    (n_rows, a), the commands at the rows, where it has them.
     """
 
     @property

@@ -131,7 +131,8 @@ def prior_derivatives(problem: Problem) -> tuple[Callable, Callable]:
     def single(u: Array) -> Array:
         return jnp.asarray(problem.log_prior(u[None]))[0]
 
-    gradient, hessian = jax.jit(jax.grad(single)), jax.jit(jax.hessian(single))
+    own = getattr(problem, "prior_derivatives", None)
+    gradient, hessian = own or (jax.jit(jax.grad(single)), jax.jit(jax.hessian(single)))
     return (lambda u: np.asarray(gradient(u))), (lambda u: np.asarray(hessian(u)))
 
 
