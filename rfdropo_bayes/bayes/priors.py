@@ -24,11 +24,29 @@ def _half_normal(spec: ParameterSpec, scale: float) -> dist.Distribution:
     return dist.TruncatedNormal(0.0, scale, low=max(0.0, spec.low), high=_open(spec.high), **UNCHECKED)
 
 
+class TruncatedLogNormal(dist.TransformedDistribution):
+    """Log-normal distribution confined to an interval.
+
+    Its support is said here: a transformed distribution takes the whole codomain of its transform, here all positive
+    numbers, for its support, and forgets where its base ends.
+    """
+
+    def __init__(self, median: float, sigma: float, low: float, high: float) -> None:
+        first = math.log(low) if low > 0.0 else None
+        last = math.log(high) if math.isfinite(high) else None
+        base = dist.TruncatedNormal(math.log(median), sigma, low=first, high=last, **UNCHECKED)
+        self._interval = (max(low, 0.0), high)
+        super().__init__(base, dist.transforms.ExpTransform(), **UNCHECKED)
+
+    @property
+    def support(self) -> dist.constraints.Constraint:
+        """The interval."""
+        low, high = self._interval
+        return dist.constraints.interval(low, high) if math.isfinite(high) else dist.constraints.greater_than(low)
+
+
 def _log_normal(spec: ParameterSpec, median: float, sigma: float) -> dist.Distribution:
-    low = math.log(spec.low) if spec.low > 0 else None
-    high = math.log(spec.high) if math.isfinite(spec.high) else None
-    base = dist.TruncatedNormal(math.log(median), sigma, low=low, high=high, **UNCHECKED)
-    return dist.TransformedDistribution(base, dist.transforms.ExpTransform(), **UNCHECKED)
+    return TruncatedLogNormal(median, sigma, spec.low, spec.high)
 
 
 def _uniform(spec: ParameterSpec, low: float, high: float) -> dist.Distribution:

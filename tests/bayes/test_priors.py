@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
 
 from rfdropo_bayes.bayes.priors import prior_from_table
+from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -52,3 +54,18 @@ def test_an_unusable_table_says_what_is_wrong_and_where(spec, table, message):
         prior_from_table(spec, table, where="[model.priors] here")
     assert str(caught.value).startswith("[model.priors] here: ")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 20.0), (0.05, 20.0), (0.0, np.inf), (0.05, np.inf)])
+def test_a_log_normal_prior_ends_at_the_hard_bounds(low, high):
+    """However far a climb goes in unconstrained coordinates, and with a density that integrates to one there."""
+    spec = ParameterSpec("drag", "1/s", low, high, 0.1, {"distribution": "LogNormal", "median": 0.1, "sigma": 1.0}, "")
+    space = build_space([spec], {"drag": {}}, {}, ["a"])
+    u = jnp.linspace(-30.0, 30.0, 60001)[:, None]
+    value = np.asarray(space.from_unconstrained(u)["drag"])
+    assert low <= value.min() < value.max() <= high
+    density = np.exp(np.asarray(space.log_prior_unconstrained(u)))
+    assert np.trapezoid(density, np.asarray(u)[:, 0]) == pytest.approx(1.0, abs=1e-6)
+    prior = space["drag"].prior
+    assert bool(prior.support(0.5 * (max(low, 0.01) + 1.0)))
+    assert not bool(prior.support(high + 1.0)) or high == np.inf
