@@ -63,6 +63,12 @@ class Lanes:
         position, status = (np.concatenate([part[i] for part in parts])[: len(lane)] for i in range(2))
         return position, status
 
+    def tension(self, theta: Float[np.ndarray, " physical"], commands: Commands, lane: int) -> np.ndarray:
+        """Cable tensions [N] of one rollout."""
+        values = dict(zip(self.physical, jnp.asarray(theta), strict=True))
+        own = Commands(*(np.asarray(part)[lane] for part in commands))
+        return np.asarray(self.simulator.rollout(values, own, jnp.asarray(own.step.shape[0])).tension)
+
     def differentiate(self, theta: Thetas, tangent: Thetas, commands: Commands, lane: np.ndarray) -> np.ndarray:
         """Derivatives of the marker coordinates along tangents."""
         return np.concatenate(self._chunks(self._derived, commands, lane, theta, tangent))[: len(lane)]
@@ -110,6 +116,12 @@ class RoutedLanes(Lanes):
         for mask, own, codes in found:
             position[mask], status[mask] = own, codes
         return position, status
+
+    def tension(self, theta: Float[np.ndarray, " physical"], commands: Commands, lane: int) -> np.ndarray:
+        """See `Lanes.tension`."""
+        if self._needs_slow(theta[None])[0]:
+            return self.slow.tension(theta, commands, lane)
+        return self.fast.tension(theta[self._kept], commands, lane)
 
     def differentiate(self, theta: Thetas, tangent: Thetas, commands: Commands, lane: np.ndarray) -> np.ndarray:
         """See `Lanes.differentiate`."""
@@ -162,6 +174,13 @@ class Forward:
         if not fine[0]:
             raise InputError("a rollout at the optimum did not end well", where="audit", remedy=Result.DIVERGED.remedy)
         return position[0]
+
+    def tension(self, point: Float[np.ndarray, " d"]) -> Float[np.ndarray, "recording time cable"]:
+        """Cable tensions at one point [N]."""
+        theta, lane = self._lanes_of(point[None])
+        return np.stack(
+            [self.lanes.tension(values, self.commands, int(r)) for values, r in zip(theta, lane, strict=True)]
+        )
 
     def derivatives(self, point: Float[np.ndarray, " d"], directions: Points) -> Series:
         """Derivative of the marker coordinates along each direction; one-sided where a mechanism is so at null."""

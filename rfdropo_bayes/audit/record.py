@@ -17,6 +17,9 @@ from rfdropo_bayes.audit.verdict import NO_DISCREPANCY
 
 SCHEMA_VERSION = 1
 MILLIMETRES = 1e3
+STIFFNESS = "young_modulus"
+# Units that carry a force, and the power of it; the first that fits counts.
+FORCES = (("/N", -1), ("kg", 1), ("N", 1), ("Pa", 1))
 
 
 def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_experiment: Any) -> dict[str, Any]:
@@ -83,13 +86,16 @@ def _finding(answer: Answer, step: Step, share: float | None) -> dict[str, Any]:
     row = step.before.row(step.name)
     mechanism = next((c.mechanism for c in answer.question.candidates if c.name == step.name), None)
     parameters: dict[str, Any] = {}
+    relative: dict[str, Any] = {}
     if step.name != DISCRETISATION:
         indices = next(c.indices for c in answer.question.candidates if c.name == step.name)
         parameters = _drawn_parameters(answer, indices)
+        relative = _relative_sizes(answer, indices)
     return {
         "mechanism": step.name,
         "equivalence_class": list(step.members),
         "parameters": parameters,
+        "relative": relative,
         "cause": getattr(mechanism, "cause", "the mesh or the time step of the simulator is too coarse"),
         "remedy": getattr(mechanism, "remedy", "raise [simulator] refine and shorten its time_step"),
         "explained_fraction": share,
@@ -113,6 +119,38 @@ def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any
             "q05": float(np.quantile(column, 0.05)),
             "q95": float(np.quantile(column, 0.95)),
             "unit": coordinates.space.parameters[i].spec.unit,
+        }
+    return found
+
+
+def _relative_sizes(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any]:
+    """Masses, forces and stiffnesses over Young's modulus: cables that impose lengths leave their common scale free,
+    so that only the ratio is known where no force was measured. First-order error propagation in logarithms."""
+    coordinates, fit = answer.question.coordinates, answer.extended
+    if STIFFNESS not in coordinates.names[: coordinates.base]:
+        return {}
+    place = {int(i): k for k, i in enumerate(fit.free)}
+    modulus = coordinates.names.index(STIFFNESS)
+    named, slopes = coordinates.named(fit.x), coordinates.slopes(fit.x[None])[0]
+    found = {}
+    for i in indices:
+        name, unit = coordinates.names[i], coordinates.space.parameters[i].spec.unit
+        power = next((p for token, p in FORCES if token in unit), 0)
+        if power == 0 or i not in place or named[name] == 0.0:
+            continue
+        gradient = np.zeros(len(fit.free))
+        gradient[place[i]] = slopes[i] / named[name]
+        gradient[place[modulus]] -= power * slopes[modulus] / named[STIFFNESS]
+        ratio = named[name] / named[STIFFNESS] ** power
+        spread = float(np.sqrt(gradient @ fit.covariance @ gradient))
+        low, high = ratio * (1 - 1.645 * spread), ratio * (1 + 1.645 * spread)
+        title = f"{name}_over_{STIFFNESS}" if power > 0 else f"{name}_times_{STIFFNESS}"
+        found[title] = {
+            "mean": ratio,
+            "sd": abs(ratio) * spread,
+            "q05": min(low, high),
+            "q95": max(low, high),
+            "unit": f"{unit}/Pa" if power > 0 else f"{unit} Pa",
         }
     return found
 

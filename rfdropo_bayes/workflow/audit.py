@@ -25,6 +25,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.report import software_versions
+from rfdropo_bayes.report.audit_page import render_audit
 from rfdropo_bayes.report.summary import combined_hash
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands
@@ -43,7 +44,9 @@ from rfdropo_bayes.workflow.assembly import (
 from rfdropo_bayes.workflow.experiment import Experiment, describe, load_experiment, matching
 from rfdropo_bayes.workflow.files import output_folder
 
-AUDIT, EXTENDED = "audit.json", "extended.toml"
+Workshop = dict[str, Lanes]
+
+AUDIT, EXTENDED, REPORT = "audit.json", "extended.toml", "report.html"
 FINER = 2
 
 
@@ -54,6 +57,7 @@ def run_audit(
     overrides: Sequence[str] = (),
     base: Path | None = None,
     seed: int | None = None,
+    workshop: Workshop | None = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Audit an experiment and write what was found.
@@ -65,6 +69,7 @@ def run_audit(
         overrides: assignments that replace entries of the file.
         base: folder of an earlier calibration, from whose optimum the base model starts.
         seed: of the audit; that of the file by default.
+        workshop: see `build_question`.
         report: called with a line of words now and then.
 
     Returns:
@@ -77,7 +82,7 @@ def run_audit(
     folder = Path(path).resolve().parent
     fitted, tested = (load_data(experiment, folder, role) for role in ("fit", "test"))
     chosen = experiment.seed if seed is None else seed
-    question = build_question(experiment, folder, fitted, tested, chosen, start=_start(base))
+    question = build_question(experiment, folder, fitted, tested, chosen, start=_start(base), workshop=workshop)
     out = output_folder(out)
     answer = audit(question, report)
     content = record(
@@ -88,6 +93,8 @@ def run_audit(
     )
     (out / AUDIT).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     (out / EXTENDED).write_text(describe(extended_tables(tables, answer, folder)), encoding="utf-8")
+    page = render_audit(answer, content, experiment.title or path.stem, describe(tables))
+    (out / REPORT).write_text(page, encoding="utf-8")
     return content
 
 
@@ -99,8 +106,12 @@ def build_question(
     seed: int,
     *,
     start: dict[str, float] | None = None,
+    workshop: Workshop | None = None,
 ) -> Question:
-    """The experiment's base model with every candidate of the library in it, at its null value."""
+    """The experiment's base model with every candidate of the library in it, at its null value.
+
+    ``workshop`` keeps compiled simulators for further data sets of the same experiment.
+    """
     robot = find_robot(experiment, folder)
     names = candidate_names(experiment)
     simulator = build_simulator(_with(experiment, names), robot, folder)
@@ -124,7 +135,11 @@ def build_question(
     ]
 
     def lanes(changed: Experiment) -> tuple[Lanes, Commands]:
-        return _lanes(changed, names, robot, folder, trajectories, coordinates)
+        shop = {} if workshop is None else workshop
+        key = repr((changed.robot, changed.simulator, names, recordings.marker_index.tolist(), coordinates.fixed))
+        found, commands = _lanes(changed, names, robot, folder, trajectories, coordinates, shop.get(key))
+        shop[key] = found
+        return found, commands
 
     finer = _finer(experiment, robot)
     return Question(
@@ -168,10 +183,13 @@ def _lanes(
     folder: Path,
     trajectories: Sequence[Trajectory],
     coordinates: Coordinates,
+    made: Lanes | None,
 ) -> tuple[Lanes, Commands]:
     """The simulator with all candidates; those that the compiled engine lacks get an engine of their own."""
     whole = build_simulator(_with(experiment, names), robot, folder)
     recordings = gather_recordings(whole, trajectories)
+    if made is not None:
+        return made, recordings.commands
     slow = {m.name for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _lacking(whole, m)}
     added = whole.mechanisms[len(experiment.model.mechanisms) :]
     kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]

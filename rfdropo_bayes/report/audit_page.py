@@ -1,0 +1,131 @@
+"""report.html of an audit: one file that needs nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from rfdropo_bayes.audit.omnibus import BLOCK
+from rfdropo_bayes.audit.pipeline import Answer
+from rfdropo_bayes.audit.score import likeness
+from rfdropo_bayes.report import audit_figures as figures
+from rfdropo_bayes.report.page import breakable, duration, number
+from rfdropo_bayes.report.style import Picture, embed
+from rfdropo_bayes.report.units import display_name
+
+SECTIONS = (
+    ("result", "Verdict"),
+    ("show", "Where and when the base model fails"),
+    ("name", "Candidates"),
+    ("measure", "What the extension is worth"),
+    ("remainder", "What remains unexplained"),
+    ("limits", "What this cannot see"),
+)
+MOST_COSINES = 16
+
+
+def render_audit(answer: Answer, content: Mapping[str, Any], title: str, config: str) -> str:
+    """HTML of an audit.
+
+    Args:
+        answer: the audit.
+        content: of audit.json.
+        title: of the experiment.
+        config: the experiment file as it was run.
+    """
+    environment = Environment(
+        loader=PackageLoader("rfdropo_bayes.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"number": number, "words": display_name, "duration": duration, "breakable": breakable}
+    stylesheet = environment.loader.get_source(environment, "page.css")[0] if environment.loader else ""
+    return environment.get_template("audit.html.j2").render(
+        audit=content,
+        title=title,
+        sections=SECTIONS,
+        stylesheet=Markup(stylesheet),
+        pictures=_pictures(answer),
+        config=config,
+    )
+
+
+def residuals_of(answer: Answer) -> figures.Residuals:
+    """The base model's residuals beside commands, rates, tensions and positions."""
+    target = answer.target
+    measured, forward = target.measurements, target.forward
+    position = forward.position(answer.base.x)
+    left = np.where(measured.valid, measured.position - position, 0.0)
+    rows = measured.valid.any(axis=2)
+    flat = left[rows]
+    values, vectors = np.linalg.eigh(flat.T @ flat)
+    pattern = vectors[:, -1]
+    times = np.asarray(measured.time)
+    step = forward.lanes.simulator.description["time_step_s"]
+    command, rate = [], []
+    for group in range(len(times)):
+        sent = np.vstack([forward.commands.initial[group][None], forward.commands.step[group]])
+        command.append(sent[np.minimum(forward.commands.sample_step[group], len(sent) - 1)])
+        moved = np.vstack([np.zeros((1, sent.shape[1])), np.diff(sent, axis=0) / float(str(step))])
+        rate.append(moved[np.minimum(forward.commands.sample_step[group], len(sent) - 1)])
+    return figures.Residuals(
+        flat @ pattern,
+        float(values[-1] / max(values.sum(), 1e-300)),
+        times[rows],
+        np.stack(command)[rows],
+        np.stack(rate)[rows],
+        forward.tension(answer.base.x)[rows],
+        (position - position[:, :1])[rows] @ pattern,
+        tuple(forward.lanes.simulator.channel_names),
+        tuple(forward.lanes.simulator.cable_names),
+    )
+
+
+def _pictures(answer: Answer) -> dict[str, Picture | None]:
+    measured = answer.target.measurements
+    step = float(np.median(np.diff(measured.time[0])))
+    titles = ["base model", *(f"with {display_name(s.name)}" for s in answer.steps)]
+    found: dict[str, Picture | None] = {
+        "panels": embed(
+            figures.panels_figure(residuals_of(answer)), "Residual against time, command, rate, position and tension"
+        ),
+        "blocks": embed(
+            figures.blocks_figure([look.omnibus.blocks.tolist() for look in answer.looks], BLOCK * step, titles),
+            "Misfit of each block of rows",
+        ),
+        "cosines": None,
+        "overlay": None,
+        "remainder": None,
+    }
+    rows = [row for row in answer.looks[0].rows if row.probe is not None][:MOST_COSINES]
+    if len(rows) > 1:
+        marks = [row.probe.mark for row in rows if row.probe is not None]
+        cosines = np.array([[likeness(a, b) for b in marks] for a in marks])
+        found["cosines"] = embed(figures.cosine_figure([r.name for r in rows], cosines), "Cosines between signatures")
+    if answer.predictions is not None and answer.unseen is not None:
+        worst = int(
+            np.argmax(np.sum((answer.unseen.position - answer.predictions[0].mean) ** 2 * answer.unseen.valid, (1, 2)))
+        )
+        seen = answer.unseen.valid[worst].any(axis=1)
+        series = {
+            "measured": np.where(answer.unseen.valid, answer.unseen.position, np.nan)[worst, seen, -3:],
+            "base model": answer.predictions[0].mean[worst, seen, -3:],
+            "extended model": answer.predictions[1].mean[worst, seen, -3:],
+        }
+        found["overlay"] = embed(
+            figures.overlay_figure(step * np.flatnonzero(seen), series, "last marker"),
+            "Measured, base model and extended model",
+        )
+    rest = answer.remainder
+    if rest.amplitude > 0.0:
+        found["remainder"] = embed(
+            figures.remainder_figure(rest.time, rest.mean[0, :, -3:], rest.sd[0, :, -3:], "left of the last marker"),
+            "Gaussian process of what remains",
+        )
+    return found

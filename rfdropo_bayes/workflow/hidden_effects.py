@@ -1,0 +1,276 @@
+"""Recordings with an effect hidden in them, for tests of the audit: it sees the files and nothing else.
+
+Three repeats of one random command and one recording of another are to be fitted, six more are untouched. The size of
+what is hidden is rho: the root mean square of what a refit of the base model cannot absorb, on noise-free recordings,
+in standard deviations of the noise. Data come from a finer mesh and time step than the audit's own; that
+discretisation's rho is computed as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.audit.fit import Target, climb
+from rfdropo_bayes.audit.forward import Forward
+from rfdropo_bayes.audit.measurements import gather_measurements
+from rfdropo_bayes.audit.noise import STATED, NoiseModel
+from rfdropo_bayes.audit.score import project_out, span
+from rfdropo_bayes.bayes.model import gather_recordings
+from rfdropo_bayes.bayes.noise import draw_noise
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.workflow.assembly import build_simulator, find_robot
+from rfdropo_bayes.workflow.audit import Workshop, build_question
+from rfdropo_bayes.workflow.commands import random_walk
+from rfdropo_bayes.workflow.experiment import AuditTable, CommandsTable, Experiment, describe
+from rfdropo_bayes.workflow.files import output_folder
+
+NOISE, MEMORY = 5e-4, 0.6  # standard deviation [m] and correlation from row to row
+REPEATS, UNTOUCHED = 3, 6
+SIZES = np.geomspace(1e-4, 60.0, 40)  # multiples of the prior's scale among which a size is looked for
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How data sets are made, and how they are audited.
+
+    Attributes:
+        robot: name; recordings: command sequences.
+        audited, made: [simulator] tables of the audit and of the data.
+        spread: relative deviation of the truth from the middle of the priors.
+        priors: of the base parameters.
+    """
+
+    robot: str = "smooth_arm"
+    commands: CommandsTable = field(
+        default_factory=lambda: CommandsTable(
+            duration=5.0, interval=0.2, step=0.005, low=0.0, high=0.02, sample_time=0.05, recordings=["any"]
+        )
+    )
+    audited: Mapping[str, Any] = field(default_factory=lambda: {"refine": 1, "time_step": 0.01})
+    made: Mapping[str, Any] = field(default_factory=lambda: {"refine": 2, "time_step": 0.0075})
+    spread: float = 0.3
+    priors: Mapping[str, Mapping[str, Any]] = field(
+        default_factory=lambda: {
+            "young_modulus": {"distribution": "LogNormal", "median": 2e6, "sigma": 0.5},
+            "poisson_ratio": {"distribution": "Uniform", "low": 0.4, "high": 0.499},
+            "trunk_mass": {"distribution": "LogNormal", "median": 0.09, "sigma": 0.5},
+            "rayleigh_stiffness": {"distribution": "LogNormal", "median": 0.05, "sigma": 0.7},
+        }
+    )
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """What is in a data set.
+
+    Attributes:
+        values: true parameters, base and hidden, by name.
+        rho: of each hidden mechanism, and ``discretisation`` for that of the mesh and time step.
+        folder: of the recordings and the experiment file.
+        clean: noise-free untouched recordings [m].
+    """
+
+    values: dict[str, float]
+    rho: dict[str, float]
+    folder: Path
+    clean: Float[np.ndarray, "trajectory time channel"]
+
+    @property
+    def experiment(self) -> Path:
+        """The file to audit."""
+        return self.folder / "audit.toml"
+
+
+def hide(
+    setting: Setting,
+    mechanisms: Sequence[str],
+    rho: float,
+    seed: int,
+    out: Path,
+    *,
+    exclude: Sequence[str] = (),
+    workshop: Workshop | None = None,
+) -> Hidden | None:
+    """Write a data set with mechanisms hidden in it, each of size ``rho``.
+
+    Args:
+        setting: see `Setting`.
+        mechanisms: registry names; none for null data.
+        rho: size of each.
+        seed: of truth, commands, sizes and noise.
+        out: folder to write to.
+        exclude: candidates that the audit is not to have.
+        workshop: keeps compiled simulators from one data set to the next.
+
+    Returns:
+        what is hidden; None where no size of a mechanism within its bounds reaches rho.
+    """
+    rng = np.random.default_rng(seed)
+    out = output_folder(out)
+    experiment = _experiment(setting, exclude)
+    blank = _blank_recordings(setting, rng)
+    fitted, untouched = blank[: REPEATS + 1], blank[REPEATS + 1 :]
+    question = build_question(_with_all(experiment), out, fitted, untouched, seed, workshop=workshop)
+    coordinates = question.coordinates
+    truth = coordinates.null.copy()
+    truth[: coordinates.base] += (
+        setting.spread * coordinates.prior_sd[: coordinates.base] * rng.standard_normal(coordinates.base)
+    )
+    measurements = gather_measurements(gather_recordings(question.lanes.simulator, fitted), fitted, join=True)
+    chosen = {name: group[0] for name, group in zip(measurements.names, measurements.members, strict=True)}
+    forward = Forward(question.lanes, coordinates, question.recordings.commands, chosen)
+    white = NoiseModel(np.full(measurements.position.shape[-1], NOISE), np.ones(1), STATED, np.inf)
+    target = Target(forward, replace(measurements, count=measurements.valid.astype(float)), white)
+    sizes = {}
+    for name in mechanisms:
+        index = next(c.indices for c in question.candidates if c.name == name)
+        moved = _sized(target, truth, index, rho, rng)
+        if moved is None:
+            return None
+        truth = moved
+        sizes[name] = rho
+    values = {n: v for n, v in coordinates.named(truth).items() if _belongs(question, n, mechanisms)}
+    clean = _made(setting, mechanisms, values, blank)
+    sizes["discretisation"] = _discretisation(target, truth, clean[: REPEATS + 1], measurements.members)
+    _write(setting, experiment, blank, clean, values, seed, out)
+    return Hidden(values, sizes, out, clean[REPEATS + 1 :].reshape(UNTOUCHED, clean.shape[1], -1))
+
+
+def _belongs(question: Any, name: str, mechanisms: Sequence[str]) -> bool:
+    hidden = [c for c in question.candidates if c.name in mechanisms]
+    names = question.coordinates.names
+    own = {names[i] for c in hidden for i in c.indices}
+    return name in own or names.index(name) < question.coordinates.base
+
+
+def _experiment(setting: Setting, exclude: Sequence[str]) -> Experiment:
+    return Experiment.model_validate(
+        {
+            "robot": setting.robot,
+            "data": {"format": "netcdf", "fit": ["fit_*.nc", "screen.nc"], "test": ["test_*.nc"]},
+            "model": {"priors": {name: dict(table) for name, table in setting.priors.items()}},
+            "simulator": dict(setting.audited),
+            "audit": {"exclude": list(exclude)},
+        }
+    )
+
+
+def _with_all(experiment: Experiment) -> Experiment:
+    return experiment.model_copy(update={"audit": AuditTable()})
+
+
+def _blank_recordings(setting: Setting, rng: np.random.Generator) -> list[Trajectory]:
+    """Commands and times of all recordings; their positions are still those at rest."""
+    robot = find_robot(_experiment(setting, ()), Path())
+    table = setting.commands
+    sequences = [random_walk(table, len(robot.channel_names), rng) for _ in range(2 + UNTOUCHED)]
+    names = [*(f"fit_{k + 1}" for k in range(REPEATS)), "screen", *(f"test_{k + 1}" for k in range(UNTOUCHED))]
+    order = [*([0] * REPEATS), *range(1, 2 + UNTOUCHED)]
+    time = table.sample_time * np.arange(round(table.duration / table.sample_time) + 1)
+    return [
+        Trajectory.build(
+            name=name,
+            robot=robot.name,
+            format="netcdf",
+            time=time,
+            position=np.tile(robot.marker_points(), (len(time), 1, 1)),
+            command_time=sequences[k][0],
+            command=sequences[k][1],
+            command_unit=robot.command_unit,
+            marker_names=robot.marker_names,
+            cable_names=robot.channel_names,
+            synthetic=True,
+        )
+        for name, k in zip(names, order, strict=True)
+    ]
+
+
+def _sized(
+    target: Target, truth: np.ndarray, indices: Sequence[int], rho: float, rng: np.random.Generator
+) -> np.ndarray | None:
+    """The truth with a mechanism of size ``rho`` in it, its signs and shapes at random.
+
+    The size is looked for on a grid of multiples of the prior's scale, between whose values rho is taken as a power.
+    """
+    coordinates = target.forward.coordinates
+    low, high = coordinates.bounds
+    indices = list(indices)
+    shapes = [i for i in indices if not coordinates.affine[i] or coordinates.space.parameters[i].spec.grid]
+    amplitudes = [i for i in indices if i not in shapes] or shapes
+    start = truth.copy()
+    for i in shapes:
+        start[i] = coordinates.quantiles(i, [rng.uniform(0.3, 0.7)])[0]
+    direction = np.zeros(len(truth))
+    signs = np.where(coordinates.one_sided[amplitudes] != 0, 1.0, rng.choice([-1.0, 1.0], len(amplitudes)))
+    direction[amplitudes] = signs * rng.uniform(0.5, 1.0, len(amplitudes))
+    start[amplitudes] = truth[amplitudes]
+    points = start + SIZES[:, None] * direction
+    inside = ((points >= low) & (points <= high)).all(axis=1)
+    points = points[inside]
+    base = span(target.jacobian(truth, np.arange(coordinates.base)))
+    effect = target.residual(truth[None])[0] - target.residual(points)
+    found = np.sqrt(np.mean(project_out(base, effect.T).T ** 2, axis=1))
+    above = np.flatnonzero(found >= rho)
+    if len(above) == 0 or above[0] == 0:
+        return None
+    k = above[0]
+    share = np.log(rho / max(found[k - 1], 1e-9)) / np.log(found[k] / max(found[k - 1], 1e-9))
+    size = np.exp(np.log(SIZES[inside][k - 1]) + share * np.log(SIZES[inside][k] / SIZES[inside][k - 1]))
+    return start + size * direction
+
+
+def _made(
+    setting: Setting, mechanisms: Sequence[str], values: Mapping[str, float], blank: Sequence[Trajectory]
+) -> Float[np.ndarray, "recording time marker 3"]:
+    """Noise-free positions from the finer simulator."""
+    experiment = _experiment(setting, ())
+    experiment = experiment.model_copy(
+        update={
+            "model": experiment.model.model_copy(update={"mechanisms": list(mechanisms)}),
+            "simulator": type(experiment.simulator).model_validate(dict(setting.made)),
+        }
+    )
+    simulator = build_simulator(experiment, find_robot(experiment, Path()))
+    recordings = gather_recordings(simulator, blank)
+    given = {name: jnp.asarray(v) for name, v in values.items()}
+    observed = jax.vmap(lambda c: simulator.rollout(given, c, jnp.asarray(c.step.shape[0])))(recordings.commands)
+    assert int(np.max(np.asarray(observed.status))) == 0, "the truth does not roll out well"
+    return np.asarray(observed.position)
+
+
+def _discretisation(target: Target, truth: np.ndarray, clean: np.ndarray, members: Sequence[Sequence[int]]) -> float:
+    """RMS of what a refit with the true mechanisms in the model cannot absorb, in noise deviations."""
+    chosen = clean[[group[0] for group in members]]
+    fitted = replace(target.measurements, position=chosen.reshape(target.measurements.position.shape))
+    refit = climb(replace(target, measurements=fitted), truth, np.arange(target.forward.coordinates.base))
+    return float(np.sqrt(np.mean(refit.residual**2)))
+
+
+def _write(
+    setting: Setting,
+    experiment: Experiment,
+    blank: Sequence[Trajectory],
+    clean: np.ndarray,
+    values: Mapping[str, float],
+    seed: int,
+    out: Path,
+) -> None:
+    step = setting.commands.sample_time
+    for index, (recording, position) in enumerate(zip(blank, clean, strict=True)):
+        key = jax.random.fold_in(jax.random.key(seed), index)
+        memory = jnp.asarray(-step / np.log(MEMORY))
+        noise = draw_noise(key, jnp.asarray(recording.time), position.shape[1], jnp.asarray(NOISE), memory)
+        dataset = recording.dataset.copy()
+        dataset["position"] = dataset["position"].copy(data=position + np.asarray(noise))
+        Trajectory(dataset).save(out / f"{recording.name}.nc")
+    tables = experiment.model_dump(exclude_none=True, exclude_defaults=True)
+    tables["seed"] = seed
+    (out / "audit.toml").write_text(describe(tables), encoding="utf-8")
