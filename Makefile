@@ -16,7 +16,7 @@ DEV     = $(VENV)/dev.stamp
 export OPENBLAS_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint format bench notebooks demo-data clean
+.PHONY: help demo test test-all lint format bench validate notebooks demo-data clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-16s%s\n", $$1, $$2 }'
@@ -42,6 +42,9 @@ format: $(DEV) ## let ruff mend what it can
 
 bench: $(CORE) ## rollouts per second of the engines, as a table and as JSON
 	$(BIN)/python benchmarks/rollouts.py --json reports/bench/rollouts.json
+
+validate: $(CORE) ## references and other simulators with ours beside them, in reports/validation (minutes)
+	$(BIN)/python benchmarks/validate.py
 
 notebooks: $(DEV) ## run every notebook from top to bottom
 	$(PYTEST) -m notebook

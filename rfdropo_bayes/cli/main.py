@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from rfdropo_bayes import __version__
-from rfdropo_bayes.cli import inference
+from rfdropo_bayes.cli import inference, pictures
 from rfdropo_bayes.errors import InputError
 
 INPUT_ERROR, INTERRUPTED = 2, 3
@@ -111,6 +111,7 @@ def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a ca
 
 
 app.command()(inference.export)
+app.command()(pictures.view)
 
 
 def _default_folder(experiment: Path) -> Path:
