@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -31,3 +32,25 @@ def check(path: Path, out: Path, name: str, datasets: int, overrides: list[str],
     found = run_check(path, out, name, datasets=datasets, overrides=overrides, resume=resume)
     typer.echo(found["sentence"])
     typer.echo(f"details: {out / f'{name}.json'}")
+
+
+def table1(
+    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/table1"),
+    truths: Annotated[int, typer.Option(help="truths of each kind for our rows")] = 100,
+    rival_truths: Annotated[int, typer.Option(help="truths of each kind for the other rows")] = 5,
+    budget: Annotated[int, typer.Option(help="rollouts per posterior")] = 10000,
+    actions: Annotated[int, typer.Option(help="length of a recording, in actions of 50 ms")] = 100,
+    seed: Annotated[int, typer.Option(help="of everything")] = 0,
+    rows: Annotated[list[str] | None, typer.Option("--row", help="only this row; may be repeated")] = None,
+    resume: Annotated[bool, typer.Option(help="keep the fits that an interrupted run has done")] = False,
+    cluster: Annotated[str | None, typer.Option(help="local, or HOST:PORT of a Dask scheduler")] = None,
+) -> None:
+    """The paper's Table I, with baselines, rivals and off-centre truths: table1.json, table1.md, table1.png."""
+    from rfdropo_bayes.workflow.table1 import ROWS, Size, run_table1
+
+    size = Size(truths, rival_truths, budget, actions, seed)
+    words = " ".join(["rfdropo", *sys.argv[1:]])
+    content = run_table1(out, size, rows=rows or tuple(ROWS), resume=resume, cluster=cluster, command=words)
+    for claim in content["claims"]:
+        typer.echo(f"{'holds' if claim['holds'] else 'FAILS'}: {claim['task']}, {claim['claim']}: {claim['value']:.3g}")
+    typer.echo(f"table: {out / 'table1.md'}")

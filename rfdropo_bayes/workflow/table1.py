@@ -1,0 +1,245 @@
+"""``rfdropo benchmark table1``: the paper's Table I with its rivals and with truths that its table lacks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.rivals import import_sbi
+from rfdropo_bayes.report.facts import software_versions
+from rfdropo_bayes.workflow.comparison import RIVALS, ROWS, TASKS, fit
+from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.fits import run_fits
+from rfdropo_bayes.workflow.table1_figure import draw_figure
+
+PAPER = {  # mean squared error and its deviation, Table I
+    "TrunkReach": {"BayesSim": (16.60, 0.30), "NPDR": (8.38, 3.22), "RF-DROPO": (1.70, 1.93)},
+    "TrunkPush": {"BayesSim": (25.50, 5.14), "NPDR": (1.71, 0.17), "RF-DROPO": (0.62, 0.34)},
+}
+NEEDS_SBI = ("BayesSim", "NPDR")
+OWN = ("ours", "ours + tension")
+TRUTHS = ("paper", "off-centre")
+HEADINGS = (
+    *("row", "fits", "MSE", "E / mass [%]", "Poisson [%]", "90 % coverage"),
+    *("log score", "held out [mm]", "rollouts", "s"),
+)
+FIGURES = ("mse", "ratio_error_percent", "poisson_error_percent", "log_score", "held_out_mm", "rollouts", "seconds")
+
+
+@dataclass(frozen=True)
+class Size:
+    """How large the benchmark is.
+
+    Attributes:
+        truths: off-centre truths for our rows, and data sets at the paper's truth.
+        rival_truths: the same for every other row.
+        budget: rollouts per posterior.
+        actions: length of the recording, in moves of 50 ms; the paper's has 100.
+        seed: of everything.
+    """
+
+    truths: int = 100
+    rival_truths: int = 5
+    budget: int = 10000
+    actions: int = 100
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if value < (0 if name == "seed" else 1):
+                raise InputError(f"{name} = {value} is too small", where="benchmark table1")
+
+
+def run_table1(
+    out: Path,
+    size: Size,
+    *,
+    rows: Sequence[str] = tuple(ROWS),
+    resume: bool = False,
+    cluster: str | None = None,
+    command: str = "",
+) -> dict[str, Any]:
+    """Do all fits and write ``table1.json``, ``table1.md`` and ``table1.png``; fits.jsonl keeps each fit as it ends.
+
+    Raises:
+        InputError: an unknown row, or a folder that cannot be written.
+    """
+    for row in rows:
+        if row not in ROWS:
+            raise InputError(f"unknown row {row!r}", where="--rows", remedy=f"some of {', '.join(ROWS)}")
+    out = output_folder(out)
+    left_out = _without_sbi(rows)
+    jobs = list_jobs(size, [row for row in rows if row not in left_out])
+    with Progress("table1", show=None, log=out / "log.jsonl") as progress:
+        found = run_fits(jobs, fit, out / "fits.jsonl", resume=resume, cluster=cluster, progress=progress)
+    content = {
+        "schema_version": 1,
+        "command": command,
+        "size": asdict(size),
+        "left_out": left_out,
+        "paper": PAPER,
+        "cells": summarise(found),
+        "claims": claims(found),
+        "versions": software_versions(),
+    }
+    (out / "table1.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    (out / "table1.md").write_text(as_markdown(content), encoding="utf-8")
+    draw_figure(content, out / "table1.png")
+    return content
+
+
+def list_jobs(size: Size, rows: Sequence[str]) -> list[dict[str, Any]]:
+    """Every fit; rows share their truths and data, so that they can be compared in pairs. Cheap rounds come first."""
+    shared = {"budget": size.budget, "actions": size.actions, "seed": size.seed}
+    jobs = []
+    for index in range(max(size.truths, size.rival_truths)):
+        for truths in TRUTHS:
+            for task in TASKS:
+                chosen = [row for row in rows if index < (size.truths if row in OWN else size.rival_truths)]
+                jobs += [{"task": task, "row": row, "truths": truths, "index": index, **shared} for row in chosen]
+    return jobs
+
+
+def _without_sbi(rows: Sequence[str]) -> dict[str, str]:
+    """Rows that the optional package is missing for, with the reason."""
+    if not any(row in NEEDS_SBI for row in rows):
+        return {}
+    try:
+        import_sbi()
+    except InputError as error:
+        return {row: str(error) for row in rows if row in NEEDS_SBI}
+    return {}
+
+
+def summarise(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Mean, deviation and median of every figure, and pooled coverage, per task, kind of truth and row."""
+    cells = []
+    for task in TASKS:
+        for truths in TRUTHS:
+            for row in ROWS:
+                members = [r for r in found if (r["task"], r["truths"], r["row"]) == (task, truths, row)]
+                done = [r for r in members if "failed" not in r]
+                if not members:
+                    continue
+                cell: dict[str, Any] = {"task": task, "truths": truths, "row": row, "fits": len(done)}
+                cell["failed"] = [r["failed"] for r in members if "failed" in r]
+                cell |= {figure: _moments([r[figure] for r in done]) for figure in FIGURES}
+                # A point has no interval to cover anything with.
+                inside = [hit for r in done for hit in r["inside_90"]] if row != "mid-range" else []
+                cell["coverage_90"] = float(np.mean(inside)) if inside else None
+                cells.append(cell)
+    return cells
+
+
+def _moments(values: Sequence[float | None]) -> dict[str, float | None]:
+    known = np.array([value for value in values if value is not None], dtype=float)
+    if len(known) == 0:
+        return {"mean": None, "sd": None, "median": None}
+    sd = float(known.std(ddof=1)) if len(known) > 1 else None
+    return {"mean": float(known.mean()), "sd": sd, "median": float(np.median(known))}
+
+
+def claims(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """What ours is meant to achieve, checked: the claim, the number behind it, and whether it holds at this size."""
+    checked = []
+    for task in TASKS:
+        at = partial(_of, found, task, "off-centre")
+        plain, tension = at("ours"), at("ours + tension")
+        if plain:
+            for figure, words in (("ratio_error_percent", "E / mass"), ("poisson_error_percent", "Poisson's ratio")):
+                value = float(np.median([r[figure] for r in plain]))
+                checked.append(
+                    _claim(task, f"median error of {words} at most 1 % without tension", value, value <= 1.0)
+                )
+            share = float(np.mean([hit for r in plain for hit in r["inside_90"]]))
+            checked.append(_claim(task, "90 % intervals hold 85 to 95 % of the truths", share, 0.85 <= share <= 0.95))
+        if tension:
+            value = float(np.mean([r["mse"] for r in tension]))
+            checked.append(_claim(task, "the paper's error at most 0.05 with tension", value, value <= 0.05))
+        for rival in RIVALS:
+            excess = _paired(plain, at(rival))
+            if excess is not None:
+                words = f"held-out error not worse than {rival}'s by more than 2 paired standard errors"
+                checked.append(_claim(task, words, excess, excess <= 2.0))
+    return checked
+
+
+def _of(found: Sequence[Mapping[str, Any]], task: str, truths: str, row: str) -> list[Mapping[str, Any]]:
+    return [r for r in found if (r["task"], r["truths"], r["row"]) == (task, truths, row) and "failed" not in r]
+
+
+def _claim(task: str, words: str, value: float, holds: bool) -> dict[str, Any]:
+    return {"task": task, "claim": words, "value": value, "holds": bool(holds)}
+
+
+def _paired(own: Sequence[Mapping[str, Any]], rival: Sequence[Mapping[str, Any]]) -> float | None:
+    """Mean excess of our held-out error over a rival's in its standard errors; None for fewer than two pairs."""
+    theirs = {r["index"]: r["held_out_mm"] for r in rival if r["held_out_mm"] is not None}
+    pairs = [
+        (r["held_out_mm"], theirs[r["index"]]) for r in own if r["index"] in theirs and r["held_out_mm"] is not None
+    ]
+    if len(pairs) < 2:
+        return None
+    excess = np.array([a - b for a, b in pairs])
+    error = float(excess.std(ddof=1)) / np.sqrt(len(excess))
+    return float(excess.mean() / max(error, 1e-12))
+
+
+def as_markdown(content: Mapping[str, Any]) -> str:
+    """The table for people."""
+    size = content["size"]
+    lines = [
+        "# Table I, with the rows it lacks",
+        "",
+        f"`{content['command']}`",
+        "",
+        f"Recordings of {size['actions']} actions; at most {size['budget']} rollouts per posterior; of each kind of "
+        f"truth {size['truths']} for our rows and {size['rival_truths']} for the others. Mean ± standard deviation. "
+        "MSE: the paper's, in ranges scaled to [0, 4]. Held out: tip error of the mean prediction under commands that "
+        "no fit saw.",
+        "",
+    ]
+    for task in dict.fromkeys(cell["task"] for cell in content["cells"]):
+        for truths in TRUTHS:
+            lines += [f"## {task}, {'the truth of the paper' if truths == 'paper' else 'off-centre truths'}", ""]
+            lines += [
+                f"| {' | '.join(HEADINGS)} |",
+                f"|{'---|' * len(HEADINGS)}",
+            ]
+            cells = [c for c in content["cells"] if (c["task"], c["truths"]) == (task, truths)]
+            lines += [_row(cell) for cell in cells] + [""]
+    lines += ["## Claims", "", "| claim | value | holds |", "|---|---|---|"]
+    lines += [
+        f"| {c['task']}: {c['claim']} | {c['value']:.3g} | {'yes' if c['holds'] else 'NO'} |" for c in content["claims"]
+    ]
+    missing = [f"{row}: {reason}" for row, reason in content["left_out"].items()]
+    missing += [f"{c['row']}, {c['truths']}: {reason}" for c in content["cells"] for reason in c["failed"]]
+    if missing:
+        lines += ["", "## Left out or failed", "", *(f"- {line}" for line in missing)]
+    lines += ["", "The paper: " + "; ".join(_published(task) for task in PAPER) + "."]
+    return "\n".join(lines) + "\n"
+
+
+def _published(task: str) -> str:
+    return f"{task} " + ", ".join(f"{row} {mean:g} ± {sd:g}" for row, (mean, sd) in PAPER[task].items())
+
+
+def _row(cell: Mapping[str, Any]) -> str:
+    def moments(figure: str) -> str:
+        entry = cell[figure]
+        if entry["mean"] is None:
+            return "-"
+        spread = "" if entry["sd"] is None else f" ± {entry['sd']:.2g}"
+        return f"{entry['mean']:.3g}{spread}"
+
+    coverage = "-" if cell["coverage_90"] is None else f"{100 * cell['coverage_90']:.0f} %"
+    figures = [moments(figure) for figure in FIGURES[:3]] + [coverage] + [moments(figure) for figure in FIGURES[3:]]
+    return f"| {cell['row']} | {cell['fits']} | " + " | ".join(figures) + " |"

@@ -1,0 +1,151 @@
+"""The comparison with Table I: fits that resume, scores by hand, and the tables made of them."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.workflow import table1
+from rfdropo_bayes.workflow.comparison import TASKS, draw_truth, fit, scores
+from rfdropo_bayes.workflow.fits import run_fits
+from rfdropo_bayes.workflow.table1 import Size, as_markdown, claims, list_jobs, run_table1, summarise
+
+REACH = TASKS["TrunkReach"]
+
+
+def square(job):
+    return {"value": job["x"] ** 2}
+
+
+def dies_once(job):
+    """Kills its worker the first time it sees a job."""
+    marker = Path(job["folder"]) / f"seen_{job['x']}"
+    if job["x"] == 1 and not marker.exists():
+        marker.touch()
+        os._exit(1)
+    return square(job)
+
+
+def test_fits_are_kept_and_not_done_twice(tmp_path):
+    jobs, done = [{"x": x} for x in range(5)], []
+
+    def counted(job):
+        done.append(job["x"])
+        return square(job)
+
+    log = tmp_path / "fits.jsonl"
+    whole = run_fits(jobs, counted, log)
+    assert [row["value"] for row in whole] == [0, 1, 4, 9, 16]
+    lines = log.read_text().splitlines()
+    log.write_text("\n".join(lines[:2]) + "\n" + lines[2][:10])  # killed in the middle of a line
+    done.clear()
+    assert run_fits(jobs, counted, log, resume=True) == whole
+    assert done == [2, 3, 4]
+    assert len(log.read_text().splitlines()) == 5
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="the optional package distributed")
+@pytest.mark.filterwarnings("ignore")  # Dask's own, on sockets of the worker that dies
+def test_a_worker_that_dies_costs_time_and_not_results(tmp_path):
+    jobs = [{"x": x, "folder": str(tmp_path)} for x in range(3)]
+    found = run_fits(jobs, dies_once, tmp_path / "fits.jsonl", cluster="local")
+    assert [row["value"] for row in found] == [0, 1, 4]
+
+
+def test_scores_by_hand():
+    truth = dict(REACH.truth)
+    rng = np.random.default_rng(0)
+    draws = {name: np.full(1000, value) for name, value in truth.items()}
+    draws["trunk_mass"] = truth["trunk_mass"] + 0.1 * rng.normal(size=1000)
+    found = scores(REACH, draws, truth)
+    assert found["mse"] == pytest.approx((0.1 * 4.0 / 0.995) ** 2, rel=0.1)
+    assert found["inside_90"] == [True, True, True]
+    assert found["poisson_error_percent"] == pytest.approx(0.0, abs=1e-9)
+    assert found["log_score"] is None  # two parameters are points
+    ridge = np.exp(0.3 * rng.normal(size=1000))
+    along = {**draws, "trunk_mass": 0.42 * ridge, "young_modulus": 4.5e6 * ridge * 1.01}
+    assert scores(REACH, along, truth)["ratio_error_percent"] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_uniform_prior_scores_what_the_paper_s_does_about():
+    """Three uniform parameters against the middle: 3 x 16 / 12 = 4, and 4.11 at the truth of the paper."""
+    rng = np.random.default_rng(1)
+    draws = {name: rng.uniform(*ends, size=100000) for name, ends in REACH.ranges.items()}
+    assert scores(REACH, draws, dict(REACH.truth))["mse"] == pytest.approx(4.11, abs=0.05)
+    middle = {name: np.full(3, 0.5 * sum(ends)) for name, ends in REACH.ranges.items()}
+    assert scores(REACH, middle, dict(REACH.truth))["mse"] == pytest.approx(0.11, abs=0.02)
+
+
+def test_off_centre_truths_stay_out_of_the_middle():
+    class Named:
+        names = tuple(REACH.ranges)
+
+    for index in range(50):
+        job = {"task": "TrunkReach", "truths": "off-centre"}
+        truth = draw_truth(job, Named(), np.random.default_rng([0, index]))
+        for name, (low, high) in REACH.ranges.items():
+            place = (truth[name] - low) / (high - low)
+            assert 0.0 <= place <= 0.25 or 0.75 <= place <= 1.0
+
+
+def rows():
+    rng = np.random.default_rng(3)
+    found = []
+    for job in list_jobs(Size(truths=8, rival_truths=4), list(table1.ROWS)):
+        worse = 3.0 if job["row"] in table1.RIVALS else 1.0
+        figures = {name: worse * (1.0 + 0.1 * rng.uniform()) for name in table1.FIGURES}
+        found.append({**job, **figures, "inside_90": [True] * 9 + [False]})
+    found[-1] = {**list_jobs(Size(truths=8), ["ours"])[-1], "failed": "no reason"}
+    return found
+
+
+def test_cells_claims_and_the_table_follow_from_the_fits(tmp_path):
+    found = rows()
+    cells, checked = summarise(found), claims(found)
+    ours = next(c for c in cells if c["row"] == "ours" and c["truths"] == "paper")
+    assert ours["fits"] == 8
+    assert ours["coverage_90"] == pytest.approx(0.9)
+    assert ours["mse"]["mean"] == pytest.approx(1.05, abs=0.05)
+    assert next(c for c in cells if c["row"] == "mid-range")["coverage_90"] is None
+    by_words = {c["claim"]: c for c in checked}
+    assert by_words["90 % intervals hold 85 to 95 % of the truths"]["holds"]
+    assert not by_words["the paper's error at most 0.05 with tension"]["holds"]
+    assert sum("paired" in words and c["holds"] for words, c in by_words.items()) == len(table1.RIVALS)
+    content = {
+        "command": "c",
+        "size": {"actions": 1, "budget": 2, "truths": 8, "rival_truths": 4},
+        "cells": cells,
+        "claims": checked,
+        "left_out": {},
+        "paper": table1.PAPER,
+    }
+    text = as_markdown(content)
+    assert "| NO |" in text
+    assert text.count("| ours |") == 2
+
+
+def test_a_run_writes_its_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(table1, "fit", lambda job: {**dict.fromkeys(table1.FIGURES, 1.0), "inside_90": [True]})
+    run_table1(tmp_path, Size(1, 1), rows=["prior", "ours"], command="rfdropo benchmark table1")
+    content = json.loads((tmp_path / "table1.json").read_text())
+    assert {cell["row"] for cell in content["cells"]} == {"prior", "ours"}
+    assert (tmp_path / "table1.png").stat().st_size > 5000
+    assert "rfdropo benchmark table1" in (tmp_path / "table1.md").read_text()
+    with pytest.raises(InputError, match="unknown row"):
+        run_table1(tmp_path, Size(1, 1), rows=["theirs"])
+
+
+@pytest.mark.slow
+def test_a_posterior_beats_the_prior_on_the_trunk():
+    job = {"task": "TrunkReach", "truths": "paper", "index": 0, "budget": 2500, "actions": 20, "seed": 0}
+    before, after = (fit({**job, "row": row}) for row in ("prior", "ours"))
+    assert after["rollouts"] <= 2500
+    assert after["held_out_mm"] < before["held_out_mm"]
+    assert after["ratio_error_percent"] < 20.0
