@@ -18,7 +18,7 @@ from rfdropo_bayes.bayes.model import Measured, TrajectoryModel
 from rfdropo_bayes.bayes.noise import draw_noise, noise_specs
 from rfdropo_bayes.simulators.protocol import Result
 
-Batch = Mapping[str, Float[Array, " n"]]
+Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
 
 SMALLEST_CHUNK = 8
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from rfdropo_bayes import __version__
-from rfdropo_bayes.cli import inference, pictures
+from rfdropo_bayes.cli import inference, pictures, prediction
 from rfdropo_bayes.errors import InputError
 
 INPUT_ERROR, INTERRUPTED = 2, 3
@@ -112,6 +112,7 @@ def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a ca
 
 app.command()(inference.export)
 app.command()(pictures.view)
+app.command()(prediction.predict)
 
 benchmark = typer.Typer(help="Comparisons that take hours; each can be interrupted and resumed.", no_args_is_help=True)
 benchmark.command()(inference.table1)

@@ -9,6 +9,7 @@ from rfdropo_bayes.data.repeats import PureError, group_repeats, noise_floor, pu
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.spec import DATA_VARIABLE, DataSpec, RecordingEntry, find_data_file, load_recordings
 from rfdropo_bayes.data.trajectory import Trajectory
+from rfdropo_bayes.data.unseen import first_row_only, load_unseen, start_is_known
 
 __all__ = [
     "DATA_VARIABLE",
@@ -22,8 +23,10 @@ __all__ = [
     "clock_offset",
     "find_data_file",
     "find_faults",
+    "first_row_only",
     "group_repeats",
     "load_recordings",
+    "load_unseen",
     "noise_floor",
     "pure_error",
     "read_asl_csv",
@@ -33,5 +36,6 @@ __all__ = [
     "read_sofa_csv",
     "register",
     "shift_commands",
+    "start_is_known",
     "to_base_frame",
 ]

@@ -85,6 +85,46 @@ def read_asl_csv(observations: Path, commands: Path | None, *, mask_missing: boo
     )
 
 
+def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> Trajectory:
+    """Commands with the start pose at most: positions of one observation row, all others masked.
+
+    Args:
+        commands: file of commands.
+        observations: file that holds the start pose; None where it is not known.
+        row: that of the start pose; a file of a single row has it there.
+
+    Raises:
+        InputError: on a damaged file, or one without that row.
+    """
+    command = _read_commands(commands)
+    time = np.arange(len(command) + 1) / RATE
+    position, mask = np.zeros((len(time), 3, 3)), np.zeros((len(time), 3), dtype=bool)
+    if observations is not None:
+        points = CsvTable(observations, ["ID", *_DISKS]).points(_DISKS, allow_missing=True) @ MOCAP_TO_BASE.T
+        if row >= len(time) or (len(points) != 1 and row >= len(points)):
+            raise InputError(f"has no row {row} to start from", where=str(observations), remedy="choose other --rows")
+        first = points[min(row, len(points) - 1)]
+        seen = np.all(np.isfinite(first), axis=1)
+        position[:], mask[row] = np.where(seen[:, None], first, 0.0), seen
+    return Trajectory.build(
+        name=_stem(commands),
+        robot="asl_trunk",
+        format=FORMAT,
+        time=time,
+        position=position,
+        position_mask=mask,
+        marker_names=["disk1", "disk2", "disk3"],
+        command_time=time[:-1],
+        command=command,
+        initial_command=command[0],
+        command_unit="rad",
+        cable_names=[f"motor{motor}" for motor in range(1, MOTORS + 1)],
+        provenance=commands.name,
+        frame=FRAME,
+        settings={"unseen": True},
+    )
+
+
 def read_motor_step(values: Path, times: Path) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows 6"]]:
     """Times [s] after the command and motor angles [rad] of the 30-degree step on motor 1 (files without a header).
 

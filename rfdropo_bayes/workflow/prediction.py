@@ -82,6 +82,8 @@ def _offsets_from_first_row(problem: CalibrationProblem, values: Batch) -> Batch
     shifted = dict(values)
     for index, name in enumerate(recordings.names):
         valid = recordings.line.valid[index, 0]
+        if not recordings.line.valid[index].any():
+            continue  # commands alone: where the frame lies is as uncertain as it was among the fitted recordings
         if not valid.any():
             raise InputError("the first row is masked throughout", where=name, remedy="start the recording later")
         error = recordings.position[index, 0, valid] - position[:, index, 0, valid]

@@ -1,0 +1,48 @@
+"""The command that predicts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rfdropo_bayes.errors import InputError
+
+
+def predict(
+    experiment: Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment that was calibrated")],
+    posterior: Annotated[Path, typer.Option("--posterior", help="folder of its calibration")],
+    commands: Annotated[str, typer.Option("--commands", help="file of commands, in the format of the experiment")],
+    out: Annotated[Path, typer.Option("--out", help="folder to write to")],
+    start: Annotated[
+        str | None, typer.Option("--start", help="file whose first row is the start pose, where it is another file")
+    ] = None,
+    rows: Annotated[str | None, typer.Option("--rows", help="FIRST:LAST observation rows, both included")] = None,
+    seed: Annotated[int | None, typer.Option(help="seed of the draws; that of the experiment by default")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="as in calibrate")] = None,
+) -> None:
+    """Predict commands that were never run: mean, 50 and 90 % bands as NetCDF and CSV (m, base frame)."""
+    from rfdropo_bayes.workflow.unseen import run_prediction
+
+    facts = run_prediction(
+        experiment,
+        posterior,
+        commands,
+        out,
+        start=start,
+        rows=_window(rows),
+        overrides=overrides or [],
+        seed=seed,
+    )
+    typer.echo(json.dumps(facts, indent=2))
+
+
+def _window(rows: str | None) -> tuple[int, int] | None:
+    if rows is None:
+        return None
+    first, _, last = rows.partition(":")
+    if not (first.isdecimal() and last.isdecimal()):
+        raise InputError(f"{rows!r} is not FIRST:LAST", where="--rows", remedy="e.g. --rows 10000:15000")
+    return int(first), int(last)

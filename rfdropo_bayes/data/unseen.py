@@ -1,0 +1,74 @@
+"""Commands whose outcome is to be predicted, with at most the first row of what was measured.
+
+Whatever else a file holds is masked here, so that no prediction can have seen it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from rfdropo_bayes.data.asl_csv import read_asl_start
+from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, load_recordings
+from rfdropo_bayes.data.trajectory import Trajectory
+from rfdropo_bayes.errors import InputError
+
+
+def load_unseen(
+    spec: DataSpec, base: Path, commands: str, start: str | None = None, rows: tuple[int, int] | None = None
+) -> Trajectory:
+    """The commands of a file in the format of an experiment, and its start pose.
+
+    Formats that keep commands and observations in one file take the start pose from its first row. "asl-csv" and "csv"
+    with a command file take it from the first row of ``start``; without one, "asl-csv" starts from an unknown pose.
+
+    Args:
+        spec: the [data] table of the experiment; its recordings are not read.
+        base: folder that paths are relative to.
+        commands: the file of commands.
+        start: the file of observations, where it is another; only one row of it counts.
+        rows: keep observation rows first to last, both included; the start pose is then that of row ``first``.
+
+    Raises:
+        InputError: a file that is missing or bad, a start where the format has it in the same file, or none where a
+            table of columns needs one.
+    """
+    if spec.format == "asl-csv":
+        observations = None if start is None else find_data_file(start, base)
+        whole = read_asl_start(find_data_file(commands, base), observations, rows[0] if rows else 0)
+        return whole if rows is None else whole.slice_rows(*rows)
+    if spec.format == "csv" and start is not None:
+        entry = RecordingEntry(observations=start, commands=commands, rows=rows)
+    elif start is not None:
+        raise InputError(
+            f"format {spec.format!r} keeps commands and observations in one file",
+            where=start,
+            remedy="leave --start out: the first row of the command file is the start",
+        )
+    else:
+        entry = RecordingEntry(observations=commands, rows=rows)
+    changes = {"fit": [entry], "test": [], "resample": None, "missing": "mask"}
+    recordings = load_recordings(spec.model_copy(update=changes), base)
+    if len(recordings) > 1:
+        raise InputError(f"names {len(recordings)} files", where=commands, remedy="predict one at a time")
+    return first_row_only(recordings[0])
+
+
+def first_row_only(trajectory: Trajectory) -> Trajectory:
+    """The same commands and times with every measurement after the first row taken out."""
+    dataset = trajectory.dataset.drop_vars(["tension", "motor_angle", "object_pose"], errors="ignore").copy()
+    position, mask = dataset["position"].values.copy(), dataset["position_mask"].values.copy()
+    position[1:], mask[1:] = position[:1], False
+    return Trajectory(
+        dataset.assign(
+            position=xr.Variable(dataset["position"].dims, position, dataset["position"].attrs),
+            position_mask=xr.Variable(dataset["position_mask"].dims, mask),
+        )
+    )
+
+
+def start_is_known(trajectory: Trajectory) -> bool:
+    """Whether any marker was measured in the first row."""
+    return bool(np.any(trajectory.position_mask[0]))

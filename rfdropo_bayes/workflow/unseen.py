@@ -1,0 +1,144 @@
+"""``rfdropo predict``: what a calibrated simulator expects of commands that were never run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pandas as pd
+import xarray as xr
+from jaxtyping import Float
+
+from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
+from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
+from rfdropo_bayes.data import load_unseen, start_is_known
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.report.run_folder import POSTERIOR
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values
+from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.prediction import predict_new, thin
+
+DRAWS = 200
+LEVELS = {"q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
+SCHEMA_VERSION = 1
+
+
+def run_prediction(
+    path: Path,
+    posterior: Path,
+    commands: str,
+    out: Path,
+    *,
+    start: str | None = None,
+    rows: tuple[int, int] | None = None,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+) -> dict[str, Any]:
+    """Predict what the markers will do under given commands, from at most the start pose.
+
+    Writes ``prediction.nc`` (mean and the 5, 25, 75 and 95 % quantiles of what would be measured, in metres, in the
+    robot's base frame), ``prediction.csv`` (the same, one row per time) and ``prediction.json``.
+
+    Args:
+        path: the experiment file that was calibrated.
+        posterior: folder of its calibration.
+        commands, start: see `data.load_unseen`.
+        out: folder to write to.
+        rows: predict observation rows first to last only; the pose of the first is then that of row ``first``.
+        overrides: assignments that replace entries of the experiment file.
+        seed: of the draws; that of the experiment by default.
+
+    Raises:
+        InputError: bad input, or a posterior that does not belong to the experiment.
+    """
+    experiment, _ = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    if experiment.data is None:
+        raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format the commands are")
+    record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
+    unseen = load_unseen(experiment.data, folder, commands, start, rows)
+    simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
+    fixed = fixed_values(experiment, simulator)
+    specs = simulator.parameters + noise_specs(experiment.model.noise)
+    space = _fitted_space(record, specs)
+    model = TrajectoryModel(simulator, space, fixed, experiment.model.noise, gather_recordings(simulator, [unseen]))
+    values = thin({info.name: record.posterior[info.name] for info in record.free}, DRAWS)
+    key = jax.random.key(experiment.seed if seed is None else seed)
+    predicted = predict_new(model, [unseen], values, key, chunk=simulator.lanes)[0]
+    out = output_folder(out)
+    table = summarise(predicted)
+    table.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": simulator.robot.name, "recording": unseen.name}
+    table.to_netcdf(out / "prediction.nc", engine="h5netcdf")
+    _columns(table).to_csv(out / "prediction.csv", index=False, float_format="%.6f")
+    facts = {
+        "schema_version": SCHEMA_VERSION,
+        "experiment": str(path),
+        "posterior": str(posterior),
+        "commands": commands,
+        "start_pose_known": start_is_known(unseen),
+        "rows": len(predicted.time),
+        "draws": int(predicted.predicted.shape[0]),
+        "unit": "m",
+        "frame": unseen.dataset.attrs["frame"],
+        "simulator": simulator.description,
+        "files": [str(out / "prediction.nc"), str(out / "prediction.csv")],
+    }
+    (out / "prediction.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    return facts
+
+
+def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> ParameterSpace:
+    """The parameters a posterior holds, with the recordings they belong to.
+
+    Raises:
+        InputError: a parameter that the experiment's model lacks.
+    """
+    scopes: dict[str, list[str]] = {}
+    priors: dict[str, dict[str, Any]] = {}
+    for info in record.free:
+        name, _, recording = info.name.partition(SEPARATOR)
+        priors[name] = dict(info.prior)
+        if recording:
+            scopes.setdefault(name, []).append(recording)
+    known = {spec.name for spec in specs}
+    missing = [name for name in priors if name not in known]
+    if missing:
+        raise InputError(
+            f"the posterior holds {missing[0]!r}, which the experiment's model lacks",
+            where="--posterior",
+            remedy="predict with the experiment that was calibrated, mechanisms included",
+        )
+    recordings = sorted({recording for names in scopes.values() for recording in names})
+    return build_space(specs, priors, scopes, recordings, where="posterior")
+
+
+def summarise(predicted: RecordingPrediction) -> xr.Dataset:
+    """Mean and quantiles of the draws of one prediction."""
+    dims = ("time", "marker", "axis")
+    data: dict[str, Any] = {"mean": (dims, predicted.central)}
+    quantiles = np.quantile(predicted.predicted, list(LEVELS.values()), axis=0)
+    data |= {name: (dims, quantile) for name, quantile in zip(LEVELS, quantiles, strict=True)}
+    coords = {"time": predicted.time, "marker": list(predicted.marker_names), "axis": list("xyz")}
+    dataset = xr.Dataset(data, coords, {"schema_version": SCHEMA_VERSION, "unit": "m"})
+    dataset["time"].attrs["units"] = "s"
+    for name in data:
+        dataset[name].attrs["units"] = "m"
+    return dataset
+
+
+def _columns(table: xr.Dataset) -> pd.DataFrame:
+    """One row per time [s]; columns ``<marker>_<axis>_<statistic>`` [m]."""
+    columns: dict[str, Float[np.ndarray, " time"]] = {"time": table["time"].values}
+    for name in ("mean", *LEVELS):
+        for i, marker in enumerate(table["marker"].values):
+            for j, axis in enumerate("xyz"):
+                columns[f"{marker}_{axis}_{name}"] = table[name].values[:, i, j]
+    return pd.DataFrame(columns)

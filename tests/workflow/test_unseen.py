@@ -1,0 +1,114 @@
+"""``rfdropo predict``: commands that were never run, from at most the start pose."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+from rfdropo_bayes.data import Trajectory, first_row_only
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.workflow.unseen import run_prediction
+
+EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
+COMMANDS = "demo/demo_3.nc"
+SHIFT = np.array([0.004, -0.003, 0.002])  # [m]
+RANGES = {"young_modulus": (1.9e6, 2.1e6), "trunk_mass": (0.088, 0.092), "observation_noise": (0.0019, 0.0021)}
+UNITS = {"young_modulus": "Pa", "trunk_mass": "kg", "observation_noise": "m"}
+COARSE = ("simulator.refine=1", "simulator.precision=float64")
+
+
+@pytest.fixture(scope="module")
+def posterior(tmp_path_factory) -> Path:
+    """A posterior of two shared parameters, the noise, and offsets of two recordings."""
+    folder, rng = tmp_path_factory.mktemp("posterior"), np.random.default_rng(0)
+    infos, draws = [], {}
+    for name, (low, high) in RANGES.items():
+        infos.append(ParameterInfo(name, UNITS[name], 0.0, np.inf, prior_of(0.5 * (low + high))))
+        draws[name] = rng.uniform(low, high, (1, 40))
+    for axis in "xyz":
+        for recording in ("demo_1", "demo_2"):
+            name = f"offset_{axis}@{recording}"
+            infos.append(ParameterInfo(name, "m", -0.05, 0.05, {"distribution": "Normal", "loc": 0.0, "scale": 0.005}))
+            draws[name] = rng.normal(0.0, 0.003, (1, 40))
+    PosteriorRecord(tuple(infos), draws).save(folder / "posterior.nc")
+    return folder
+
+
+def prior_of(median: float) -> dict[str, object]:
+    return {"distribution": "LogNormal", "median": median, "sigma": 0.5}
+
+
+def predict(posterior: Path, commands: str, out: Path, rows: tuple[int, int] = (0, 30), **options) -> xr.Dataset:
+    run_prediction(EXPERIMENTS / "demo.toml", posterior, commands, out, rows=rows, overrides=COARSE, **options)
+    with xr.open_dataset(out / "prediction.nc") as opened:
+        return opened.load()
+
+
+def test_only_the_first_row_is_seen_and_sets_the_frame(posterior, tmp_path):
+    """The measured rest pose is shifted: so is all of the prediction. What came after it changes nothing."""
+    whole = Trajectory.load(EXPERIMENTS / COMMANDS)
+    moved = whole.dataset.assign(position=whole.dataset["position"] + xr.DataArray(SHIFT, dims="axis"))
+    Trajectory(moved).save(tmp_path / "moved.nc")
+    first_row_only(Trajectory(moved)).save(tmp_path / "first.nc")
+    here = predict(posterior, COMMANDS, tmp_path / "a")
+    there = predict(posterior, str(tmp_path / "moved.nc"), tmp_path / "b")
+    blind = predict(posterior, str(tmp_path / "first.nc"), tmp_path / "c")
+    for name in ("mean", "q05", "q95"):
+        np.testing.assert_allclose(
+            there[name].values - here[name].values, np.broadcast_to(SHIFT, here[name].shape), atol=1e-7
+        )
+        np.testing.assert_array_equal(blind[name].values, there[name].values)
+    start = here["mean"].values[0] - whole.position[0]
+    np.testing.assert_allclose(start.mean(axis=0), 0.0, atol=1e-9)
+
+
+def test_bands_are_those_of_what_would_be_measured(posterior, tmp_path):
+    """Quantiles in order, no narrower than the noise alone; the table holds the same numbers as the NetCDF."""
+    found = predict(posterior, COMMANDS, tmp_path)
+    levels = [found[name].values for name in ("q05", "q25", "q75", "q95")]
+    assert all(np.all(low <= high) for low, high in pairwise(levels))
+    width = np.median(levels[3] - levels[0])
+    assert 0.8 * 2 * 1.645 * 0.0019 < width < 0.01
+    table = pd.read_csv(tmp_path / "prediction.csv")
+    np.testing.assert_allclose(table["m4_z_q95"], found["q95"].sel(marker="m4", axis="z"), atol=1e-6)
+    np.testing.assert_array_equal(table["time"].round(6), found["time"].values.round(6))
+    assert found["mean"].attrs["units"] == "m"
+
+
+def test_wrong_requests_are_named(posterior, tmp_path):
+    with pytest.raises(InputError, match="one file"):
+        predict(posterior, COMMANDS, tmp_path, start=COMMANDS)
+    with pytest.raises(InputError, match="out of range"):
+        predict(posterior, COMMANDS, tmp_path, rows=(5, 10**6))
+    with pytest.raises(InputError, match="no such file"):
+        predict(posterior, "demo/none.nc", tmp_path)
+    stranger = PosteriorRecord.load(posterior / "posterior.nc")
+    infos = (*stranger.parameters, ParameterInfo("delay", "s", 0.0, 1.0, prior_of(0.1)))
+    draws = {**stranger.posterior, "delay": np.full((1, 40), 0.1)}
+    (tmp_path / "other").mkdir()
+    PosteriorRecord(infos, draws).save(tmp_path / "other" / "posterior.nc")
+    with pytest.raises(InputError, match="the experiment's model lacks"):
+        predict(tmp_path / "other", COMMANDS, tmp_path)
+
+
+def test_asl_commands_may_come_with_a_start_pose_or_without(datasets):
+    from rfdropo_bayes.data import DataSpec, load_recordings, load_unseen
+
+    observations, commands = (f"asl_trunk/{kind}_controlled_1.csv.gz" for kind in ("observations", "control_inputs"))
+    entry = {"observations": observations, "commands": commands, "rows": [10000, 10400]}
+    spec = DataSpec.parse({"format": "asl-csv", "fit": [entry]})
+    measured = load_recordings(spec, datasets)[0]
+    seen = load_unseen(spec, datasets, commands, observations, (10000, 10400))
+    np.testing.assert_array_equal(seen.position[0], measured.position[0])
+    assert not seen.position_mask[1:].any()
+    np.testing.assert_array_equal(seen.command, measured.command)
+    np.testing.assert_array_equal(seen.initial_command, measured.initial_command)
+    unknown = load_unseen(spec, datasets, commands, None, (10000, 10400))
+    assert not unknown.position_mask.any()
+    np.testing.assert_array_equal(unknown.command, measured.command)
