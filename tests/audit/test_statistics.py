@@ -1,0 +1,176 @@
+"""Statistics of the audit on linear-Gaussian models with known answers. Seeds are fixed; where a bound could fail by
+chance, the test says how often it would under another seed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from rfdropo_bayes.audit.bootstrap import tail
+from rfdropo_bayes.audit.extension import Rules
+from rfdropo_bayes.audit.gain import Gain, Unseen, explained_fraction
+from rfdropo_bayes.audit.noise import REPEATS, STATED, NoiseModel, estimate_noise, levinson, rows_before
+from rfdropo_bayes.audit.omnibus import joint_test, statistics
+from rfdropo_bayes.audit.score import likeness, signature, span, statistic
+from rfdropo_bayes.audit.verdict import decide
+
+RNG = np.random.default_rng(20261121)
+ROWS = 400
+BASE = RNG.normal(size=(ROWS, 5))
+EFFECT = RNG.normal(size=(ROWS, 1)) + BASE[:, :1]
+
+
+def ar1(rng: np.random.Generator, shape: tuple[int, ...], phi: float) -> np.ndarray:
+    return NoiseModel(np.ones(shape[-1]), np.array([1.0, phi]), STATED, np.inf).draw(rng, shape)
+
+
+def test_the_score_statistic_is_chi_squared_where_the_base_model_is_right():
+    """Kolmogorov-Smirnov against chi2 at 2000 draws: fails for one seed in 1000."""
+    base = span(BASE)
+    for columns, sign in ((EFFECT, 0), (RNG.normal(size=(ROWS, 3)), 0)):
+        mark = signature(base, columns, sign)
+        lm, surprise = statistic(mark, RNG.normal(size=(2000, ROWS)))
+        assert stats.kstest(lm, stats.chi2(columns.shape[1]).cdf).pvalue > 1e-3
+        np.testing.assert_allclose(np.exp(-surprise), stats.chi2.sf(lm, columns.shape[1]), rtol=1e-8)
+
+
+def test_the_score_statistic_is_the_drop_of_the_sum_of_squares():
+    """For linear models LM is the likelihood-ratio statistic exactly."""
+    residual = RNG.normal(size=ROWS) + 0.2 * EFFECT[:, 0]
+
+    def left(design: np.ndarray) -> float:
+        return float(np.sum((residual - design @ np.linalg.lstsq(design, residual, rcond=None)[0]) ** 2))
+
+    lm, _ = statistic(signature(span(BASE), EFFECT), residual)
+    assert lm == pytest.approx(left(BASE) - left(np.hstack([BASE, EFFECT])), rel=1e-9)
+
+
+def test_a_constrained_effect_counts_on_one_side_only():
+    mark = signature(span(BASE), EFFECT, 1)
+    lm, surprise = statistic(mark, np.stack([EFFECT[:, 0], -EFFECT[:, 0]]))
+    assert lm[0] > 0.0
+    assert lm[1] == 0.0
+    assert surprise[1] == 0.0
+    assert np.exp(-surprise[0]) == pytest.approx(0.5 * stats.chi2.sf(lm[0], 1))
+
+
+def test_what_the_base_parameters_can_imitate_is_not_visible():
+    assert signature(span(BASE), BASE @ RNG.normal(size=(5, 1))).rank == 0
+
+
+def test_likeness_is_the_cosine_of_what_the_base_parameters_leave():
+    base = span(BASE)
+    first = signature(base, EFFECT, 1)
+    assert likeness(first, signature(base, 3.0 * EFFECT + BASE[:, 1:2], 1)) == pytest.approx(1.0)
+    assert likeness(first, signature(base, -EFFECT, 1)) == pytest.approx(-1.0)
+    assert likeness(first, signature(base, -EFFECT, 0)) == pytest.approx(1.0)
+    within = signature(base, np.hstack([EFFECT, RNG.normal(size=(ROWS, 1))]))
+    assert likeness(first, within) == pytest.approx(1.0)
+
+
+def test_the_largest_of_many_statistics_keeps_the_family_at_its_level():
+    """400 null data sets at .02: 8 expected; more than 18 has a chance of 1 in 1000."""
+    base = span(BASE)
+    marks = [signature(base, RNG.normal(size=(ROWS, 1)), k % 2) for k in range(20)]
+
+    def most(residuals: np.ndarray) -> np.ndarray:
+        return np.max([statistic(mark, residuals)[1] for mark in marks], axis=0)
+
+    reference = most(RNG.normal(size=(999, ROWS)))
+    named = sum(tail(value, reference) <= Rules().family for value in most(RNG.normal(size=(400, ROWS))))
+    assert named <= 18
+
+
+def test_the_joint_test_holds_its_level_and_finds_a_slow_discrepancy():
+    """300 null data sets at .05: 15 expected, more than 29 has a chance of 4 in 10000."""
+
+    def drawn(count: int) -> np.ndarray:
+        return RNG.normal(size=(count, 2, 60, 4))
+
+    reference = statistics(drawn(499))
+    observed = statistics(drawn(300))
+
+    def p(observed: dict, row: int) -> float:
+        return joint_test({name: float(v[row]) for name, v in observed.items()}, reference, np.ones(6)).p
+
+    assert sum(p(observed, row) <= 0.05 for row in range(300)) <= 29
+    slow = statistics(drawn(1) + 0.5 * np.sin(np.arange(60) / 8.0)[:, None])
+    assert p(slow, 0) <= 0.01
+
+
+def test_levinson_predicts_as_the_normal_equations_do():
+    correlation = np.array([1.0, 0.7, 0.3, 0.05])
+    table, deviation = levinson(correlation)
+    toeplitz = correlation[np.abs(np.subtract.outer(np.arange(3), np.arange(3)))]
+    exact = np.linalg.solve(toeplitz, correlation[1:])
+    np.testing.assert_allclose(table[3], exact, atol=1e-12)
+    assert deviation[3] ** 2 == pytest.approx(1.0 - exact @ correlation[1:])
+
+
+def test_whitening_is_the_inverse_of_the_covariance_across_gaps_as_well():
+    """Squares of whitened rows sum to r' C^-1 r; a gap of AR(1) noise starts a new stretch."""
+    noise = NoiseModel(np.array([2.0]), np.array([1.0, 0.6]), STATED, np.inf)
+    series, valid = RNG.normal(size=(30, 1)), np.ones((30, 1), dtype=bool)
+    covariance = 4.0 * 0.6 ** np.abs(np.subtract.outer(np.arange(30), np.arange(30)))
+    white = noise.whiten(series, valid)
+    assert np.sum(white**2) == pytest.approx(series[:, 0] @ np.linalg.solve(covariance, series[:, 0]))
+    valid[10:13] = False
+    parts = [slice(0, 10), slice(13, 30)]
+    expected = sum(series[p, 0] @ np.linalg.solve(covariance[p, p], series[p, 0]) for p in parts)
+    assert np.sum(noise.whiten(series, valid) ** 2) == pytest.approx(expected)
+    assert rows_before(valid)[13, 0] == 0
+
+
+def test_the_noise_is_found_from_deviations_of_repeats():
+    """Three repeats of 100 rows and 12 channels: sd and memory within four standard errors (1 seed in 8000)."""
+    repeats = 5e-4 * ar1(RNG, (3, 100, 12), 0.6)
+    deviations = repeats - repeats.mean(axis=0)
+    found = estimate_noise(deviations, np.ones(deviations.shape, dtype=bool), 2 / 3, source=REPEATS)
+    assert found.order == 1
+    assert np.ptp(found.scale) == 0.0
+    assert found.scale[0] == pytest.approx(5e-4, rel=4 * 0.021)
+    assert found.autocorrelation[1] == pytest.approx(0.6, abs=4 * 0.018)
+
+
+def test_the_explained_fraction_is_that_of_the_discrepancy():
+    """Half of the amplitude taken away is three quarters of the mean square. 90 % intervals: 60 data sets, of which
+    fewer than 46 cover the truth for one seed in 1000."""
+    noise = NoiseModel(np.ones(12), np.array([1.0, 0.6]), REPEATS, 2400.0)
+    time = np.arange(100)[:, None]
+    wave = np.sin(time / 9.0 + np.arange(12)) * np.linspace(0.2, 1.6, 12)
+    valid = np.ones((6, 100, 12), dtype=bool)
+    covered, points = 0, []
+    for _ in range(60):
+        size = 1.0 + 0.02 * RNG.standard_normal()
+        error = ar1(RNG, (6, 100, 12), 0.6)
+        stated = NoiseModel(size * np.ones(12), noise.autocorrelation, REPEATS, 2400.0)
+        pattern = stated.whiten(ar1(RNG, (2, 100, 12), 0.6) + wave, np.ones((2, 100, 12), dtype=bool))
+        point, (low, high) = explained_fraction(
+            Unseen(error, valid), error + wave, error + 0.5 * wave, stated, pattern, RNG
+        )
+        points.append(point)
+        covered += low <= 0.75 <= high
+    assert np.mean(points) == pytest.approx(0.75, abs=0.03)
+    assert covered >= 46
+
+
+def gain(explained: float, low: float) -> Gain:
+    return Gain(2e-3, 1e-3, 10.0, 2.0, {}, explained, (low, 1.0), 9e-4, 6)
+
+
+@pytest.mark.parametrize(
+    ("base", "extended", "sizes", "measured", "verdict"),
+    [
+        (0.2, None, [], None, "no_discrepancy"),
+        (0.001, None, [], None, "unexplained"),
+        (0.001, 0.3, [1], gain(0.95, 0.85), "explained"),
+        (0.001, 0.3, [2], gain(0.95, 0.85), "equivalent"),
+        (0.001, 0.04, [1], gain(0.95, 0.85), "partly_explained"),
+        (0.001, 0.3, [1], gain(0.9, 0.75), "partly_explained"),
+        (0.001, 0.3, [1], gain(0.15, 0.1), "unexplained"),
+        (0.001, 0.3, [1], None, "partly_explained"),
+    ],
+)
+def test_the_verdict_follows_its_rules(base, extended, sizes, measured, verdict):
+    assert decide(Rules(), base, extended, sizes, measured) == verdict
