@@ -126,7 +126,7 @@ class Inquiry:
         refits: dict[str, float] = {}
         fits: dict[str, Fit] = {}
         for row in chosen:
-            fits[row.name] = self._refit(found.fit, row)
+            fits[row.name] = self.refit(found.fit, row)
             refits[row.name] = fits[row.name].log_evidence - found.fit.log_evidence
             self.report(f"refit with {row.name}: log Bayes factor {refits[row.name]:.1f}")
         if not refits or max(refits.values()) < self.rules.evidence:
@@ -161,7 +161,8 @@ class Inquiry:
         ]
         return (best.name, *alike)
 
-    def _refit(self, fit: Fit, row: Row) -> Fit:
+    def refit(self, fit: Fit, row: Row) -> Fit:
+        """The model of a fit with a candidate in it."""
         assert row.probe is not None
         if row.name == DISCRETISATION:
             assert self.finer is not None

@@ -94,7 +94,7 @@ def audit(question: Question, report: Callable[[str], None] = lambda line: None)
     """
     began = time.monotonic()
     rng = np.random.default_rng(question.seed)
-    target, base = _base_model(question, rng)
+    target, base = base_model(question, rng)
     report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.order})")
     finer = None
     if question.finer is not None:
@@ -141,7 +141,7 @@ def _simulated(question: Question, finer: bool, chosen: dict[str, int]) -> Forwa
     return Forward(lanes, question.coordinates, commands, chosen)
 
 
-def _base_model(question: Question, rng: np.random.Generator) -> tuple[Target, Fit]:
+def base_model(question: Question, rng: np.random.Generator) -> tuple[Target, Fit]:
     """Noise and base fit; where the noise is estimated from residuals, the two in turn."""
     coordinates = question.coordinates
     per_recording = any(p.recording for p in coordinates.space.parameters)

@@ -70,6 +70,26 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
     }
 
 
+def next_experiment(answer: Answer) -> dict[str, Any] | None:
+    """What to do next: how to split a class, or how to learn more where nothing was named; None if all is well."""
+    if answer.verdict == NO_DISCREPANCY:
+        return None
+    by_name = {c.name: c.mechanism for c in answer.question.candidates}
+    for step in answer.steps:
+        if len(step.members) > 1:
+            checks = [f"{m.replace('_', ' ')}: {by_name[m].remedy}" for m in step.members if m in by_name]
+            words = " from ".join(m.replace("_", " ") for m in step.members[:2])
+            sentence_ = f"To tell {words}: {'; '.join(checks)}. Or let `rfdropo design` propose commands that differ."
+            return {"sentence": sentence_, "separates": list(step.members)}
+    if not answer.steps:
+        leading = [row.name for row in answer.looks[0].rows[:2]]
+        sentence_ = "Run `rfdropo design` for commands that would separate the leading candidates, and repeat each."
+        return {"sentence": sentence_, "separates": leading}
+    name = answer.steps[0].name
+    remedy = getattr(by_name.get(name), "remedy", "raise [simulator] refine and shorten its time_step")
+    return {"sentence": f"Check {name.replace('_', ' ')} on the robot: {remedy}.", "separates": [name]}
+
+
 def _rms(answer: Answer, white: np.ndarray) -> float:
     return float(np.sqrt(np.mean(white[answer.target.measurements.valid.reshape(-1)] ** 2)))
 

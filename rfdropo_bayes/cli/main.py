@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from rfdropo_bayes import __version__
-from rfdropo_bayes.cli import inference, pictures, prediction
+from rfdropo_bayes.cli import audit, inference, pictures, prediction
 from rfdropo_bayes.errors import InputError
 
 INPUT_ERROR, INTERRUPTED = 2, 3
@@ -66,32 +66,6 @@ def calibrate(
 
 
 @app.command()
-def audit(
-    experiment: ExperimentFile,
-    out: OutFolder = None,
-    base: Annotated[
-        Path | None, typer.Option("--base", help="folder of an earlier calibration, to start the base model from")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="seed of the audit; that of the experiment file by default")] = None,
-    overrides: Overrides = None,
-) -> None:
-    """Say what the simulator lacks, by name: writes audit.json, extended.toml and report.html."""
-    from rfdropo_bayes.workflow.audit import run_audit
-
-    folder = out or _default_folder(experiment)
-    found = run_audit(
-        experiment,
-        folder,
-        overrides=overrides or [],
-        base=base,
-        seed=seed,
-        report=lambda line: typer.echo(f"  {line}", err=True),
-    )
-    typer.echo(f"{found['verdict']}: {found['sentence']}")
-    typer.echo(f"audit: {folder / 'audit.json'}; extended model: {folder / 'extended.toml'}")
-
-
-@app.command()
 def simulate(experiment: ExperimentFile, out: OutFolder = None, overrides: Overrides = None) -> None:
     """Simulate the experiment's commands: writes NetCDF and CSV, prints the error against the recording as JSON."""
     from rfdropo_bayes.workflow.experiment import load_experiment
@@ -110,12 +84,15 @@ def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a ca
     typer.echo(f"report: {rebuild_report(folder)}")
 
 
+app.command()(audit.audit)
+app.command()(audit.design)
 app.command()(inference.export)
 app.command()(pictures.view)
 app.command()(prediction.predict)
 
 benchmark = typer.Typer(help="Comparisons that take hours; each can be interrupted and resumed.", no_args_is_help=True)
 benchmark.command()(inference.table1)
+benchmark.command("audit")(audit.benchmark_audit)
 app.add_typer(benchmark, name="benchmark")
 
 

@@ -17,7 +17,7 @@ from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
 from rfdropo_bayes.audit.forward import NARROW, Lanes, RoutedLanes
 from rfdropo_bayes.audit.noise import STATED, NoiseModel
 from rfdropo_bayes.audit.pipeline import Answer, Question, audit
-from rfdropo_bayes.audit.record import record
+from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.bayes.model import gather_recordings
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.space import ParameterSpace, build_space
@@ -89,7 +89,7 @@ def run_audit(
         answer,
         versions=software_versions(),
         data_sha256=combined_hash([trajectory.sha256 for trajectory in [*fitted, *tested]]),
-        next_experiment=None,
+        next_experiment=next_experiment(answer),
     )
     (out / AUDIT).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     (out / EXTENDED).write_text(describe(extended_tables(tables, answer, folder)), encoding="utf-8")

@@ -51,11 +51,11 @@ class Setting:
     robot: str = "smooth_arm"
     commands: CommandsTable = field(
         default_factory=lambda: CommandsTable(
-            duration=5.0, interval=0.2, step=0.005, low=0.0, high=0.02, sample_time=0.05, recordings=["any"]
+            duration=5.0, interval=0.2, step=0.0025, low=0.0, high=0.01, sample_time=0.05, recordings=["any"]
         )
     )
-    audited: Mapping[str, Any] = field(default_factory=lambda: {"refine": 1, "time_step": 0.01})
-    made: Mapping[str, Any] = field(default_factory=lambda: {"refine": 2, "time_step": 0.0075})
+    audited: Mapping[str, Any] = field(default_factory=lambda: {"refine": 2, "time_step": 0.005})
+    made: Mapping[str, Any] = field(default_factory=lambda: {"refine": 3, "time_step": 0.05 / 12})
     spread: float = 0.3
     priors: Mapping[str, Mapping[str, Any]] = field(
         default_factory=lambda: {

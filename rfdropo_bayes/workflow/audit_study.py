@@ -1,0 +1,255 @@
+"""``rfdropo benchmark audit``: how often the audit is right, on data sets with effects hidden in them."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms import REGISTRY
+from rfdropo_bayes.workflow.audit import Workshop, run_audit
+from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.hidden_effects import Hidden, Setting, hide
+
+RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
+TRIES = 8  # mechanisms that are tried until one reaches the wanted size
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One kind of data set: how many effects of which size, and whether the library has them."""
+
+    name: str
+    effects: int
+    rho: float
+    removed: bool = False
+
+
+CONDITIONS = (
+    Condition("null", 0, 0.0),
+    Condition("rho_0.5", 1, 0.5),
+    Condition("rho_0.15", 1, 0.15),
+    Condition("two_effects_rho_1", 2, 1.0),
+    Condition("removed_rho_0.5", 1, 0.5, removed=True),
+)
+
+
+def run_study(
+    out: Path,
+    datasets: int,
+    seed: int,
+    *,
+    workers: int = 1,
+    conditions: Sequence[str] = (),
+    mechanisms: Sequence[str] = (),
+    exclude: Sequence[str] = (),
+    report: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """Hide, audit and count; a data set that is already in the ledger is not run again.
+
+    Args:
+        out: folder for the ledger, audit_power.json and the table.
+        datasets: per condition.
+        seed: of the study.
+        workers: processes.
+        conditions: names of `CONDITIONS`; all by default.
+        mechanisms: that are hidden, by registry name; all by default.
+        exclude: mechanisms that are neither hidden nor tried.
+        report: called with a line after each data set.
+
+    Raises:
+        InputError: an unknown condition or mechanism.
+    """
+    out = output_folder(out)
+    chosen = _conditions(conditions)
+    unknown = [name for name in [*mechanisms, *exclude] if name not in REGISTRY]
+    if unknown:
+        raise InputError(f"unknown mechanism {unknown[0]!r}", where="benchmark audit")
+    library = [name for name in (mechanisms or REGISTRY) if name not in exclude]
+    done = _ledger(out, seed)
+    known = {(row["condition"], row["index"]) for row in done}
+    jobs = [(c, k) for k in range(datasets) for c in chosen if (c.name, k) not in known]
+    began = time.monotonic()
+    arguments = [(asdict(c), k, seed, library, list(exclude), str(out / "data")) for c, k in jobs]
+    for row in _results(arguments, workers):
+        done.append(row)
+        with (out / LEDGER).open("a", encoding="utf-8") as ledger:
+            ledger.write(json.dumps({"seed": seed, **row}) + "\n")
+        report(f"{row['condition']} {row['index']}: hidden {row['hidden']}, {row['verdict']}, named {row['named']}")
+    content = {
+        "seed": seed,
+        "datasets": datasets,
+        "hours": round(sum(row["seconds"] for row in done) / 3600.0, 3),
+        "wall_hours": round((time.monotonic() - began) / 3600.0, 3),
+        "library": library,
+        "conditions": {c.name: summarise([r for r in done if r["condition"] == c.name]) for c in chosen},
+        "schema_version": 1,
+    }
+    (out / RESULT).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    (out / TABLE).write_text(as_table(content), encoding="utf-8")
+    return content
+
+
+def _conditions(names: Sequence[str]) -> list[Condition]:
+    known = {c.name: c for c in CONDITIONS}
+    for name in names:
+        if name not in known:
+            raise InputError(f"unknown condition {name!r}", where="--condition", remedy=f"one of {', '.join(known)}")
+    return [known[name] for name in names] if names else list(CONDITIONS)
+
+
+def _ledger(out: Path, seed: int) -> list[dict[str, Any]]:
+    path = out / LEDGER
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+    return [row for row in rows if row["seed"] == seed]
+
+
+def _results(arguments: Sequence[tuple], workers: int) -> Any:
+    if workers == 1:
+        yield from map(_one, arguments)
+        return
+    # Each process compiles for itself: a forked one would inherit locks of JAX's threads.
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(_one, arguments)
+
+
+_WORKSHOPS: dict[str, Workshop] = {}
+
+
+def _one(argument: tuple[Mapping[str, Any], int, int, list[str], list[str], str]) -> dict[str, Any]:
+    """One data set: hidden, audited, judged."""
+    table, index, seed, library, exclude, folder = argument
+    condition = Condition(**table)
+    began = time.monotonic()
+    workshop = _WORKSHOPS.setdefault("study", {})
+    place = Path(folder) / f"{condition.name}_{index}"
+    number = int(np.random.SeedSequence([seed, index, _place(condition)]).generate_state(1)[0])
+    found = _hidden(condition, number, library, exclude, place, workshop)
+    if found is None:
+        raise InputError("no mechanism reaches the wanted size", where=condition.name)
+    hidden, names = found
+    content = run_audit(hidden.experiment, place / "audit", workshop=workshop)
+    if condition.removed:
+        content = run_audit(
+            hidden.experiment, place / "removed", workshop=workshop, overrides=[_without(content, names, exclude)]
+        )
+    return {
+        "condition": condition.name,
+        "index": index,
+        "hidden": names,
+        "rho": hidden.rho,
+        "truth": hidden.values,
+        **judge(content, names, hidden),
+        "seconds": round(time.monotonic() - began, 1),
+    }
+
+
+def _place(condition: Condition) -> int:
+    return [c.name for c in CONDITIONS].index(condition.name)
+
+
+def _hidden(
+    condition: Condition, seed: int, library: Sequence[str], exclude: Sequence[str], place: Path, workshop: Workshop
+) -> tuple[Hidden, list[str]] | None:
+    """A data set with mechanisms of the library chosen at random, among those that can reach the size."""
+    rng = np.random.default_rng(seed)
+    for _ in range(TRIES):
+        names = sorted(rng.choice(library, condition.effects, replace=False).tolist(), key=list(REGISTRY).index)
+        found = hide(Setting(), names, condition.rho, seed, place, exclude=exclude, workshop=workshop)
+        if found is not None:
+            return found, names
+    return None
+
+
+def _without(content: Mapping[str, Any], names: Sequence[str], exclude: Sequence[str]) -> str:
+    """An override that takes the hidden mechanism and its class out of the library."""
+    alike = {c["mechanism"]: c["cosines"] for c in content["candidates"]}
+    out = set(names) | set(exclude)
+    for name in names:
+        out |= {pair["mechanism"] for pair in alike.get(name, []) if pair["cosine"] > 0.95}
+    return f"audit.exclude={json.dumps(sorted(out & set(REGISTRY)))}"
+
+
+def judge(content: Mapping[str, Any], names: Sequence[str], hidden: Hidden) -> dict[str, Any]:
+    """What the audit said, against what is there.
+
+    ``named_first``: the first finding is a hidden mechanism, or has it in its class. ``covered``: the 90 % interval of
+    each parameter of a mechanism named itself holds the truth, in the identifiable form where there is one.
+    """
+    findings = content["findings"]
+    classes = [set(f["equivalence_class"]) for f in findings]
+    covered = {}
+    for finding in findings:
+        if finding["mechanism"] in names:
+            forms = dict(finding["parameters"])
+            for title, row in finding["relative"].items():
+                name, _, power = title.partition("_over_") if "_over_" in title else title.partition("_times_")
+                forms.pop(name, None)
+                sign = -1.0 if "_over_" in title else 1.0
+                truth = hidden.values[name] * hidden.values[power] ** sign
+                covered[title] = bool(row["q05"] <= truth <= row["q95"])
+            covered |= {n: bool(r["q05"] <= hidden.values[n] <= r["q95"]) for n, r in forms.items()}
+    return {
+        "verdict": content["verdict"],
+        "named": [f["mechanism"] for f in findings],
+        "class_sizes": [len(c) for c in classes],
+        "named_first": bool(classes and any(n in classes[0] for n in names)),
+        "all_named": bool(names) and all(any(n in c for c in classes) for n in names),
+        "explained_fraction": content["gain"]["explained_fraction"] if content["gain"] else None,
+        "covered": covered,
+        "audit_seconds": content["seconds"],
+    }
+
+
+def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Counts over the data sets of one condition; ``confusions`` counts hidden -> named first."""
+    verdicts: dict[str, int] = {}
+    confusions: dict[str, int] = {}
+    for row in rows:
+        verdicts[row["verdict"]] = verdicts.get(row["verdict"], 0) + 1
+        if row["hidden"] and not row["named_first"]:
+            key = f"{' + '.join(row['hidden'])} -> {row['named'][0] if row['named'] else 'none'}"
+            confusions[key] = confusions.get(key, 0) + 1
+    covered = [value for row in rows for value in row["covered"].values()]
+    sizes = [row["class_sizes"][0] for row in rows if row["class_sizes"]]
+    return {
+        "datasets": len(rows),
+        "verdicts": verdicts,
+        "named_first": sum(row["named_first"] for row in rows),
+        "all_named": sum(row["all_named"] for row in rows),
+        "median_class_size": float(np.median(sizes)) if sizes else None,
+        "interval_coverage": float(np.mean(covered)) if covered else None,
+        "discretisation_rho": [round(row["rho"]["discretisation"], 4) for row in rows],
+        "median_audit_seconds": float(np.median([row["audit_seconds"] for row in rows])) if rows else None,
+        "confusions": confusions,
+    }
+
+
+def as_table(content: Mapping[str, Any]) -> str:
+    """The study as a Markdown table."""
+    lines = [
+        f"Seed {content['seed']}; {content['hours']} processor-hours.",
+        "",
+        "| condition | data sets | verdicts | named first | all named | median class | 90 % intervals cover | "
+        "largest discretisation rho |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, row in content["conditions"].items():
+        verdicts = ", ".join(f"{verdict} {count}" for verdict, count in sorted(row["verdicts"].items()))
+        share = "-" if row["interval_coverage"] is None else f"{100 * row['interval_coverage']:.0f} %"
+        rho = max(row["discretisation_rho"], default=0.0)
+        lines.append(
+            f"| {name} | {row['datasets']} | {verdicts} | {row['named_first']} | {row['all_named']} | "
+            f"{row['median_class_size'] or '-'} | {share} | {rho:.3f} |"
+        )
+    confusions = ((name, row["confusions"]) for name, row in content["conditions"].items())
+    wrong = [f"- {name}: {pair} ({count})" for name, pairs in confusions for pair, count in pairs.items()]
+    return "\n".join([*lines, "", "Not named first (hidden -> named):", "", *(wrong or ["- none"])]) + "\n"
