@@ -77,7 +77,7 @@ class ParameterSpace:
         """Log density of the prior in physical units."""
         return sum(p.prior.log_prob(values[p.name]) for p in self.parameters)
 
-    def to_unconstrained(self, values: Mapping[str, Float[Array, "..."]]) -> Float[Array, "... d"]:
+    def to_unconstrained(self, values: Mapping[str, Float[Any, "..."]]) -> Float[Array, "... d"]:
         """Map values to the real line, parameter by parameter in the order of ``names``."""
         return jnp.stack([p.transform.inv(jnp.asarray(values[p.name])) for p in self.parameters], axis=-1)
 

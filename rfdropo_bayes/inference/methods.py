@@ -14,7 +14,7 @@ from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import bridge, horizon_smc, laplace, rfdropo, rivals, starts
+from rfdropo_bayes.inference import bridge, horizon_smc, laplace, nested, nuts, rfdropo, rivals, starts
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 
@@ -36,6 +36,8 @@ METHODS: dict[str, Method] = {
     "rfdropo": Method(rfdropo.RfdropoConfig, rfdropo.run),
     "laplace": Method(laplace.LaplaceConfig, laplace.run),
     "bridge": Method(bridge.BridgeConfig, bridge.run),
+    "nuts": Method(nuts.NutsConfig, nuts.run),
+    "nested": Method(nested.NestedConfig, nested.run),
     "bayessim": Method(rivals.BayesSimConfig, rivals.run_bayessim),
     "npdr": Method(rivals.NpdrConfig, rivals.run_npdr),
     "udr": Method(rivals.UdrConfig, rivals.run_udr),

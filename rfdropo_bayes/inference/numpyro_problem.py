@@ -124,6 +124,11 @@ class NumpyroProblem:
         rows = np.asarray(self._rows(self._join(values)))[:, :horizon]
         return np.where(np.isnan(rows), -np.inf, rows), np.where(np.isnan(rows).any(axis=1), 1, 0)
 
+    def log_likelihood_at(self, u: Float[Array, " d"]) -> Float[Array, ""]:
+        """Log likelihood of all rows at one unconstrained point; traceable and differentiable."""
+        sites = constrain_fn(self.model, self.args, self.kwargs, self._ravelled(u))
+        return self._single_rows({name: sites[name] for name in self._shapes}).sum()
+
     status_names: Mapping[int, str] = {1: "not_a_number"}
 
     @cached_property
@@ -151,14 +156,14 @@ class NumpyroProblem:
 
         return jax.jit(jax.vmap(single))
 
+    def _single_rows(self, sites: dict[str, Array]) -> Float[Array, " rows"]:
+        seeded = handlers.seed(self.model, jax.random.key(0))
+        parts, _ = compute_log_probs(seeded, self.args, self.kwargs, sites, sum_log_prob=False)
+        return jnp.concatenate([_sum_rows(parts[name]) for name in self.row_sites])
+
     @cached_property
     def _rows(self) -> Callable:
-        def single(sites: dict[str, Array]) -> Array:
-            seeded = handlers.seed(self.model, jax.random.key(0))
-            parts, _ = compute_log_probs(seeded, self.args, self.kwargs, sites, sum_log_prob=False)
-            return jnp.concatenate([_sum_rows(parts[name]) for name in self.row_sites])
-
-        return jax.jit(jax.vmap(single))
+        return jax.jit(jax.vmap(self._single_rows))
 
     def _ravelled(self, u: Float[Array, " d"]) -> dict[str, Array]:
         parts, start = {}, 0

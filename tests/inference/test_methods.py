@@ -10,7 +10,8 @@ from rfdropo_bayes.inference import methods
 
 from .toys import Decay, Spring
 
-RIVALS = ("bayessim", "npdr", "udr")  # need an optional package, or no rollouts: tests/inference/test_rivals.py
+# Those that need an optional package, no rollouts or a gradient have tests of their own.
+OTHERS = ("bayessim", "npdr", "udr", "nuts", "nested")
 
 
 @pytest.mark.parametrize(
@@ -41,7 +42,7 @@ def test_options_come_as_toml_has_them():
     assert methods.make_config("smc", {"rollouts": None}).rollouts is None
 
 
-@pytest.mark.parametrize("method", [name for name in methods.METHODS if name not in RIVALS])
+@pytest.mark.parametrize("method", [name for name in methods.METHODS if name not in OTHERS])
 def test_every_method_answers_in_the_same_form(method):
     problem = Spring() if method == "rfdropo" else Decay(n_rows=20)
     options = {"smc": {"particles": 100}, "rfdropo": {"evaluations": 40, "rollouts_per_candidate": 10}}.get(method, {})
