@@ -117,6 +117,9 @@ def make_target(
         return evaluate_prior(problem, points) + likelihood(points)
 
     residuals_at, linearise = _make_linearise(problem, horizon, ledger, u, jacobian)
+    physical = getattr(problem, "physical_names", problem.names)
+    if noise is None and len(physical) < len(problem.names):
+        noise = np.array([name not in physical for name in problem.names])
     if noise is None:
         ledger.charge(problem, 2 * len(u) + 1, horizon)
         noise = _noise_coordinates(
@@ -217,10 +220,13 @@ def _slope(likelihood: Callable, u: np.ndarray, chosen: np.ndarray) -> np.ndarra
 def quadratic_model(target: Target, u: Float[np.ndarray, " d"]) -> tuple[np.ndarray, np.ndarray]:
     """Gradient of the log posterior and a positive definite stand-in for minus its Hessian."""
     residual, jacobian = target.linearise(u)
+    # Where a neighbour's rollout is lost there is no derivative: that coordinate stays where it is for this step.
+    jacobian = np.where(np.isfinite(jacobian).all(axis=0), jacobian, 0.0)
     gradient = -jacobian.T @ residual
     curvature = jacobian.T @ jacobian
     if target.noise.any():
-        gradient[target.noise] = _slope(target.likelihood, u, target.noise)
+        slope = _slope(target.likelihood, u, target.noise)
+        gradient[target.noise] = np.where(np.isfinite(slope), slope, 0.0)
         # Twice, exact in expectation for a scale: J'J has m where the information is 2 m.
         curvature[np.ix_(target.noise, target.noise)] *= 2.0
     return gradient + target.prior_gradient(u), curvature + _positive_part(-target.prior_hessian(u))
@@ -262,11 +268,27 @@ def step(target: Target, state: LevenbergState, tolerance: float) -> tuple[Leven
     return moved, StepInfo(gain, promised, len(dampings))
 
 
+def with_fitting_noise(target: Target, u: Float[np.ndarray, " d"], width: float = 12.0) -> np.ndarray:
+    """The point with its noise coordinates, one after the other, at the best of a wide grid.
+
+    A start drawn from the prior, or the optimum of a shorter horizon, may have a noise that makes its residuals look
+    impossible; every step then answers to the few rows that are hardest to fit.
+    """
+    steps = np.linspace(-0.5 * width, 0.5 * width, 25)
+    for coordinate in np.flatnonzero(target.noise):
+        points = np.tile(u, (len(steps), 1))
+        points[:, coordinate] += steps
+        densities = target.density(points)
+        if np.isfinite(densities).any():
+            u = points[int(np.nanargmax(np.where(np.isfinite(densities), densities, -np.inf)))]
+    return u
+
+
 def maximise(
     target: Target, u: Float[np.ndarray, " d"], *, max_steps: int, tolerance: float
 ) -> tuple[LevenbergState, list[dict[str, Any]]]:
-    """Climb from one start until a step promises less than ``tolerance`` nats."""
-    state = init(target, u)
+    """Climb from one start, noise first, until a step promises less than ``tolerance`` nats."""
+    state = init(target, with_fitting_noise(target, u))
     trace: list[dict[str, Any]] = []
     while not state.converged and len(trace) < max_steps:
         state, info = step(target, state, tolerance)
@@ -281,7 +303,8 @@ def laplace(target: Target, state: LevenbergState) -> Laplace:
         exact = -_noise_hessian(target.likelihood, state.position, target.noise)
         index = np.flatnonzero(target.noise)
         prior = _positive_part(-target.prior_hessian(state.position))
-        curvature[np.ix_(index, index)] = exact + prior[np.ix_(index, index)]
+        if np.isfinite(exact).all():
+            curvature[np.ix_(index, index)] = exact + prior[np.ix_(index, index)]
     values, vectors = np.linalg.eigh(curvature)
     values = np.maximum(values, 1e-12 * values[-1])
     return Laplace(state.position, (vectors / values) @ vectors.T, state.log_density)
