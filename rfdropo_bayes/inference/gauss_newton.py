@@ -23,6 +23,7 @@ from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 
 DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order one
+NOISE_GRID = 13  # values of a noise coordinate tried at the start of a climb
 BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
 
 
@@ -274,7 +275,7 @@ def with_fitting_noise(target: Target, u: Float[np.ndarray, " d"], width: float 
     A start drawn from the prior, or the optimum of a shorter horizon, may have a noise that makes its residuals look
     impossible; every step then answers to the few rows that are hardest to fit.
     """
-    steps = np.linspace(-0.5 * width, 0.5 * width, 25)
+    steps = np.linspace(-0.5 * width, 0.5 * width, NOISE_GRID)
     for coordinate in np.flatnonzero(target.noise):
         points = np.tile(u, (len(steps), 1))
         points[:, coordinate] += steps

@@ -18,6 +18,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.checkpoints import Checkpoint, open_checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.gauss_newton import (
+    NOISE_GRID,
     Laplace,
     LevenbergState,
     laplace,
@@ -30,6 +31,7 @@ from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chai
 from rfdropo_bayes.inference.schedules import block_boundaries
 
 JACOBIANS = ("auto", "forward", "central")
+RIVAL = 30.0  # [nat]: an optimum that far below the best matters to no posterior
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class LaplaceConfig:
     """Levenberg-Marquardt and Laplace.
 
     Attributes:
-        starts: number of climbs.
+        starts: number of climbs at the first horizon; half of them go on to each longer one.
         screen: prior draws, judged at the first horizon: the best is the first start, the others lie apart from it
             among the best quarter.
         blocks: horizons of a climb, doubling; short ones first, because a long recording has many local optima.
@@ -126,7 +128,7 @@ def find_modes(
             target = make_target(
                 problem, horizons[climbs.level], climbs.ledger, best, prior, config.jacobian, climbs.noise
             )
-        allowed = _affordable_steps(problem.n_rows, config, climbs, horizons)
+        allowed = _affordable_steps(problem.n_rows, config, climbs, horizons, int(target.noise.sum()))
         state, steps = maximise(target, climbs.positions[climbs.done], max_steps=allowed, tolerance=config.tolerance)
         climbs = _record(climbs, state, len(steps), horizons[climbs.level], target.noise)
         climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
@@ -140,7 +142,7 @@ def find_modes(
     return _collect(problem, config, climbs, prior)
 
 
-def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizons: tuple[int, ...]) -> int:
+def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizons: tuple[int, ...], noise: int) -> int:
     """Steps the present climb may take: what is left of the budget is shared among climbs by their horizons."""
     if config.rollouts is None:
         return config.max_steps
@@ -148,8 +150,9 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
     now = horizons[climbs.level]
     shares = now * (starts - climbs.done) + starts * sum(horizons[climbs.level + 1 :])
     allowed = (config.rollouts - climbs.ledger.rollouts) * now / shares
-    # A Jacobian by central differences, two more rows for noise coordinates, and six dampings tried.
-    return int(np.clip(allowed * n_rows / now / (4.0 * d + 7.0), 0, config.max_steps))
+    # The grid of the noise; then a Jacobian by central differences, two more rows per noise, six dampings tried.
+    left = allowed * n_rows / now - NOISE_GRID * noise
+    return int(np.clip(left / (4.0 * d + 7.0), 0, config.max_steps))
 
 
 def _screen(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int) -> Climbs:
@@ -187,7 +190,10 @@ def _spread_starts(u: Float[np.ndarray, "n d"], density: Float[np.ndarray, " n"]
 
 
 def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, noise: np.ndarray) -> Climbs:
-    """Put down one finished climb; after the last one of a horizon drop duplicates and go to the next horizon."""
+    """Put down one finished climb; after the last one of a horizon drop duplicates and go to the next horizon.
+
+    Of the climbs of a horizon the better half goes on (successive halving), and every rival of the best.
+    """
     positions, density, converged = climbs.positions.copy(), climbs.log_density.copy(), climbs.converged.copy()
     positions[climbs.done], density[climbs.done] = state.position, state.log_density
     converged[climbs.done] = state.converged
@@ -203,6 +209,9 @@ def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, noi
     for index in order:
         if all(np.max(np.abs(positions[index] - positions[other])) > 0.02 for other in kept):
             kept.append(int(index))
+    kept = [
+        index for rank, index in enumerate(kept) if 2 * rank < len(kept) or density[index] > density[kept[0]] - RIVAL
+    ]
     return climbs._replace(
         positions=positions[kept],
         log_density=density[kept],
@@ -217,7 +226,7 @@ def _collect(
 ) -> Modes:
     """Laplace at every optimum that could matter, in the order of their evidence."""
     warnings = []
-    near = climbs.log_density > climbs.log_density.max() - 30.0
+    near = climbs.log_density > climbs.log_density.max() - RIVAL
     assert climbs.noise is not None
     target = make_target(
         problem, problem.n_rows, climbs.ledger, climbs.positions[0], prior, config.jacobian, climbs.noise
