@@ -66,8 +66,10 @@ def bound_warnings(
     *,
     edge: float = 0.01,
     share: float = 0.1,
+    reached: float = 4.0,
 ) -> list[str]:
-    """A sentence for every parameter with more than ``share`` of its draws within ``edge`` of its range from a bound.
+    """A sentence for every parameter with more than ``share`` of its draws within ``edge`` of its range from a bound,
+    and that bound within ``reached`` standard deviations.
 
     Draws that pile up on a bound say that the bound, not the data, decides: a uniform posterior has 1 % there. Bounds
     that lie decades apart are compared in logarithms: a linear range would put every ordinary value at the lower one.
@@ -82,8 +84,12 @@ def bound_warnings(
         else:
             start, end = low, high
         reach = edge * (end - start)
-        for side, near in (("lower", values < start + reach), ("upper", values > end - reach)):
-            if np.mean(near) > share:
+        away, spread = np.mean(values), reached * np.std(values)
+        for side, near, gap in (
+            ("lower", values < start + reach, away - start),
+            ("upper", values > end - reach, end - away),
+        ):
+            if np.mean(near) > share and gap < spread:
                 bound = low if side == "lower" else high
                 sentences.append(
                     f"{name} sits on its {side} bound {bound:g}: {np.mean(near):.0%} of the draws are there"

@@ -179,8 +179,15 @@ def test_draws_on_a_bound_are_warned_of():
 
 
 def test_a_wide_positive_range_is_measured_in_decades():
-    draws = {"noise": np.full((1, 50), 2e-3), "mass": np.full((1, 50), 1.01e-3), "tilt": np.full((1, 50), 2e-3)}
-    sentences = bound_warnings(draws, {"noise": (1e-6, 1.0), "mass": (1e-3, 1e3), "tilt": (0.0, 1.0)})
+    spread = np.linspace(0.5, 1.5, 50)[None]
+    draws = {
+        "noise": 2e-3 * spread,
+        "mass": 1e-3 + 1e-5 * spread,
+        "tilt": 2e-3 * spread,
+        "damping": 2e-3 + 1e-5 * spread,
+    }
+    bounds = {"noise": (1e-6, 1.0), "mass": (1e-3, 1e3), "tilt": (0.0, 1.0), "damping": (0.0, 2.0)}
+    sentences = bound_warnings(draws, bounds)
     assert [sentence.split()[0] for sentence in sentences] == ["mass", "tilt"]
 
 
