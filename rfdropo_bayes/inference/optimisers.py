@@ -41,8 +41,17 @@ def default_population(name: str, d: int) -> int:
     return max(hansen, 5 * d) if name == "cem" else hansen
 
 
-def make_optimiser(name: str, d: int, *, high: float, sigma: float, population: int, seed: int) -> Optimiser:
-    """An optimiser over ``[0, high]^d`` that starts in the middle.
+def make_optimiser(
+    name: str,
+    d: int,
+    *,
+    high: float,
+    sigma: float,
+    population: int,
+    seed: int,
+    start: Float[np.ndarray, " d"] | None = None,
+) -> Optimiser:
+    """An optimiser over ``[0, high]^d`` that starts in the middle, or at ``start`` (CMA-ES only).
 
     Args:
         name: "cma" or "cem".
@@ -53,7 +62,7 @@ def make_optimiser(name: str, d: int, *, high: float, sigma: float, population: 
         seed: of its random numbers.
     """
     if name == "cma":
-        return CovarianceAdaptation(d, high, sigma * high, population, seed)
+        return CovarianceAdaptation(d, high, sigma * high, population, seed, start)
     if name == "cem":
         return CrossEntropy(d, high, sigma * high, population, seed)
     raise InputError(f"unknown optimiser {name!r}", where="[inference]", remedy=f"one of {', '.join(OPTIMISERS)}")
@@ -98,7 +107,9 @@ class CrossEntropy:
 class CovarianceAdaptation:
     """CMA-ES of pycma, with random numbers of its own instead of numpy's global ones."""
 
-    def __init__(self, d: int, high: float, sigma: float, population: int, seed: int) -> None:
+    def __init__(
+        self, d: int, high: float, sigma: float, population: int, seed: int, start: np.ndarray | None = None
+    ) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # pycma warns of optional plotting packages when imported
             import cma
@@ -113,7 +124,7 @@ class CovarianceAdaptation:
             "tolfun": 0.0,  # the number of generations is the schedule's to decide, not a tolerance's
             "tolx": 0.0,
         }
-        self._strategy = cma.CMAEvolutionStrategy(np.full(d, 0.5 * high), sigma, options)
+        self._strategy = cma.CMAEvolutionStrategy(np.full(d, 0.5 * high) if start is None else start, sigma, options)
 
     def ask(self) -> Float[np.ndarray, "population d"]:
         """Candidates of the next generation."""

@@ -55,6 +55,22 @@ class SearchSpace(NamedTuple):
         drawn = mean[..., None, :] + std[..., None, :] * ndtri(share)
         return np.clip(drawn, self.hard_low, self.hard_high)  # rounding only
 
+    @property
+    def columns(self) -> int:
+        """Uniform numbers that a draw takes."""
+        return len(self.names)
+
+    def log_density(self, vector: Float[np.ndarray, " k"], values: Float[np.ndarray, "n d"]) -> np.ndarray:
+        """Log density of parameter sets under the truncated normals; minus infinity beyond a truncation."""
+        mean, std = self.unpack(vector)
+        lower = np.clip((self.hard_low - mean) / std, -TRUNCATION, TRUNCATION)
+        upper = np.clip((self.hard_high - mean) / std, -TRUNCATION, TRUNCATION)
+        z = (values - mean) / std
+        inside = np.all((z >= lower - 1e-9) & (z <= upper + 1e-9), axis=1)
+        with np.errstate(divide="ignore"):
+            mass = np.log(ndtr(upper) - ndtr(lower)) + 0.5 * np.log(2.0 * np.pi) + np.log(std)
+        return np.where(inside, np.sum(-0.5 * z**2 - mass, axis=1), -np.inf)
+
     def describe(self, vector: Float[np.ndarray, " k"], units: Mapping[str, str]) -> dict[str, dict[str, Any]]:
         """The distribution as a table: mean, std (before truncation), truncation limits and unit of each parameter."""
         mean, std = self.unpack(vector)

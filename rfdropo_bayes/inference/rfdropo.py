@@ -15,22 +15,23 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
-from scipy.stats import qmc
 
 from rfdropo_bayes.bayes.problem import Problem, RolloutProblem
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.candidates import Plan, Simulated, losses, simulate, target_features, uniforms
 from rfdropo_bayes.inference.checkpoints import Checkpoint, open_checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
+from rfdropo_bayes.inference.families import FAMILIES, make_family
 from rfdropo_bayes.inference.optimisers import OPTIMISERS, default_population, make_optimiser
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.proposals import host_generator
-from rfdropo_bayes.inference.randomisation import WIDTH, SearchSpace, search_space
+from rfdropo_bayes.inference.randomisation import WIDTH, search_space
 from rfdropo_bayes.inference.result import InferenceResult, exclusion_warnings
+from rfdropo_bayes.inference.reuse import bootstrap, make_pool, refine
 from rfdropo_bayes.inference.schedules import linear_horizon, paper_horizon
-from rfdropo_bayes.inference.trajectory_match import motion_scale, step_log_likelihood
+from rfdropo_bayes.inference.trajectory_match import motion_scale
 
 HORIZONS = ("paper", "linear", "full")
 FINAL = 10**6  # key of the finalists' random numbers, beyond any generation's
@@ -54,6 +55,9 @@ class RfdropoConfig:
         finalists: candidates scored again at the full horizon.
         parameters: names to search; empty for all that rollouts depend on.
         search: ranges that differ from the central 99 % of the prior, by name.
+        family: "independent" truncated normals (the paper's), "full" covariance, or "mixture" of two.
+        polish: distributions tried at the end on the finalists' own rollouts, re-weighted; none costs a rollout.
+        bootstrap: repetitions of that with the recordings drawn again, for the scatter of phi; needs two recordings.
         draws: draws of the final distribution.
         mended: False gives the published schedule (99 of 100 rows) and returns the lowest loss at any horizon.
     """
@@ -70,6 +74,9 @@ class RfdropoConfig:
     finalists: int = 10
     parameters: tuple[str, ...] = ()
     search: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    family: str = "independent"
+    polish: int = 0
+    bootstrap: int = 0
     draws: int = 2000
     mended: bool = True
 
@@ -83,32 +90,14 @@ class RfdropoConfig:
         for name, lowest in least.items():
             if getattr(self, name) < lowest:
                 raise InputError(f"{name} = {getattr(self, name)} is less than {lowest}", where=where)
+        if self.family not in FAMILIES:
+            raise InputError(f"unknown family {self.family!r}", where=where, remedy=f"one of {', '.join(FAMILIES)}")
+        if self.polish < 0 or self.bootstrap < 0 or self.bootstrap == 1:
+            raise InputError("polish must be 0 or more, bootstrap 0 or 2 and more", where=where)
         if self.population is not None and self.population < 4:
             raise InputError(f"population = {self.population} is less than 4", where=where)
         if self.variance_floor <= 0.0 or self.sigma <= 0.0:
             raise InputError("variance_floor and sigma must be positive", where=where)
-
-
-class Plan(NamedTuple):
-    """Sizes fixed at the start.
-
-    Attributes:
-        space: what is searched.
-        population: candidates per generation.
-        horizons: of every generation, in rows.
-        simulated: rows simulated for each of them.
-        finalists: how many are scored again.
-        fixed: values of the parameters that are not searched.
-        scale: unit of the features [unit of the problem's features].
-    """
-
-    space: SearchSpace
-    population: int
-    horizons: tuple[int, ...]
-    simulated: tuple[int, ...]
-    finalists: int
-    fixed: dict[str, float]
-    scale: float
 
 
 class SearchState(NamedTuple):
@@ -135,7 +124,7 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
     """
     prior = {name: np.asarray(values) for name, values in problem.sample_prior(key, 1000).items()}
     names = config.parameters or tuple(getattr(problem, "physical_names", problem.names))
-    space = search_space(problem, names, config.search, prior)
+    space = make_family(config.family, search_space(problem, names, config.search, prior))
     population = config.population or default_population(config.optimiser, space.dimension)
     fixed = {name: float(np.median(prior[name])) for name in problem.names if name not in names}
     scale = motion_scale(np.asarray(problem.observed, dtype=float), np.asarray(problem.observed_mask))
@@ -187,56 +176,16 @@ def _affordable_generations(n_rows: int, population: int, finalists: int, config
     return low
 
 
-def uniforms(key: PRNGKeyArray, m: int, d: int, *, stratified: bool) -> Float[np.ndarray, "m d"]:
-    """Uniform numbers that all candidates of a generation share; stratified ones (Latin hypercube) scatter less."""
-    generator = host_generator(key)
-    return qmc.LatinHypercube(d, rng=generator).random(m) if stratified else generator.uniform(size=(m, d))
-
-
-def losses(
-    problem: RolloutProblem,
-    plan: Plan,
-    config: RfdropoConfig,
-    candidates: Float[np.ndarray, "c k"],
-    uniform: Float[np.ndarray, "m d"],
-    horizon: int,
-    simulated: int,
-    ledger: Ledger,
-) -> Float[np.ndarray, " c"]:
-    """Minus the log likelihood (eq. 3) of every candidate at one horizon; infinite where half of its rollouts failed.
-
-    Candidates times rollouts go to the problem as ONE batch.
-    """
-    drawn = plan.space.draw(candidates, uniform)
-    c, m, _ = drawn.shape
-    values = {name: jnp.full(c * m, value) for name, value in plan.fixed.items()}
-    values |= {name: jnp.asarray(drawn[..., j].ravel()) for j, name in enumerate(plan.space.names)}
-    features, status = (np.asarray(part) for part in problem.rollouts(values, simulated))
-    ledger.charge(problem, c * m, simulated)
-    features = features[:, :horizon].astype(float) / plan.scale
-    not_a_number = np.logical_not(np.isfinite(features).all(axis=(1, 2)))
-    ledger.exclude(problem, status, not_a_number)
-    alive = ((status == 0) & ~not_a_number).reshape(c, m)
-    features = features.reshape(c, m, *features.shape[1:])
-    mask = np.asarray(problem.observed_mask)[:horizon]
-    observed = np.where(mask, np.asarray(problem.observed, dtype=float)[:horizon], 0.0) / plan.scale
-    out = np.full(c, np.inf)
-    for index in range(c):
-        if alive[index].sum() >= max(2, m / 2):
-            rows = step_log_likelihood(features[index], alive[index], observed, mask, config.variance_floor)
-            out[index] = -rows.sum()
-    return out
-
-
 def step(
     key: PRNGKeyArray, state: SearchState, problem: RolloutProblem, plan: Plan, config: RfdropoConfig, asked: np.ndarray
 ) -> SearchState:
     """Score one generation at its horizon."""
     began = time.monotonic()
     i = len(state.losses)
-    m, d = config.rollouts_per_candidate, len(plan.space.names)
+    m, d = config.rollouts_per_candidate, plan.space.columns
     uniform = uniforms(jax.random.fold_in(key, i), m, d, stratified=config.mended)
-    values = losses(problem, plan, config, asked, uniform, plan.horizons[i], plan.simulated[i], state.ledger)
+    found = simulate(problem, plan, asked, uniform, plan.simulated[i], state.ledger)
+    values = losses(problem, plan, config.variance_floor, found, plan.horizons[i])
     facts = {"generation": i, "horizon": plan.horizons[i], "loss": float(values.min())}
     state.trace.append(facts | {"rollouts": state.ledger.rollouts})
     return state._replace(
@@ -289,7 +238,7 @@ def run(
             remedy="narrow the search ranges to parameters that the simulator can handle",
         )
     chosen, details = _choose(problem, config, plan, state, centre, search_key)
-    uniform = uniforms(jax.random.fold_in(search_key, DRAWS), config.draws, len(plan.space.names), stratified=False)
+    uniform = uniforms(jax.random.fold_in(search_key, DRAWS), config.draws, plan.space.columns, stratified=False)
     draws = plan.space.draw(chosen, uniform)
     ledger = state.ledger
     return InferenceResult(
@@ -350,11 +299,46 @@ def _choose(
         return state.candidates[best], details
     finalists = choose_finalists(state, plan, centre)
     m, n = config.rollouts_per_candidate, problem.n_rows
-    uniform = uniforms(jax.random.fold_in(key, FINAL), m, len(plan.space.names), stratified=True)
-    scores = losses(problem, plan, config, finalists, uniform, n, n, state.ledger)
+    uniform = uniforms(jax.random.fold_in(key, FINAL), m, plan.space.columns, stratified=True)
+    found = simulate(problem, plan, finalists, uniform, n, state.ledger)
+    scores = losses(problem, plan, config.variance_floor, found, n)
     details["finalist_losses"] = scores.tolist()
     state.trace.append({"horizon": n, "loss": float(scores.min()), "rollouts": state.ledger.rollouts, "final": True})
-    return finalists[int(np.argmin(scores))], details
+    best_finalist = finalists[int(np.argmin(scores))]
+    if config.polish or config.bootstrap:
+        generator = host_generator(jax.random.fold_in(key, FINAL + 2))
+        return _reuse(problem, config, plan, finalists, found, best_finalist, generator, details), details
+    return best_finalist, details
+
+
+def _reuse(
+    problem: RolloutProblem,
+    config: RfdropoConfig,
+    plan: Plan,
+    finalists: np.ndarray,
+    found: Simulated,
+    best: np.ndarray,
+    generator: np.random.Generator,
+    details: dict[str, Any],
+) -> np.ndarray:
+    """Polish phi, and measure its scatter over recordings, on the finalists' rollouts alone."""
+    recordings = int(getattr(problem, "n_recordings", 1))
+    observed, mask = target_features(problem, plan, problem.n_rows)
+    pool = make_pool(plan.space, finalists, *found, observed, mask, recordings, config.variance_floor)
+    counts = np.ones(recordings)
+    before = pool.loss(best, counts)
+    polished = refine(pool, best, counts, config.polish, int(generator.integers(2**31))) if config.polish else best
+    details["reuse"] = {
+        "rollouts": len(pool.values),
+        "effective_sample_size": pool.weights(polished)[1],
+        "loss": [before, pool.loss(polished, counts)],
+    }
+    if config.bootstrap and recordings < 2:
+        details["bootstrap"] = "needs two recordings or more"
+    elif config.bootstrap:
+        tried = config.polish or 10 * plan.space.dimension
+        details["bootstrap"] = bootstrap(pool, polished, config.bootstrap, tried, generator)
+    return polished
 
 
 def _pack(state: SearchState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

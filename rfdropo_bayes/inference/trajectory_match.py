@@ -12,6 +12,7 @@ def step_log_likelihood(
     observed: Float[np.ndarray, "time f"],
     mask: Bool[np.ndarray, "time f"],
     variance_floor: float,
+    weights: Float[np.ndarray, " m"] | None = None,
 ) -> Float[np.ndarray, " time"]:
     """Log density of each observed time step under the Gaussian of the Monte-Carlo rollouts.
 
@@ -24,15 +25,20 @@ def step_log_likelihood(
         observed: the trajectory, in the units of the features.
         mask: observed entries that count.
         variance_floor: in squared units of the features.
+        weights: of the live rollouts, summing to one; None for equal ones.
     """
     good = features[alive]
-    deviation = np.where(mask, good - good.mean(axis=0), 0.0)
-    covariance = np.einsum("mtf,mtg->tfg", deviation, deviation, optimize=True) / (len(good) - 1)
+    share = np.full(len(good), 1.0 / len(good)) if weights is None else weights
+    mean = np.einsum("m,mtf->tf", share, good)
+    deviation = np.where(mask, good - mean, 0.0)
+    # Unbiased: for equal weights 1 / (m - 1).
+    share = share / (1.0 - np.sum(share**2))
+    covariance = np.einsum("mtf,mtg->tfg", share[:, None, None] * deviation, deviation, optimize=True)
     f = observed.shape[1]
     # A masked entry becomes an independent unit normal at its mean: it adds nothing but a constant, left out below.
     covariance[:, np.arange(f), np.arange(f)] += np.where(mask, variance_floor, 1.0)
     factor = np.linalg.cholesky(covariance)
-    residual = np.where(mask, observed - good.mean(axis=0), 0.0)
+    residual = np.where(mask, observed - mean, 0.0)
     white = np.linalg.solve(factor, residual[..., None])[..., 0]
     log_determinant = np.log(factor[:, np.arange(f), np.arange(f)]).sum(axis=1)
     return -0.5 * np.sum(white**2, axis=1) - log_determinant - 0.5 * np.log(2.0 * np.pi) * mask.sum(axis=1)
