@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,8 +19,10 @@ from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
 from rfdropo_bayes.simulators.mesh_engines import CompiledMeshEngine
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
 from rfdropo_bayes.simulators.push_engines import LayeredPushEngine, MeshPushEngine
-from rfdropo_bayes.simulators.pushing import PushSimulator, push_table
+from rfdropo_bayes.simulators.pushing import PushMotion, PushSimulator, push_table
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
+from rfdropo_bayes.workflow.engines import build_push_simulator
+from rfdropo_bayes.workflow.experiment import SimulatorTable
 
 TIME_STEP, HALF = 0.01, 0.0175
 SOFA = load_robot("trunk_sofa_mesh")
@@ -148,8 +152,58 @@ def test_a_layered_body_pushes_too():
     assert np.asarray(below.position)[-1, near, 1].min() > REST_HEIGHT + HALF + 0.005 + 0.006
 
 
-def test_lost_and_unsolved_rollouts_say_so(rollout):
+def test_a_rollout_that_is_lost_says_so(rollout):
     assert int(rollout(cube_mass=float("nan")).status) == Result.DIVERGED
+
+
+class Standing(NamedTuple):
+    """An engine whose trunk and cube stand still, and whose rollout ends as it is told."""
+
+    trunk: MeshTrunkSimulator
+    ending: dict
+    time_step: float = TIME_STEP
+    lanes: int = 1
+
+    def describe(self) -> dict:
+        return {"engine": "none"}
+
+    def motion(self, values, commands, cube) -> PushMotion:
+        rows = len(commands.step) + 1
+        pose = jnp.concatenate([cube.start.position, cube.start.orientation])
+        fine = {"diverged": False, "cables_converged": True, "contacts_converged": True, "imbalance": 0.0}
+        ending = {name: jnp.asarray(value) for name, value in (fine | self.ending).items()}
+        markers = jnp.zeros((rows, len(self.trunk.marker_names), 3))
+        return PushMotion(markers, jnp.zeros((rows, 8)), jnp.tile(pose, (rows, 1)), **ending)
+
+
+@pytest.mark.parametrize(
+    ("ending", "result"),
+    [
+        ({}, Result.OK),
+        ({"contacts_converged": False}, Result.CONTACT_NOT_CONVERGED),
+        ({"contacts_converged": False, "cables_converged": False}, Result.CABLE_LIMIT),
+        ({"imbalance": 1.0, "contacts_converged": False}, Result.NOT_IN_EQUILIBRIUM),
+        ({"diverged": True, "contacts_converged": False}, Result.DIVERGED),
+    ],
+)
+def test_a_rollout_says_how_it_ended(trunk, commands, ending, result):
+    simulator = PushSimulator(Standing(trunk, ending))
+    observation = simulator.rollout({"cube_yaw": jnp.asarray(0.4)}, commands)
+    assert int(observation.status) == result
+    np.testing.assert_allclose(observation.object_pose[-1, 3:], [0.0, np.sin(0.2), 0.0, np.cos(0.2)], atol=1e-12)
+    assert simulator.description["engine"] == "none"
+    assert simulator.description["object"] == "cube"
+
+
+def test_an_engine_without_contacts_is_replaced_and_says_so(trunk, caplog):
+    assert isinstance(build_push_simulator(SimulatorTable(push=True), trunk).engine, MeshPushEngine)
+    assert not caplog.messages
+    for asked in ({"engine": "numba"}, {"precision": "float32"}):
+        caplog.clear()
+        built = build_push_simulator(SimulatorTable(push=True, **asked), trunk)
+        assert built.description["engine"] == "jax"
+        assert built.description["precision"] == "float64"
+        assert len(caplog.messages) == 1
 
 
 def test_a_robot_without_a_cube_is_refused():
