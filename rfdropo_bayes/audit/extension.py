@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -84,7 +84,6 @@ class Inquiry:
     seed: int
     finer: Forward | None = None
     report: Callable[[str], None] = lambda line: None
-    looks: list[Look] = field(default_factory=list)
 
     def look_at(self, fit: Fit, without: Sequence[str] = ()) -> tuple[Look, list[Probe]]:
         """Test a fit and screen the candidates that are not in it."""

@@ -196,6 +196,6 @@ def _wiener(pattern: Float[np.ndarray, "group time component"], rows: int) -> Fl
     for index in range(BANDS):
         if (band == index).any():
             excess[band == index] = np.maximum(power[band == index].mean(axis=0) - 1.0, 0.0)
-    share = excess / (excess + 1.0)
+    share = excess / (excess + 1.0) if excess.any() else np.ones_like(excess)
     at = np.minimum((np.arange(rows) / rows * len(power)).astype(int), len(power) - 1)
     return share[at]

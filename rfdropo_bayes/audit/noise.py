@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from scipy.signal import lfilter
 
 MAX_ORDER = 3
+LEAST_SHARE = 0.05  # of the mean deviation that a channel has at least: a marker that never moves is no certainty
 REPEATS, STATED, RESIDUALS = "repeats", "stated", "residuals"
 
 
@@ -113,6 +114,7 @@ def estimate_noise(
     count = np.maximum(valid.sum(axis=(0, 1)), 1) * freedom_share
     own = np.sqrt(np.maximum(square.sum(axis=(0, 1)) / count, 1e-20))
     shared = float(np.sqrt(max(square.sum() / count.sum(), 1e-20)))
+    own = np.maximum(own, LEAST_SHARE * shared)
     if pooled is None:
         gain = count.sum() * np.log(shared) - np.sum(count * np.log(own))
         pooled = bool(gain < 0.5 * len(own) * np.log(count.sum()) * 3.0)  # memory leaves a third of the rows' worth

@@ -132,6 +132,7 @@ def build_question(
     candidates = [
         Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
         for name, m in zip(names, added, strict=True)
+        if name not in experiment.audit.exclude
     ]
 
     def lanes(changed: Experiment) -> tuple[Lanes, Commands]:
@@ -157,17 +158,19 @@ def build_question(
 
 
 def candidate_names(experiment: Experiment) -> list[str]:
-    """What is tried: the registry and the experiment's own, less what is in the model or excluded.
+    """What may be in the model: the registry and the experiment's own, less what is in its base model.
+
+    Excluded ones are among them, so that what is compiled does not depend on what is excluded.
 
     Raises:
-        InputError: a name to exclude that is not tried.
+        InputError: a name to exclude that is not there.
     """
     table = experiment.audit
-    check = [name for name in table.exclude if name not in [*REGISTRY, *table.candidates]]
-    if check:
-        raise InputError(f"unknown mechanism {check[0]!r}", where="[audit] exclude", remedy=nearest(check[0], REGISTRY))
-    tried = [*REGISTRY, *(name for name in table.candidates if name not in REGISTRY)]
-    return [name for name in tried if name not in experiment.model.mechanisms and name not in table.exclude]
+    known = [*REGISTRY, *(name for name in table.candidates if name not in REGISTRY)]
+    for name in table.exclude:
+        if name not in known:
+            raise InputError(f"unknown mechanism {name!r}", where="[audit] exclude", remedy=nearest(name, known))
+    return [name for name in known if name not in experiment.model.mechanisms]
 
 
 def _with(experiment: Experiment, names: Sequence[str]) -> Experiment:
