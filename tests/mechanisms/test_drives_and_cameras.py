@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.robots import load_robot
 
+REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.01
 TIME = jnp.asarray(np.cumsum(np.concatenate([[0.0], np.random.default_rng(0).uniform(0.04, 0.06, 79)])))
 COMMAND = jnp.stack([0.01 * jnp.sin(jnp.arange(80) / 9.0), 0.008 * (1 - jnp.cos(jnp.arange(80) / 13.0))], axis=1)
@@ -126,3 +129,13 @@ def test_a_mechanism_of_the_users_own_is_found_beside_the_experiment(tmp_path):
     for wrong in ("mine.py:None_", "other.py:Half", "no.such:Thing", "mine.py:Nothing"):
         with pytest.raises(InputError):
             mechanisms_named([wrong], folder=tmp_path)
+
+
+def test_the_documented_example_is_a_mechanism(tmp_path):
+    text = (REPOSITORY / "docs" / "mechanisms.md").read_text()
+    (tmp_path / "overshoot.py").write_text(text.split("```python\n")[1].split("```")[0])
+    (mechanism,) = mechanisms_named(["overshoot.py:Overshoot"], folder=tmp_path)
+    np.testing.assert_array_equal(mechanism.actuate({"overshoot_time": 0.0}, COMMAND, START, STEP), COMMAND)
+    ramp = STEP * jnp.arange(1, 81)[:, None] * jnp.ones(2)
+    moved = mechanism.actuate({"overshoot_time": 0.03}, ramp, START, STEP)
+    np.testing.assert_allclose(moved, ramp + 0.03, atol=1e-12)
