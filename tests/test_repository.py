@@ -83,6 +83,7 @@ def test_documented_make_commands_exist(document: Path) -> None:
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_documented_rfdropo_commands_exist(document: Path) -> None:
     known = {command.name or command.callback.__name__ for command in app.registered_commands if command.callback}
+    known |= {group.name for group in app.registered_groups}
     named = set(re.findall(r"\brfdropo +([a-z][a-z-]*)", code_in(document)))
     assert named <= known, f"{document.name} names {sorted(named - known)}"
 

@@ -16,7 +16,8 @@ from rfdropo_bayes.inference.mixture import ModeMixture
 from rfdropo_bayes.inference.schedules import log_effective_sample_size
 
 INFLATION, DEGREES, PRIOR_SHARE = 1.3, 5.0, 0.2  # a short prefix says little: its posterior is near the prior
-STEPS = 12  # of the climb from the optimum of all rows to that of a prefix
+MOST_STEPS = 12  # of the climb from the optimum of all rows to that of a prefix
+MOST_DRAWS, FEWEST_DRAWS = 400, 30
 
 
 class PrefixEvidence(NamedTuple):
@@ -33,7 +34,7 @@ def prefix_evidence(
     mode: Laplace,
     noise: np.ndarray,
     horizons: tuple[int, ...],
-    draws: int,
+    budget: float | None,
     key: PRNGKeyArray,
     ledger: Ledger,
 ) -> list[PrefixEvidence]:
@@ -44,20 +45,39 @@ def prefix_evidence(
         mode: of all rows, from which the climbs to the prefixes' optima start.
         noise: noise coordinates.
         horizons: prefix lengths.
-        draws: importance draws per prefix.
+        budget: full-length rollouts for all of it, half for climbs and half for draws; None for no limit.
         key: random key.
         ledger: is charged.
+
+    Returns:
+        nothing where the budget does not allow it.
     """
+    steps, draws = _affordable(problem, noise, horizons, budget)
+    if steps < 1 or draws < FEWEST_DRAWS:
+        return []
     prior, start, found = prior_derivatives(problem), mode.mean, []
     for horizon in sorted(horizons, reverse=True):
         target = make_target(problem, horizon, ledger, start, prior, "auto", noise)
-        state, _ = maximise(target, start, max_steps=STEPS, tolerance=1e-2)
+        state, _ = maximise(target, start, max_steps=steps, tolerance=1e-2)
         start = state.position
         mixture = ModeMixture(problem, [laplace(target, state)], INFLATION, DEGREES, PRIOR_SHARE)
         u = mixture.sample(jax.random.fold_in(key, horizon), draws)
         density = evaluate_prior(problem, u) + evaluate_rows(problem, u, horizon, ledger).sum(axis=1)
         found.append(_estimate(horizon, density - mixture.log_density(u)))
     return found[::-1]
+
+
+def _affordable(
+    problem: ResidualProblem, noise: np.ndarray, horizons: tuple[int, ...], budget: float | None
+) -> tuple[int, int]:
+    """Steps of each climb, and draws for each prefix."""
+    if budget is None or not horizons:
+        return MOST_STEPS, MOST_DRAWS
+    share = 0.5 * budget * problem.n_rows / sum(horizons)  # rollouts of a prefix, climb and draws each
+    d, k = len(noise), int(noise.sum())
+    step = 4.0 * d + 7.0  # a Jacobian by differences, noise coordinates, six dampings
+    around = step + 4.0 * k**2  # the normal approximation at the end
+    return min(MOST_STEPS, int((share - around) / step)), min(MOST_DRAWS, int(share))
 
 
 def _estimate(horizon: int, log_weights: Float[np.ndarray, " n"]) -> PrefixEvidence:

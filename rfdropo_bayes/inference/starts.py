@@ -31,7 +31,7 @@ from rfdropo_bayes.inference.schedules import block_boundaries
 from rfdropo_bayes.inference.sharpness import Way, way_from_prior
 
 CLIMBING = 0.25  # share of the budget that looking for optima may take
-SCORING = 0.05  # and the evidence of the blocks
+SCORING = 0.1  # and the evidence of the blocks
 MARGIN = 3.0  # what real posteriors cost over the estimate, which takes them to be normal and data to be even
 WORTH_A_REPLICATE = 100  # particles
 ENOUGH = 200  # particles per replicate that a start at the prior must allow
@@ -120,7 +120,7 @@ def _from_optima(
     sample_key, score_key = jax.random.split(key)
     left = None if config.rollouts is None else config.rollouts - found.climbs.ledger.rollouts
     scoring = None if left is None else SCORING * config.rollouts  # type: ignore[operator]
-    sampling = None if left is None else left - 2.0 * scoring  # type: ignore[operator]
+    sampling = None if left is None else left - scoring  # type: ignore[operator]
     settings = bridge.BridgeConfig(
         rollouts=sampling,
         particles=config.particles,
@@ -166,10 +166,7 @@ def _prefixes(
     """Evidence at the ends of all blocks but the last, whose evidence is the sampler's."""
     ledger = Ledger()
     horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)[:-1]
-    looks = sum(horizons) / problem.n_rows
-    draws = 400 if scoring is None else int(scoring / max(looks, 1e-9))
-    if not horizons or draws < 30:
-        return [], ledger
     assert found.climbs.noise is not None
-    best = found.modes[0]
-    return prefix_evidence(problem, best, found.climbs.noise, horizons, min(draws, 400), key, ledger), ledger
+    if not horizons:
+        return [], ledger
+    return prefix_evidence(problem, found.modes[0], found.climbs.noise, horizons, scoring, key, ledger), ledger

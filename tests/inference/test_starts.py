@@ -93,6 +93,15 @@ def test_both_modes_survive_a_start_at_the_optima():
     assert np.mean(result.draws["x0"] > 0) == pytest.approx(share, abs=0.2)
 
 
+@pytest.mark.parametrize("budget", [2500, 4000])
+def test_the_budget_covers_climbs_sampler_and_scores(budget):
+    """The whole is within the budget, whatever the parts take; scores are left out before it is exceeded."""
+    problem = LinearGaussian(n_rows=40, d=6, noise=1e-2)
+    result = methods.run(problem, "smc", {"rollouts": budget, "blocks": 2, "start": "optimum"}, KEY)
+    assert result.rollouts <= budget
+    assert sum(n * h for n, h in problem.calls) / problem.n_rows <= budget
+
+
 def test_a_start_at_the_optima_needs_residuals():
     with pytest.raises(InputError, match="no residuals"):
         methods.run(Spring(), "smc", {"start": "optimum"}, KEY)
