@@ -43,9 +43,14 @@ def local_displacement(
     frame: Float[Array, "layers 3 3"], position: Float[Array, "layers nodes2 3"], rest: Float[Array, "layers nodes2 3"]
 ) -> Float[Array, "layers dofs"]:
     """Displacement in the layer's own frame, R' x - X. Node positions relative to a node keep its digits."""
-    relative = position - position[:, :1]
-    turned = jnp.einsum("lji,lnj->lni", frame, relative)
-    return (turned - (rest - rest[:, :1])).reshape(len(frame), -1)
+    return turned_back(frame, position) - (rest - rest[:, :1]).reshape(len(frame), -1)
+
+
+def turned_back(
+    frame: Float[Array, "layers 3 3"], field: Float[Array, "layers nodes2 3"]
+) -> Float[Array, "layers dofs"]:
+    """A nodal field in each layer's own frame, relative to its first node."""
+    return jnp.einsum("lji,lnj->lni", frame, field - field[:, :1]).reshape(len(frame), -1)
 
 
 def internal_force(

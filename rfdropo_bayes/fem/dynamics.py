@@ -3,11 +3,11 @@
     A dv = h (f(x) + M g + f_ext - (h + b) K v - a M v) - h J' T,    A = (1 + h a) M + h (h + b) K,    x += h (v + dv)
 
 with Rayleigh damping a M + b K, the corotational tangent K, cable Jacobian J = dl/dx and tensions T >= 0 (Baraff and
-Witkin 1998; the same linearised step as SOFA's EulerImplicitSolver). What taut cables hold against twist is implicit
-too: at the necks of a notched trunk it exceeds the body's own stiffness, and steps that leave it out swing. What
-``effects`` add is implicit in the same way: their force, linearised, at the end of the step. Everything is a pure
-function of arrays: batch with ``jax.vmap``, differentiate with ``jax.jvp`` or ``jax.grad``. A ``System`` is static and
-is closed over, never traced.
+Witkin 1998; the same linearised step as SOFA's EulerImplicitSolver). What taut cables and layers hold against twist and
+lateral motion is implicit too: under opposed cables it exceeds the body's own stiffness, and steps that leave it out
+swing. What ``effects`` add is implicit in the same way: their force, linearised, at the end of the step. Everything is
+a pure function of arrays: batch with ``jax.vmap``, differentiate with ``jax.jvp`` or ``jax.grad``. A ``System`` is
+static and is closed over, never traced.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
 from rfdropo_bayes.fem.layered import LayeredBody
 from rfdropo_bayes.fem.pulling import CableSolution, Pull, constrained_increment
 from rfdropo_bayes.fem.surroundings import SectionLoad, section_load
+from rfdropo_bayes.fem.tension_stiffening import lateral_stiffening, layer_tension
 
 POISSON_LIMIT = 0.499
 """Larger Poisson ratios are taken as this one: the displacement element has no incompressible limit."""
-LOST = 10.0
+LOST = 3.0
 """A node further from its place at rest than this many body lengths means that the rollout has diverged."""
 
 
@@ -239,6 +240,7 @@ class _Elastic(NamedTuple):
     """Elastic forces of a step: what acts at its start, and how that changes to its end."""
 
     frame: Float[Array, "layers 3 3"]
+    resistance: Float[Array, "layers dofs"]  # in the frames, to strain and its rate
     force: Float[Array, "nodes 3"]
     tangent: BlockTridiagonal
     lookahead: Scalar  # [s] times the tangent times the velocity is the change of force
@@ -254,7 +256,7 @@ def _elastic(system: System, prepared: Prepared, state: State, time_step: Scalar
     """
     frame, local = frames_and_displacements(system, prepared, state.position)
     force, packed = resistance(prepared, local)
-    memory, gain = state.memory, jnp.zeros(())
+    memory, gain, left = state.memory, jnp.zeros(()), jnp.ones(())
     viscous, rate = prepared.effects.viscoelasticity, prepared.effects.softening_rate
     if viscous is not None and memory.branch is not None:
         share = time_step / (viscous.time + time_step)
@@ -267,8 +269,11 @@ def _elastic(system: System, prepared: Prepared, state: State, time_step: Scalar
         left = jnp.exp(-rate * clock)
         force, packed, memory = left * force, left * packed, memory._replace(clock=clock)
     tangent = corotational.tangent(packed, frame)
-    force = corotational.internal_force(frame, force).reshape(-1, 3)
-    return _Elastic(frame, force, tangent, time_step * (1.0 + gain) + prepared.rayleigh_stiffness, memory)
+    lookahead = time_step * (1.0 + gain) + prepared.rayleigh_stiffness
+    moving = corotational.turned_back(frame, layered.layer_positions(system.body, state.velocity))
+    viscous_force = left * lookahead * jnp.einsum("lij,lj->li", prepared.stiffness, moving)
+    nodal = corotational.internal_force(frame, force).reshape(-1, 3)
+    return _Elastic(frame, force + viscous_force, nodal, tangent, lookahead, memory)
 
 
 def _surround(
@@ -285,6 +290,16 @@ def _surround(
     force = load.force - time_step * jnp.einsum("sij,sj->si", load.stiffness, velocity)
     added = time_step * load.damping + time_step**2 * load.stiffness
     return with_section_matrix(system, matrix, added), right + time_step * shared(system, force)
+
+
+def _taut(system: System, prepared: Prepared, state: State, elastic: _Elastic, time_step: Scalar) -> BlockTridiagonal:
+    """What taut cables and layers hold against twist and lateral motion, times the time step squared."""
+    jacobian = lengths_and_jacobian(system.cables, prepared.guides, state.position)[1]
+    cable = -jnp.einsum("cni,c->ni", jacobian, state.tension)
+    tension = layer_tension(system.body, elastic.resistance, cable, elastic.frame)
+    twist = twist_stiffening(system.body, system.cables, elastic.frame, time_step**2 * state.tension)
+    lateral = lateral_stiffening(system.body, elastic.frame, time_step**2 * tension)
+    return jax.tree.map(jnp.add, twist, lateral)
 
 
 class Linear(NamedTuple):
@@ -312,9 +327,9 @@ def linearised(
     inertia, elasticity = 1.0 + time_step * prepared.rayleigh_mass, time_step * elastic.lookahead
     mass = _with_axes(prepared.mass)
     matrix = BlockTridiagonal(*(inertia * m + elasticity * k for m, k in zip(mass, elastic.tangent, strict=True)))
-    twist = twist_stiffening(system.body, system.cables, elastic.frame, time_step**2 * state.tension)
-    matrix = BlockTridiagonal(*(m + k for m, k in zip(matrix, twist, strict=True)))
-    right = right - multiply(twist, state.velocity.reshape(stations, -1, 1)).reshape(-1, 3)
+    taut = _taut(system, prepared, state, elastic, time_step)
+    matrix = BlockTridiagonal(*(m + k for m, k in zip(matrix, taut, strict=True)))
+    right = right - multiply(taut, state.velocity.reshape(stations, -1, 1)).reshape(-1, 3)
     centre, drift = section_means(system, state.position), section_means(system, state.velocity)
     around = section_load(system.body, prepared.effects, centre, drift)
     matrix, right = _surround(system, around, matrix, right, drift, time_step)

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -28,6 +27,7 @@ from rfdropo_bayes.fem.dynamics import (
 )
 from rfdropo_bayes.fem.pulling import Pull, constrained_increment
 from rfdropo_bayes.fem.surroundings import section_load
+from rfdropo_bayes.fem.tension_stiffening import lateral_stiffening, layer_tension
 
 ITERATIONS = 60
 TOLERANCE = 1e-6
@@ -52,36 +52,6 @@ class _Iterate(NamedTuple):
     relaxation: Float[Array, ""]
 
 
-def _tension_stiffening(
-    system: System, frame: Float[Array, "layers 3 3"], tension: Float[Array, " layers"]
-) -> BlockTridiagonal:
-    """Geometric stiffness N / L of layers in tension against lateral motion of one face relative to the other.
-
-    The corotational tangent leaves it out; without it the iteration for a soft body that hangs in its cables or its own
-    weight swings about the answer with growing amplitude. Compression is left out: its stiffness would be negative.
-    """
-    nodes = system.body.section_nodes
-    axis = frame[:, :, 2]
-    lateral = jnp.eye(3) - axis[:, :, None] * axis[:, None, :]
-    spring = jnp.maximum(tension, 0.0) / np.diff(system.body.station) / nodes**2
-    block = jax.vmap(lambda part: jnp.kron(jnp.ones((nodes, nodes)), part))(lateral * spring[:, None, None])
-    none = jnp.zeros_like(block[:1])
-    return BlockTridiagonal(jnp.concatenate([block, none]) + jnp.concatenate([none, block]), -block)
-
-
-def _layer_tension(
-    system: System,
-    local_force: Float[Array, "layers dofs"],
-    cable_force: Float[Array, "nodes 3"],
-    frame: Float[Array, "layers 3 3"],
-) -> Float[Array, " layers"]:
-    """Axial force [N] in each section, body and cables together: what a cable compresses, it holds straight as well."""
-    nodes = system.body.section_nodes
-    body = jnp.sum(local_force.reshape(len(frame), 2 * nodes, 3)[:, nodes:, 2], axis=1)
-    beyond = jnp.cumsum(jnp.sum(cable_force.reshape(-1, nodes, 3), axis=1)[::-1], axis=0)[::-1][1:]
-    return body - jnp.einsum("li,li->l", beyond, frame[:, :, 2])
-
-
 class _Forces(NamedTuple):
     body: Float[Array, "nodes 3"]  # of the body and of what surrounds it
     tangent: BlockTridiagonal
@@ -97,7 +67,7 @@ def _forces(system: System, prepared: Prepared, iterate: _Iterate) -> _Forces:
     body = corotational.internal_force(frame, local_force).reshape(-1, 3)
     length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, iterate.position)
     cable = -jnp.einsum("cni,c->ni", jacobian, iterate.tension)
-    stiffening = _tension_stiffening(system, frame, _layer_tension(system, local_force, cable, frame))
+    stiffening = lateral_stiffening(system.body, frame, layer_tension(system.body, local_force, cable, frame))
     twist = twist_stiffening(system.body, system.cables, frame, iterate.tension)
     tangent = jax.tree.map(lambda *parts: sum(parts), corotational.tangent(packed, frame), stiffening, twist)
     centre = section_means(system, iterate.position)

@@ -138,6 +138,7 @@ class CompiledEngine:
             jax.ShapeDtypeStruct((rows, cables), jnp.float64),
             jax.ShapeDtypeStruct((), jnp.bool_),
             jax.ShapeDtypeStruct((), jnp.float64),
+            jax.ShapeDtypeStruct((), jnp.bool_),
         )
         return jax.pure_callback(
             self._on_host, shapes, material, start, displacement, limit, vmap_method="broadcast_all"
@@ -160,6 +161,7 @@ class CompiledEngine:
             padded(found.tension, rows).reshape(*batch, rows, displacement.shape[-1]),
             found.diverged.reshape(batch),
             found.residual.reshape(batch),
+            found.cables_converged.reshape(batch),
         )
 
 

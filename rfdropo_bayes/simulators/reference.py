@@ -59,4 +59,5 @@ class ReferenceEngine:
             jnp.concatenate([state.tension[None], rollout.tension]),
             rollout.diverged,
             imbalance,
+            rollout.cables_converged,
         )

@@ -28,6 +28,7 @@ class Motion(NamedTuple):
     tension: Float[Array, "row cable"]
     diverged: Bool[Array, ""]
     imbalance: Float[Array, ""]  # relative unbalanced force of the initial equilibrium; 0 for a start at rest
+    cables_converged: Bool[Array, ""]  # whether the tensions of every step were found
 
 
 class Engine(Protocol):
@@ -171,11 +172,12 @@ class TrunkSimulator(RobotSimulator):
         values = self.complete(parameters)
         start, displacement = self.wound(values, commands, self.discretisation.time_step)
         motion = self.engine.motion(self.material(values), start, displacement, steps)
-        status = jnp.where(
-            motion.diverged,
-            int(Result.DIVERGED),
-            jnp.where(motion.imbalance > EQUILIBRIUM_TOLERANCE, int(Result.NOT_IN_EQUILIBRIUM), int(Result.OK)),
+        cases = (
+            (motion.diverged, Result.DIVERGED),
+            (motion.imbalance > EQUILIBRIUM_TOLERANCE, Result.NOT_IN_EQUILIBRIUM),
+            (~motion.cables_converged, Result.CABLE_LIMIT),
         )
+        status = jnp.select([case for case, _ in cases], [int(code) for _, code in cases], int(Result.OK))
         seen = observed_at(commands, self.discretisation.time_step)
         position = self.measured(values, sample(motion.position, commands), seen)
         return Observation(position, sample(motion.tension, commands), None, status)

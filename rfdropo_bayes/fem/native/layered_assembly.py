@@ -19,7 +19,7 @@ from rfdropo_bayes.fem.native.layered_effects import (
     subtract_surroundings_product,
 )
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, inlined, kernel, load, store
-from rfdropo_bayes.fem.native.tension_stiffening import resist_twist
+from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral, resist_twist
 
 POLAR_ITERATIONS = 6
 
@@ -276,6 +276,7 @@ def subtract_tangent_product(tables, samples, factors, change, field, work, toke
     for layer in range(tables.stations - 1):
         _local_change(change, elasticity, tables.modes, layer, work, token)
         _subtract_reaction(tables, samples, layer, work, field, token)
+        resist_lateral(tables, layer, change, field, work, token)
         resist_twist(tables, layer, change, field, work, token)
         if samples.present[BENDING]:
             subtract_law_product(tables, layer, elasticity, change, field, work, token)

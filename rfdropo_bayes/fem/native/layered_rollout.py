@@ -127,6 +127,7 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         beyond=rows(3 * layers),
         imbalance=rows(1),
         twist=rows(layers),
+        string=rows(layers),
         softness=rows(1),
         branch=rows(layers * 2 * size),
         slope=rows(6 * layers),
@@ -266,7 +267,7 @@ def compile_rollout(sources: str) -> Callable:
                 pitch, offset = batch.displacement_pitch, step * cables
                 _fill_lanes(batch.displacement, pitch, offset, cables, first, count, work.commanded, token)
             rate = 1.0 / schedule.time_step if step >= 0 else 1.0
-            solve_increment(tables, samples, factors, work, rate, schedule, step < 0, token)
+            solve_increment(tables, samples, factors, work, rate, schedule, token)
             if step >= 0:
                 for _ in range(schedule.refinements):
                     refine_increment(tables, samples, factors, work, token)

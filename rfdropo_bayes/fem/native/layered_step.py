@@ -14,7 +14,13 @@ from rfdropo_bayes.fem.native.layered_assembly import (
 )
 from rfdropo_bayes.fem.native.layered_effects import SURROUNDED, add_surroundings, stretch_cables
 from rfdropo_bayes.fem.native.simd import fill, fma, inlined, kernel, load, square_root, store, where_greater
-from rfdropo_bayes.fem.native.tension_stiffening import resist_twist, stiffen, stiffen_twist, sum_cable_forces
+from rfdropo_bayes.fem.native.tension_stiffening import (
+    resist_lateral,
+    resist_twist,
+    stiffen,
+    stiffen_twist,
+    sum_cable_forces,
+)
 
 LARGEST = 1e30
 """Tensions beyond this [N] are not finite."""
@@ -139,7 +145,7 @@ def _tensions(cables, panels, work, rate, tolerance, regularisation, token):
 
 
 @inlined
-def solve_increment(tables, samples, factors, work, rate, schedule, static, token):
+def solve_increment(tables, samples, factors, work, rate, schedule, token):
     """``solution`` = A^-1 (r - J' T) and the tensions; the matrix is assembled and eliminated station by station."""
     tiles, stations, cables, held = tables.modes, tables.stations, tables.cables, tables.held
     size, panels = 3 * tiles, (cables + 3) // 3
@@ -150,14 +156,13 @@ def solve_increment(tables, samples, factors, work, rate, schedule, static, toke
     clear(work.pivot, (stations - 1) * block, stations * block, token)
     gather_cables(tables, work, rate, token)
     start_loads(tables, samples, factors, work, token)
-    if static:
-        sum_cable_forces(tables, work, token)
+    sum_cable_forces(tables, work, token)
     for station in range(stations - 1, held - 1, -1):
         last = station == held
         if station > 0:
             assemble_layer(tables, samples, factors, station - 1, work, not last, token)
-            if static:
-                stiffen(tables, station - 1, work, not last, token)
+            stiffen(tables, station - 1, rate, work, not last, token)
+            resist_lateral(tables, station - 1, work.velocity, work.field, work, token)
             stiffen_twist(tables, station - 1, rate, work, not last, token)
             resist_twist(tables, station - 1, work.velocity, work.field, work, token)
         entry, t = station * tables.pairs, station * block

@@ -1,4 +1,4 @@
-"""Geometric stiffness of layers in tension and of taut cables, for the iteration to equilibrium; `fem.equilibrium`."""
+"""Geometric stiffness of layers in tension and of taut cables; see ``fem.tension_stiffening``, ``fem.cable_twist``."""
 
 from __future__ import annotations
 
@@ -24,18 +24,19 @@ def sum_cable_forces(tables, work, token):
 
 
 @kernel
-def stiffen(tables, layer, work, whole, token):
+def stiffen(tables, layer, rate, work, whole, token):
     """Add N / L against lateral motion of the mean of one face relative to the other, N > 0 of body and cables
-    together.
+    together, over ``rate`` squared.
 
-    ``reaction`` must hold the elastic force of the layer; ``whole`` as in ``layered_assembly``.
+    ``reaction`` must hold what the layer resists over ``rate``; ``whole`` as in ``layered_assembly``.
     """
     modes, axes, zero = tables.modes, work.axes, fill(0.0, work.axes, token)
     length = tables.rest[3 * (layer + 1) * modes + 2] - tables.rest[3 * layer * modes + 2]
-    tension = load(work.reaction, 3 * modes + 2, token)
+    tension = load(work.reaction, 3 * modes + 2, token) * fill(rate, axes, token)
     for i in range(3):
         tension = fnma(load(work.beyond, 3 * layer + i, token), load(axes, 9 * layer + 3 * i + 2, token), tension)
-    spring = where_greater(tension, zero, tension, zero) / fill(length, axes, token)
+    spring = where_greater(tension, zero, tension, zero) / fill(length * rate * rate, axes, token)
+    store(work.string, layer, spring)
     block = 9 * modes * modes
     upper = (layer + 1) * block
     for c in range(3):
@@ -47,6 +48,22 @@ def stiffen(tables, layer, work, whole, token):
             if whole:
                 store(work.pivot, upper - block + k, load(work.pivot, upper - block + k, token) + value)
                 store(work.coupling, upper + k, load(work.coupling, upper + k, token) - value)
+
+
+@kernel
+def resist_lateral(tables, layer, change, field, work, token):
+    """Subtract what a layer in tension puts against lateral motion, its stiffness in ``string``, times a change."""
+    modes, axes, a = tables.modes, work.axes, 9 * layer
+    low, high = 3 * layer * modes, 3 * (layer + 1) * modes
+    spring, along = load(work.string, layer, token), fill(0.0, axes, token)
+    for i in range(3):
+        gap = load(change, high + i, token) - load(change, low + i, token)
+        along = fma(load(axes, a + 3 * i + 2, token), gap, along)
+    for i in range(3):
+        gap = load(change, high + i, token) - load(change, low + i, token)
+        pull = spring * fnma(load(axes, a + 3 * i + 2, token), along, gap)
+        store(field, high + i, load(field, high + i, token) - pull)
+        store(field, low + i, load(field, low + i, token) + pull)
 
 
 @kernel
