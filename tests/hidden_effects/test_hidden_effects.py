@@ -1,7 +1,7 @@
 """Data sets with an effect hidden in them: the audit sees the files only, and must find what is there.
 
 Seeds are fixed. Under another seed each of these would fail now and then: a null data set is called discrepant in 1 %
-of cases by construction, a hidden effect is missed in less than 10 % (see reports/audit_power).
+of cases by construction; how often a hidden effect is missed, `rfdropo benchmark audit` measures.
 """
 
 from __future__ import annotations
@@ -67,6 +67,7 @@ def test_a_cause_that_the_library_lacks_is_not_called_explained(tmp_path):
     assert json.loads((tmp_path / "out" / "audit.json").read_text()) == content
 
 
+@pytest.mark.slow
 def test_the_size_of_what_is_hidden_is_as_asked(tmp_path):
     """Short and coarse: the made recordings differ from those without effect by rho, less what a refit absorbs."""
     brief = Setting()
@@ -81,7 +82,7 @@ def test_the_size_of_what_is_hidden_is_as_asked(tmp_path):
     base = hide(setting, [], 0.0, 0, tmp_path / "b", workshop=SHOP)
     assert found is not None
     assert base is not None
-    assert found.rho["discretisation"] < 1e-3
+    assert found.rho["discretisation"] < 0.01  # one mesh and time step: what is left is the pull of the priors
     rest = base.clean.reshape(*base.clean.shape[:2], -1, 3)
     moved = found.clean.reshape(rest.shape)
     # A rotation keeps every distance to the base's origin, and moves markers by at least what cannot be absorbed.
