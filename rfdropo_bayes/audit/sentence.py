@@ -35,6 +35,8 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         head = f"Unexplained: the best of the library, {named}, explains only {share}"
     elif answer.verdict in (EXPLAINED, "equivalent"):
         head = f"{named} explain{'s' if len(findings) == 1 else ''} {share}"
+    elif answer.looks[-1].omnibus.p > answer.question.rules.extended_passes:
+        head = f"The best of the library, {named}, explains {share}; the rest may be noise, but that is not certain"
     else:
         head = f"The best of the library, {named}, explains {share}, but not all: something else is at work"
     return f"{head}{_excluded(answer)}; {_remains(answer)}{_assumption(answer)}."
