@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import jax
 import numpy as np
 import numpyro
@@ -87,33 +85,3 @@ def test_nested_sampling_has_the_evidence_of_a_conjugate_model():
     precision = 1.0 / 2.25 + 6.0 / 0.64
     assert result.draws["mu"].mean() == pytest.approx((0.7 / 2.25 + y.sum() / 0.64) / precision, abs=0.1)
     assert result.draws["mu"].std() == pytest.approx(precision**-0.5, rel=0.15)
-
-
-@pytest.mark.slow
-def test_nuts_on_the_differentiable_engine_agrees_with_laplace():
-    """Three parameters of the layered arm from eight rows, on the engine that has gradients."""
-    from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
-    from rfdropo_bayes.workflow.experiment import load_experiment
-
-    path = Path(__file__).resolve().parents[2] / "experiments" / "demo.toml"
-    experiment, _ = load_experiment(
-        path,
-        [
-            'data.fit=[{observations="demo/demo_1.nc", rows=[0, 8]}]',
-            "data.test=[]",
-            "simulator.refine=1",
-            "simulator.time_step=0.025",
-            "simulator.engine=jax",
-            "simulator.precision=float64",
-            "trunk_mass=0.075",
-            "poisson_ratio=0.462",
-        ],
-    )
-    simulator = build_simulator(experiment, find_robot(experiment, path.parent), path.parent)
-    problem = build_problem(build_model(experiment, simulator, load_data(experiment, path.parent, "fit")))
-    chain = methods.run(problem, "nuts", {"chains": 1, "warmup": 60, "draws": 80, "screen": 8}, KEY)
-    normal = methods.run(problem, "laplace", {"starts": 1, "blocks": 1, "screen": 8}, KEY)
-    for name in ("young_modulus", "observation_noise"):
-        first, second = np.log(chain.draws[name].ravel()), np.log(normal.draws[name].ravel())
-        assert abs(first.mean() - second.mean()) < second.std()
-        assert 0.5 < first.std() / second.std() < 2.0
