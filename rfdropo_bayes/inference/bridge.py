@@ -155,6 +155,7 @@ def sample_from_modes(
     evaluations = ledger.evaluations + sampled.evaluations
     # Several optima are what the mixture is for: no warning here, unlike in Laplace alone.
     kept = [sentence for sentence in sampled.warnings if "got no weight" not in sentence]
+    kept += [sentence for sentence in found.warnings if "converged" in sentence]
     return replace(
         sampled,
         method="bridge",

@@ -31,6 +31,7 @@ from rfdropo_bayes.inference.schedules import block_boundaries
 from rfdropo_bayes.inference.sharpness import Way, way_from_prior
 
 CLIMBING = 0.25  # share of the budget that looking for optima may take
+STEPS = 12.0  # that a climb takes at each horizon, typically
 SCORING = 0.1  # and the evidence of the blocks
 MARGIN = 3.0  # what real posteriors cost over the estimate, which takes them to be normal and data to be even
 WORTH_A_REPLICATE = 100  # particles
@@ -54,7 +55,7 @@ def run(
     if config.start == "prior" or (config.start == "auto" and not _worth_climbing(problem, config)):
         return horizon_smc.run(problem, config, key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress)
     climb_key, way_key, sample_key = jax.random.split(key, 3)
-    climbing = LaplaceConfig(rollouts=None if config.rollouts is None else CLIMBING * config.rollouts)
+    climbing = _climbing(config, len(problem.names))
     digest = run_digest(problem, "smc_climbs", config, key)
     checkpoint = open_checkpoint(checkpoint_dir, "smc_climbs", digest, resume=resume)
     try:
@@ -79,6 +80,16 @@ def run(
         return _with_climbs(result, found, way)
     assert isinstance(problem, ResidualProblem)  # or no optima would have been found
     return _from_optima(problem, config, found, way, sample_key, checkpoint_dir, resume, progress)
+
+
+def _climbing(config: SmcConfig, d: int) -> LaplaceConfig:
+    """As many climbs as the budget can bring to an optimum: one that stops on the way misleads what starts from it."""
+    if config.rollouts is None:
+        return LaplaceConfig()
+    budget = CLIMBING * config.rollouts
+    # Three horizons that double cost 1.75 times the last; a step is a Jacobian by differences and six dampings.
+    whole = 1.75 * STEPS * (4.0 * d + 7.0)
+    return LaplaceConfig(starts=int(np.clip(budget / whole, 1, LaplaceConfig().starts)), rollouts=budget)
 
 
 def _worth_climbing(problem: Problem, config: SmcConfig) -> bool:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import methods
+from rfdropo_bayes.inference import methods, starts
 from rfdropo_bayes.inference.gauss_newton import Laplace
+from rfdropo_bayes.inference.horizon_smc import SmcConfig
 from rfdropo_bayes.inference.mixture import ModeMixture
 from rfdropo_bayes.inference.sharpness import way_from_prior
 
@@ -91,6 +92,12 @@ def test_both_modes_survive_a_start_at_the_optima():
     evidence, share = problem.mode_evidence()
     assert result.log_evidence[0] == pytest.approx(evidence, abs=0.25)
     assert np.mean(result.draws["x0"] > 0) == pytest.approx(share, abs=0.2)
+
+
+def test_a_small_budget_finishes_one_climb_rather_than_beginning_four():
+    small, large = (starts._climbing(SmcConfig(rollouts=budget), 6) for budget in (3000.0, 40000.0))
+    assert (small.starts, large.starts) == (1, 4)
+    assert small.rollouts == 750.0
 
 
 @pytest.mark.parametrize("budget", [2500, 4000])
