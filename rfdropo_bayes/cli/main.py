@@ -111,5 +111,5 @@ def main() -> None:
         print(f"rfdropo: {error}; see rfdropo --help", file=sys.stderr)
         sys.exit(INPUT_ERROR)
     except (KeyboardInterrupt, typer.Abort):
-        print("rfdropo: interrupted; the same command with --resume goes on from here", file=sys.stderr)
+        print("rfdropo: interrupted; where the command takes --resume, it goes on from here", file=sys.stderr)
         sys.exit(INTERRUPTED)
