@@ -1,4 +1,4 @@
-"""Process-wide numerical settings: double precision, and one BLAS thread for the small solves."""
+"""Process-wide settings: double precision, operations in turn, and one BLAS thread for the small solves."""
 
 from __future__ import annotations
 
@@ -16,7 +16,13 @@ def limit_blas_threads() -> None:
 
 
 def configure_jax() -> None:
-    """Make float64 the default of JAX: stiff finite-element solves lose their answer in float32."""
+    """Make float64 the default of JAX, and let it finish one operation before the next.
+
+    Stiff finite-element solves lose their answer in float32. Operations that run ahead of a callback into the compiled
+    engines can take the threads that the callback waits for: on two processors a rollout outside ``jax.jit`` then
+    hangs for ever.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_cpu_enable_async_dispatch", False)

@@ -113,6 +113,7 @@ def test_a_weighed_part_counts_once_and_in_every_prefix():
     assert chosen.fingerprint != plain.fingerprint
 
 
+@pytest.mark.slow
 def test_force_breaks_the_ridge():
     """Stiffness alone: free without force, to about 1 % with tension readings of 1 %. Thresholds are at twice that; a
     Laplace deviation has no randomness but that of 2000 draws."""

@@ -90,6 +90,7 @@ def reference(material, displacement, start):
     return jnp.concatenate([first[None], motion.position]), tension, info.residual
 
 
+@pytest.mark.slow
 def test_agrees_with_the_reference():
     """All effects at once, random parameters and commands, from equilibrium, in both precisions."""
     material, displacement = case(1)

@@ -87,6 +87,7 @@ def test_follows_sofa_to_its_last_digit_before_contact(scene, datasets, name, ro
     assert error.mean() < ROUNDING / 2
 
 
+@pytest.mark.slow
 def test_single_precision_stays_close(scene, datasets):
     command, recorded = recording(datasets, "reach_1")
     error = error_mm(scene.fast(command, np.float32), recorded)

@@ -44,6 +44,7 @@ def fitted():
     return problem, methods.run(problem, "smc", {"rollouts": 8000, "blocks": 3}, KEY)
 
 
+@pytest.mark.slow
 def test_a_sharp_ridge_is_sampled_within_its_budget(fitted):
     """Evidence: replicates of 100 scatter by 0.1, their mean by 0.05. Means of 400 draws: by 0.05 deviations if
     independent, by about twice that after resampling; thresholds are four times that."""

@@ -33,6 +33,7 @@ def recorded(trunk: TrunkSimulator):
     return trunk.commands(clock, value, np.zeros(value.shape[1]), np.arange(0.1, 0.61, 0.1))
 
 
+@pytest.mark.slow
 def test_all_at_once_null_values_and_derivatives():
     """Every mechanism of the body present in one simulator: null values change nothing, derivatives are differences."""
     base, extended = simulator(), simulator(*BODY)

@@ -73,6 +73,7 @@ def test_it_is_a_simulator_with_the_cubes_parameters(pushing, trunk):
         pushing.rollout({"cube_weight": jnp.asarray(1.0)}, None)
 
 
+@pytest.mark.slow
 def test_the_cube_comes_to_rest_and_a_trunk_that_does_not_touch_it_moves_as_without(rollout, trunk, commands):
     aside = rollout(young_modulus=4.5e6, cube_x=0.25, cube_y=-0.03, cube_yaw=0.5)
     pose = np.asarray(aside.object_pose)

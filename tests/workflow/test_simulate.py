@@ -68,6 +68,7 @@ def sofa(datasets, monkeypatch) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_sofa_reaching_is_followed_to_the_last_digit(sofa, tmp_path, monkeypatch, capsys):
     report = simulate(EXPERIMENTS / "sofa_reach.toml", tmp_path, monkeypatch, capsys)
     error = report["recordings"]["reach_1"]["error_mm"]
@@ -125,6 +126,7 @@ def test_values_set_on_the_command_line_count(sofa, tmp_path, monkeypatch, capsy
     assert report["error_mm"]["max"] > 0.1
 
 
+@pytest.mark.slow
 def test_one_switch_brings_back_the_layered_body(sofa, tmp_path, monkeypatch, capsys):
     report = simulate(EXPERIMENTS / "sofa_reach.toml", tmp_path, monkeypatch, capsys, "simulator.body=layered")
     assert "layers" in report["simulator"]
