@@ -249,13 +249,11 @@ def _run(
                 shown = torch.as_tensor(target, dtype=torch.float32)[None]
             kept, mean, spread = scaling
             x = torch.as_tensor((summaries[:, kept] - mean) / spread, dtype=torch.float32)
-            trainer.append_simulations(
-                torch.as_tensor(found.theta, dtype=torch.float32), x, proposal=proposal if index else None
-            )
+            given = torch.as_tensor(found.theta, dtype=torch.float32)
+            trainer.append_simulations(given, x, proposal=proposal if index else None)
             atoms = {"num_atoms": config.atoms} if index else {}
             network = trainer.train(max_num_epochs=config.max_epochs, show_train_summary=False, **atoms)
-            posterior = trainer.build_posterior(network).set_default_x(shown)
-            proposal = posterior
+            proposal = posterior = trainer.build_posterior(network).set_default_x(shown)
             trace.append({"round": index, "rollouts": ledger.rollouts})
             if progress is not None:
                 progress.stage((index + 1) / rounds, method=name, **trace[-1])
