@@ -100,6 +100,7 @@ def test_a_prefix_has_the_rows_of_the_whole(sofa):
     np.testing.assert_array_equal(part.position[:3], whole.position[:3])
 
 
+@pytest.mark.slow
 def test_single_precision_stays_close(mesh, sofa):
     commands = pulls(sofa)
     single = trunk(mesh, precision="float32", **SOFA).rollout({}, commands)
