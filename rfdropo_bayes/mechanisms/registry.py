@@ -37,6 +37,7 @@ from rfdropo_bayes.mechanisms.sensing import CameraRotation, CameraScale
 from rfdropo_bayes.mechanisms.sensor_lag import SensorLag
 from rfdropo_bayes.mechanisms.spool_growth import SpoolGrowth
 from rfdropo_bayes.mechanisms.surroundings import QuadraticDrag, WallContact
+from rfdropo_bayes.mechanisms.travel_stop import TravelStop
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.parameters import nearest
@@ -51,6 +52,7 @@ REGISTRY: dict[str, type] = {
         CableSlack,
         Backlash,
         EndStop,
+        TravelStop,
         RateLimit,
         SpoolGrowth,
         DriveCreep,

@@ -27,6 +27,7 @@ DRIVES = (
     "drive_creep",
     "drive_drift",
     "end_stop",
+    "travel_stop",
     "rate_limit",
     "spool_growth",
 )
@@ -72,9 +73,25 @@ def test_play_follows_by_half_its_width():
     np.testing.assert_allclose(moved[125:], ramp[125:, 0] + 0.1, atol=1e-12)
 
 
-def test_an_end_stop_cuts_and_a_rate_limit_slows():
+def test_an_end_stop_cuts():
     cut = applied("end_stop", {"inverse_travel_limit": jnp.asarray(200.0)})
     np.testing.assert_allclose(cut, np.clip(COMMAND, -0.005, 0.005), atol=1e-15)
+
+
+def test_a_travel_stop_forgets_what_was_commanded_beyond_it():
+    """Released by 8 mm with 3 mm to go, then pulled by 8 mm, the drive stands 5 mm out and not where it began."""
+    sent = jnp.asarray([0.0, -0.004, -0.008, -0.004, 0.0, 0.010])[:, None] + 0.002
+    travel = REGISTRY["travel_stop"]().actuate(
+        {"inverse_release_travel": jnp.asarray(1 / 0.003), "inverse_pull_travel": jnp.asarray(1 / 0.012)},
+        sent,
+        sent[0],
+        0.1,
+    )
+    expected = np.array([0.0, -0.003, -0.003, 0.001, 0.005, 0.012]) + 0.002
+    np.testing.assert_allclose(travel[:, 0], expected, atol=1e-15)
+
+
+def test_a_rate_limit_slows():
     slow = applied("rate_limit", {"inverse_speed_limit": jnp.asarray(15.0)})
     assert np.abs(np.diff(slow, axis=0)).max() <= STEP / 15.0 + 1e-12
     np.testing.assert_allclose(slow[:, 1], COMMAND[:, 1], atol=1e-15)  # never faster than 0.062 m/s

@@ -1,0 +1,62 @@
+"""A drive that waits at the end of its travel, and turns back from there at once."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+GRID = (5.0, 15.0, 30.0, 60.0, 85.0, 110.0, 150.0, 250.0, 500.0, 1000.0)
+
+
+class TravelStop:
+    """Commands beyond a stop are lost, not remembered: a drive at its stop moves with the next command away from it.
+
+    In contrast to `EndStop`, which cuts off the accumulated command and has to be commanded all the way back. Travel is
+    counted from the initial command. Both limits are infinite, their inverses zero, at null.
+    """
+
+    name = "travel_stop"
+    stage = "actuation"
+    cause = "commands relative to the present position, at a stop or limit of the drive (or a slack cable that it rewinds)"
+    remedy = "record where the drives are, not what they were told; command absolute positions"
+    parameters = (
+        ParameterSpec(
+            "inverse_release_travel",
+            "1/m or 1/rad",
+            0.0,
+            1e5,
+            0.0,
+            {"distribution": "HalfNormal", "scale": 200.0},
+            "one over the travel from the initial command to the stop on the side of release",
+            grid=GRID,
+        ),
+        ParameterSpec(
+            "inverse_pull_travel",
+            "1/m or 1/rad",
+            0.0,
+            1e5,
+            0.0,
+            {"distribution": "HalfNormal", "scale": 200.0},
+            "one over the travel from the initial command to the stop on the side of pull",
+            grid=GRID,
+        ),
+    )
+
+    def actuate(
+        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
+    ) -> Float[Array, "step channel"]:
+        """Follow the command, less all that was lost at the stops."""
+        release, pull = values["inverse_release_travel"], values["inverse_pull_travel"]
+
+        def advance(lost: Array, sent: Array) -> tuple[Array, Array]:
+            travel = sent - initial - lost
+            over = jnp.where(travel * pull > 1.0, travel - 1.0 / jnp.maximum(pull, 1e-12), 0.0)
+            under = jnp.where(-travel * release > 1.0, travel + 1.0 / jnp.maximum(release, 1e-12), 0.0)
+            lost = lost + over + under
+            return lost, sent - lost
+
+        return jax.lax.scan(advance, jnp.zeros_like(initial), command)[1]
