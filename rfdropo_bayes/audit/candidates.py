@@ -78,7 +78,10 @@ def probe_all(target: Target, fit: Fit, candidates: Sequence[Candidate]) -> list
     base = span(fit.jacobian)
     open_ = [c for c in candidates if c.indices]
     indices = [i for c in open_ for i in c.indices]
-    at_null = target.jacobian(fit.x, np.array(indices, dtype=int)) if indices else np.zeros((len(fit.residual), 0))
+    at_null = np.zeros((len(fit.residual), 0))
+    if indices:
+        chosen = np.array(indices, dtype=int)
+        at_null = target.recall("null", [fit.x, chosen], lambda: {"slopes": target.jacobian(fit.x, chosen)})["slopes"]
     column = dict(zip(indices, at_null.T, strict=True))
     jobs: list[tuple[Candidate, dict[int, float]]] = []
     probes: list[Probe] = []
@@ -119,13 +122,13 @@ def _probe_grid(
     for row, (_, point) in enumerate(jobs):
         for index, value in point.items():
             points[row, index] = value
-    residual = target.residual(points)
+    residual = target.recall("grid", [points], lambda: {"residual": target.residual(points)})["residual"]
     secants = np.clip(fit.residual - residual, -1e3, 1e3)
     alone = np.linalg.norm(secants, axis=1) > UNSEEN
     slots = [(row, i) for row, (c, p) in enumerate(jobs) if not alone[row] for i in c.indices if i not in p]
     rows = np.array([row for row, _ in slots], dtype=int)
     directions = np.eye(points.shape[1])[[i for _, i in slots]] if slots else np.zeros((0, points.shape[1]))
-    slopes = target.measurements.whiten(target.forward.derivatives_at(points[rows], directions), target.noise)
+    slopes = target.recall("slopes", [points[rows], directions], lambda: _slopes(target, points[rows], directions))
     probes = []
     for row, (candidate, point) in enumerate(jobs):
         if alone[row]:
@@ -133,8 +136,13 @@ def _probe_grid(
         else:
             amplitudes = tuple(i for i in candidate.indices if i not in point)
             if amplitudes:
-                probes.append(_probe(target, base, candidate, point, slopes[rows == row].T, amplitudes))
+                probes.append(_probe(target, base, candidate, point, slopes["slopes"][rows == row].T, amplitudes))
     return probes
+
+
+def _slopes(target: Target, points: np.ndarray, directions: np.ndarray) -> dict[str, np.ndarray]:
+    found = target.forward.derivatives_at(points, directions)
+    return {"slopes": target.measurements.whiten(found, target.noise)}
 
 
 def _probe(

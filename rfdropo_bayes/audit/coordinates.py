@@ -13,9 +13,9 @@ from functools import cached_property
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import expit, logit
 
 from rfdropo_bayes.bayes.space import Parameter, ParameterSpace
 
@@ -23,6 +23,47 @@ MEASURED_FROM_NULL = ("Normal", "TruncatedNormal", "HalfNormal")
 PRIOR_DRAWS = 4000
 # Prior deviations from its mean at which an unconstrained coordinate ends: a logistic is flat there.
 FAR = 8.0
+
+
+@dataclass(frozen=True)
+class Support:
+    """Where a prior is positive, and the map from the real line to it: logistic, exponential or none.
+
+    The same maps as numpyro's, without a compilation for every number of points.
+    """
+
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, parameter: Parameter) -> Support:
+        """That of a parameter's prior."""
+        support = parameter.prior.support
+        return cls(float(getattr(support, "lower_bound", -np.inf)), float(getattr(support, "upper_bound", np.inf)))
+
+    def value(self, x: np.ndarray) -> np.ndarray:
+        """Physical values of coordinates."""
+        if np.isfinite(self.low) and np.isfinite(self.high):
+            return self.low + (self.high - self.low) * expit(x)
+        if np.isfinite(self.low):
+            return self.low + np.exp(x)
+        return self.high - np.exp(x) if np.isfinite(self.high) else x
+
+    def free(self, value: np.ndarray) -> np.ndarray:
+        """Coordinates of physical values."""
+        if np.isfinite(self.low) and np.isfinite(self.high):
+            return logit((value - self.low) / (self.high - self.low))
+        if np.isfinite(self.low):
+            return np.log(value - self.low)
+        return np.log(self.high - value) if np.isfinite(self.high) else value
+
+    def slope(self, x: np.ndarray) -> np.ndarray:
+        """Derivatives of the values."""
+        if np.isfinite(self.low) and np.isfinite(self.high):
+            return (self.high - self.low) * expit(x) * expit(-x)
+        if np.isfinite(self.low):
+            return np.exp(x)
+        return -np.exp(x) if np.isfinite(self.high) else np.ones_like(x)
 
 
 @dataclass(frozen=True)
@@ -83,8 +124,11 @@ class Coordinates:
 
     @cached_property
     def _free_draws(self) -> list[np.ndarray]:
-        draws = {name: jnp.asarray(values) for name, values in self._draws.items()}
-        return list(np.asarray(self.space.to_unconstrained(draws)).T)
+        return [s.free(self._draws[name]) for s, name in zip(self._supports, self.names, strict=True)]
+
+    @cached_property
+    def _supports(self) -> list[Support]:
+        return [Support.of(p) for p in self.space.parameters]
 
     @cached_property
     def bounds(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
@@ -108,7 +152,7 @@ class Coordinates:
         """Physical values of one parameter as coordinates."""
         if self.affine[index]:
             return (np.asarray(values, dtype=float) - self._null[index]) / self._scale[index]
-        return np.asarray(self.space.parameters[index].transform.inv(jnp.asarray(values, dtype=float)))
+        return self._supports[index].free(np.asarray(values, dtype=float))
 
     @cached_property
     def null(self) -> Float[np.ndarray, " d"]:
@@ -121,8 +165,8 @@ class Coordinates:
 
     def values(self, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Physical values."""
-        free = np.asarray(self._transformed(jnp.asarray(x)))
-        return np.where(self.affine, self._null + self._scale * x, free)
+        free = [support.value(column) for support, column in zip(self._supports, x.T, strict=True)]
+        return np.where(self.affine, self._null + self._scale * x, np.stack(free, axis=1))
 
     def named(self, x: Float[np.ndarray, " d"]) -> dict[str, float]:
         """Physical values of one point by name."""
@@ -136,18 +180,10 @@ class Coordinates:
                 x[i] = float(self.encode_one(i, values[name]))
         return np.clip(x, *self.bounds)
 
-    @cached_property
-    def _transformed(self) -> Any:
-        def apply(x: jax.Array) -> jax.Array:
-            found = self.space.from_unconstrained(x)
-            return jnp.stack([found[name] for name in self.names], axis=-1)
-
-        return jax.jit(apply)
-
     def slopes(self, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Derivative of each physical value with respect to its coordinate."""
-        _, free = jax.jvp(self._transformed, (jnp.asarray(x),), (jnp.ones(x.shape),))
-        return np.where(self.affine, self._scale, np.asarray(free))
+        free = [support.slope(column) for support, column in zip(self._supports, x.T, strict=True)]
+        return np.where(self.affine, self._scale, np.stack(free, axis=1))
 
     def slots(self, recordings: Sequence[str]) -> Int[np.ndarray, "recording d"]:
         """Where each coordinate goes in a recording's physical parameters; -1 for those of other recordings."""

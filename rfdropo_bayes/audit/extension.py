@@ -91,7 +91,8 @@ class Inquiry:
         names = [c.name for c in free]
         probes = probe_all(self.target, fit, free)
         if self.finer is not None and DISCRETISATION not in without:
-            finer = replace(self.target, forward=self.finer).residual(fit.x[None])[0]
+            refined = replace(self.target, forward=self.finer)
+            finer = refined.recall("finer", [fit.x], lambda: {"left": refined.residual(fit.x[None])[0]})["left"]
             probes.append(discretisation_probe(fit, DISCRETISATION, finer, span(fit.jacobian)))
             names.append(DISCRETISATION)
         found = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps)

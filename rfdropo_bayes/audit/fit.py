@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,6 +12,7 @@ from scipy.optimize import least_squares
 from scipy.stats import norm
 
 from rfdropo_bayes.audit.forward import Forward
+from rfdropo_bayes.audit.journal import Arrays, Journal, digest
 from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.noise import NoiseModel
 
@@ -49,11 +52,30 @@ class Fit:
 
 @dataclass(frozen=True)
 class Target:
-    """What is fitted: measurements under a noise, by a simulator."""
+    """What is fitted: measurements under a noise, by a simulator; ``journal`` keeps what was computed."""
 
     forward: Forward
     measurements: Measurements
     noise: NoiseModel
+    journal: Journal = field(default_factory=Journal)
+
+    @cached_property
+    def identity(self) -> str:
+        """Digest of everything that a residual depends on beside the parameters."""
+        data, noise = self.measurements, self.noise
+        return digest(self.forward.identity, data.position, data.count, noise.scale, noise.autocorrelation)
+
+    def recall(self, what: str, inputs: Sequence[np.ndarray], compute: Callable[[], Arrays]) -> Arrays:
+        """A computation with this target, looked up where the journal has it; its rollouts count either way."""
+        before = self.forward.rollouts
+
+        def counted() -> Arrays:
+            found = compute()
+            return {**found, "rollouts": np.asarray(self.forward.rollouts - before)}
+
+        found = self.journal.recall(digest(self.identity, what, *inputs), counted)
+        self.forward.rollouts = before + int(found["rollouts"])
+        return {name: value for name, value in found.items() if name != "rollouts"}
 
     def residual(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n m"]:
         """Whitened residuals, measured less simulated, of a batch of points."""
@@ -71,6 +93,16 @@ def climb(
     target: Target, start: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"], *, evaluations: int = 40
 ) -> Fit:
     """Posterior mode over the free coordinates from one start, the others held."""
+
+    def compute() -> Arrays:
+        found = _climb(target, start, free, evaluations)
+        return {part.name: np.asarray(getattr(found, part.name)) for part in fields(Fit)}
+
+    found = target.recall("climb", [start, free, np.array(evaluations)], compute)
+    return Fit(**{**found, "log_evidence": float(found["log_evidence"])})  # type: ignore[arg-type]
+
+
+def _climb(target: Target, start: np.ndarray, free: np.ndarray, evaluations: int) -> Fit:
     coordinates = target.forward.coordinates
     low, high = (bound[free] for bound in coordinates.bounds)
     mean, sd = coordinates.prior_mean[free], coordinates.prior_sd[free]
@@ -122,6 +154,6 @@ def fit_base(
     points = np.repeat(coordinates.null[None], SCREENED, axis=0)
     points[1:, free] += coordinates.prior_sd[free] * rng.standard_normal((SCREENED - 1, len(free)))
     points = np.clip(points, *coordinates.bounds)
-    cost = np.sum(target.residual(points) ** 2, axis=1)
+    cost = target.recall("screen", [points], lambda: {"cost": np.sum(target.residual(points) ** 2, axis=1)})["cost"]
     best = [climb(target, points[index], free) for index in np.argsort(cost, kind="stable")[:STARTS]]
     return max(best, key=lambda fit: fit.log_evidence)

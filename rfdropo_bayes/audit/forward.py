@@ -1,7 +1,8 @@
-"""Rollouts and their derivatives in batches of one shape, so that two compilations serve a whole audit."""
+"""Rollouts and their derivatives in batches of one size, so that two compilations serve a whole audit."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -12,12 +13,14 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.coordinates import Coordinates
+from rfdropo_bayes.audit.journal import digest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
-# Few lanes for a single point, many for a Jacobian; an engine that gains nothing by many compiles only once.
-WIDTHS, NARROW = (8, 32), (8, 8)
+# Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. Processors take
+# four lanes each.
+WIDTH = max(8, 4 * (os.cpu_count() or 1))
 
 Thetas = Float[np.ndarray, "lane physical"]
 Points = Float[np.ndarray, "n d"]
@@ -30,13 +33,13 @@ class Lanes:
     Args:
         simulator: with the base model's mechanisms and every candidate at its null value.
         marker_index: which of its markers are measured.
-        widths: lanes of one call, few and many; the last call of a batch is padded.
+        width: lanes of one call; the last call of a batch is padded.
     """
 
-    def __init__(self, simulator: Simulator, marker_index: np.ndarray, widths: tuple[int, int] = WIDTHS) -> None:
+    def __init__(self, simulator: Simulator, marker_index: np.ndarray, width: int = WIDTH) -> None:
         self.simulator = simulator
         self.marker_index = marker_index
-        self.widths = widths
+        self.width = width
         self.physical = tuple(spec.name for spec in simulator.parameters)
 
     def _observe(self, theta: jax.Array, commands: Commands) -> tuple[jax.Array, jax.Array]:
@@ -74,13 +77,11 @@ class Lanes:
         return np.concatenate(self._chunks(self._derived, commands, lane, theta, tangent))[: len(lane)]
 
     def _chunks(self, function: Any, commands: Commands, lane: np.ndarray, *arrays: np.ndarray) -> list[Any]:
-        parts, start = [], 0
-        while start < len(lane):
-            width = self.widths[len(lane) - start > self.widths[0]]
-            index = np.minimum(np.arange(start, start + width), len(lane) - 1)
+        parts = []
+        for start in range(0, len(lane), self.width):
+            index = np.minimum(np.arange(start, start + self.width), len(lane) - 1)
             chosen = Commands(*(np.asarray(part)[lane[index]] for part in commands))
             parts.append(jax.device_get(function(*(a[index] for a in arrays), chosen)))
-            start += width
         return parts
 
 
@@ -145,15 +146,32 @@ class Forward:
         coordinates: what a point means.
         commands: of the recordings, stacked.
         chosen: which of these are simulated, by name.
+        rows: observations that are wanted of each; all by default.
     """
 
-    def __init__(self, lanes: Lanes, coordinates: Coordinates, commands: Commands, chosen: Mapping[str, int]) -> None:
+    def __init__(
+        self,
+        lanes: Lanes,
+        coordinates: Coordinates,
+        commands: Commands,
+        chosen: Mapping[str, int],
+        rows: int | None = None,
+    ) -> None:
         self.lanes = lanes
         self.coordinates = coordinates
-        self.commands = Commands(*(np.asarray(part)[list(chosen.values())] for part in commands))
+        self.commands = _cut(Commands(*(np.asarray(part)[list(chosen.values())] for part in commands)), rows)
         self.slots = coordinates.slots(list(chosen))
         self.count = len(chosen)
         self.rollouts = 0
+
+    @cached_property
+    def identity(self) -> str:
+        """Digest of the simulator, its parameters with their priors, and the commands."""
+        own, simulator = self.coordinates, self.lanes.simulator
+        named = (simulator.description, own.names, own.base, sorted(own.fixed.items()), sorted(own.nominal.items()))
+        scale = own.values(np.stack([np.zeros(len(own.names)), np.ones(len(own.names))]))
+        prior = (own.prior_mean, own.prior_sd, *own.bounds)
+        return digest(repr(named), self.lanes.marker_index, scale, self.slots, *prior, *map(np.asarray, self.commands))
 
     def positions(self, points: Points) -> tuple[Series, np.ndarray]:
         """Marker coordinates [m] of every recording, and True where all its rollouts ended well."""
@@ -199,3 +217,10 @@ class Forward:
     def _lanes_of(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
         theta = self.coordinates.physical_values(points, self.slots)
         return theta.reshape(-1, theta.shape[-1]), np.tile(np.arange(self.count), len(points))
+
+
+def _cut(commands: Commands, rows: int | None) -> Commands:
+    """The first observations only, and the steps that lead to them."""
+    observed = commands.sample_step[:, :rows]
+    last = int(observed.max()) + 1  # an observation may lie between two steps
+    return Commands(commands.initial, commands.step[:, :last], observed, commands.sample_fraction[:, :rows])

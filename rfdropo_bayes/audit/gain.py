@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy.fft import dct
+from scipy.linalg import toeplitz
 from scipy.special import logsumexp
 from scipy.stats import norm
 
@@ -132,7 +133,8 @@ def explained_fraction(
     The mean squares are taken frequency by frequency and pattern by pattern (cosine transform in time, principal
     components over the channels), each weighted by the share of discrepancy in what the base model leaves on the
     FITTED data there (a Wiener filter): where there is nothing but noise, noise is not counted. The interval holds the
-    scatter of noise and trajectories (bootstrap over trajectories) and the uncertainty of the noise's own size.
+    scatter of noise and trajectories (bootstrap over trajectories) and the uncertainty of the noise's power at these
+    frequencies.
     """
     axes = _components(pattern, unseen.valid.shape[-1])
     spectrum = _noise_power(noise, base.shape[1])
@@ -147,14 +149,20 @@ def explained_fraction(
     second, _ = energies(extended)
     point = _fraction(first.sum(), second.sum(), floor.sum(), 1.0)
     chosen = rng.integers(len(first), size=(RESAMPLES, len(first)))
+    sizes = 1.0 + rng.standard_normal(RESAMPLES) * _floor_error(noise, weight[0].sum(axis=1) / spectrum)
     # Few trajectories scatter more than a bootstrap of them shows: noise is drawn for each as well.
-    sizes = 1.0 + rng.standard_normal(RESAMPLES) * _floor_error(noise)
     scatter = rng.standard_normal((RESAMPLES, len(first))) * np.sqrt(2.0 * np.sum(weight**2) * usable)
     within = scatter.sum(axis=1) if len(first) < DIFFERENCE_FROM else 0.0
     drawn = _fraction(
-        first[chosen].sum(axis=1) + within, second[chosen].sum(axis=1) + within, floor[chosen].sum(axis=1), sizes
+        _resampled(first, chosen) + within, _resampled(second, chosen) + within, _resampled(floor, chosen), sizes
     )
     return float(point), (float(np.quantile(drawn, 0.05)), float(np.quantile(drawn, 0.95)))
+
+
+def _resampled(values: Float[np.ndarray, " n"], chosen: np.ndarray) -> np.ndarray:
+    """Bootstrap of a sum; resampling n values shows only (n - 1) / n of its variance."""
+    total, count = values.sum(), len(values)
+    return total + np.sqrt(count / max(count - 1, 1)) * (values[chosen].sum(axis=1) - total)
 
 
 def _fraction(base: np.ndarray, extended: np.ndarray, floor: np.ndarray, size: np.ndarray | float) -> np.ndarray:
@@ -163,13 +171,27 @@ def _fraction(base: np.ndarray, extended: np.ndarray, floor: np.ndarray, size: n
     return 1.0 - left / np.maximum(base - size * floor, 1e-3 * floor)
 
 
-def _floor_error(noise: NoiseModel) -> float:
-    """Relative standard error of the noise's power."""
+def _floor_error(noise: NoiseModel, weight: Float[np.ndarray, " row"]) -> float:
+    """Relative standard error of the noise's power, summed over frequencies with weights.
+
+    Innovation variance and coefficients of an estimated autoregression are independent; their variances are 2 / n and
+    (innovation variance) (covariance)^-1 / n (Brockwell and Davis 1991, section 8.8).
+    """
     if noise.source == STATED or not np.isfinite(noise.freedom):
         return 0.0
-    memory = noise.autocorrelation[1] if noise.order else 0.0
-    long_run = 2.0 * np.sqrt(max(1.0 - memory**2, 0.0)) / (1.0 - memory) if noise.order else 0.0
-    return float(np.sqrt((2.0 + long_run**2) / noise.freedom))
+    coefficients, deviation = noise.predictors
+    own = coefficients[-1][: noise.order]
+
+    def power(step: np.ndarray) -> float:
+        return float(weight @ _spectrum(own + step, deviation[-1], len(weight)))
+
+    relative = 2.0
+    if noise.order:
+        steps = 1e-4 * np.eye(noise.order)
+        slope = np.array([(power(step) - power(-step)) / 2e-4 / power(0.0 * step) for step in steps])
+        correlation = toeplitz(noise.autocorrelation[: noise.order])
+        relative += deviation[-1] ** 2 * slope @ np.linalg.solve(correlation, slope)
+    return float(np.sqrt(relative / noise.freedom))
 
 
 def _components(pattern: np.ndarray, channels: int) -> Float[np.ndarray, "channel channel"]:
@@ -180,22 +202,28 @@ def _components(pattern: np.ndarray, channels: int) -> Float[np.ndarray, "channe
 def _noise_power(noise: NoiseModel, rows: int) -> Float[np.ndarray, " row"]:
     """Power of the noise at the frequencies of the cosine transform, in units of its variance."""
     coefficients, deviation = noise.predictors
+    return _spectrum(coefficients[-1][: noise.order], deviation[-1], rows)
+
+
+def _spectrum(coefficients: Float[np.ndarray, " lag"], deviation: float, rows: int) -> Float[np.ndarray, " row"]:
     angle = np.pi * np.arange(rows) / rows
-    lags = np.arange(1, noise.order + 1)
-    transfer = 1.0 - np.exp(-1j * np.outer(angle, lags)) @ coefficients[-1][: noise.order]
-    return deviation[-1] ** 2 / np.abs(transfer) ** 2
+    transfer = 1.0 - np.exp(-1j * np.outer(angle, np.arange(1, len(coefficients) + 1))) @ coefficients
+    return deviation**2 / np.abs(transfer) ** 2
 
 
 def _wiener(pattern: Float[np.ndarray, "group time component"], rows: int) -> Float[np.ndarray, "row component"]:
-    """Share of discrepancy in each band of frequencies and component, from residuals of unit noise."""
+    """Share of discrepancy in each band of frequencies and component, from residuals of unit noise; none where their
+    power is within two standard errors of the noise's."""
     power = np.mean(dct(pattern, axis=1, norm="ortho") ** 2, axis=0)
     place = np.arange(len(power)) / len(power)
     edges = np.concatenate([[0.0], np.geomspace(1.5 / len(power), 1.0, BANDS)])
     band = np.clip(np.searchsorted(edges, place, side="right") - 1, 0, BANDS - 1)
     excess = np.zeros_like(power)
     for index in range(BANDS):
-        if (band == index).any():
-            excess[band == index] = np.maximum(power[band == index].mean(axis=0) - 1.0, 0.0)
+        own = band == index
+        if own.any():
+            mean, error = power[own].mean(axis=0), np.sqrt(2.0 / (len(pattern) * own.sum()))
+            excess[own] = np.where(mean > 1.0 + 2.0 * error, mean - 1.0, 0.0)
     share = excess / (excess + 1.0) if excess.any() else np.ones_like(excess)
     at = np.minimum((np.arange(rows) / rows * len(power)).astype(int), len(power) - 1)
     return share[at]

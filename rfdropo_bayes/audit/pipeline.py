@@ -15,6 +15,7 @@ from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step
 from rfdropo_bayes.audit.fit import Fit, Target, climb, fit_base
 from rfdropo_bayes.audit.forward import Forward, Lanes
 from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
+from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
 from rfdropo_bayes.audit.noise import RESIDUALS, NoiseModel
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
@@ -86,15 +87,22 @@ class Answer:
         return self.steps[-1].fit if self.steps else self.base
 
 
-def audit(question: Question, report: Callable[[str], None] = lambda line: None) -> Answer:
+def audit(
+    question: Question, report: Callable[[str], None] = lambda line: None, journal: Journal | None = None
+) -> Answer:
     """Run the audit. Same question, same answer.
+
+    Args:
+        question: see `Question`.
+        report: called with a line of words now and then.
+        journal: keeps what was computed, for an audit that is interrupted.
 
     Raises:
         InputError: rollouts at the optimum do not end well.
     """
     began = time.monotonic()
     rng = np.random.default_rng(question.seed)
-    target, base = base_model(question, rng)
+    target, base = base_model(question, rng, journal)
     report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.order})")
     finer = None
     if question.finer is not None:
@@ -138,15 +146,17 @@ def _simulated(question: Question, finer: bool, chosen: dict[str, int]) -> Forwa
     lanes, commands = question.lanes, question.recordings.commands
     if finer and question.finer is not None:
         lanes, commands = question.finer
-    return Forward(lanes, question.coordinates, commands, chosen)
+    rows = int(question.recordings.rows[list(chosen.values())].max())
+    return Forward(lanes, question.coordinates, commands, chosen, rows)
 
 
-def base_model(question: Question, rng: np.random.Generator) -> tuple[Target, Fit]:
+def base_model(question: Question, rng: np.random.Generator, journal: Journal | None = None) -> tuple[Target, Fit]:
     """Noise and base fit; where the noise is estimated from residuals, the two in turn."""
+    journal = journal or Journal()
     coordinates = question.coordinates
     per_recording = any(p.recording for p in coordinates.space.parameters)
     count = len(question.trajectories)
-    fitted = _subset(question.recordings, count)
+    fitted = _subset(question.recordings, range(count))
     measurements = gather_measurements(fitted, question.trajectories, join=not per_recording)
     forward = _forward(question, False, measurements)
     free = np.arange(coordinates.base)
@@ -155,10 +165,10 @@ def base_model(question: Question, rng: np.random.Generator) -> tuple[Target, Fi
         noise = question.stated_noise
         if noise is None or measurements.has_repeats:
             noise = measurements.noise(measurements.single, 0)
-        target = Target(forward, measurements, noise)
+        target = Target(forward, measurements, noise, journal)
         return target, fit_base(target, free, rng, start)
     white = NoiseModel(np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf)
-    target = Target(forward, measurements, white)
+    target = Target(forward, measurements, white, journal)
     fit = fit_base(target, free, rng, start)
     for _ in range(2):
         target = replace(target, noise=_residual_noise(target, fit))
@@ -175,16 +185,18 @@ def _residual_noise(target: Target, fit: Fit) -> NoiseModel:
     return target.measurements.noise(np.where(target.measurements.single_valid, single, 0.0), len(fit.free))
 
 
-def _subset(recordings: RecordingSet, count: int) -> RecordingSet:
-    """The first recordings only."""
+def _subset(recordings: RecordingSet, chosen: Sequence[int]) -> RecordingSet:
+    """Some recordings only, no more rows than the longest of them has."""
+    index = list(chosen)
+    rows = int(recordings.rows[index].max())
     return replace(
         recordings,
-        names=recordings.names[:count],
-        time=recordings.time[:count],
-        rows=recordings.rows[:count],
-        position=recordings.position[:count],
-        line=type(recordings.line)(*(part[:count] for part in recordings.line)),
-        commands=Commands(*(part[:count] for part in recordings.commands)),
+        names=tuple(recordings.names[i] for i in index),
+        time=recordings.time[index, :rows],
+        rows=recordings.rows[index],
+        position=recordings.position[index, :rows],
+        line=type(recordings.line)(*(part[index, :rows] for part in recordings.line)),
+        commands=Commands(*(part[index] for part in recordings.commands)),
     )
 
 
@@ -239,10 +251,9 @@ def _measured(
 
 
 def _unseen(recordings: RecordingSet, chosen: Sequence[int]) -> Unseen:
-    index = list(chosen)
-    position = recordings.position[index]
-    valid = np.repeat(np.asarray(recordings.line.valid)[index], 3, axis=-1)
-    return Unseen(position.reshape(*position.shape[:2], -1), valid)
+    own = _subset(recordings, chosen)
+    valid = np.repeat(np.asarray(own.line.valid), 3, axis=-1)
+    return Unseen(own.position.reshape(*own.position.shape[:2], -1), valid)
 
 
 def _left_out(
@@ -266,7 +277,7 @@ def _left_out(
             forward = target.forward
             if DISCRETISATION in names[: i + 1] and inquiry.finer is not None:
                 forward = inquiry.finer
-            refitted = climb(Target(forward, kept, target.noise), fit.x, fit.free, evaluations=15)
+            refitted = climb(replace(target, forward=forward, measurements=kept), fit.x, fit.free, evaluations=15)
             parts[i].append(_predict(forward, refitted, [question.seed, 3]).draws)
     draws = min(len(part) for row in parts for part in row)
     predictions = []

@@ -11,6 +11,7 @@ import typer
 
 from rfdropo_bayes import __version__
 from rfdropo_bayes.cli import audit, inference, pictures, prediction
+from rfdropo_bayes.cli.options import ExperimentFile, OutFolder, Overrides, Resume, folder_for
 from rfdropo_bayes.errors import InputError
 
 INPUT_ERROR, INTERRUPTED = 2, 3
@@ -27,13 +28,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file")]
-OutFolder = Annotated[Path | None, typer.Option("--out", help="folder to write to; reports/<experiment> by default")]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="name=value: a parameter's value, or table.key=value of the experiment file"),
-]
-
 
 @app.callback(invoke_without_command=True)
 def version(show: Annotated[bool, typer.Option("--version", help="print the version and stop")] = False) -> None:
@@ -47,7 +41,7 @@ def version(show: Annotated[bool, typer.Option("--version", help="print the vers
 def calibrate(
     experiment: ExperimentFile,
     out: OutFolder = None,
-    resume: Annotated[bool, typer.Option(help="go on from the checkpoint of an interrupted run")] = False,
+    resume: Resume = False,
     check: Annotated[
         str | None, typer.Option(help="sbc: instead of fitting, check the method on simulated data")
     ] = None,
@@ -57,7 +51,7 @@ def calibrate(
     """Fit the simulator to recordings: writes posterior.nc, summary.json and report.html."""
     from rfdropo_bayes.workflow.calibration import run_calibration
 
-    folder = out or _default_folder(experiment)
+    folder = folder_for(experiment, out)
     if check is not None:
         inference.check(experiment, folder, check, datasets, overrides or [], resume)
         return
@@ -72,7 +66,7 @@ def simulate(experiment: ExperimentFile, out: OutFolder = None, overrides: Overr
     from rfdropo_bayes.workflow.simulation import run_simulation
 
     loaded, _ = load_experiment(experiment, overrides or [])
-    report = run_simulation(loaded, experiment.resolve().parent, out or _default_folder(experiment))
+    report = run_simulation(loaded, experiment.resolve().parent, folder_for(experiment, out))
     typer.echo(json.dumps(report, indent=2))
 
 
@@ -94,10 +88,6 @@ benchmark = typer.Typer(help="Comparisons that take hours; each can be interrupt
 benchmark.command()(inference.table1)
 benchmark.command("audit")(audit.benchmark_audit)
 app.add_typer(benchmark, name="benchmark")
-
-
-def _default_folder(experiment: Path) -> Path:
-    return Path("reports") / experiment.stem
 
 
 def main() -> None:

@@ -14,7 +14,8 @@ import numpy as np
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
-from rfdropo_bayes.audit.forward import NARROW, Lanes, RoutedLanes
+from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
+from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.noise import STATED, NoiseModel
 from rfdropo_bayes.audit.pipeline import Answer, Question, audit
 from rfdropo_bayes.audit.record import next_experiment, record
@@ -46,7 +47,7 @@ from rfdropo_bayes.workflow.files import output_folder
 
 Workshop = dict[str, Lanes]
 
-AUDIT, EXTENDED, REPORT = "audit.json", "extended.toml", "report.html"
+AUDIT, EXTENDED, REPORT, JOURNAL = "audit.json", "extended.toml", "report.html", "checkpoints/audit"
 FINER = 2
 
 
@@ -57,6 +58,7 @@ def run_audit(
     overrides: Sequence[str] = (),
     base: Path | None = None,
     seed: int | None = None,
+    resume: bool = False,
     workshop: Workshop | None = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
@@ -69,6 +71,7 @@ def run_audit(
         overrides: assignments that replace entries of the file.
         base: folder of an earlier calibration, from whose optimum the base model starts.
         seed: of the audit; that of the file by default.
+        resume: go on from what an interrupted audit has left in ``out``.
         workshop: see `build_question`.
         report: called with a line of words now and then.
 
@@ -84,7 +87,7 @@ def run_audit(
     chosen = experiment.seed if seed is None else seed
     question = build_question(experiment, folder, fitted, tested, chosen, start=_start(base), workshop=workshop)
     out = output_folder(out)
-    answer = audit(question, report)
+    answer = audit(question, report, Journal(out / JOURNAL, resume=resume))
     content = record(
         answer,
         versions=software_versions(),
@@ -200,7 +203,7 @@ def _lanes(
         return Lanes(whole, recordings.marker_index), recordings.commands
     fast = Lanes(build_simulator(_with(experiment, kept), robot, folder), recordings.marker_index)
     null = dict(coordinates.nominal) | dict(coordinates.fixed) | coordinates.named(coordinates.null)
-    routed = RoutedLanes(fast, Lanes(whole, recordings.marker_index, NARROW), null)
+    routed = RoutedLanes(fast, Lanes(whole, recordings.marker_index), null)
     return routed, recordings.commands
 
 

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.workflow.audit import Workshop, run_audit
 from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.fits import Job, run_fits
 from rfdropo_bayes.workflow.hidden_effects import Hidden, Setting, hide
 
 RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
@@ -47,11 +48,10 @@ def run_study(
     datasets: int,
     seed: int,
     *,
-    workers: int = 1,
     conditions: Sequence[str] = (),
     mechanisms: Sequence[str] = (),
     exclude: Sequence[str] = (),
-    report: Callable[[str], None] = lambda line: None,
+    cluster: str | None = None,
 ) -> dict[str, Any]:
     """Hide, audit and count; a data set that is already in the ledger is not run again.
 
@@ -59,11 +59,10 @@ def run_study(
         out: folder for the ledger, audit_power.json and the table.
         datasets: per condition.
         seed: of the study.
-        workers: processes.
         conditions: names of `CONDITIONS`; all by default.
         mechanisms: that are hidden, by registry name; all by default.
         exclude: mechanisms that are neither hidden nor tried.
-        report: called with a line after each data set.
+        cluster: see `run_fits`.
 
     Raises:
         InputError: an unknown condition or mechanism.
@@ -74,21 +73,14 @@ def run_study(
     if unknown:
         raise InputError(f"unknown mechanism {unknown[0]!r}", where="benchmark audit")
     library = [name for name in (mechanisms or REGISTRY) if name not in exclude]
-    done = _ledger(out, seed)
-    known = {(row["condition"], row["index"]) for row in done}
-    jobs = [(c, k) for k in range(datasets) for c in chosen if (c.name, k) not in known]
-    began = time.monotonic()
-    arguments = [(asdict(c), k, seed, library, list(exclude), str(out / "data")) for c, k in jobs]
-    for row in _results(arguments, workers):
-        done.append(row)
-        with (out / LEDGER).open("a", encoding="utf-8") as ledger:
-            ledger.write(json.dumps({"seed": seed, **row}) + "\n")
-        report(f"{row['condition']} {row['index']}: hidden {row['hidden']}, {row['verdict']}, named {row['named']}")
+    jobs = [{"condition": c.name, "index": k, "seed": seed} for k in range(datasets) for c in chosen]
+    one = partial(_one, library=library, exclude=list(exclude), folder=out / "data")
+    with Progress("audits", show=None) as progress:
+        done = run_fits(jobs, one, out / LEDGER, resume=True, cluster=cluster, progress=progress)
     content = {
         "seed": seed,
         "datasets": datasets,
         "hours": round(sum(row["seconds"] for row in done) / 3600.0, 3),
-        "wall_hours": round((time.monotonic() - began) / 3600.0, 3),
         "library": library,
         "conditions": {c.name: summarise([r for r in done if r["condition"] == c.name]) for c in chosen},
         "schema_version": 1,
@@ -106,54 +98,31 @@ def _conditions(names: Sequence[str]) -> list[Condition]:
     return [known[name] for name in names] if names else list(CONDITIONS)
 
 
-def _ledger(out: Path, seed: int) -> list[dict[str, Any]]:
-    path = out / LEDGER
-    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
-    return [row for row in rows if row["seed"] == seed]
+_WORKSHOP: Workshop = {}  # of this process
 
 
-def _results(arguments: Sequence[tuple], workers: int) -> Any:
-    if workers == 1:
-        yield from map(_one, arguments)
-        return
-    # Each process compiles for itself: a forked one would inherit locks of JAX's threads.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        yield from pool.map(_one, arguments)
-
-
-_WORKSHOPS: dict[str, Workshop] = {}
-
-
-def _one(argument: tuple[Mapping[str, Any], int, int, list[str], list[str], str]) -> dict[str, Any]:
+def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path) -> dict[str, Any]:
     """One data set: hidden, audited, judged."""
-    table, index, seed, library, exclude, folder = argument
-    condition = Condition(**table)
+    condition, index = _conditions([job["condition"]])[0], int(job["index"])
     began = time.monotonic()
-    workshop = _WORKSHOPS.setdefault("study", {})
-    place = Path(folder) / f"{condition.name}_{index}"
-    number = int(np.random.SeedSequence([seed, index, _place(condition)]).generate_state(1)[0])
-    found = _hidden(condition, number, library, exclude, place, workshop)
+    place = folder / f"{condition.name}_{index}"
+    number = int(np.random.SeedSequence([job["seed"], index, CONDITIONS.index(condition)]).generate_state(1)[0])
+    found = _hidden(condition, number, library, exclude, place, _WORKSHOP)
     if found is None:
         raise InputError("no mechanism reaches the wanted size", where=condition.name)
     hidden, names = found
-    content = run_audit(hidden.experiment, place / "audit", workshop=workshop)
+    content = run_audit(hidden.experiment, place / "audit", workshop=_WORKSHOP)
     if condition.removed:
         content = run_audit(
-            hidden.experiment, place / "removed", workshop=workshop, overrides=[_without(content, names, exclude)]
+            hidden.experiment, place / "removed", workshop=_WORKSHOP, overrides=[_without(content, names, exclude)]
         )
     return {
-        "condition": condition.name,
-        "index": index,
         "hidden": names,
         "rho": hidden.rho,
         "truth": hidden.values,
         **judge(content, names, hidden),
         "seconds": round(time.monotonic() - began, 1),
     }
-
-
-def _place(condition: Condition) -> int:
-    return [c.name for c in CONDITIONS].index(condition.name)
 
 
 def _hidden(

@@ -11,6 +11,7 @@ import pytest
 from rfdropo_bayes.audit.experiment_design import Hypothesis, at_hand, outlooks
 from rfdropo_bayes.audit.extension import Inquiry
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
+from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.simulators.commands import Commands
@@ -77,6 +78,32 @@ def test_a_cause_outside_the_library_is_not_called_explained_and_a_gain_is_invis
 def test_the_same_seed_gives_the_same_audit():
     first, second = (found({}, 100) for _ in range(2))
     assert {k: v for k, v in first.items() if k != "seconds"} == {k: v for k, v in second.items() if k != "seconds"}
+
+
+def test_a_killed_audit_goes_on_where_it_was_and_says_the_same(tmp_path, monkeypatch):
+    asked = question({**TRUTH, "play": 1.0}, 1)
+
+    def killed(line: str) -> None:
+        if line.startswith("refit"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        audit(asked, killed, Journal(tmp_path))
+    assert list(tmp_path.glob("*.npz"))
+    (tmp_path / "broken.npz").write_bytes(b"half of a file")
+    lanes, calls = Lanes.roll, []
+    monkeypatch.setattr(Lanes, "roll", lambda *given: calls.append(1) or lanes(*given))
+    resumed = audit(asked, journal=Journal(tmp_path, resume=True))
+    again, calls[:] = len(calls), []
+    whole = audit(asked, journal=Journal(tmp_path / "other"))
+    assert again < 0.7 * len(calls)
+    first, second = (record(a, versions={}, data_sha256="", next_experiment=None) for a in (resumed, whole))
+    assert {k: v for k, v in first.items() if k != "seconds"} == {k: v for k, v in second.items() if k != "seconds"}
+    # Other data share nothing with what was kept; without resume, what was kept is gone.
+    other = audit(question({**TRUTH, "play": 1.0}, 2), journal=Journal(tmp_path, resume=True))
+    assert other.base.log_evidence != whole.base.log_evidence
+    Journal(tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_commands_that_excite_only_one_of_two_effects_separate_them():

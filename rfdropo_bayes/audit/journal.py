@@ -1,0 +1,82 @@
+"""What an audit has computed so far, on disk: one that was killed looks up what it has and goes on from there.
+
+An audit is a fixed sequence of long computations, each a function of its inputs. Results are kept under a digest of
+these inputs, so that a change of data, model or seed finds nothing and computes anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes import __version__
+
+Arrays = dict[str, np.ndarray]
+
+
+def digest(*parts: Any) -> str:
+    """SHA-256 of arrays (shape, type and bytes) and of the text of everything else."""
+    found = hashlib.sha256(__version__.encode())
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            found.update(f"{part.shape}{part.dtype}".encode())
+            found.update(np.ascontiguousarray(part).tobytes())
+        else:
+            found.update(repr(part).encode())
+    return found.hexdigest()
+
+
+class Journal:
+    """Results on disk by the digest of what they depend on.
+
+    Args:
+        folder: to keep them in; None keeps nothing.
+        resume: look up what an earlier run has left there; else it is removed.
+    """
+
+    def __init__(self, folder: Path | None = None, *, resume: bool = False) -> None:
+        self.folder = folder
+        if folder is not None:
+            if not resume:
+                shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def recall(self, key: str, compute: Callable[[], Arrays]) -> Arrays:
+        """The arrays kept under a key, or else those that are computed now, and kept."""
+        if self.folder is None:
+            return compute()
+        path = self.folder / f"{key[:32]}.npz"
+        found = _read(path)
+        if found is None:
+            found = compute()
+            _write(path, found)
+        return found
+
+
+def _read(path: Path) -> Arrays | None:
+    """Arrays of a file; None where there is none, or a damaged one."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+        return None
+
+
+def _write(path: Path, arrays: Arrays) -> None:
+    """Replace the file whole: a kill leaves all of it or nothing."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
