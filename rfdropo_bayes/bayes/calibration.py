@@ -30,10 +30,17 @@ class CalibrationProblem:
     cut into chunks of at most ``chunk`` parameter sets, the last one padded to one of `chunk_sizes`, so that a few
     compilations serve every batch size, and the number of simulated steps is a run-time argument, so that they serve
     every horizon.
+
+    Args:
+        model: priors, simulator and data.
+        chunk: most parameter sets in one compiled call.
+        earlier: draws of the posterior of another model of the same robot, by parameter name, from which climbs may
+            start; parameters that it lacks start from their priors.
     """
 
-    def __init__(self, model: TrajectoryModel, *, chunk: int = 32) -> None:
+    def __init__(self, model: TrajectoryModel, *, chunk: int = 32, earlier: Batch | None = None) -> None:
         self.model = model
+        self.earlier = {} if earlier is None else {name: np.asarray(draws) for name, draws in earlier.items()}
         self.measured = model.measured
         self.jacobian = "auto"
         self.chunk = chunk
@@ -61,6 +68,7 @@ class CalibrationProblem:
             self.model.noise,
             sorted(self.model.simulator.description.items()),
             *self.model.weighed,
+            *((name, draws.tobytes()) for name, draws in sorted(self.earlier.items())),
         )
         digest.update(repr(rest).encode())
         return digest.hexdigest()
@@ -68,6 +76,10 @@ class CalibrationProblem:
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
         """Independent prior draws."""
         return self.model.space.sample(key, n)
+
+    def sample_starts(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
+        """Where climbs may start: the prior, with what an earlier posterior knows in its place."""
+        return self.model.space.sample_around(self.earlier, key, n)
 
     def to_unconstrained(self, values: Batch) -> Float[Array, "n d"]:
         """Values as points of the unconstrained space, columns in the order of ``names``."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro.distributions as dist
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -17,6 +18,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
 
 SEPARATOR = "@"
+INTERIOR = 15.0  # in unconstrained space: within 3e-7 of the width of a bound
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,12 @@ class Parameter:
         """Bijection from the real line to the support of the prior."""
         return dist.biject_to(self.prior.support)
 
+    def inside(self, values: Float[Array, " n"], otherwise: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Values, those on the edge of the support moved inside, and ``otherwise`` for those beyond it."""
+        u = self.transform.inv(values)
+        u = jnp.where(jnp.isnan(u), self.transform.inv(otherwise), u)
+        return self.transform(jnp.where(jnp.isinf(u), jnp.sign(u) * INTERIOR, u))
+
 
 @dataclass(frozen=True)
 class ParameterSpace:
@@ -72,6 +80,23 @@ class ParameterSpace:
         """Independent draws from the prior, one array of length n per parameter."""
         keys = jax.random.split(key, len(self.parameters))
         return {p.name: p.prior.sample(k, (n,)) for p, k in zip(self.parameters, keys, strict=True)}
+
+    def sample_around(
+        self, earlier: Mapping[str, Float[Array | np.ndarray, " m"]], key: PRNGKeyArray, n: int
+    ) -> dict[str, Float[Array, " n"]]:
+        """Prior draws with draws of an earlier posterior in the place of the parameters that it holds.
+
+        A parameter of one recording takes the value of the same recording, else that which all recordings shared.
+        """
+        prior_key, choice = jax.random.split(key)
+        values = self.sample(prior_key, n)
+        for parameter in self.parameters:
+            draws = earlier.get(parameter.name, earlier.get(parameter.spec.name))
+            if draws is not None:
+                # The same rows for all parameters: their values belong together.
+                chosen = jnp.asarray(draws)[jax.random.randint(choice, (n,), 0, len(draws))]
+                values[parameter.name] = parameter.inside(chosen, values[parameter.name])
+        return values
 
     def log_prior(self, values: Mapping[str, Float[Array, "..."]]) -> Float[Array, "..."]:
         """Log density of the prior in physical units."""

@@ -46,6 +46,10 @@ def calibrate(
         str | None, typer.Option(help="sbc: instead of fitting, check the method on simulated data")
     ] = None,
     datasets: Annotated[int, typer.Option(help="number of data sets of a check")] = 200,
+    start: Annotated[
+        Path | None,
+        typer.Option("--from", help="folder of an earlier calibration of this robot, to start climbs from"),
+    ] = None,
     overrides: Overrides = None,
 ) -> None:
     """Fit the simulator to recordings: writes posterior.nc, summary.json and report.html."""
@@ -55,7 +59,7 @@ def calibrate(
     if check is not None:
         inference.check(experiment, folder, check, datasets, overrides or [], resume)
         return
-    report = run_calibration(experiment, folder, overrides=overrides or [], resume=resume)
+    report = run_calibration(experiment, folder, overrides=overrides or [], resume=resume, start=start)
     typer.echo(f"report: {report}")
 
 

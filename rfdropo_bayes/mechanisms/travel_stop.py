@@ -21,7 +21,7 @@ class TravelStop:
 
     name = "travel_stop"
     stage = "actuation"
-    cause = "commands relative to the present position, at a stop or limit of the drive (or a slack cable that it rewinds)"
+    cause = "commands given relative to where the drive is, at a stop or at a limit of its controller"
     remedy = "record where the drives are, not what they were told; command absolute positions"
     parameters = (
         ParameterSpec(

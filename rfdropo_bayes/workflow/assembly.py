@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.calibration import Batch, CalibrationProblem
 from rfdropo_bayes.bayes.forces import Weighed, check_weighed, gather_tension, tension_specs
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
 from rfdropo_bayes.bayes.noise import noise_specs
@@ -113,7 +113,7 @@ def build_model(
     return TrajectoryModel(simulator, space, fixed, table.noise, recordings, tension, weighed)
 
 
-def build_problem(model: TrajectoryModel) -> CalibrationProblem:
-    """The model as the inference methods see it, in chunks that suit its engine."""
+def build_problem(model: TrajectoryModel, earlier: Batch | None = None) -> CalibrationProblem:
+    """The model as the inference methods see it, in chunks that suit its engine; ``earlier``: see the problem."""
     lanes = model.simulator.lanes
-    return CalibrationProblem(model, chunk=max(1, lanes // len(model.recordings.names)))
+    return CalibrationProblem(model, chunk=max(1, lanes // len(model.recordings.names)), earlier=earlier)

@@ -17,17 +17,21 @@ from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
 from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, software_versions, write_run
+from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
 from rfdropo_bayes.workflow.experiment import Experiment, describe, load_experiment
 from rfdropo_bayes.workflow.files import output_folder
-from rfdropo_bayes.workflow.prediction import predict_fitted, predict_new, thin
+from rfdropo_bayes.workflow.prediction import Batch, predict_fitted, predict_new, thin
 
 PREDICTIVE_DRAWS = 200
 PRIOR_DRAWS = 2000
 PRIOR_PREDICTIVE_DRAWS = 64
+START_DRAWS = 1000
 
 
-def run_calibration(path: Path, out: Path, *, overrides: Sequence[str] = (), resume: bool = False) -> Path:
+def run_calibration(
+    path: Path, out: Path, *, overrides: Sequence[str] = (), resume: bool = False, start: Path | None = None
+) -> Path:
     """Fit an experiment and write what it found.
 
     Args:
@@ -35,6 +39,8 @@ def run_calibration(path: Path, out: Path, *, overrides: Sequence[str] = (), res
         out: folder to write to; checkpoints go to its folder ``checkpoints``.
         overrides: assignments that replace entries of the file.
         resume: go on from the checkpoint of an interrupted run of the same experiment.
+        start: folder of an earlier calibration of the same robot, perhaps with fewer mechanisms or other recordings:
+            climbs start from its posterior. What is inferred, and from which data, does not change.
 
     Returns:
         path of report.html.
@@ -47,7 +53,7 @@ def run_calibration(path: Path, out: Path, *, overrides: Sequence[str] = (), res
     fitted = load_data(experiment, folder, "fit")
     tested = load_data(experiment, folder, "test")
     simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
-    problem = build_problem(build_model(experiment, simulator, fitted))
+    problem = build_problem(build_model(experiment, simulator, fitted), earlier_draws(start))
     method = experiment.inference.method
     config = make_config(method, inference_options(experiment))
     out = output_folder(out)
@@ -57,6 +63,18 @@ def run_calibration(path: Path, out: Path, *, overrides: Sequence[str] = (), res
     record = record_posterior(problem, result, tested, predicting, _attributes(experiment, [*fitted, *tested]))
     facts = gather_facts(experiment, path.stem, problem, result, fitted, tested)
     return write_run(out, record, facts, describe(tables))
+
+
+def earlier_draws(folder: Path | None) -> Batch | None:
+    """Draws of an earlier calibration, chains joined; None without one.
+
+    Raises:
+        InputError: a folder that holds no posterior.
+    """
+    if folder is None:
+        return None
+    record = PosteriorRecord.load(Path(folder) / POSTERIOR)
+    return thin({info.name: record.posterior[info.name] for info in record.free}, START_DRAWS)
 
 
 def inference_options(experiment: Experiment) -> dict[str, Any]:

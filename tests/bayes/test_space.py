@@ -46,6 +46,20 @@ def test_the_unconstrained_map_is_a_bijection_and_its_density_carries_the_jacobi
     np.testing.assert_allclose(chosen.log_prior_unconstrained(u), expected, rtol=1e-9)
 
 
+def test_draws_around_an_earlier_posterior_keep_its_rows_together_and_stay_inside():
+    """What it lacks, and what lies outside the support, comes from the prior; one value for all serves every one."""
+    modulus = np.array([2e6, 3e6, 1e6, 9e9])  # the third on the bound, the fourth beyond it
+    earlier = {"young_modulus": modulus, "offset_x": 1e-9 * modulus, "offset_x@b": np.full(4, 0.02)}
+    values = space().sample_around(earlier, jax.random.key(3), 200)
+    assert np.isfinite(space().to_unconstrained(values)).all()
+    inside = np.isin(np.round(values["young_modulus"], 3), modulus)
+    np.testing.assert_allclose(values["offset_x@a"][inside], 1e-9 * values["young_modulus"][inside], rtol=1e-9)
+    assert np.isin([2e6, 3e6], np.round(values["young_modulus"], 3)).all()
+    assert np.max(values["young_modulus"]) < 5e7
+    np.testing.assert_allclose(values["offset_x@b"], 0.02, rtol=1e-12)
+    assert len(np.unique(values["poisson_ratio"])) == 200
+
+
 @pytest.mark.parametrize(
     ("priors", "scopes", "message"),
     [
