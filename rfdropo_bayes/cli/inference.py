@@ -14,14 +14,16 @@ from rfdropo_bayes.errors import InputError
 def export(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a calibration has written")],
     phi: Annotated[bool, typer.Option("--phi", help="the distribution to randomise over")] = False,
+    posterior: Annotated[bool, typer.Option("--posterior", help="a posterior.nc without its predictions")] = False,
     out: Annotated[Path | None, typer.Option("--out", help="folder to write to; DIR by default")] = None,
 ) -> None:
-    """Write the distribution to randomise over as tables with units (CSV and JSON), for other simulators."""
-    from rfdropo_bayes.workflow.export import export_phi
+    """Write the distribution to randomise over as tables with units, or a posterior small enough to keep."""
+    from rfdropo_bayes.workflow.export import export_phi, export_posterior
 
-    if not phi:
-        raise InputError("nothing to export was named", where="export", remedy="add --phi")
-    for path in export_phi(folder, out):
+    if not phi and not posterior:
+        raise InputError("nothing to export was named", where="export", remedy="add --phi or --posterior")
+    paths = export_phi(folder, out) if phi else []
+    for path in [*paths, *([export_posterior(folder, out)] if posterior else [])]:
         typer.echo(str(path))
 
 

@@ -1,4 +1,4 @@
-"""``rfdropo export``: the distribution to randomise over, as tables that other simulators can read."""
+"""``rfdropo export``: the distribution to randomise over as tables, or a posterior small enough to keep."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from rfdropo_bayes.workflow.files import output_folder
 
 TABLE, TABLE_JSON, DRAWS = "phi.csv", "phi.json", "phi_draws.csv"
 MOST_DRAWS = 2000
+KEPT_DRAWS = 500
 SCHEMA_VERSION = 1
 LENGTH_POWER = {"m": 1, "N": 1, "Pa": -1, "J": 2, "W": 2}
 
@@ -77,6 +78,28 @@ def export_phi(folder: Path, out: Path | None = None) -> list[Path]:
             f"cannot be written ({error.strerror})", where=str(out), remedy="choose another with --out"
         ) from None
     return paths
+
+
+def export_posterior(folder: Path, out: Path | None) -> Path:
+    """Write posterior.nc with `KEPT_DRAWS` draws and no predictions: enough to predict with, or to start climbs from.
+
+    Returns:
+        the file written.
+
+    Raises:
+        InputError: no posterior in ``folder``, or ``out`` is that folder, or cannot be written.
+    """
+    record = PosteriorRecord.load(folder / POSTERIOR)
+    if out is None or out.resolve() == folder.resolve():
+        raise InputError(
+            "would replace the whole posterior", where=str(folder), remedy="name another folder with --out"
+        )
+    size = next(iter(record.posterior.values())).shape[1]
+    kept = np.linspace(0, size - 1, min(KEPT_DRAWS, size)).round().astype(int)
+    draws = {name: values[:, kept] for name, values in record.posterior.items()}
+    path = output_folder(out) / POSTERIOR
+    PosteriorRecord(record.parameters, draws, derived=record.derived, attrs=record.attrs).save(path)
+    return path
 
 
 def _rows(record: PosteriorRecord, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
