@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.fit import Fit, Target
-from rfdropo_bayes.audit.score import Signature, signature, span
+from rfdropo_bayes.audit.score import Signature, project_out, signature, span
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)  # quantiles of the prior at which a shape is tried
 LEVELS_OF_TWO = (0.2, 0.5, 0.8)  # if there are two of them
+WAY = np.geomspace(0.05, 1.5, 12)  # from null to where a shape was tried: where on it the data are met best
 UNSEEN = 1e-6  # of the whitened data per prior deviation: the parameter does nothing at null
 
 
@@ -158,9 +159,42 @@ def _probe(
     return Probe(candidate.name, point, columns, amplitudes, mark)
 
 
+def lead(target: Target, fit: Fit, probe: Probe, lm: float) -> tuple[float, Float[np.ndarray, " d"]]:
+    """What a candidate may take from the sum of squares, and the point from which a refit should start.
+
+    The score statistic is the drop that an amplitude brings. A shape alone has none: its effect has the size it has,
+    and may be too large where it was tried. The way there from its null value is searched.
+    """
+    if probe.amplitudes:
+        return lm, probe.start(fit)
+    base = span(fit.jacobian)
+    points = np.repeat(fit.x[None], len(WAY), axis=0)
+    null = target.forward.coordinates.null
+    for index, value in probe.point.items():
+        points[:, index] = null[index] + WAY * (value - null[index])
+    points = np.clip(points, *target.forward.coordinates.bounds)
+    found = target.recall("way", [points], lambda: {"residual": target.residual(points)})["residual"]
+    left = np.sum(project_out(base, found.T) ** 2, axis=0)
+    best = int(np.argmin(left))
+    at_null = float(np.sum(project_out(base, fit.residual[:, None]) ** 2))
+    start = points[best]
+    step = np.linalg.lstsq(fit.jacobian, found[best], rcond=1e-6)[0]
+    start[fit.free] += np.clip(step, -1.0, 1.0)
+    return at_null - float(left[best]), start
+
+
 def discretisation_probe(
     fit: Fit, name: str, finer: Float[np.ndarray, " n"], candidate_base: Float[np.ndarray, "n rank"]
 ) -> Probe:
     """The effect of a finer mesh and time step, from the residual of the finer simulator at the same point."""
     columns = (fit.residual - finer)[:, None]
     return Probe(name, {}, columns, (), signature(candidate_base, columns, 1))
+
+
+def fixed_drop(fit: Fit, probe: Probe) -> float:
+    """What a change without an amplitude takes from the sum of squares, base parameters moved with it."""
+    base = span(fit.jacobian)
+    now, then = (
+        np.sum(project_out(base, r) ** 2) for r in (fit.residual[:, None], fit.residual[:, None] - probe.columns)
+    )
+    return float(now - then)

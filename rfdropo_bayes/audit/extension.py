@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rfdropo_bayes.audit.candidates import Candidate, Probe, discretisation_probe, probe_all
+from rfdropo_bayes.audit.candidates import Candidate, Probe, discretisation_probe, fixed_drop, lead, probe_all
 from rfdropo_bayes.audit.fit import Fit, Target, climb
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.score import likeness, span
@@ -122,11 +122,10 @@ class Inquiry:
     def _extend(self, found: Look, named: Sequence[str]) -> Step | None:
         """Refit the leading classes and add the best of them, if it is worth it."""
         significant = [row for row in found.rows if row.adjusted_p <= self.rules.family and row.probe is not None]
-        chosen = self._leading(significant)
         refits: dict[str, float] = {}
         fits: dict[str, Fit] = {}
-        for row in chosen:
-            fits[row.name] = self.refit(found.fit, row)
+        for row, start in self._leading(found.fit, significant):
+            fits[row.name] = self._refit(found.fit, row, start)
             refits[row.name] = fits[row.name].log_evidence - found.fit.log_evidence
             self.report(f"refit with {row.name}: log Bayes factor {refits[row.name]:.1f}")
         if not refits or max(refits.values()) < self.rules.evidence:
@@ -135,11 +134,22 @@ class Inquiry:
         members = self._class_of(found.row(best), significant)
         return Step(best, members, found, fits[best], refits[best], refits)
 
-    def _leading(self, significant: Sequence[Row]) -> list[Row]:
-        """The best candidates of the leading classes, and further members of these while there is room."""
+    def _leading(self, fit: Fit, significant: Sequence[Row]) -> list[tuple[Row, np.ndarray]]:
+        """The best candidates of the leading classes, and further members of these while there is room; each with the
+        point from which its refit starts. Those that cannot bring what a mechanism must are left out."""
+        drops: dict[str, float] = {}
+        starts: dict[str, np.ndarray] = {}
+        for row in significant:
+            assert row.probe is not None
+            if row.name == DISCRETISATION:
+                drops[row.name], starts[row.name] = fixed_drop(fit, row.probe), fit.x
+            else:
+                drops[row.name], starts[row.name] = lead(self.target, fit, row.probe, row.lm)
+        able = [row for row in significant if drops[row.name] > 2.0 * self.rules.evidence]
+        able.sort(key=lambda row: row.rank * np.log(len(fit.residual)) - drops[row.name])
         heads: list[Row] = []
         rest: list[Row] = []
-        for row in significant:
+        for row in able:
             assert row.probe is not None
             alike = any(likeness(row.probe.mark, h.probe.mark) > self.rules.class_cosine for h in heads if h.probe)
             if not alike and len(heads) < self.rules.classes:
@@ -148,7 +158,11 @@ class Inquiry:
                 rest.append(row)
         chosen = [*heads, *rest][: self.rules.members]
         # A refit on a finer mesh costs as much as all others: only where it could win.
-        return [row for row in chosen if row.name != DISCRETISATION or row.lm > 0.5 * chosen[0].lm]
+        return [
+            (row, starts[row.name])
+            for row in chosen
+            if row.name != DISCRETISATION or drops[row.name] > 0.5 * drops[chosen[0].name]
+        ]
 
     def _class_of(self, best: Row, significant: Sequence[Row]) -> tuple[str, ...]:
         assert best.probe is not None
@@ -164,14 +178,17 @@ class Inquiry:
     def refit(self, fit: Fit, row: Row) -> Fit:
         """The model of a fit with a candidate in it."""
         assert row.probe is not None
+        start = fit.x if row.name == DISCRETISATION else lead(self.target, fit, row.probe, row.lm)[1]
+        return self._refit(fit, row, start)
+
+    def _refit(self, fit: Fit, row: Row, start: np.ndarray) -> Fit:
         if row.name == DISCRETISATION:
             assert self.finer is not None
-            return climb(replace(self.target, forward=self.finer), fit.x, fit.free)
+            return climb(replace(self.target, forward=self.finer), start, fit.free)
         candidate = next(c for c in self.candidates if c.name == row.name)
         free = np.array([*fit.free, *candidate.indices], dtype=int)
         low, high = self.target.forward.coordinates.bounds
-        start = np.clip(row.probe.start(fit), low, high)
-        return climb(self.target, start, free)
+        return climb(self.target, np.clip(start, low, high), free)
 
     def _reconsider(self, base: Fit, steps: list[Step]) -> list[Step]:
         """With the last mechanism in the model, was the first one named rightly? Take it out and ask again."""

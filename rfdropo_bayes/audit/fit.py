@@ -120,18 +120,18 @@ def _climb(target: Target, start: np.ndarray, free: np.ndarray, evaluations: int
 
     inside = np.clip(start[free], low + 1e-9 * (high - low), high - 1e-9 * (high - low))
     found = least_squares(
-        residual, inside, jacobian, bounds=(low, high), x_scale=sd, ftol=1e-7, xtol=1e-7, gtol=1e-9,
+        residual, inside, jacobian, bounds=(low, high), x_scale=sd, ftol=1e-6, xtol=1e-6, gtol=1e-9,
         max_nfev=evaluations,
     )  # fmt: skip
-    return at_point(target, place(found.x), free)
+    rows = len(found.fun) - len(free)  # those after them are the prior's
+    return _around(target, place(found.x), free, found.fun[:rows], -found.jac[:rows])
 
 
-def at_point(target: Target, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]) -> Fit:
+def _around(target: Target, x: np.ndarray, free: np.ndarray, residual: np.ndarray, jacobian: np.ndarray) -> Fit:
     """The normal approximation around a point that is taken for the mode."""
     coordinates = target.forward.coordinates
     low, high = (bound[free] for bound in coordinates.bounds)
     mean, sd = coordinates.prior_mean[free], coordinates.prior_sd[free]
-    residual, jacobian = target.residual(x[None])[0], target.jacobian(x, free)
     precision = jacobian.T @ jacobian + np.diag(1.0 / sd**2)
     covariance = np.linalg.inv(precision)
     z = (x[free] - mean) / sd
@@ -145,7 +145,11 @@ def at_point(target: Target, x: Float[np.ndarray, " d"], free: Int[np.ndarray, "
 
 
 def fit_base(
-    target: Target, free: Int[np.ndarray, " free"], rng: np.random.Generator, start: np.ndarray | None = None
+    target: Target,
+    free: Int[np.ndarray, " free"],
+    rng: np.random.Generator,
+    start: np.ndarray | None = None,
+    report: Callable[[str], None] = lambda line: None,
 ) -> Fit:
     """Posterior mode of the base model: climbs from a given start, or from the best of some prior draws."""
     coordinates = target.forward.coordinates
@@ -155,5 +159,8 @@ def fit_base(
     points[1:, free] += coordinates.prior_sd[free] * rng.standard_normal((SCREENED - 1, len(free)))
     points = np.clip(points, *coordinates.bounds)
     cost = target.recall("screen", [points], lambda: {"cost": np.sum(target.residual(points) ** 2, axis=1)})["cost"]
-    best = [climb(target, points[index], free) for index in np.argsort(cost, kind="stable")[:STARTS]]
+    best = []
+    for index in np.argsort(cost, kind="stable")[:STARTS]:
+        best.append(climb(target, points[index], free))
+        report(f"base model, start {len(best)} of {STARTS}: sum of squares {best[-1].residual @ best[-1].residual:.0f}")
     return max(best, key=lambda fit: fit.log_evidence)

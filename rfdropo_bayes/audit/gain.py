@@ -17,6 +17,7 @@ from rfdropo_bayes.audit.noise import STATED, NoiseModel
 DIFFERENCE_FROM = 6  # trajectories below which an ELPD difference has no standard error worth stating
 RESAMPLES = 2000
 BANDS = 12
+SURE = 3.0  # standard errors by which a discrepancy must exceed the noise to be taken for one
 LEVELS = (0.5, 0.9)
 
 
@@ -131,41 +132,43 @@ def explained_fraction(
     """``1 - (ext^2 - noise^2) / (base^2 - noise^2)`` with its 90 % interval.
 
     The mean squares are taken frequency by frequency and pattern by pattern (cosine transform in time, principal
-    components over the channels), each weighted by the share of discrepancy in what the base model leaves on the
-    FITTED data there (a Wiener filter): where there is nothing but noise, noise is not counted. The interval holds the
-    scatter of noise and trajectories (bootstrap over trajectories) and the uncertainty of the noise's power at these
-    frequencies.
+    components over the channels), each weighted by the squared share of discrepancy in what the base model leaves on
+    the FITTED data there (a Wiener filter of both factors): where there is nothing but noise, noise is not counted, and
+    where there is little else, little of it. The interval is that of the fraction on these trajectories: it holds the
+    noise in both mean squares, which is the same noise, and the uncertainty of its power at these frequencies.
     """
     axes = _components(pattern, unseen.valid.shape[-1])
     spectrum = _noise_power(noise, base.shape[1])
-    weight = _wiener(pattern @ axes, base.shape[1])[None] * spectrum[None, :, None]
-    usable = np.maximum(unseen.valid.mean(axis=(1, 2)), 1e-9)
-
-    def energies(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        cosines = dct(noise.whiten(residual, unseen.valid) @ axes, axis=1, norm="ortho")
-        return np.sum(weight * cosines**2, axis=(1, 2)), usable * np.sum(weight)
-
-    first, floor = energies(base)
-    second, _ = energies(extended)
-    point = _fraction(first.sum(), second.sum(), floor.sum(), 1.0)
-    chosen = rng.integers(len(first), size=(RESAMPLES, len(first)))
-    sizes = 1.0 + rng.standard_normal(RESAMPLES) * _floor_error(noise, weight[0].sum(axis=1) / spectrum)
-    # Few trajectories scatter more than a bootstrap of them shows: noise is drawn for each as well.
-    scatter = rng.standard_normal((RESAMPLES, len(first))) * np.sqrt(2.0 * np.sum(weight**2) * usable)
-    within = scatter.sum(axis=1) if len(first) < DIFFERENCE_FROM else 0.0
-    drawn = _fraction(
-        _resampled(first, chosen) + within, _resampled(second, chosen) + within, _resampled(floor, chosen), sizes
+    weight = _wiener(pattern @ axes, base.shape[1]) ** 2 * spectrum[:, None]
+    usable = float(np.maximum(unseen.valid.mean(axis=(1, 2)), 1e-9).sum())
+    first, second = (
+        dct(noise.whiten(residual, unseen.valid) @ axes, axis=1, norm="ortho") for residual in (base, extended)
     )
-    return float(point), (float(np.quantile(drawn, 0.05)), float(np.quantile(drawn, 0.95)))
+    sums = np.array([np.sum(weight * first**2), np.sum(weight * second**2)])
+    floor = usable * float(np.sum(weight))
+    point = _fraction(sums[0], sums[1], floor, 1.0)
+    drawn = sums + rng.standard_normal((RESAMPLES, 2)) @ _noise_in_sums(weight, first, second, usable).T
+    sizes = 1.0 + rng.standard_normal(RESAMPLES) * _floor_error(noise, weight.sum(axis=1) / spectrum)
+    found = _fraction(drawn[:, 0], drawn[:, 1], floor, sizes)
+    return float(point), (float(np.quantile(found, 0.05)), float(np.quantile(found, 0.95)))
 
 
-def _resampled(values: Float[np.ndarray, " n"], chosen: np.ndarray) -> np.ndarray:
-    """Bootstrap of a sum; resampling n values shows only (n - 1) / n of its variance."""
-    total, count = values.sum(), len(values)
-    return total + np.sqrt(count / max(count - 1, 1)) * (values[chosen].sum(axis=1) - total)
+def _noise_in_sums(
+    weight: Float[np.ndarray, "row component"], first: np.ndarray, second: np.ndarray, usable: float
+) -> Float[np.ndarray, "2 2"]:
+    """Square root of the covariance of the weighted sums of squares of two series that hold the same unit noise.
+
+    The covariance of (d + z)^2 and (e + z)^2 is 2 + 4 d e, whose second part is estimated by 4 (d + z) (e + z) - 4.
+    """
+    square = weight**2
+    least = 2.0 * usable * float(np.sum(square))
+    products = [[float(np.sum(square * a * b)) for b in (first, second)] for a in (first, second)]
+    covariance = 4.0 * np.array(products) - least
+    values, vectors = np.linalg.eigh(covariance + np.diag(np.maximum(least - np.diag(covariance), 0.0)))
+    return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def _fraction(base: np.ndarray, extended: np.ndarray, floor: np.ndarray, size: np.ndarray | float) -> np.ndarray:
+def _fraction(base: np.ndarray, extended: np.ndarray, floor: float, size: np.ndarray | float) -> np.ndarray:
     left = np.maximum(extended - size * floor, 0.0)
     # Less than the noise's own uncertainty is no discrepancy to be explained.
     return 1.0 - left / np.maximum(base - size * floor, 1e-3 * floor)
@@ -213,7 +216,7 @@ def _spectrum(coefficients: Float[np.ndarray, " lag"], deviation: float, rows: i
 
 def _wiener(pattern: Float[np.ndarray, "group time component"], rows: int) -> Float[np.ndarray, "row component"]:
     """Share of discrepancy in each band of frequencies and component, from residuals of unit noise; none where their
-    power is within two standard errors of the noise's."""
+    power is within three standard errors of the noise's."""
     power = np.mean(dct(pattern, axis=1, norm="ortho") ** 2, axis=0)
     place = np.arange(len(power)) / len(power)
     edges = np.concatenate([[0.0], np.geomspace(1.5 / len(power), 1.0, BANDS)])
@@ -223,7 +226,7 @@ def _wiener(pattern: Float[np.ndarray, "group time component"], rows: int) -> Fl
         own = band == index
         if own.any():
             mean, error = power[own].mean(axis=0), np.sqrt(2.0 / (len(pattern) * own.sum()))
-            excess[own] = np.where(mean > 1.0 + 2.0 * error, mean - 1.0, 0.0)
+            excess[own] = np.where(mean > 1.0 + SURE * error, mean - 1.0, 0.0)
     share = excess / (excess + 1.0) if excess.any() else np.ones_like(excess)
     at = np.minimum((np.arange(rows) / rows * len(power)).astype(int), len(power) - 1)
     return share[at]

@@ -102,7 +102,7 @@ def audit(
     """
     began = time.monotonic()
     rng = np.random.default_rng(question.seed)
-    target, base = base_model(question, rng, journal)
+    target, base = base_model(question, rng, journal, report)
     report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.order})")
     finer = None
     if question.finer is not None:
@@ -150,7 +150,12 @@ def _simulated(question: Question, finer: bool, chosen: dict[str, int]) -> Forwa
     return Forward(lanes, question.coordinates, commands, chosen, rows)
 
 
-def base_model(question: Question, rng: np.random.Generator, journal: Journal | None = None) -> tuple[Target, Fit]:
+def base_model(
+    question: Question,
+    rng: np.random.Generator,
+    journal: Journal | None = None,
+    report: Callable[[str], None] = lambda line: None,
+) -> tuple[Target, Fit]:
     """Noise and base fit; where the noise is estimated from residuals, the two in turn."""
     journal = journal or Journal()
     coordinates = question.coordinates
@@ -166,10 +171,10 @@ def base_model(question: Question, rng: np.random.Generator, journal: Journal | 
         if noise is None or measurements.has_repeats:
             noise = measurements.noise(measurements.single, 0)
         target = Target(forward, measurements, noise, journal)
-        return target, fit_base(target, free, rng, start)
+        return target, fit_base(target, free, rng, start, report)
     white = NoiseModel(np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf)
     target = Target(forward, measurements, white, journal)
-    fit = fit_base(target, free, rng, start)
+    fit = fit_base(target, free, rng, start, report)
     for _ in range(2):
         target = replace(target, noise=_residual_noise(target, fit))
         fit = climb(target, fit.x, free)

@@ -166,6 +166,8 @@ def _relative_sizes(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any]:
         low, high = ratio * (1 - 1.645 * spread), ratio * (1 + 1.645 * spread)
         title = f"{name}_over_{STIFFNESS}" if power > 0 else f"{name}_times_{STIFFNESS}"
         found[title] = {
+            "parameter": name,
+            "power": power,
             "mean": ratio,
             "sd": abs(ratio) * spread,
             "q05": min(low, high),

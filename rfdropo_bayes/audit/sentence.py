@@ -17,6 +17,11 @@ CLEARLY_WORSE = 10.0  # nats
 
 def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     """What was found, how much of the discrepancy it explains, what is excluded, what remains."""
+    words = _words(answer, findings)
+    return words[0].upper() + words[1:]
+
+
+def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if answer.verdict == NO_DISCREPANCY:
         return (
             f"No discrepancy: what the base model leaves is noise as far as these data can tell "
@@ -46,7 +51,10 @@ def _named(finding: dict[str, Any]) -> str:
     name = finding["mechanism"].replace("_", " ")
     if finding["mechanism"] == DISCRETISATION:
         return "the coarse mesh or time step"
-    sizes = ", ".join(_size(p, row) for p, row in list(finding["parameters"].items())[:4])
+    # Where cables leave the common scale of forces and stiffness free, only the ratio means something.
+    ratios = {row["parameter"]: (title, row) for title, row in finding["relative"].items()}
+    given = [ratios.get(name, (name, row)) for name, row in finding["parameters"].items()]
+    sizes = ", ".join(_size(title, row) for title, row in given[:4])
     others = [other.replace("_", " ") for other in finding["equivalence_class"][1:]]
     alike = f" (not to be told from {', '.join(others)} by these data)" if others else ""
     return f"{name} ({sizes}){alike}"

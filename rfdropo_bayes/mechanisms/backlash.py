@@ -9,6 +9,8 @@ from jaxtyping import Array, Float
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
+REST = 1e-9  # m or rad per step: less is the rounding of a command that is held
+
 
 class Backlash:
     """At each reversal a drive moves by twice ``backlash`` before the cable follows (play operator); none at null."""
@@ -34,10 +36,14 @@ class Backlash:
     ) -> Float[Array, "step channel"]:
         """Drag the cable's end along with the drive, from the middle of the play at first."""
         half = values["backlash"]
+        sent = jnp.concatenate([jnp.asarray(initial, command.dtype)[None], command])
+        moves = jnp.diff(sent, axis=0)
 
-        def drag(last: Array, sent: Array) -> tuple[Array, Array]:
+        def drag(lead: Array, move: Array) -> tuple[Array, Array]:
             # Written with strict comparisons, so that without play the derivative stays that of the last move.
-            reached = jnp.where(sent - last > half, sent - half, jnp.where(last - sent > half, sent + half, last))
-            return reached, reached
+            ahead = lead + move
+            lead = jnp.where(ahead > half, half, jnp.where(ahead < -half, -half, ahead))
+            return lead, lead
 
-        return jax.lax.scan(drag, jnp.asarray(initial, command.dtype), command)[1]
+        moves = jnp.where(jnp.abs(moves) > REST, moves, 0.0)
+        return command - jax.lax.scan(drag, jnp.zeros_like(sent[0]), moves)[1]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
 
 from rfdropo_bayes.report import style
 from rfdropo_bayes.report.units import display_name
@@ -86,15 +87,17 @@ def _binned(x: np.ndarray, y: np.ndarray, bins: int) -> tuple[np.ndarray, np.nda
 @style.styled
 def blocks_figure(blocks: Sequence[Sequence[float]], seconds: float, titles: Sequence[str]) -> Figure:
     """When the models fail: mean square of the block means, 1 where a model is right."""
-    figure = Figure(figsize=(style.WIDTH, 2.4))
+    figure = Figure(figsize=(style.WIDTH, 2.6))
     axes = figure.subplots()
-    for row, title in zip(blocks, titles, strict=True):
-        axes.step(seconds * np.arange(len(row)), row, where="post", label=title)
+    for row, title, colour in zip(blocks, titles, style.AXIS_COLOURS * len(titles), strict=False):
+        axes.stairs(row, seconds * np.arange(len(row) + 1), baseline=None, label=title, color=colour, linewidth=1.4)
     axes.axhline(1.0, color=style.MEASURED, linewidth=0.8)
     axes.set_yscale("log")
+    for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+        ticks(LogFormatter(minor_thresholds=(1.5, 0.6)))
     axes.set_xlabel("time [s]")
     axes.set_ylabel("misfit (noise = 1)")
-    axes.legend(loc="upper right", ncols=2)
+    figure.legend(loc="outside upper center", ncols=4)
     return figure
 
 

@@ -19,11 +19,11 @@ from rfdropo_bayes.report.units import display_name
 
 SECTIONS = (
     ("result", "Verdict"),
-    ("show", "Where and when the base model fails"),
+    ("show", "Where the model fails"),
     ("name", "Candidates"),
-    ("measure", "What the extension is worth"),
-    ("remainder", "What remains unexplained"),
-    ("limits", "What this cannot see"),
+    ("measure", "Gain"),
+    ("remainder", "What remains"),
+    ("limits", "Limits"),
 )
 MOST_COSINES = 16
 

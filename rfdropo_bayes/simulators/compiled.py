@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import ClassVar, Literal
@@ -145,16 +145,19 @@ class CompiledEngine:
         )
 
     def _on_host(self, material: Material, start: Array, displacement: Array, limit: Array) -> Motion:
-        """Flatten whatever batch axes vmap has added, roll out, and restore them."""
+        """Flatten whatever batch axes vmap has added, roll out what differs, and restore them."""
         batch = displacement.shape[:-2]
         count = int(np.prod(batch))
-        flat = jax.tree.map(lambda value: flattened(np.asarray(value), len(batch), count), material)
-        found = self._native.rollout(
-            flat,
-            flattened(np.asarray(displacement), len(batch), count),
-            start=flattened(np.asarray(start), len(batch), count) if self.from_equilibrium else None,
-            steps=int(np.max(limit)),
+        given = jax.tree.map(
+            lambda value: flattened(np.asarray(value), len(batch), count), (material, start, displacement)
         )
+        # Padding of a batch, and perturbations of what acts after the body, ask for the same rollout again and again.
+        chosen, place = distinct(jax.tree.leaves(given))
+        body, first, commands = jax.tree.map(lambda value: value[chosen], given)
+        found = self._native.rollout(
+            body, commands, start=first if self.from_equilibrium else None, steps=int(np.max(limit))
+        )
+        found = type(found)(*(part[place] for part in found))
         rows = displacement.shape[-2] + 1
         return Motion(
             padded(found.position, rows).reshape(*batch, rows, -1, 3),
@@ -163,6 +166,13 @@ class CompiledEngine:
             found.residual.reshape(batch),
             found.cables_converged.reshape(batch),
         )
+
+
+def distinct(arrays: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Which rows differ from all before them, and for every row the place of its like among these."""
+    seen: dict[bytes, int] = {}
+    place = [seen.setdefault(b"".join(a[row].tobytes() for a in arrays), len(seen)) for row in range(len(arrays[0]))]
+    return np.unique(place, return_index=True)[1], np.array(place)
 
 
 def flattened(array: np.ndarray, axes: int, count: int) -> np.ndarray:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rfdropo_bayes.audit.record import STIFFNESS
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.mechanisms import REGISTRY
@@ -160,10 +161,9 @@ def judge(content: Mapping[str, Any], names: Sequence[str], hidden: Hidden) -> d
         if finding["mechanism"] in names:
             forms = dict(finding["parameters"])
             for title, row in finding["relative"].items():
-                name, _, power = title.partition("_over_") if "_over_" in title else title.partition("_times_")
+                name = row["parameter"]
                 forms.pop(name, None)
-                sign = -1.0 if "_over_" in title else 1.0
-                truth = hidden.values[name] * hidden.values[power] ** sign
+                truth = hidden.values[name] * hidden.values[STIFFNESS] ** -row["power"]
                 covered[title] = bool(row["q05"] <= truth <= row["q95"])
             covered |= {n: bool(r["q05"] <= hidden.values[n] <= r["q95"]) for n, r in forms.items()}
     return {

@@ -12,6 +12,7 @@ import pytest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.simulators.commands import commands_on_grid
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.01
@@ -48,6 +49,21 @@ def applied(name: str, values: dict):
 def test_the_null_value_is_the_base_simulator(name):
     base = COMMAND if name in DRIVES else POSITION
     np.testing.assert_allclose(applied(name, {}), base, rtol=0, atol=1e-17)
+
+
+def test_rounding_in_a_held_command_is_no_reversal():
+    """Ramped commands waver by 1e-18 while they are held; the derivative of play must not flip with them."""
+    time = np.arange(0.0, 4.0, 0.2)
+    level = np.random.default_rng(3).choice([0.0, 0.0025, 0.005], (len(time), 2))
+    sent = commands_on_grid(time, level, np.zeros(2), np.arange(0.0, 4.0, 0.05), time_step=STEP, ramp=0.1).step
+    moves = np.abs(np.diff(sent, axis=0))
+    assert ((moves > 0.0) & (moves < 1e-12)).any()
+
+    def driven(half):
+        return REGISTRY["backlash"]().actuate({"backlash": half}, jnp.asarray(sent), jnp.zeros(2), STEP)
+
+    slope = jax.jvp(driven, (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1]
+    np.testing.assert_allclose(slope, (driven(jnp.asarray(1e-6)) - sent) / 1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", [*DRIVES, *CAMERAS])
