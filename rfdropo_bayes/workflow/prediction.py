@@ -17,6 +17,8 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import RecordingPrediction
 
 OFFSETS = ("offset_x", "offset_y", "offset_z")
+MARKER_ERRORS = "marker_errors_m"  # among the attributes of a posterior
+SMALLEST_ERROR = 1e-6  # [m]
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 
@@ -36,21 +38,48 @@ def predict_fitted(
     return _predictions(problem, values, key, "fit", prior)
 
 
+def marker_errors(predictions: Sequence[RecordingPrediction]) -> dict[str, float]:
+    """How far [m] the mean prediction of each marker was off in the recordings that were fitted, root mean square."""
+    fitted = [p for p in predictions if p.split == "fit" and p.mask.any()]
+    errors = {}
+    for index, name in enumerate(fitted[0].marker_names if fitted else ()):
+        square = [np.sum((p.central - p.observed)[p.mask[:, index], index] ** 2, axis=-1) for p in fitted]
+        errors[name] = float(np.sqrt(np.mean(np.concatenate(square))))
+    return errors
+
+
 def predict_new(
-    model: TrajectoryModel, trajectories: Sequence[Trajectory], values: Batch, key: PRNGKeyArray, *, chunk: int
+    model: TrajectoryModel,
+    trajectories: Sequence[Trajectory],
+    values: Batch,
+    key: PRNGKeyArray,
+    *,
+    chunk: int,
+    errors: Mapping[str, float] | None = None,
 ) -> list[RecordingPrediction]:
     """Predictions of recordings that no fit has seen, from their commands and at most their first row.
 
     A parameter that was free per recording takes, for a new one, the values it had in the fitted recordings, one of
     them at random for every draw. Where the offset of the measuring frame is such a parameter, it is set from the
-    first row: each draw is shifted so that the mean over the markers agrees there.
+    first row: each draw is shifted so that the weighted mean over the markers agrees there, and a marker weighs as
+    little as the model is wrong about it. A further piece of a fitted recording keeps the parameters of that recording.
+
+    Args:
+        errors: `marker_errors` of the fit; all markers weigh the same without.
     """
     space, extended = _for_new_recordings(model.space, values, [t.name for t in trajectories], key)
     fresh = replace(model, space=space, recordings=gather_recordings(model.simulator, trajectories))
     problem = CalibrationProblem(fresh, chunk=chunk)
-    if any(p.recording and p.spec.name in OFFSETS for p in space.parameters):
-        extended = _offsets_from_first_row(problem, extended)
+    own = {_whole(p.recording) for p in model.space.parameters if p.recording}
+    shifted = [t.name for t in trajectories if _whole(t.name) not in own]
+    if any(p.recording in shifted and p.spec.name in OFFSETS for p in space.parameters):
+        extended = _offsets_from_first_row(problem, extended, shifted, errors or {})
     return _predictions(problem, extended, key, "test", None)
+
+
+def _whole(name: str) -> str:
+    """The recording that a piece is cut from."""
+    return name.partition("[")[0]
 
 
 def _for_new_recordings(
@@ -68,21 +97,25 @@ def _for_new_recordings(
     for index, recording in enumerate(names):
         # One fitted recording is chosen per draw for all families at once: its values belong together.
         chosen = np.asarray(jax.random.randint(jax.random.fold_in(key, index), (count,), 0, 2**31 - 1))
-        for name, members in families.items():
+        for name, family in families.items():
+            members = [p for p in family if _whole(p.recording) == _whole(recording)] or family
             pool = np.stack([values[member.name] for member in members])
             extended[f"{name}{SEPARATOR}{recording}"] = pool[chosen % len(members), np.arange(count)]
             parameters.append(replace(members[0], recording=recording))
     return ParameterSpace(tuple(parameters)), extended
 
 
-def _offsets_from_first_row(problem: CalibrationProblem, values: Batch) -> Batch:
+def _offsets_from_first_row(
+    problem: CalibrationProblem, values: Batch, names: Sequence[str], errors: Mapping[str, float]
+) -> Batch:
     """Shift each draw's offsets so that simulated and measured markers agree on average in the first row."""
     recordings = problem.model.recordings
     position, _ = problem.predict(values)
+    precision = np.array([1.0 / max(errors.get(name, 1.0), SMALLEST_ERROR) ** 2 for name in recordings.markers])
     shifted = dict(values)
     for index, name in enumerate(recordings.names):
         valid = recordings.line.valid[index, 0]
-        if not recordings.line.valid[index].any():
+        if name not in names or not recordings.line.valid[index].any():
             continue  # commands alone: where the frame lies is as uncertain as it was among the fitted recordings
         if not valid.any():
             raise InputError("the first row is masked throughout", where=name, remedy="start the recording later")
@@ -90,7 +123,7 @@ def _offsets_from_first_row(problem: CalibrationProblem, values: Batch) -> Batch
         for axis, offset in enumerate(OFFSETS):
             key = f"{offset}{SEPARATOR}{name}"
             if key in shifted:
-                shifted[key] = shifted[key] + error[:, :, axis].mean(axis=1)
+                shifted[key] = shifted[key] + np.average(error[:, :, axis], axis=1, weights=precision[valid])
     return shifted
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import xarray as xr
 from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.workflow.prediction import MARKER_ERRORS
 from rfdropo_bayes.workflow.unseen import run_prediction
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
@@ -66,6 +68,35 @@ def test_only_the_first_row_is_seen_and_sets_the_frame(posterior, tmp_path):
         np.testing.assert_array_equal(blind[name].values, there[name].values)
     start = here["mean"].values[0] - whole.position[0]
     np.testing.assert_allclose(start.mean(axis=0), 0.0, atol=1e-9)
+
+
+def test_the_marker_that_the_model_knows_best_sets_the_frame(posterior, tmp_path):
+    """All weight on the first marker: it agrees in the first row, draw by draw, and the others keep their error."""
+    record = PosteriorRecord.load(posterior / "posterior.nc")
+    errors = {"m1": 1e-6, "m2": 1.0, "m3": 1.0, "m4": 1.0}
+    (tmp_path / "weighed").mkdir()
+    attributes = {**record.attrs, MARKER_ERRORS: errors}
+    PosteriorRecord(record.parameters, record.posterior, attrs=attributes).save(tmp_path / "weighed" / "posterior.nc")
+    start = predict(tmp_path / "weighed", COMMANDS, tmp_path / "a")["mean"].values[0]
+    measured = Trajectory.load(EXPERIMENTS / COMMANDS).position[0]
+    np.testing.assert_allclose(start[0], measured[0], atol=1e-8)
+    assert np.abs(start - measured)[1:].max() > 1e-4
+
+
+def test_a_piece_of_a_fitted_recording_keeps_its_frame(posterior, tmp_path):
+    """What its first row says about the frame has been used already, with all the other rows."""
+    record = PosteriorRecord.load(posterior / "posterior.nc")
+    renamed = [i.name.replace("@demo_1", "@demo_3[0:9]").replace("@demo_2", "@other") for i in record.parameters]
+    infos = tuple(replace(info, name=name) for info, name in zip(record.parameters, renamed, strict=True))
+    draws = {name: record.posterior[info.name] for name, info in zip(renamed, record.parameters, strict=True)}
+    (tmp_path / "same").mkdir()
+    PosteriorRecord(infos, draws).save(tmp_path / "same" / "posterior.nc")
+    whole = Trajectory.load(EXPERIMENTS / COMMANDS)
+    moved = whole.dataset.assign(position=whole.dataset["position"] + xr.DataArray(SHIFT, dims="axis"))
+    Trajectory(moved).save(tmp_path / "moved.nc")
+    here = predict(tmp_path / "same", COMMANDS, tmp_path / "a", rows=(20, 30))
+    there = predict(tmp_path / "same", str(tmp_path / "moved.nc"), tmp_path / "b", rows=(20, 30))
+    np.testing.assert_array_equal(here["mean"].values, there["mean"].values)
 
 
 def test_bands_are_those_of_what_would_be_measured(posterior, tmp_path):
