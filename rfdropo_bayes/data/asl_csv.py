@@ -107,7 +107,7 @@ def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> T
         seen = np.all(np.isfinite(first), axis=1)
         position[:], mask[row] = np.where(seen[:, None], first, 0.0), seen
     return Trajectory.build(
-        name=_stem(commands),
+        name=_stem(observations or commands),
         robot="asl_trunk",
         format=FORMAT,
         time=time,
