@@ -86,15 +86,18 @@ class ParameterSpace:
     ) -> dict[str, Float[Array, " n"]]:
         """Prior draws with draws of an earlier posterior in the place of the parameters that it holds.
 
-        A parameter of one recording takes the value of the same recording, else that which all recordings shared.
+        A parameter of one recording takes the value of the same recording, else that which all recordings shared, else
+        that of another recording.
         """
         prior_key, choice = jax.random.split(key)
         values = self.sample(prior_key, n)
         for parameter in self.parameters:
-            draws = earlier.get(parameter.name, earlier.get(parameter.spec.name))
-            if draws is not None:
+            alike = [name for name in earlier if name.partition(SEPARATOR)[0] == parameter.spec.name]
+            known = [name for name in (parameter.name, parameter.spec.name, *alike) if name in earlier]
+            if known:
                 # The same rows for all parameters: their values belong together.
-                chosen = jnp.asarray(draws)[jax.random.randint(choice, (n,), 0, len(draws))]
+                draws = jnp.asarray(earlier[known[0]])
+                chosen = draws[jax.random.randint(choice, (n,), 0, len(draws))]
                 values[parameter.name] = parameter.inside(chosen, values[parameter.name])
         return values
 

@@ -58,6 +58,8 @@ def test_draws_around_an_earlier_posterior_keep_its_rows_together_and_stay_insid
     assert np.max(values["young_modulus"]) < 5e7
     np.testing.assert_allclose(values["offset_x@b"], 0.02, rtol=1e-12)
     assert len(np.unique(values["poisson_ratio"])) == 200
+    other = space().sample_around({"offset_x@elsewhere": np.full(4, 0.03)}, jax.random.key(3), 5)
+    np.testing.assert_allclose(other["offset_x@a"], 0.03, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
