@@ -132,6 +132,14 @@ class CsvTable:
         """Columns x, y, z of several points, in the order of ``names``."""
         return self.numbers(names, allow_missing=allow_missing).reshape(len(self), -1, 3)
 
+    def pose(self, names: Sequence[str], unit: float) -> Float[np.ndarray, "rows 7"] | None:
+        """Columns of a position in a ``unit`` of so many metres, then of a quaternion; None where there are none."""
+        if not any(name in self for name in names):
+            return None
+        values = self.numbers(names)
+        values[:, :3] *= unit
+        return values
+
 
 def _check_rectangular(path: Path, lines: Sequence[str]) -> None:
     fields = lines[0].count(",") + 1

@@ -50,10 +50,6 @@ def read_optitrack_csv(path: Path, *, mask_missing: bool = False) -> Trajectory:
     _check_gaps(time, str(path))
     position = _MILLIMETRE * table.points(_COLUMNS, allow_missing=mask_missing)
     faults = find_faults(time, position)
-    pose = None
-    if any(name in table for name in _CUBE):
-        pose = table.numbers(_CUBE)
-        pose[:, :3] *= _MILLIMETRE
     return Trajectory.build(
         name=path.stem,
         robot="trunk_physical",
@@ -66,7 +62,7 @@ def read_optitrack_csv(path: Path, *, mask_missing: bool = False) -> Trajectory:
         command=actions.cumulative_displacement(acted),
         command_unit="m",
         cable_names=actions.CABLE_NAMES,
-        object_pose=pose,
+        object_pose=table.pose(_CUBE, _MILLIMETRE),
         provenance=f"{path.name}: OptiTrack",
         settings=actions.SETTINGS | {"faults": faults.counts},
     )

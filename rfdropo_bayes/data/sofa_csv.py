@@ -39,10 +39,6 @@ def read_sofa_csv(path: Path) -> Trajectory:
     settings = actions.SETTINGS | {"simulation_step": STEP, "steps_per_action": STEPS_PER_ACTION}
     if all(name in table for name in _GOAL):
         settings["goal"] = (_MILLIMETRE * table.numbers(_GOAL)[0]).tolist()
-    pose = None
-    if any(name in table for name in _CUBE):
-        pose = table.numbers(_CUBE)
-        pose[:, :3] *= _MILLIMETRE
     return Trajectory.build(
         name=path.stem,
         robot="trunk_sofa",
@@ -54,7 +50,7 @@ def read_sofa_csv(path: Path) -> Trajectory:
         command=actions.cumulative_displacement(acted),
         command_unit="m",
         cable_names=actions.CABLE_NAMES,
-        object_pose=pose,
+        object_pose=table.pose(_CUBE, _MILLIMETRE),
         synthetic=True,
         provenance=f"{path.name}: SOFA simulation",
         settings=settings,
