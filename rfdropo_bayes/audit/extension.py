@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +27,8 @@ class Rules:
         effects: most mechanisms that are added.
         evidence: log Bayes factor a mechanism must bring to be added.
         bootstraps: simulated data sets behind every p-value.
+        minutes: of processor time for a candidate that only a slower simulator knows; one that needs more is not
+            examined.
         base_passes, extended_passes: p-values of the joint test from which a model is let pass.
         explained, significant: shares of the discrepancy for "explained" and for "partly explained".
     """
@@ -38,6 +40,7 @@ class Rules:
     effects: int = 3
     evidence: float = 3.0
     bootstraps: int = 999
+    minutes: float = 10.0
     base_passes: float = 0.01
     extended_passes: float = 0.05
     explained: float = 0.8
@@ -124,27 +127,29 @@ class Inquiry:
         significant = [row for row in found.rows if row.adjusted_p <= self.rules.family and row.probe is not None]
         refits: dict[str, float] = {}
         fits: dict[str, Fit] = {}
-        for row, start in self._leading(found.fit, significant):
-            fits[row.name] = self._refit(found.fit, row, start)
+        leads = {row.name: self._lead(found.fit, row) for row in significant}
+        for row in self._leading(significant, {name: drop for name, (drop, _) in leads.items()}, found.fit):
+            fits[row.name] = self._refit(found.fit, row, leads[row.name][1])
             refits[row.name] = fits[row.name].log_evidence - found.fit.log_evidence
             self.report(f"refit with {row.name}: log Bayes factor {refits[row.name]:.1f}")
         if not refits or max(refits.values()) < self.rules.evidence:
             return None
         best = max(refits, key=lambda name: refits[name])
-        members = self._class_of(found.row(best), significant)
+        enough = self.rules.class_cosine**2 * leads[best][0]
+        able = [row for row in significant if leads[row.name][0] > enough]
+        members = self._class_of(found.row(best), able)
         return Step(best, members, found, fits[best], refits[best], refits)
 
-    def _leading(self, fit: Fit, significant: Sequence[Row]) -> list[tuple[Row, np.ndarray]]:
-        """The best candidates of the leading classes, and further members of these while there is room; each with the
-        point from which its refit starts. Those that cannot bring what a mechanism must are left out."""
-        drops: dict[str, float] = {}
-        starts: dict[str, np.ndarray] = {}
-        for row in significant:
-            assert row.probe is not None
-            if row.name == DISCRETISATION:
-                drops[row.name], starts[row.name] = fixed_drop(fit, row.probe), fit.x
-            else:
-                drops[row.name], starts[row.name] = lead(self.target, fit, row.probe, row.lm)
+    def _lead(self, fit: Fit, row: Row) -> tuple[float, np.ndarray]:
+        """See `lead`; a finer mesh has no parameter, and its effect only one size."""
+        assert row.probe is not None
+        if row.name == DISCRETISATION:
+            return fixed_drop(fit, row.probe), fit.x
+        return lead(self.target, fit, row.probe, row.lm)
+
+    def _leading(self, significant: Sequence[Row], drops: Mapping[str, float], fit: Fit) -> list[Row]:
+        """The best candidates of the leading classes, and further members of these while there is room; those that
+        cannot bring what a mechanism must are left out."""
         able = [row for row in significant if drops[row.name] > 2.0 * self.rules.evidence]
         able.sort(key=lambda row: row.rank * np.log(len(fit.residual)) - drops[row.name])
         heads: list[Row] = []
@@ -158,17 +163,14 @@ class Inquiry:
                 rest.append(row)
         chosen = [*heads, *rest][: self.rules.members]
         # A refit on a finer mesh costs as much as all others: only where it could win.
-        return [
-            (row, starts[row.name])
-            for row in chosen
-            if row.name != DISCRETISATION or drops[row.name] > 0.5 * drops[chosen[0].name]
-        ]
+        return [row for row in chosen if row.name != DISCRETISATION or drops[row.name] > 0.5 * drops[chosen[0].name]]
 
-    def _class_of(self, best: Row, significant: Sequence[Row]) -> tuple[str, ...]:
+    def _class_of(self, best: Row, able: Sequence[Row]) -> tuple[str, ...]:
+        """The best, and of those that explain as much of these data the ones that look the same."""
         assert best.probe is not None
         alike = [
             row.name
-            for row in significant
+            for row in able
             if row.name != best.name
             and row.probe is not None
             and likeness(best.probe.mark, row.probe.mark) > self.rules.class_cosine
@@ -177,9 +179,7 @@ class Inquiry:
 
     def refit(self, fit: Fit, row: Row) -> Fit:
         """The model of a fit with a candidate in it."""
-        assert row.probe is not None
-        start = fit.x if row.name == DISCRETISATION else lead(self.target, fit, row.probe, row.lm)[1]
-        return self._refit(fit, row, start)
+        return self._refit(fit, row, self._lead(fit, row)[1])
 
     def _refit(self, fit: Fit, row: Row, start: np.ndarray) -> Fit:
         if row.name == DISCRETISATION:

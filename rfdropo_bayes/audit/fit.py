@@ -17,6 +17,7 @@ from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.noise import NoiseModel
 
 STARTS, SCREENED = 3, 48
+FIRST, ALL = 8, 40  # evaluations of a climb from each start, and of the one that goes on from the best of them
 FAILED = 1e6  # whitened residual of a rollout that did not end well: no step is ever taken there
 
 
@@ -90,7 +91,7 @@ class Target:
 
 
 def climb(
-    target: Target, start: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"], *, evaluations: int = 40
+    target: Target, start: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"], *, evaluations: int = ALL
 ) -> Fit:
     """Posterior mode over the free coordinates from one start, the others held."""
 
@@ -161,6 +162,6 @@ def fit_base(
     cost = target.recall("screen", [points], lambda: {"cost": np.sum(target.residual(points) ** 2, axis=1)})["cost"]
     best = []
     for index in np.argsort(cost, kind="stable")[:STARTS]:
-        best.append(climb(target, points[index], free))
+        best.append(climb(target, points[index], free, evaluations=FIRST))
         report(f"base model, start {len(best)} of {STARTS}: sum of squares {best[-1].residual @ best[-1].residual:.0f}")
-    return max(best, key=lambda fit: fit.log_evidence)
+    return climb(target, max(best, key=lambda fit: fit.log_evidence).x, free)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from rfdropo_bayes.audit.affordable import unaffordable
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step
@@ -62,13 +63,15 @@ class Question:
 class Answer:
     """What an audit found; see the attributes' own classes.
 
-    ``looks`` are the looks at the base model and after each step; ``stages`` the explained fraction after each step.
+    ``unexamined`` holds candidates that would have taken too long, with the minutes; ``looks`` are the looks at the
+    base model and after each step; ``stages`` the explained fraction after each step.
     """
 
     verdict: str
     question: Question
     target: Target
     base: Fit
+    unexamined: dict[str, float]
     steps: list[Step]
     looks: list[Look]
     gain: Gain | None
@@ -107,7 +110,11 @@ def audit(
     finer = None
     if question.finer is not None:
         finer = _forward(question, True, target.measurements)
-    inquiry = Inquiry(target, question.candidates, question.rules, question.seed, finer, report)
+    unexamined = unaffordable(question.candidates, target, base, question.rules.minutes)
+    for name, minutes in unexamined.items():
+        report(f"{name} is not examined: on the slower engine it would take {minutes:.0f} minutes")
+    examined = [c for c in question.candidates if c.name not in unexamined]
+    inquiry = Inquiry(target, examined, question.rules, question.seed, finer, report)
     steps, last = inquiry.name_causes(base)
     looks = [*(step.before for step in steps), last]
     extended = steps[-1].fit if steps else base
@@ -122,6 +129,7 @@ def audit(
         question,
         target,
         base,
+        unexamined,
         steps,
         looks,
         gain,
@@ -138,10 +146,10 @@ def audit(
 
 def _forward(question: Question, finer: bool, measurements: Measurements) -> Forward:
     chosen = {name: group[0] for name, group in zip(measurements.names, measurements.members, strict=True)}
-    return _simulated(question, finer, chosen)
+    return simulated(question, finer, chosen)
 
 
-def _simulated(question: Question, finer: bool, chosen: dict[str, int]) -> Forward:
+def simulated(question: Question, finer: bool, chosen: dict[str, int]) -> Forward:
     """Some of the recordings, on the simulator itself or on the finer one."""
     lanes, commands = question.lanes, question.recordings.commands
     if finer and question.finer is not None:
@@ -243,7 +251,7 @@ def _measured(
         unseen = _unseen(question.recordings, range(count, every))
         tested = {question.recordings.names[i]: i for i in range(count, every)}
         predictions = [
-            _predict(_simulated(question, DISCRETISATION in names[: i + 1], tested), fit, [question.seed, 3])
+            _predict(simulated(question, DISCRETISATION in names[: i + 1], tested), fit, [question.seed, 3])
             for i, fit in enumerate(fits)
         ]
     else:

@@ -32,6 +32,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         "sentence": sentence(answer, findings),
         "findings": findings,
         "candidates": _candidates(answer),
+        "not_examined": {name: round(minutes, 1) for name, minutes in answer.unexamined.items()},
         "omnibus": [{"after": n, **_omnibus(look)} for n, look in enumerate(answer.looks)],
         "gain": None
         if gain is None

@@ -17,8 +17,13 @@ CLEARLY_WORSE = 10.0  # nats
 
 def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     """What was found, how much of the discrepancy it explains, what is excluded, what remains."""
-    words = _words(answer, findings)
+    words = _words(answer, findings) + _unexamined(answer)
     return words[0].upper() + words[1:]
+
+
+def _unexamined(answer: Answer) -> str:
+    names = " and ".join(name.replace("_", " ") for name in answer.unexamined)
+    return f" Not examined, as it would have taken too long: {names}." if names else ""
 
 
 def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:

@@ -61,6 +61,7 @@ def run_audit(
     resume: bool = False,
     workshop: Workshop | None = None,
     report: Callable[[str], None] = lambda line: None,
+    inspect: Callable[[Answer], None] = lambda answer: None,
 ) -> dict[str, Any]:
     """Audit an experiment and write what was found.
 
@@ -74,6 +75,7 @@ def run_audit(
         resume: go on from what an interrupted audit has left in ``out``.
         workshop: see `build_question`.
         report: called with a line of words now and then.
+        inspect: called with the answer.
 
     Returns:
         the content of audit.json.
@@ -88,6 +90,7 @@ def run_audit(
     question = build_question(experiment, folder, fitted, tested, chosen, start=_start(base), workshop=workshop)
     out = output_folder(out)
     answer = audit(question, report, Journal(out / JOURNAL, resume=resume))
+    inspect(answer)
     content = record(
         answer,
         versions=software_versions(),
@@ -155,7 +158,7 @@ def build_question(
         candidates,
         _stated(experiment, recordings.position.shape[2], fitted[0]),
         start,
-        Rules(bootstraps=experiment.audit.bootstraps),
+        Rules(bootstraps=experiment.audit.bootstraps, minutes=experiment.audit.minutes),
         seed,
     )
 

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from rfdropo_bayes.audit.fit import climb
+from rfdropo_bayes.audit.pipeline import Answer, simulated
 from rfdropo_bayes.audit.record import STIFFNESS
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
@@ -22,6 +24,7 @@ from rfdropo_bayes.workflow.fits import Job, run_fits
 from rfdropo_bayes.workflow.hidden_effects import Hidden, Setting, hide
 
 RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
+NEAR = 1.3  # times the error of the model that knows what is hidden
 TRIES = 8  # mechanisms that are tried until one reaches the wanted size
 
 
@@ -112,7 +115,8 @@ def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path)
     if found is None:
         raise InputError("no mechanism reaches the wanted size", where=condition.name)
     hidden, names = found
-    content = run_audit(hidden.experiment, place / "audit", workshop=_WORKSHOP)
+    answers: list[Answer] = []
+    content = run_audit(hidden.experiment, place / "audit", workshop=_WORKSHOP, inspect=answers.append)
     if condition.removed:
         content = run_audit(
             hidden.experiment, place / "removed", workshop=_WORKSHOP, overrides=[_without(content, names, exclude)]
@@ -122,6 +126,7 @@ def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path)
         "rho": hidden.rho,
         "truth": hidden.values,
         **judge(content, names, hidden),
+        "error_over_oracle": None if condition.removed else error_over_oracle(answers[0], names, hidden),
         "seconds": round(time.monotonic() - began, 1),
     }
 
@@ -178,6 +183,25 @@ def judge(content: Mapping[str, Any], names: Sequence[str], hidden: Hidden) -> d
     }
 
 
+def error_over_oracle(answer: Answer, names: Sequence[str], hidden: Hidden) -> float | None:
+    """Root mean square error of the extended model against the noise-free truth of untouched commands, over that of the
+    model that knows which mechanisms are hidden; None where nothing is hidden or named."""
+    if not names or answer.predictions is None:
+        return None
+    question, coordinates = answer.question, answer.question.coordinates
+    own = [i for c in question.candidates if c.name in names for i in c.indices]
+    start = coordinates.encode(hidden.values)
+    oracle = climb(answer.target, start, np.array([*range(coordinates.base), *own]))
+    count = len(question.trajectories)
+    untouched = {name: i for i, name in enumerate(question.recordings.names) if i >= count}
+    predicted = simulated(question, False, untouched).position(oracle.x)
+
+    def error(position: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((position - hidden.clean) ** 2)))
+
+    return error(answer.predictions[1].mean) / error(predicted)
+
+
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Counts over the data sets of one condition; ``confusions`` counts hidden -> named first."""
     verdicts: dict[str, int] = {}
@@ -188,6 +212,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             key = f"{' + '.join(row['hidden'])} -> {row['named'][0] if row['named'] else 'none'}"
             confusions[key] = confusions.get(key, 0) + 1
     covered = [value for row in rows for value in row["covered"].values()]
+    ratios = [r["error_over_oracle"] for r in rows if r["error_over_oracle"] is not None and r["named_first"]]
     sizes = [row["class_sizes"][0] for row in rows if row["class_sizes"]]
     return {
         "datasets": len(rows),
@@ -196,6 +221,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "all_named": sum(row["all_named"] for row in rows),
         "median_class_size": float(np.median(sizes)) if sizes else None,
         "interval_coverage": float(np.mean(covered)) if covered else None,
+        "within_1.3_of_the_oracle": float(np.mean(np.array(ratios) <= NEAR)) if ratios else None,
         "discretisation_rho": [round(row["rho"]["discretisation"], 4) for row in rows],
         "median_audit_seconds": float(np.median([row["audit_seconds"] for row in rows])) if rows else None,
         "confusions": confusions,
@@ -208,16 +234,19 @@ def as_table(content: Mapping[str, Any]) -> str:
         f"Seed {content['seed']}; {content['hours']} processor-hours.",
         "",
         "| condition | data sets | verdicts | named first | all named | median class | 90 % intervals cover | "
-        "largest discretisation rho |",
-        "|---|---|---|---|---|---|---|---|",
+        "error within 1.3 of the oracle's | largest discretisation rho |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for name, row in content["conditions"].items():
         verdicts = ", ".join(f"{verdict} {count}" for verdict, count in sorted(row["verdicts"].items()))
-        share = "-" if row["interval_coverage"] is None else f"{100 * row['interval_coverage']:.0f} %"
+        share, near = (
+            "-" if row[key] is None else f"{100 * row[key]:.0f} %"
+            for key in ("interval_coverage", "within_1.3_of_the_oracle")
+        )
         rho = max(row["discretisation_rho"], default=0.0)
         lines.append(
             f"| {name} | {row['datasets']} | {verdicts} | {row['named_first']} | {row['all_named']} | "
-            f"{row['median_class_size'] or '-'} | {share} | {rho:.3f} |"
+            f"{row['median_class_size'] or '-'} | {share} | {near} | {rho:.3f} |"
         )
     confusions = ((name, row["confusions"]) for name, row in content["conditions"].items())
     wrong = [f"- {name}: {pair} ({count})" for name, pairs in confusions for pair, count in pairs.items()]

@@ -4,6 +4,7 @@ seed in twenty or fewer, those on several as stated."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -121,6 +122,20 @@ def test_commands_that_excite_only_one_of_two_effects_separate_them():
     assert moving.separation > now
     assert resting.information == pytest.approx(0.0, abs=1e-9)
     assert moving.information > 0.1
+
+
+def test_a_candidate_that_would_take_too_long_is_named_and_not_examined():
+    class Without(Toy):
+        parameters = tuple(s for s in Toy.parameters if s.name != "play")
+
+    asked = question({**TRUTH, "play": 1.0}, 1)
+    routed = RoutedLanes(Lanes(Without(), np.arange(4)), asked.lanes, {"play": 0.0})
+    answer = audit(replace(asked, lanes=routed, rules=replace(asked.rules, minutes=0.0)))
+    assert list(answer.unexamined) == ["play"]
+    assert answer.verdict in ("unexplained", "partly_explained")
+    content = record(answer, versions={}, data_sha256="", next_experiment=None)
+    assert "play" not in {c["mechanism"] for c in content["candidates"]}
+    assert content["sentence"].endswith("Not examined, as it would have taken too long: play.")
 
 
 def test_rollouts_go_to_the_simulator_that_knows_their_candidates():
