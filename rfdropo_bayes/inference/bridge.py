@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,16 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from rfdropo_bayes.bayes.problem import Problem, Values
+from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, Values
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import horizon_smc
-from rfdropo_bayes.inference.checkpoints import open_checkpoint, run_digest
+from rfdropo_bayes.inference.checkpoints import run_digest
 from rfdropo_bayes.inference.evaluations import evaluate_prior
-from rfdropo_bayes.inference.gauss_newton import Laplace
 from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes, mode_values
-from rfdropo_bayes.inference.mixture import ModeMixture
-from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.levenberg import Laplace
+from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
+from rfdropo_bayes.inference.mixture import ModeMixture, covering
 from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, exclusion_warnings
+from rfdropo_bayes.inference.straight import StraightProblem
 
 
 @dataclass(frozen=True)
@@ -117,19 +117,14 @@ def run(
     problem: Problem,
     config: BridgeConfig,
     key: PRNGKeyArray,
-    *,
-    checkpoint_dir: Path | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
+    logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
     """Find the optima, then sample from around them to the posterior."""
     climb_key, sample_key = jax.random.split(key)
     digest = run_digest(problem, "bridge", config, key)
-    checkpoint = open_checkpoint(checkpoint_dir, "bridge_climbs", digest, resume=resume)
-    found = find_modes(problem, config.climb, climb_key, checkpoint=checkpoint, progress=progress)
-    return sample_from_modes(
-        problem, config, found, sample_key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress
-    )
+    checkpoint = logbook.checkpoint("bridge_climbs", digest)
+    found = find_modes(problem, config.climb, climb_key, checkpoint, logbook)
+    return sample_from_modes(problem, config, found, sample_key, logbook)
 
 
 def sample_from_modes(
@@ -137,18 +132,19 @@ def sample_from_modes(
     config: BridgeConfig,
     found: Modes,
     key: PRNGKeyArray,
-    *,
-    checkpoint_dir: Path | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
+    logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
     """Sample from around optima that are known to the posterior; the climbs' cost is part of the result's."""
-    bridged = BridgedProblem(problem, found.modes, config)
-    sampled = horizon_smc.run(
-        bridged, config.sampler, key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress
-    )
+    moment_key, run_key = jax.random.split(key)
+    view: Problem = problem
+    modes = found.modes
+    if isinstance(problem, ResidualProblem):
+        view = straight = StraightProblem(problem, moment_key)
+        modes = [straight.mode(mode) for mode in modes]
+    bridged = BridgedProblem(view, covering(view, modes, moment_key), config)
+    sampled = horizon_smc.run(bridged, config.sampler, run_key, logbook)
     u = np.stack([sampled.draws[name] for name in bridged.names], axis=-1)
-    values = problem.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
+    values = view.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
     draws = {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in problem.names}
     ledger = found.climbs.ledger
     excluded = ledger.excluded + Counter(sampled.excluded)

@@ -22,8 +22,7 @@ class Plan(NamedTuple):
     Attributes:
         space: what is searched.
         population: candidates per generation.
-        horizons: of every generation, in rows.
-        simulated: rows simulated for each of them.
+        horizons: of every generation, in rows; the shortest that is allowed where the schedule adapts.
         finalists: how many are scored again.
         fixed: values of the parameters that are not searched.
         scale: unit of the features [unit of the problem's features].
@@ -32,7 +31,6 @@ class Plan(NamedTuple):
     space: Family
     population: int
     horizons: tuple[int, ...]
-    simulated: tuple[int, ...]
     finalists: int
     fixed: dict[str, float]
     scale: float
@@ -80,16 +78,15 @@ def target_features(problem: RolloutProblem, plan: Plan, horizon: int) -> tuple[
     return np.where(mask, np.asarray(problem.observed, dtype=float)[:horizon], 0.0) / plan.scale, mask
 
 
-def losses(
+def row_scores(
     problem: RolloutProblem, plan: Plan, variance_floor: float, found: Simulated, horizon: int
-) -> Float[np.ndarray, " c"]:
-    """Minus the log likelihood (eq. 3) of every candidate at one horizon; infinite where half of them failed."""
+) -> Float[np.ndarray, "c horizon"]:
+    """Log likelihood (eq. 3) of each row under every candidate; minus infinity where half of its rollouts failed."""
     observed, mask = target_features(problem, plan, horizon)
     c, m = found.alive.shape
-    out = np.full(c, np.inf)
+    rows = np.full((c, horizon), -np.inf)
     for index in range(c):
         if found.alive[index].sum() >= max(2, m / 2):
             features = found.features[index, :, :horizon]
-            rows = step_log_likelihood(features, found.alive[index], observed, mask, variance_floor)
-            out[index] = -rows.sum()
-    return out
+            rows[index] = step_log_likelihood(features, found.alive[index], observed, mask, variance_floor)
+    return rows

@@ -17,7 +17,7 @@ from jaxtyping import PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 _META = "meta_json"
 
 
@@ -111,3 +111,6 @@ def open_checkpoint(folder: Path | None, name: str, digest: str, *, resume: bool
     if not resume:
         path.unlink(missing_ok=True)
     return Checkpoint(path, digest)
+
+
+UNSAVED = Checkpoint(None, "")

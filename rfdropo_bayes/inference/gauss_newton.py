@@ -1,4 +1,4 @@
-"""Posterior mode by Levenberg-Marquardt in the unconstrained space, and the Laplace approximation around it.
+"""The posterior of a problem with residuals as climbs see it: Gauss-Newton in the unconstrained space.
 
 Observation noise among the parameters. The residuals r are whitened, so the log likelihood is ``-r'r / 2 + c`` where c
 holds the log determinants and depends on noise parameters alone. Noise parameters stay in the vector that is optimised
@@ -21,9 +21,9 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.levenberg import positive_part
 
 DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order one
-NOISE_GRID = 13  # values of a noise coordinate tried at the start of a climb
 BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
 
 
@@ -45,49 +45,29 @@ class Target(NamedTuple):
     linearise: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     noise: Bool[np.ndarray, " d"]
 
+    def quadratic(self, u: Float[np.ndarray, " d"]) -> tuple[np.ndarray, np.ndarray]:
+        """See `Climbable.quadratic`."""
+        residual, jacobian = self.linearise(u)
+        # Where a neighbour's rollout is lost there is no derivative: that coordinate stays where it is for this step.
+        jacobian = np.where(np.isfinite(jacobian).all(axis=0), jacobian, 0.0)
+        gradient = -jacobian.T @ residual
+        curvature = jacobian.T @ jacobian
+        if self.noise.any():
+            slope = _slope(self.likelihood, u, self.noise)
+            gradient[self.noise] = np.where(np.isfinite(slope), slope, 0.0)
+            # Twice, exact in expectation for a scale: J'J has m where the information is 2 m.
+            curvature[np.ix_(self.noise, self.noise)] *= 2.0
+        return gradient + self.prior_gradient(u), curvature + positive_part(-self.prior_hessian(u))
 
-class LevenbergState(NamedTuple):
-    """Where an optimisation stands.
-
-    Attributes:
-        position: unconstrained point.
-        log_density: log posterior there.
-        damping: Levenberg-Marquardt's, relative to the diagonal of the Hessian.
-        converged: the last step promised less than the tolerance, or little more and delivered less.
-    """
-
-    position: Float[np.ndarray, " d"]
-    log_density: float
-    damping: float
-    converged: bool
-
-
-class StepInfo(NamedTuple):
-    """One step: the gain in log posterior, the gain the quadratic model promised, and the tries it took."""
-
-    gain: float
-    promised: float
-    tries: int
-
-
-class Laplace(NamedTuple):
-    """Normal approximation in unconstrained coordinates.
-
-    Attributes:
-        mean: the mode.
-        covariance: inverse of minus the Hessian.
-        log_density: log posterior, unnormalised, at the mode.
-    """
-
-    mean: Float[np.ndarray, " d"]
-    covariance: Float[np.ndarray, "d d"]
-    log_density: float
-
-    @property
-    def log_evidence(self) -> float:
-        """Log of the integral of the unnormalised posterior, were it normal."""
-        d = len(self.mean)
-        return self.log_density + 0.5 * d * np.log(2.0 * np.pi) + 0.5 * float(np.linalg.slogdet(self.covariance)[1])
+    def information(self, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
+        """See `Climbable.information`: Gauss-Newton's, with second differences where noise parameters are concerned."""
+        curvature = self.quadratic(u)[1] - positive_part(-self.prior_hessian(u))
+        if self.noise.any():
+            exact = -_noise_hessian(self.likelihood, u, self.noise)
+            index = np.flatnonzero(self.noise)
+            if np.isfinite(exact).all():
+                curvature[np.ix_(index, index)] = exact
+        return curvature
 
 
 def make_target(
@@ -218,99 +198,6 @@ def _slope(likelihood: Callable, u: np.ndarray, chosen: np.ndarray) -> np.ndarra
     return (upper - lower) / (2.0 * DIFFERENCE)
 
 
-def quadratic_model(target: Target, u: Float[np.ndarray, " d"]) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient of the log posterior and a positive definite stand-in for minus its Hessian."""
-    residual, jacobian = target.linearise(u)
-    # Where a neighbour's rollout is lost there is no derivative: that coordinate stays where it is for this step.
-    jacobian = np.where(np.isfinite(jacobian).all(axis=0), jacobian, 0.0)
-    gradient = -jacobian.T @ residual
-    curvature = jacobian.T @ jacobian
-    if target.noise.any():
-        slope = _slope(target.likelihood, u, target.noise)
-        gradient[target.noise] = np.where(np.isfinite(slope), slope, 0.0)
-        # Twice, exact in expectation for a scale: J'J has m where the information is 2 m.
-        curvature[np.ix_(target.noise, target.noise)] *= 2.0
-    return gradient + target.prior_gradient(u), curvature + _positive_part(-target.prior_hessian(u))
-
-
-def init(target: Target, u: Float[np.ndarray, " d"]) -> LevenbergState:
-    """State at a starting point."""
-    return LevenbergState(u, float(target.density(u[None])[0]), 1e-3, False)
-
-
-def step(target: Target, state: LevenbergState, tolerance: float) -> tuple[LevenbergState, StepInfo]:
-    """One Levenberg-Marquardt step; damping grows until the log posterior rises.
-
-    Damping acts on the curvature's diagonal (Marquardt's scaling), so that units do not matter. All dampings of a step
-    are tried in one batch of rollouts.
-    """
-    gradient, curvature = quadratic_model(target, state.position)
-    diagonal = np.diag(np.maximum(np.diag(curvature), 1e-12))
-    dampings = state.damping * 10.0 ** np.arange(-1.0, 5.0)
-    moves = np.stack([np.linalg.solve(curvature + damping * diagonal, gradient) for damping in dampings])
-    # No coordinate moves further than 2: a logistic or a logarithm is beyond any quadratic model there.
-    moves *= np.minimum(1.0, 2.0 / np.maximum(np.abs(moves).max(axis=1, keepdims=True), 1e-300))
-    newton = np.linalg.solve(curvature + 1e-12 * diagonal, gradient)
-    promised = 0.5 * float(gradient @ newton)
-    if promised < tolerance:
-        return state._replace(converged=True), StepInfo(0.0, promised, 0)
-    densities = target.density(state.position + moves)
-    best = int(np.argmax(densities))
-    gain = float(densities[best] - state.log_density)
-    if gain <= 0.0:
-        # The differences left are those of rounding, or the model is useless here: smaller steps next time.
-        stuck = state.damping > 1e8 or promised < 100.0 * tolerance
-        return state._replace(damping=state.damping * 1e5, converged=stuck), StepInfo(0.0, promised, len(dampings))
-    # An engine in single precision has gradients that promise a little for ever; what it delivers tells.
-    idle = gain < tolerance and promised < 100.0 * tolerance
-    moved = LevenbergState(
-        state.position + moves[best], float(densities[best]), float(np.clip(dampings[best], 1e-9, 1e9)), idle
-    )
-    return moved, StepInfo(gain, promised, len(dampings))
-
-
-def with_fitting_noise(target: Target, u: Float[np.ndarray, " d"], width: float = 12.0) -> np.ndarray:
-    """The point with its noise coordinates, one after the other, at the best of a wide grid.
-
-    A start drawn from the prior, or the optimum of a shorter horizon, may have a noise that makes its residuals look
-    impossible; every step then answers to the few rows that are hardest to fit.
-    """
-    steps = np.linspace(-0.5 * width, 0.5 * width, NOISE_GRID)
-    for coordinate in np.flatnonzero(target.noise):
-        points = np.tile(u, (len(steps), 1))
-        points[:, coordinate] += steps
-        densities = target.density(points)
-        if np.isfinite(densities).any():
-            u = points[int(np.nanargmax(np.where(np.isfinite(densities), densities, -np.inf)))]
-    return u
-
-
-def maximise(
-    target: Target, u: Float[np.ndarray, " d"], *, max_steps: int, tolerance: float
-) -> tuple[LevenbergState, list[dict[str, Any]]]:
-    """Climb from one start, noise first, until a step promises less than ``tolerance`` nats."""
-    state = init(target, with_fitting_noise(target, u))
-    trace: list[dict[str, Any]] = []
-    while not state.converged and len(trace) < max_steps:
-        state, info = step(target, state, tolerance)
-        trace.append({"log_density": state.log_density, "damping": state.damping, **info._asdict()})
-    return state, trace
-
-
-def laplace(target: Target, state: LevenbergState) -> Laplace:
-    """Normal approximation at a mode, with second differences where noise parameters are concerned."""
-    _, curvature = quadratic_model(target, state.position)
-    if target.noise.any():
-        exact = -_noise_hessian(target.likelihood, state.position, target.noise)
-        index = np.flatnonzero(target.noise)
-        prior = _positive_part(-target.prior_hessian(state.position))
-        if np.isfinite(exact).all():
-            curvature[np.ix_(index, index)] = exact + prior[np.ix_(index, index)]
-    values, vectors = np.linalg.eigh(curvature)
-    values = np.maximum(values, 1e-12 * values[-1])
-    return Laplace(state.position, (vectors / values) @ vectors.T, state.log_density)
-
-
 def _noise_hessian(likelihood: Callable, u: np.ndarray, noise: np.ndarray, width: float = 1e-2) -> np.ndarray:
     """Second differences of the log likelihood along the noise coordinates.
 
@@ -321,8 +208,3 @@ def _noise_hessian(likelihood: Callable, u: np.ndarray, noise: np.ndarray, width
     points = [u + si * a + sj * b for a in steps for b in steps for si in (1, -1) for sj in (1, -1)]
     values = likelihood(np.stack(points)).reshape(k, k, 2, 2)
     return (values[..., 0, 0] - values[..., 0, 1] - values[..., 1, 0] + values[..., 1, 1]) / (4.0 * width**2)
-
-
-def _positive_part(matrix: np.ndarray) -> np.ndarray:
-    values, vectors = np.linalg.eigh(matrix)
-    return (vectors * np.maximum(values, 0.0)) @ vectors.T

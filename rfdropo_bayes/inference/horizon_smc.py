@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -21,9 +20,9 @@ from scipy.special import logsumexp
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference.checkpoints import Checkpoint, open_checkpoint, run_digest
+from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.proposals import KERNELS, initial_scale
 from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains, exclusion_warnings
 from rfdropo_bayes.inference.schedules import SPACINGS, block_boundaries
@@ -33,6 +32,7 @@ PARTICLES_WITHOUT_BUDGET = 1000
 ROLLOUTS_PER_PARTICLE = 20.0
 FEWEST_PARTICLES = 50
 STARTS = ("auto", "prior", "optimum")
+NOT_REPRESENTABLE = "not_representable"
 
 
 @dataclass(frozen=True)
@@ -158,19 +158,25 @@ def make_plan(problem: Problem, config: SmcConfig) -> Plan:
 
 
 def init(key: PRNGKeyArray, problem: Problem, plan: Plan, config: SmcConfig) -> SmcState:
-    """Prior draws, no rollouts yet."""
-    u = np.asarray(problem.to_unconstrained(problem.sample_prior(key, plan.particles)), dtype=float)
+    """Prior draws, no rollouts yet.
+
+    A draw that its coordinates cannot hold (a scale of 1e-400, whose logarithm is infinite) keeps its share of the
+    prior, without weight.
+    """
     n = plan.particles
-    population = Population(
-        u,
-        evaluate_prior(problem, u),
-        np.zeros((n, 0)),
-        np.full(n, -np.log(n)),
-        0.0,
-        initial_scale(config.kernel, u.shape[1]),
-    )
-    prefix = np.full(problem.n_rows, np.nan)
-    return SmcState(population, -1, 0, 0.0, prefix, Ledger(), [], 0.0, False)
+    u = np.array(problem.to_unconstrained(problem.sample_prior(key, n)), dtype=float)
+    base = evaluate_prior(problem, u)
+    held = np.isfinite(u).all(axis=1) & np.isfinite(base)
+    if not held.any():
+        raise InputError(
+            f"none of {n} prior draws has a finite prior density", where="[model.priors]", remedy="look at the priors"
+        )
+    stand_in = np.where(held, np.arange(n), np.argmax(held))
+    weights = np.where(held, -np.log(n), -np.inf)
+    scale = initial_scale(config.kernel, u.shape[1])
+    population = Population(u[stand_in], base[stand_in], np.zeros((n, 0)), weights, 0.0, scale)
+    ledger = Ledger(excluded=Counter({NOT_REPRESENTABLE: int(n - held.sum())} if not held.all() else {}))
+    return SmcState(population, -1, 0, 0.0, np.full(problem.n_rows, np.nan), ledger, [], 0.0, False)
 
 
 def step(
@@ -260,10 +266,7 @@ def run(
     problem: Problem,
     config: SmcConfig,
     key: PRNGKeyArray,
-    *,
-    checkpoint_dir: Path | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
+    logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
     """Sample a problem's posterior with ``config.replicates`` independent replicates.
 
@@ -274,12 +277,11 @@ def run(
     digest = run_digest(problem, "smc", config, key)
     states = []
     for replicate in range(config.replicates):
-        checkpoint = open_checkpoint(checkpoint_dir, f"smc_{replicate}", digest, resume=resume)
+        checkpoint = logbook.checkpoint(f"smc_{replicate}", digest)
 
         def report(state: SmcState, replicate: int = replicate) -> None:
-            if progress is not None:
-                done = (replicate + state.population.progress / problem.n_rows) / config.replicates
-                progress.stage(done, method="smc", replicate=replicate, stage=state.stage, **state.trace[-1])
+            done = (replicate + state.population.progress / problem.n_rows) / config.replicates
+            logbook.stage(done, method="smc", replicate=replicate, stage=state.stage, **state.trace[-1])
 
         states.append(_replicate(problem, config, plan, jax.random.fold_in(key, replicate), checkpoint, report))
     return _result(problem, config, plan, states)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -15,18 +14,12 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference.checkpoints import Checkpoint, open_checkpoint, run_digest
+from rfdropo_bayes.inference.checkpoints import UNSAVED, Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.gauss_newton import (
-    NOISE_GRID,
-    Laplace,
-    LevenbergState,
-    laplace,
-    make_target,
-    maximise,
-    prior_derivatives,
-)
-from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
+from rfdropo_bayes.inference.levenberg import NOISE_GRID, Climbable, Laplace, LevenbergState, laplace, maximise
+from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
+from rfdropo_bayes.inference.newton import SmoothTarget, log_likelihood_derivatives
 from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains, exclusion_warnings
 from rfdropo_bayes.inference.schedules import block_boundaries
 
@@ -40,8 +33,8 @@ class LaplaceConfig:
 
     Attributes:
         starts: number of climbs at the first horizon; half of them go on to each longer one.
-        screen: prior draws, judged at the first horizon: the best is the first start, the others lie apart from it
-            among the best quarter.
+        screen: draws, from the prior or from where the problem says that climbs may start, judged at the first
+            horizon: the best is the first start, the others lie apart from it among the best quarter.
         blocks: horizons of a climb, doubling; short ones first, because a long recording has many local optima.
         max_steps: most steps of a climb at one horizon.
         tolerance: a climb ends when a step promises less [nat].
@@ -106,40 +99,54 @@ def find_modes(
     problem: Problem,
     config: LaplaceConfig,
     key: PRNGKeyArray,
-    *,
-    checkpoint: Checkpoint | None = None,
-    progress: Progress | None = None,
+    checkpoint: Checkpoint = UNSAVED,
+    logbook: Logbook = UNRECORDED,
 ) -> Modes:
     """Climb from the best of some prior draws to the optima of the full posterior.
 
     Raises:
-        InputError: a problem without residuals, or none of the screened draws has a finite likelihood.
+        InputError: a problem without residuals whose likelihood JAX cannot differentiate either, or none of the
+            screened draws has a finite likelihood.
     """
-    if not isinstance(problem, ResidualProblem):
-        raise InputError("this problem has no residuals", where="[inference] method", remedy='use method = "smc"')
-    horizons = block_boundaries(problem.n_rows, config.blocks)
-    saved = checkpoint.load() if checkpoint else None
+    horizons, target_at = _targets(problem, config)
+    saved = checkpoint.load()
     climbs = _screen(problem, config, key, horizons[0]) if saved is None else _unpack(*saved)
-    target, prior = None, prior_derivatives(problem)
+    target = None
     while climbs.level < len(horizons):
         began = time.monotonic()
         if target is None:
             best = climbs.positions[np.argmax(climbs.log_density)] if climbs.done == 0 else climbs.positions[0]
-            target = make_target(
-                problem, horizons[climbs.level], climbs.ledger, best, prior, config.jacobian, climbs.noise
-            )
+            target = target_at(horizons[climbs.level], climbs.ledger, best, climbs.noise)
         allowed = _affordable_steps(problem.n_rows, config, climbs, horizons, int(target.noise.sum()))
         state, steps = maximise(target, climbs.positions[climbs.done], max_steps=allowed, tolerance=config.tolerance)
         climbs = _record(climbs, state, len(steps), horizons[climbs.level], target.noise)
         climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
         if climbs.done == 0:
             target = None
-        if checkpoint:
-            checkpoint.save(*_pack(climbs))
-        if progress is not None:
-            share = (climbs.level + climbs.done / config.starts) / len(horizons)
-            progress.stage(share, method="laplace", **climbs.trace[-1])
-    return _collect(problem, config, climbs, prior)
+        checkpoint.save(*_pack(climbs))
+        share = (climbs.level + climbs.done / config.starts) / len(horizons)
+        logbook.stage(share, method="laplace", **climbs.trace[-1])
+    assert climbs.noise is not None
+    return _collect(climbs, target_at(problem.n_rows, climbs.ledger, climbs.positions[0], climbs.noise))
+
+
+def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], Callable[..., Climbable]]:
+    """Horizons to climb at, and the posterior at one of them, given the ledger, a point, and noise coordinates."""
+    prior = prior_derivatives(problem)
+    if isinstance(problem, ResidualProblem):
+
+        def by_residuals(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
+            return make_target(problem, horizon, ledger, u, prior, config.jacobian, noise)
+
+        return block_boundaries(problem.n_rows, config.blocks), by_residuals
+    if hasattr(problem, "log_likelihood_at"):
+        derivatives = log_likelihood_derivatives(problem)
+        return (problem.n_rows,), lambda horizon, ledger, u, noise: SmoothTarget(problem, ledger, derivatives, *prior)
+    raise InputError(
+        "this problem has no residuals, and no likelihood that JAX can differentiate",
+        where="[inference] method",
+        remedy='use method = "smc"',
+    )
 
 
 def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizons: tuple[int, ...], noise: int) -> int:
@@ -158,7 +165,8 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
 def _screen(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int) -> Climbs:
     ledger = Ledger()
     began = time.monotonic()
-    u = np.asarray(problem.to_unconstrained(problem.sample_prior(key, max(config.screen, config.starts))), dtype=float)
+    draw = getattr(problem, "sample_starts", problem.sample_prior)
+    u = np.asarray(problem.to_unconstrained(draw(key, max(config.screen, config.starts))), dtype=float)
     density = evaluate_prior(problem, u) + evaluate_rows(problem, u, horizon, ledger).sum(axis=1)
     order = _spread_starts(u, density, config.starts)
     if len(order) == 0:
@@ -178,10 +186,12 @@ def _spread_starts(u: Float[np.ndarray, "n d"], density: Float[np.ndarray, " n"]
     The best few alone often lie together, and then all climb to one optimum of several.
     """
     order = np.argsort(-density, kind="stable")
-    order = order[np.isfinite(density[order])][: max(count, len(u) // 4)]
+    order = order[np.isfinite(density[order]) & np.isfinite(u[order]).all(axis=1)]
     if len(order) == 0:
         return order
-    scaled = u[order] / np.maximum(u.std(axis=0), 1e-300)
+    spread = u[order].std(axis=0)
+    order = order[: max(count, len(u) // 4)]
+    scaled = u[order] / np.maximum(spread, 1e-300)
     chosen = [0]
     while len(chosen) < min(count, len(order)):
         distance = np.linalg.norm(scaled[:, None] - scaled[chosen], axis=2).min(axis=1)
@@ -221,16 +231,10 @@ def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, noi
     )
 
 
-def _collect(
-    problem: ResidualProblem, config: LaplaceConfig, climbs: Climbs, prior: tuple[Callable, Callable]
-) -> Modes:
+def _collect(climbs: Climbs, target: Climbable) -> Modes:
     """Laplace at every optimum that could matter, in the order of their evidence."""
     warnings = []
     near = climbs.log_density > climbs.log_density.max() - RIVAL
-    assert climbs.noise is not None
-    target = make_target(
-        problem, problem.n_rows, climbs.ledger, climbs.positions[0], prior, config.jacobian, climbs.noise
-    )
     modes = []
     for position, density, converged in zip(
         climbs.positions[near], climbs.log_density[near], climbs.converged[near], strict=True
@@ -268,16 +272,13 @@ def run(
     problem: Problem,
     config: LaplaceConfig,
     key: PRNGKeyArray,
-    *,
-    checkpoint_dir: Path | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
+    logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
     """Posterior mode and draws of the normal approximation around it, mapped back to physical units."""
     mode_key, draw_key = jax.random.split(key)
     digest = run_digest(problem, "laplace", config, key)
-    checkpoint = open_checkpoint(checkpoint_dir, "laplace", digest, resume=resume)
-    found = find_modes(problem, config, mode_key, checkpoint=checkpoint, progress=progress)
+    checkpoint = logbook.checkpoint("laplace", digest)
+    found = find_modes(problem, config, mode_key, checkpoint, logbook)
     best = found.modes[0]
     factor = np.linalg.cholesky(best.covariance)
     u = best.mean + np.asarray(jax.random.normal(draw_key, (config.draws, len(best.mean)))) @ factor.T

@@ -15,6 +15,7 @@ from jaxtyping import PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import bridge, horizon_smc, laplace, nested, nuts, rfdropo, rivals, starts
+from rfdropo_bayes.inference.logbook import Logbook
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 
@@ -24,7 +25,7 @@ class Method(NamedTuple):
 
     Attributes:
         config: its configuration, a frozen dataclass.
-        run: ``run(problem, config, key, *, checkpoint_dir, resume, progress) -> InferenceResult``.
+        run: ``run(problem, config, key, logbook) -> InferenceResult``.
     """
 
     config: type
@@ -87,7 +88,7 @@ def run(
     """
     method = method_named(name)
     config = options if isinstance(options, method.config) else make_config(name, options)
-    return method.run(problem, config, key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress)
+    return method.run(problem, config, key, Logbook(checkpoint_dir, resume, progress))
 
 
 def _build(kind: type, options: Mapping[str, Any], where: str) -> Any:

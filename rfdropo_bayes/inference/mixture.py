@@ -1,4 +1,9 @@
-"""A density that covers a posterior whose optima are known: Student-t distributions around them, and the prior."""
+"""A density that covers a posterior whose optima are known: Student-t distributions around them, and the prior.
+
+At an optimum the curvature of the prior says little where the likelihood says nothing: along a ridge that ends at two
+bounds, the density falls off within a hair of the end on which the optimum lies. Each optimum therefore has a second
+distribution, with the likelihood as it is there and the prior by its mean and covariance, as long as the ridge.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +16,12 @@ from scipy.stats import multivariate_t
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.inference.evaluations import evaluate_prior
-from rfdropo_bayes.inference.gauss_newton import Laplace
+from rfdropo_bayes.inference.levenberg import Laplace, positive_part
 from rfdropo_bayes.inference.proposals import host_generator
 
 LEAST_SHARE = 0.05  # of a mode, before normalising: Laplace evidences of ill-shaped modes are off by nats
+MOMENTS = 1000  # prior draws behind its mean and covariance
+SAME = 0.05  # nats between two normal distributions that are taken for one
 
 
 class ModeMixture:
@@ -66,3 +73,37 @@ class ModeMixture:
         if self.prior_share > 0.0:
             parts.append(np.log(self.prior_share) + evaluate_prior(self.problem, np.asarray(u)))
         return logsumexp(np.stack(parts), axis=0)
+
+
+def covering(problem: Problem, modes: list[Laplace], key: PRNGKeyArray) -> list[Laplace]:
+    """The modes, and for each the normal distribution of its likelihood and the prior's moments, if that is another."""
+    drawn = np.asarray(problem.to_unconstrained(problem.sample_prior(key, MOMENTS)), dtype=float)
+    drawn = drawn[np.isfinite(drawn).all(axis=1)]
+    drawn = np.clip(drawn, *np.quantile(drawn, [0.01, 0.99], axis=0))  # heavy tails have no moments
+    mean, precision = drawn.mean(axis=0), np.linalg.inv(np.atleast_2d(np.cov(drawn.T)))
+    found = []
+    for mode in modes:
+        wide = _with_prior_moments(mode, mean, precision)
+        found += [mode] if wide is None or _divergence(mode, wide) < SAME else [mode, wide]
+    return found
+
+
+def _with_prior_moments(
+    mode: Laplace, mean: Float[np.ndarray, " d"], precision: Float[np.ndarray, "d d"]
+) -> Laplace | None:
+    if mode.information is None or mode.slope is None:
+        return None
+    information = positive_part(mode.information)
+    covariance = np.linalg.inv(information + precision)
+    centre = covariance @ (information @ mode.mean + mode.slope + precision @ mean)
+    # Of the two neither is known to be the better: they get equal shares.
+    wide = Laplace(centre, covariance, 0.0)
+    return wide._replace(log_density=mode.log_evidence - wide.log_evidence)
+
+
+def _divergence(first: Laplace, second: Laplace) -> float:
+    """Kullback-Leibler divergence of two normal distributions [nat], from the second to the first."""
+    factor = np.linalg.cholesky(second.covariance)
+    moved = np.linalg.solve(factor, second.mean - first.mean)
+    ratio = np.linalg.solve(factor, np.linalg.cholesky(first.covariance))
+    return float(0.5 * (np.sum(ratio**2) + moved @ moved - len(moved)) - np.log(np.abs(np.diag(ratio))).sum())

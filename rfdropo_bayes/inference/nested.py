@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,8 +19,8 @@ from jaxtyping import PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger
+from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.nuts import log_densities
-from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains
 
 SHRINKAGES = 100  # simulated prior volumes behind the evidence's deviation
@@ -57,10 +56,7 @@ def run(
     problem: Problem,
     config: NestedConfig,
     key: PRNGKeyArray,
-    *,
-    checkpoint_dir: Path | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
+    logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
     """Shrink the prior onto the posterior. It keeps no checkpoint: an interrupted run starts again.
 
@@ -80,8 +76,7 @@ def run(
         state, info = advance(jax.random.fold_in(step_key, index), state)
         dead.append(jax.device_get(info))
         left = float(state.integrator.logZ_live - state.integrator.logZ)
-        if progress is not None:
-            progress.stage(float(np.clip(1.0 + config.remaining / min(left, -1e-9), 0.0, 1.0)), method="nested")
+        logbook.stage(float(np.clip(1.0 + config.remaining / min(left, -1e-9), 0.0, 1.0)), method="nested")
         if left < config.remaining:
             break
     final = utils.finalise(state, dead, update_info=False)

@@ -10,24 +10,34 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from numpyro import handlers
-from numpyro.distributions import biject_to, constraints
-from numpyro.infer import Predictive
+from numpyro.distributions import Distribution, ImproperUniform, MaskedDistribution, biject_to, constraints
+from numpyro.infer import init_to_uniform
 from numpyro.infer.util import compute_log_probs, constrain_fn, potential_energy, unconstrain_fn
+from numpyro.primitives import Messenger
 
 from rfdropo_bayes.errors import InputError
 
 Batch = Mapping[str, Float[Array, " n"]]
 
 
+class _JaxData(Messenger):
+    """A model whose data are JAX arrays: numpyro compares NumPy's with NumPy, also to bounds that JAX is tracing."""
+
+    def process_message(self, msg: dict[str, Any]) -> None:
+        if msg["type"] == "sample" and msg["is_observed"]:
+            msg["value"] = jnp.asarray(msg["value"])
+
+
 class NumpyroProblem:
     """Posterior of a numpyro model given the data it was called with.
 
     Parameters are the components of the model's latent sites: site ``tau`` is ``tau``, the second component of a vector
-    ``theta`` is ``theta[1]``, of a matrix ``corr[0,1]``. Rows are the elements along the first axis of the observed
-    sites, site after site; an observed scalar (or a ``numpyro.factor``) is one row. The likelihood is that of the
-    observed sites, the prior all the rest.
+    ``theta`` is ``theta[1]``, of a matrix ``corr[0,1]``; `sites` puts draws together again. Rows are the elements along
+    the first axis of the observed sites, site after site; an observed scalar (or a ``numpyro.factor``) is one row. The
+    likelihood is that of the observed sites, the prior all the rest.
 
     Args:
         model: the model.
@@ -35,7 +45,8 @@ class NumpyroProblem:
         row_sites: observed sites in the order in which their rows come; None for the model's own order.
 
     Raises:
-        InputError: nothing is observed, nothing is latent, a latent site is discrete or has an improper prior.
+        InputError: nothing is observed, nothing is latent; a latent site is discrete or its prior improper; data are
+            not numbers; the model takes random subsamples of its data, or has ``numpyro.param`` sites.
     """
 
     def __init__(
@@ -45,13 +56,16 @@ class NumpyroProblem:
         kwargs: Mapping[str, Any] | None = None,
         row_sites: Sequence[str] | None = None,
     ) -> None:
-        self.model, self.args, self.kwargs = model, tuple(args), dict(kwargs or {})
-        trace = self._trace()
+        self.model, self.args, self.kwargs = _JaxData(model), tuple(args), dict(kwargs or {})
+        trace = self._trace(0)
+        _check_kinds(trace)
         sites = {name: site for name, site in trace.items() if site["type"] == "sample"}
         observed = [name for name, site in sites.items() if site["is_observed"]]
         latent = {name: site for name, site in sites.items() if not site["is_observed"]}
         self.row_sites = tuple(observed if row_sites is None else row_sites)
-        self._check(latent, observed)
+        self._check_observed(observed)
+        _check_latent(latent)
+        _check_data({name: sites[name] for name in observed})
         self._shapes = {name: tuple(np.shape(site["value"])) for name, site in latent.items()}
         self._free_shapes = {
             name: tuple(biject_to(site["fn"].support).inverse_shape(self._shapes[name]))
@@ -59,28 +73,17 @@ class NumpyroProblem:
         }
         self.names = tuple(name for site, shape in self._shapes.items() for name in _components(site, shape))
         self.units = dict.fromkeys(self.names, "1")
-        self.bounds = {
-            name: bound
-            for site, shape in self._shapes.items()
-            for name, bound in zip(_components(site, shape), _bounds(latent[site]["fn"].support, shape), strict=True)
-        }
+        self.bounds = self._bounds(latent)
         self.n_rows = sum(_row_count(sites[name]) for name in self.row_sites)
         self.fingerprint = self._fingerprint(sites)
 
-    def _trace(self) -> dict[str, Any]:
-        seeded = handlers.seed(self.model, jax.random.key(0))
-        try:
-            return handlers.trace(seeded).get_trace(*self.args, **self.kwargs)
-        except NotImplementedError as error:
-            raise InputError(
-                "the model has a prior that cannot be sampled",
-                where="numpyro model",
-                remedy="give every parameter a proper prior",
-            ) from error
+    def _trace(self, seed: int) -> dict[str, Any]:
+        """Sites at values that need no prior draws, which an improper prior does not have, as yet unchecked."""
+        started = handlers.substitute(handlers.seed(self.model, jax.random.key(seed)), substitute_fn=init_to_uniform)
+        with numpyro.validation_enabled(False):
+            return handlers.trace(started).get_trace(*self.args, **self.kwargs)
 
-    def _check(self, latent: Mapping[str, Any], observed: list[str]) -> None:
-        if not latent:
-            raise InputError("the model has no parameters", where="numpyro model")
+    def _check_observed(self, observed: list[str]) -> None:
         if not observed:
             raise InputError("the model observes nothing", where="numpyro model", remedy="pass the data as obs=")
         for name in self.row_sites:
@@ -89,21 +92,29 @@ class NumpyroProblem:
         missing = [name for name in observed if name not in self.row_sites]
         if missing:
             raise InputError(f"observed sites {missing} are missing", where="row_sites", remedy="list them all")
-        for name, site in latent.items():
-            if site["fn"].support.is_discrete:
-                raise InputError(f"site {name!r} is discrete", where="numpyro model", remedy="sum it out")
+
+    def _bounds(self, latent: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+        """Bounds of every parameter; none where they move with other parameters."""
+        moved, found = self._trace(1), {}
+        for site, shape in self._shapes.items():
+            ends = [_interval(sites[site]["fn"].support, shape) for sites in (latent, moved)]
+            for name, first, second in zip(_components(site, shape), *ends, strict=True):
+                found[name] = first if first == second else (-np.inf, np.inf)
+        return found
 
     def _fingerprint(self, sites: Mapping[str, Any]) -> str:
         digest = hashlib.sha256()
-        for name in self.row_sites:
-            digest.update(name.encode())
-            digest.update(np.ascontiguousarray(np.asarray(sites[name]["value"])).tobytes())
+        named = [(name, sites[name]["value"]) for name in self.row_sites]
+        for name, value in (*named, *enumerate(jax.tree.leaves((self.args, self.kwargs)))):
+            array = np.ascontiguousarray(np.asarray(value))
+            if array.dtype != object:  # an object has no bytes that say what it is
+                digest.update(f"{name} {array.shape} {array.dtype}".encode())
+                digest.update(array.tobytes())
         return digest.hexdigest()
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
         """Prior draws by running the model forward."""
-        drawn = Predictive(self.model, num_samples=n, return_sites=list(self._shapes))(key, *self.args, **self.kwargs)
-        return self._split(drawn)
+        return self._split(self._draw(jax.random.split(key, n)))
 
     def to_unconstrained(self, values: Batch) -> Float[Array, "n d"]:
         """Sites mapped by numpyro's bijections, flattened, in the model's order."""
@@ -129,7 +140,32 @@ class NumpyroProblem:
         sites = constrain_fn(self.model, self.args, self.kwargs, self._ravelled(u))
         return self._single_rows({name: sites[name] for name in self._shapes}).sum()
 
+    def sites(self, draws: Mapping[str, Float[np.ndarray, "*batch"]]) -> dict[str, Float[np.ndarray, "*batch *shape"]]:
+        """Draws of components as draws of the model's own sites, in their shapes, with those of ``deterministic``
+        sites computed from them: ``problem.sites(result.draws)["theta"]`` is (chain, draw, *shape of theta)."""
+        batch = np.shape(next(iter(draws.values())))
+        flat = self._join({name: jnp.ravel(jnp.asarray(draws[name])) for name in self.names})
+        return {name: np.asarray(value).reshape(*batch, *value.shape[1:]) for name, value in self._follow(flat).items()}
+
     status_names: Mapping[int, str] = {1: "not_a_number"}
+
+    @cached_property
+    def _draw(self) -> Callable:
+        def single(key: PRNGKeyArray) -> dict[str, Array]:
+            trace = handlers.trace(handlers.seed(self.model, key)).get_trace(*self.args, **self.kwargs)
+            return {name: trace[name]["value"] for name in self._shapes}
+
+        return jax.jit(jax.vmap(single))
+
+    @cached_property
+    def _follow(self) -> Callable:
+        def single(sites: dict[str, Array]) -> dict[str, Array]:
+            given = handlers.substitute(handlers.seed(self.model, jax.random.key(0)), data=sites)
+            trace = handlers.trace(given).get_trace(*self.args, **self.kwargs)
+            wanted = [name for name, site in trace.items() if name in sites or site["type"] == "deterministic"]
+            return {name: jnp.asarray(trace[name]["value"]) for name in wanted}
+
+        return jax.jit(jax.vmap(single))
 
     @cached_property
     def _constrain(self) -> Callable:
@@ -204,17 +240,76 @@ def _components(site: str, shape: tuple[int, ...]) -> list[str]:
     return [f"{site}[{','.join(map(str, index))}]" for index in np.ndindex(*shape)]
 
 
-def _bounds(support: Any, shape: tuple[int, ...]) -> list[tuple[float, float]]:
-    """Bounds of each component, where the support is a plain interval; infinite otherwise."""
+def _check_kinds(trace: Mapping[str, Any]) -> None:
+    """Refuse what has no posterior: parameters that are optimised, and data that change from call to call."""
+    for name, site in trace.items():
+        if site["type"] == "param":
+            raise InputError(
+                f"{name!r} is a numpyro.param, which has no prior", where="numpyro model", remedy="use numpyro.sample"
+            )
+        if site["type"] == "plate" and site["args"][1] not in (None, site["args"][0]):
+            raise InputError(
+                f"plate {name!r} takes random subsamples of the data", where="numpyro model", remedy="use all of them"
+            )
+
+
+def _check_latent(latent: Mapping[str, Any]) -> None:
+    if not latent:
+        raise InputError("the model has no parameters", where="numpyro model")
+    for name, site in latent.items():
+        if site["fn"].support.is_discrete:
+            raise InputError(f"site {name!r} is discrete", where="numpyro model", remedy="sum it out")
+        try:
+            proper = not _without_density(site["fn"]) and np.isfinite(site["fn"].sample(jax.random.key(0))).all()
+        except NotImplementedError:  # a distribution of the user's own, with a density only
+            proper = False
+        if not proper:
+            raise InputError(
+                f"the prior of site {name!r} is improper: it cannot be sampled, and there is no evidence",
+                where="numpyro model",
+                remedy="give it a proper prior, if a wide one such as Normal(0, 1000)",
+            )
+
+
+def _without_density(fn: Distribution | None) -> bool:
+    """Whether a prior, or what it is made from, is flat or masked out."""
+    while fn is not None and not isinstance(fn, ImproperUniform | MaskedDistribution):
+        fn = getattr(fn, "base_dist", None)
+    return fn is not None
+
+
+def _check_data(observed: Mapping[str, Any]) -> None:
+    for name, site in observed.items():
+        missing = np.isnan(np.asarray(site["value"], dtype=float))
+        missing = missing.any(axis=tuple(range(missing.ndim)[missing.ndim - site["fn"].event_dim :]))
+        count = int(np.sum(missing & np.asarray(_unmasked(site["fn"]))))
+        if count:
+            raise InputError(
+                f"{count} values of the observed site {name!r} are not numbers",
+                where="numpyro model",
+                remedy="leave them out, or hide them with numpyro.handlers.mask",
+            )
+
+
+def _unmasked(fn: Distribution) -> Any:
+    return fn._mask if isinstance(fn, MaskedDistribution) else True
+
+
+def _ends(support: Any) -> tuple[Any, Any]:
+    """Bounds of a support that is a plain interval; infinite otherwise."""
     while isinstance(support, constraints.independent):
         support = support.base_constraint
-    low = np.broadcast_to(np.asarray(getattr(support, "lower_bound", -np.inf), dtype=float), shape)
-    high = np.broadcast_to(np.asarray(getattr(support, "upper_bound", np.inf), dtype=float), shape)
-    return list(zip(low.ravel().tolist(), high.ravel().tolist(), strict=True))
+    return getattr(support, "lower_bound", -np.inf), getattr(support, "upper_bound", np.inf)
+
+
+def _interval(support: Any, shape: tuple[int, ...]) -> list[tuple[float, float]]:
+    """Bounds of each component of a site."""
+    low, high = (np.broadcast_to(np.asarray(end, dtype=float), shape).ravel().tolist() for end in _ends(support))
+    return list(zip(low, high, strict=True))
 
 
 def _row_count(site: Mapping[str, Any]) -> int:
-    shape = jnp.shape(site["fn"].log_prob(site["value"]))
+    shape = jax.eval_shape(site["fn"].log_prob, site["value"]).shape
     return shape[0] if shape else 1
 
 

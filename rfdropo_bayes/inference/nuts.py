@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,7 +19,7 @@ from numpyro.infer import MCMC, NUTS
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains
 
 LOWEST = -1e10  # density of a rollout that failed: finite, so that a gradient there is zero and not NaN
@@ -77,10 +76,7 @@ def run(
     problem: Problem,
     config: NutsConfig,
     key: PRNGKeyArray,
-    *,
-    checkpoint_dir: Path | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
+    logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
     """Sample the posterior. Chains keep no checkpoint: an interrupted run starts again.
 
@@ -110,8 +106,7 @@ def run(
     first = jnp.asarray(start if config.chains > 1 else start[0])
     sampler.warmup(run_key, init_params=first, extra_fields=fields, collect_warmup=True)
     steps = int(np.sum(sampler.get_extra_fields()["num_steps"]))
-    if progress is not None:
-        progress.stage(config.warmup / (config.warmup + config.draws), method="nuts", rollouts=float(steps))
+    logbook.stage(config.warmup / (config.warmup + config.draws), method="nuts", rollouts=float(steps))
     sampler.run(sampler.post_warmup_state.rng_key, extra_fields=fields)
     extra = sampler.get_extra_fields()
     steps += int(np.sum(extra["num_steps"]))
@@ -122,8 +117,7 @@ def run(
     warnings = [f"{diverging} transitions diverged: the posterior has a place that steps cannot follow"] * bool(
         diverging
     )
-    if progress is not None:
-        progress.stage(1.0, method="nuts", rollouts=ledger.rollouts)
+    logbook.stage(1.0, method="nuts", rollouts=ledger.rollouts)
     return InferenceResult(
         method="nuts",
         draws=draws,

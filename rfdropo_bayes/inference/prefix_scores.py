@@ -11,7 +11,8 @@ from scipy.special import logsumexp
 
 from rfdropo_bayes.bayes.problem import ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.gauss_newton import Laplace, laplace, make_target, maximise, prior_derivatives
+from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
+from rfdropo_bayes.inference.levenberg import Laplace, laplace, maximise
 from rfdropo_bayes.inference.mixture import ModeMixture
 from rfdropo_bayes.inference.schedules import log_effective_sample_size
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -20,20 +19,21 @@ from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, RolloutProblem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference.candidates import Plan, Simulated, losses, simulate, target_features, uniforms
-from rfdropo_bayes.inference.checkpoints import Checkpoint, open_checkpoint, run_digest
+from rfdropo_bayes.inference.candidates import Plan, Simulated, row_scores, simulate, target_features, uniforms
+from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.families import FAMILIES, make_family
+from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.optimisers import OPTIMISERS, default_population, make_optimiser
-from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.proposals import host_generator
 from rfdropo_bayes.inference.randomisation import WIDTH, search_space
 from rfdropo_bayes.inference.result import InferenceResult, exclusion_warnings
 from rfdropo_bayes.inference.reuse import bootstrap, make_pool, refine
-from rfdropo_bayes.inference.schedules import linear_horizon, paper_horizon
+from rfdropo_bayes.inference.schedules import adaptive_horizon, linear_horizon, paper_horizon
 from rfdropo_bayes.inference.trajectory_match import motion_scale
 
-HORIZONS = ("paper", "linear", "full")
+HORIZONS = ("paper", "linear", "adaptive", "full")
+AGREEING = 0.5  # share of effective candidates that an adaptive horizon keeps
 FINAL = 10**6  # key of the finalists' random numbers, beyond any generation's
 DRAWS = FINAL + 1
 
@@ -49,7 +49,9 @@ class RfdropoConfig:
         optimiser: "cma" or "cem".
         population: candidates per generation; None for 4 + floor(3 ln d), or 5 d for "cem".
         sigma: initial step, as a share of the search range.
-        horizon: schedule "paper", "linear" or "full".
+        horizon: schedule "paper", "linear", "full", or "adaptive": as far as the candidates of a generation agree, so
+            that half of them stay effective when weighted by what lies beyond the present horizon, and at least on the
+            straight line that over the second half of the generations leads to the last row.
         levels: rollouts are simulated to one of this many horizons, the shortest that is long enough.
         variance_floor: added to the variances, in squared units of the trajectory's root mean square motion.
         finalists: candidates scored again at the full horizon.
@@ -106,11 +108,13 @@ class SearchState(NamedTuple):
     Attributes:
         candidates: of every generation done.
         losses: theirs, each generation at its own horizon.
+        horizons: of every generation done, and of the next one.
         ledger, trace, seconds: as in every method.
     """
 
     candidates: Float[np.ndarray, "generation population k"]
     losses: Float[np.ndarray, "generation population"]
+    horizons: tuple[int, ...]
     ledger: Ledger
     trace: list[dict[str, Any]]
     seconds: float
@@ -133,13 +137,15 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
     if config.rollouts is not None:
         generations = _affordable_generations(problem.n_rows, population, finalists, config)
     horizons = _horizons(generations, problem.n_rows, config)
-    simulated = tuple(_simulated(tau, problem.n_rows, config.levels) for tau in horizons)
-    return Plan(space, population, horizons, simulated, min(finalists, generations + 1), fixed, scale)
+    return Plan(space, population, horizons, min(finalists, generations + 1), fixed, scale)
 
 
 def _horizons(generations: int, n_rows: int, config: RfdropoConfig) -> tuple[int, ...]:
     if config.horizon == "full":
         return (n_rows,) * generations
+    if config.horizon == "adaptive":
+        first = generations // 2
+        return (1,) * first + tuple(linear_horizon(i, generations - first, n_rows) for i in range(generations - first))
     if config.horizon == "linear":
         return tuple(linear_horizon(i, generations, n_rows) for i in range(generations))
     return tuple(paper_horizon(i, generations, n_rows, mended=config.mended) for i in range(generations))
@@ -157,7 +163,8 @@ def _affordable_generations(n_rows: int, population: int, finalists: int, config
     budget = config.rollouts / config.rollouts_per_candidate - finalists
 
     def cost(generations: int) -> float:
-        taus = _horizons(generations, n_rows, config)
+        # How far an adaptive schedule looks is not known before: it may be all the way.
+        taus = (n_rows,) * generations if config.horizon == "adaptive" else _horizons(generations, n_rows, config)
         return population * sum(_simulated(tau, n_rows, config.levels) for tau in taus) / n_rows
 
     if cost(1) > budget:
@@ -179,18 +186,24 @@ def _affordable_generations(n_rows: int, population: int, finalists: int, config
 def step(
     key: PRNGKeyArray, state: SearchState, problem: RolloutProblem, plan: Plan, config: RfdropoConfig, asked: np.ndarray
 ) -> SearchState:
-    """Score one generation at its horizon."""
+    """Score one generation at its horizon, and set that of the next."""
     began = time.monotonic()
-    i = len(state.losses)
-    m, d = config.rollouts_per_candidate, plan.space.columns
+    i, n = len(state.losses), problem.n_rows
+    m, d, horizon = config.rollouts_per_candidate, plan.space.columns, state.horizons[-1]
     uniform = uniforms(jax.random.fold_in(key, i), m, d, stratified=config.mended)
-    found = simulate(problem, plan, asked, uniform, plan.simulated[i], state.ledger)
-    values = losses(problem, plan, config.variance_floor, found, plan.horizons[i])
-    facts = {"generation": i, "horizon": plan.horizons[i], "loss": float(values.min())}
+    adaptive = config.horizon == "adaptive"
+    simulated = _simulated(min(horizon + 1, n) if adaptive else horizon, n, config.levels)
+    found = simulate(problem, plan, asked, uniform, simulated, state.ledger)
+    rows = row_scores(problem, plan, config.variance_floor, found, simulated if adaptive else horizon)
+    values = -rows[:, :horizon].sum(axis=1)
+    facts = {"generation": i, "horizon": horizon, "loss": float(values.min())}
     state.trace.append(facts | {"rollouts": state.ledger.rollouts})
+    planned = plan.horizons[min(i + 1, len(plan.horizons) - 1)]
+    following = max(adaptive_horizon(rows, horizon, AGREEING), planned) if adaptive else planned
     return state._replace(
         candidates=np.concatenate([state.candidates, asked[None]]),
         losses=np.concatenate([state.losses, values[None]]),
+        horizons=(*state.horizons, following),
         seconds=state.seconds + time.monotonic() - began,
     )
 
@@ -202,7 +215,7 @@ def choose_finalists(state: SearchState, plan: Plan, centre: Float[np.ndarray, "
     """
     stages = np.array_split(np.arange(len(state.losses)), max(1, plan.finalists - 1))
     chosen = [centre]
-    per_row = state.losses / np.asarray(plan.horizons[: len(state.losses)])[:, None]
+    per_row = state.losses / np.asarray(state.horizons[: len(state.losses)])[:, None]
     for members in stages:
         if len(members):
             generation, index = np.unravel_index(np.argmin(per_row[members]), per_row[members].shape)
@@ -214,10 +227,7 @@ def run(
     problem: Problem,
     config: RfdropoConfig,
     key: PRNGKeyArray,
-    *,
-    checkpoint_dir: Path | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
+    logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
     """Search phi and draw from the distribution found.
 
@@ -229,8 +239,8 @@ def run(
     prior_key, search_key = jax.random.split(key)
     plan = make_plan(problem, config, prior_key)
     digest = run_digest(problem, "rfdropo", config, key)
-    checkpoint = open_checkpoint(checkpoint_dir, "rfdropo", digest, resume=resume)
-    state, centre = _search(problem, config, plan, search_key, checkpoint, progress)
+    checkpoint = logbook.checkpoint("rfdropo", digest)
+    state, centre = _search(problem, config, plan, search_key, checkpoint, logbook)
     if not np.isfinite(state.losses).any():
         raise InputError(
             f"no candidate had half of its rollouts end well ({dict(state.ledger.excluded)})",
@@ -261,7 +271,7 @@ def _search(
     plan: Plan,
     key: PRNGKeyArray,
     checkpoint: Checkpoint,
-    progress: Progress | None,
+    logbook: Logbook,
 ) -> tuple[SearchState, np.ndarray]:
     """All generations; a resumed optimiser is told again what it knew."""
     k = plan.space.dimension
@@ -270,7 +280,8 @@ def _search(
         config.optimiser, k, high=WIDTH, sigma=config.sigma, population=plan.population, seed=seed
     )
     saved = checkpoint.load()
-    empty = SearchState(np.empty((0, plan.population, k)), np.empty((0, plan.population)), Ledger(), [], 0.0)
+    nothing = np.empty((0, plan.population, k)), np.empty((0, plan.population))
+    empty = SearchState(*nothing, plan.horizons[:1], Ledger(), [], 0.0)
     state = empty if saved is None else _unpack(*saved)
     for known in state.losses:
         optimiser.tell(optimiser.ask(), known)
@@ -279,8 +290,7 @@ def _search(
         state = step(key, state, problem, plan, config, asked)
         optimiser.tell(asked, state.losses[-1])
         checkpoint.save(*_pack(state))
-        if progress is not None:
-            progress.stage(len(state.losses) / len(plan.horizons), method="rfdropo", **state.trace[-1])
+        logbook.stage(len(state.losses) / len(plan.horizons), method="rfdropo", **state.trace[-1])
     return state, np.clip(optimiser.centre, 0.0, WIDTH)
 
 
@@ -294,14 +304,14 @@ def _choose(
 ) -> tuple[np.ndarray, dict[str, Any]]:
     best = np.unravel_index(np.argmin(state.losses), state.losses.shape)
     details: dict[str, Any] = {"generations": len(state.losses), "feature_scale": plan.scale}
-    details["lowest_loss_ever"] = {"loss": float(state.losses[best]), "horizon": plan.horizons[int(best[0])]}
+    details["lowest_loss_ever"] = {"loss": float(state.losses[best]), "horizon": state.horizons[int(best[0])]}
     if not config.mended:
         return state.candidates[best], details
     finalists = choose_finalists(state, plan, centre)
     m, n = config.rollouts_per_candidate, problem.n_rows
     uniform = uniforms(jax.random.fold_in(key, FINAL), m, plan.space.columns, stratified=True)
     found = simulate(problem, plan, finalists, uniform, n, state.ledger)
-    scores = losses(problem, plan, config.variance_floor, found, n)
+    scores = -row_scores(problem, plan, config.variance_floor, found, n).sum(axis=1)
     details["finalist_losses"] = scores.tolist()
     state.trace.append({"horizon": n, "loss": float(scores.min()), "rollouts": state.ledger.rollouts, "final": True})
     best_finalist = finalists[int(np.argmin(scores))]
@@ -342,10 +352,11 @@ def _reuse(
 
 
 def _pack(state: SearchState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    arrays = {"candidates": state.candidates, "losses": state.losses}
+    arrays = {"candidates": state.candidates, "losses": state.losses, "horizons": np.asarray(state.horizons)}
     return arrays, {"ledger": state.ledger.record(), "trace": state.trace, "seconds": state.seconds}
 
 
 def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SearchState:
     ledger = Ledger.from_record(meta["ledger"])
-    return SearchState(arrays["candidates"], arrays["losses"], ledger, meta["trace"], meta["seconds"])
+    horizons = tuple(arrays["horizons"].tolist())
+    return SearchState(arrays["candidates"], arrays["losses"], horizons, ledger, meta["trace"], meta["seconds"])

@@ -27,7 +27,7 @@ from jaxtyping import Float, PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem, RolloutProblem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior
-from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.proposals import host_generator
 from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains, exclusion_warnings
 from rfdropo_bayes.inference.summaries import cross_correlation_summary, informative, thinned_summary
@@ -188,10 +188,7 @@ def run_bayessim(
     problem: Problem,
     config: BayesSimConfig,
     key: PRNGKeyArray,
-    *,
-    checkpoint_dir: Path | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
+    logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
     """BayesSim. It has one stage, so there is nothing to resume from."""
     actions = getattr(problem, "actions", None)
@@ -200,20 +197,17 @@ def run_bayessim(
         known = np.zeros((features.shape[1], 0)) if actions is None else np.asarray(actions)
         return cross_correlation_summary(features, known)
 
-    return _run(problem, "bayessim", config, key, summarise, rounds=1, progress=progress)
+    return _run(problem, "bayessim", config, key, summarise, rounds=1, logbook=logbook)
 
 
 def run_npdr(
     problem: Problem,
     config: NpdrConfig,
     key: PRNGKeyArray,
-    *,
-    checkpoint_dir: Path | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
+    logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
     """NPDR. Rounds build on trained networks, which are not kept: an interrupted run starts again."""
-    return _run(problem, "npdr", config, key, thinned_summary, rounds=config.rounds, progress=progress)
+    return _run(problem, "npdr", config, key, thinned_summary, rounds=config.rounds, logbook=logbook)
 
 
 def _run(
@@ -224,18 +218,18 @@ def _run(
     summarise: Callable[[np.ndarray], np.ndarray],
     *,
     rounds: int,
-    progress: Progress | None,
+    logbook: Logbook,
 ) -> InferenceResult:
     if not isinstance(problem, RolloutProblem):
         raise InputError("this problem has no rollouts", where="[inference] method", remedy='use method = "smc"')
     torch, sbi = import_sbi()
     began = time.monotonic()
     prior_key, noise_key, seed_key = jax.random.split(key, 3)
-    torch.manual_seed(int(host_generator(seed_key).integers(2**31)))
+    seed = int(host_generator(seed_key).integers(2**31))
     prior, ledger, trace = StandardPrior(problem, prior_key), Ledger(), []
     observed = summarise(observed_features(problem))[0]
     share = int(config.rollouts // rounds)
-    with _quietly():
+    with _apart(torch, seed):
         wrapped, _, _ = sbi.utils.process_prior(prior)
         trainer = sbi.inference.NPE_C(wrapped, density_estimator=_estimator(sbi, config, len(problem.names)))
         proposal, posterior, scaling = wrapped, None, None
@@ -255,8 +249,7 @@ def _run(
             network = trainer.train(max_num_epochs=config.max_epochs, show_train_summary=False, **atoms)
             proposal = posterior = trainer.build_posterior(network).set_default_x(shown)
             trace.append({"round": index, "rollouts": ledger.rollouts})
-            if progress is not None:
-                progress.stage((index + 1) / rounds, method=name, **trace[-1])
+            logbook.stage((index + 1) / rounds, method=name, **trace[-1])
         assert posterior is not None
         drawn = posterior.sample((config.draws,), x=shown, show_progress_bars=False)
     u = prior.unconstrained(np.asarray(drawn.detach().numpy(), dtype=float))
@@ -278,9 +271,11 @@ def _run(
 
 
 @contextmanager
-def _quietly() -> Iterator[None]:
-    """Without sbi's own progress, which would draw over ours, and its advice on priors."""
-    with warnings.catch_warnings(), Path(os.devnull).open("w") as nothing:
+def _apart(torch: Any, seed: int) -> Iterator[None]:
+    """sbi on random numbers of its own, with the caller's as they were afterwards; without its progress, which would
+    draw over ours, and its advice on priors. It takes no generator: torch's global one is lent to it."""
+    with torch.random.fork_rng(devices=[]), warnings.catch_warnings(), Path(os.devnull).open("w") as nothing:
+        torch.manual_seed(seed)
         warnings.simplefilter("ignore")
         with redirect_stdout(nothing), redirect_stderr(nothing):
             yield
@@ -300,10 +295,7 @@ def run_udr(
     problem: Problem,
     config: UdrConfig,
     key: PRNGKeyArray,
-    *,
-    checkpoint_dir: Path | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
+    logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
     """Random sub-ranges of the prior's central 99 %, as the paper's baseline of uniform randomisation has them."""
     began = time.monotonic()
@@ -316,8 +308,7 @@ def run_udr(
         start, end = sorted(generator.uniform(low, high, 2).tolist())
         draws[name] = generator.uniform(start, end, size=(1, config.draws))
         ranges[name] = [start, end]
-    if progress is not None:
-        progress.stage(1.0, method="udr")
+    logbook.stage(1.0, method="udr")
     return InferenceResult(
         method="udr",
         draws=draws,

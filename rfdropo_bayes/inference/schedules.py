@@ -37,6 +37,25 @@ def linear_horizon(iteration: int, iterations: int, n_rows: int) -> int:
     return min(n_rows, max(1, math.ceil(n_rows * (iteration + 1) / iterations)))
 
 
+def adaptive_horizon(row_scores: Float[np.ndarray, "n rows"], horizon: int, target: float) -> int:
+    """Longest horizon at which candidates still agree: weighted by the likelihood of the rows after ``horizon``, the
+    share ``target`` of them is effective.
+
+    Args:
+        row_scores: log likelihood of each row for each candidate; minus infinity for those that failed.
+        horizon: present one; the answer is not shorter.
+        target: share of effective candidates among those that did not fail.
+    """
+    alive = row_scores[np.isfinite(row_scores).all(axis=1)]
+    if len(alive) == 0:
+        return horizon
+    ahead = np.cumsum(alive[:, horizon:], axis=1)
+    for rows, weights in enumerate(ahead.T):
+        if log_effective_sample_size(weights) < math.log(target * len(weights)):
+            return horizon + rows
+    return horizon + ahead.shape[1]
+
+
 def block_boundaries(n_rows: int, blocks: int, spacing: str = "geometric") -> tuple[int, ...]:
     """Prefix lengths at which a sequential method looks further ahead; strictly increasing, the last one ``n_rows``.
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -20,12 +19,12 @@ from jaxtyping import PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import bridge, horizon_smc
-from rfdropo_bayes.inference.checkpoints import open_checkpoint, run_digest
+from rfdropo_bayes.inference.checkpoints import run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES, ROLLOUTS_PER_PARTICLE, SmcConfig
 from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes
+from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.prefix_scores import PrefixEvidence, block_scores, prefix_evidence
-from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.schedules import block_boundaries
 from rfdropo_bayes.inference.sharpness import Way, way_from_prior
@@ -42,10 +41,7 @@ def run(
     problem: Problem,
     config: SmcConfig,
     key: PRNGKeyArray,
-    *,
-    checkpoint_dir: Path | None = None,
-    resume: bool = False,
-    progress: Progress | None = None,
+    logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
     """Sample a posterior, from the start that ``config.start`` names or that the budget allows.
 
@@ -53,33 +49,31 @@ def run(
         InputError: as `horizon_smc.run`; or a start at the optima is asked for and the problem has no residuals.
     """
     if config.start == "prior" or (config.start == "auto" and not _worth_climbing(problem, config)):
-        return horizon_smc.run(problem, config, key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress)
+        return horizon_smc.run(problem, config, key, logbook)
+    if not isinstance(problem, ResidualProblem):
+        raise InputError(
+            'start = "optimum" is for problems with residuals, and this one has no residuals',
+            where="[inference] start",
+            remedy='start = "prior", or method = "bridge"',
+        )
     climb_key, way_key, sample_key = jax.random.split(key, 3)
     climbing = _climbing(config, len(problem.names))
     digest = run_digest(problem, "smc_climbs", config, key)
-    checkpoint = open_checkpoint(checkpoint_dir, "smc_climbs", digest, resume=resume)
+    checkpoint = logbook.checkpoint("smc_climbs", digest)
     try:
-        found = find_modes(problem, climbing, climb_key, checkpoint=checkpoint, progress=progress)
+        found = find_modes(problem, climbing, climb_key, checkpoint, logbook)
     except InputError:
         if config.start == "optimum":
             raise
         # No screened draw had a likelihood: whether the prior excludes the data is for more particles to say.
-        return horizon_smc.run(problem, config, key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress)
+        return horizon_smc.run(problem, config, key, logbook)
     horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
     way = way_from_prior(problem, found.modes[0], horizons, config.target_ess, way_key)
     left = None if config.rollouts is None else config.rollouts - found.climbs.ledger.rollouts
     if config.start == "auto" and _affordable(way, config, left):
-        result = horizon_smc.run(
-            problem,
-            replace(config, rollouts=left),
-            sample_key,
-            checkpoint_dir=checkpoint_dir,
-            resume=resume,
-            progress=progress,
-        )
+        result = horizon_smc.run(problem, replace(config, rollouts=left), sample_key, logbook)
         return _with_climbs(result, found, way)
-    assert isinstance(problem, ResidualProblem)  # or no optima would have been found
-    return _from_optima(problem, config, found, way, sample_key, checkpoint_dir, resume, progress)
+    return _from_optima(problem, config, found, way, sample_key, logbook)
 
 
 def _climbing(config: SmcConfig, d: int) -> LaplaceConfig:
@@ -124,9 +118,7 @@ def _from_optima(
     found: Modes,
     way: Way,
     key: PRNGKeyArray,
-    checkpoint_dir: Path | None,
-    resume: bool,
-    progress: Progress | None,
+    logbook: Logbook,
 ) -> InferenceResult:
     sample_key, score_key = jax.random.split(key)
     left = None if config.rollouts is None else config.rollouts - found.climbs.ledger.rollouts
@@ -138,9 +130,7 @@ def _from_optima(
         replicates=_replicates(config, sampling),
         target_ess=config.target_ess,
     )
-    result = bridge.sample_from_modes(
-        problem, settings, found, sample_key, checkpoint_dir=checkpoint_dir, resume=resume, progress=progress
-    )
+    result = bridge.sample_from_modes(problem, settings, found, sample_key, logbook)
     prefixes, ledger = _prefixes(problem, config, found, scoring, score_key)
     value, sd = result.log_evidence or (np.nan, np.nan)
     whole = PrefixEvidence(problem.n_rows, value, 0.0 if np.isnan(sd) else sd, 1.0)

@@ -28,6 +28,7 @@ OPTIONS = {
     "bridge": {"particles": 40, "replicates": 2, "climb": {"starts": 1, "blocks": 1}},
     "rfdropo": {"evaluations": 60, "rollouts_per_candidate": 10},
 }
+CASES = [*OPTIONS.items(), ("rfdropo", {**OPTIONS["rfdropo"], "optimiser": "cem", "horizon": "adaptive"})]
 
 
 class Killed(Exception):
@@ -75,9 +76,9 @@ def same(first, second):
     np.testing.assert_equal(first.trace, second.trace)
 
 
-@pytest.mark.parametrize("method", OPTIONS)
-def test_resumed_after_a_kill_at_any_stage(method, tmp_path):
-    problem, options, counting = problem_for(method), OPTIONS[method], Counting()
+@pytest.mark.parametrize(("method", "options"), CASES)
+def test_resumed_after_a_kill_at_any_stage(method, options, tmp_path):
+    problem, counting = problem_for(method), Counting()
     whole = methods.run(problem, method, options, KEY, progress=counting)
     assert counting.count >= 3
     every = range(counting.count) if method == "smc" else (0, counting.count // 2, counting.count - 1)
@@ -122,31 +123,46 @@ def test_a_kill_inside_a_stage_costs_that_stage_only(tmp_path):
 
 
 SCRIPT = """
-import sys, time
+import json, sys, time
 from pathlib import Path
 import jax
 sys.path.insert(0, sys.argv[1])
-from toys import Decay
+from toys import Decay, Spring
 from rfdropo_bayes.inference import methods
 
-class Slow(Decay):
+class SlowDecay(Decay):
     def row_log_likelihood(self, values, horizon):
         time.sleep(0.05)
         return super().row_log_likelihood(values, horizon)
 
-options = {"particles": 40, "replicates": 2, "blocks": 2, "target_ess": 0.3}
-methods.run(Slow(n_rows=20), "smc", options, jax.random.key(12),
-            checkpoint_dir=Path(sys.argv[2]))
+class SlowSpring(Spring):
+    def rollouts(self, values, horizon):
+        time.sleep(0.2)
+        return super().rollouts(values, horizon)
+
+problem = SlowSpring() if sys.argv[3] == "rfdropo" else SlowDecay(n_rows=20)
+methods.run(problem, sys.argv[3], json.loads(sys.argv[4]), jax.random.key(12), checkpoint_dir=Path(sys.argv[2]))
 """
 
 
-def test_sigkill_and_resume(tmp_path):
+@pytest.mark.parametrize(
+    ("method", "options", "begun"),
+    [
+        ("smc", OPTIONS["smc"], "smc_1"),
+        pytest.param("bridge", OPTIONS["bridge"], "smc_0", marks=pytest.mark.slow),
+        pytest.param("rfdropo", OPTIONS["rfdropo"], "rfdropo", marks=pytest.mark.slow),
+        pytest.param(*CASES[-1], "rfdropo", marks=pytest.mark.slow),
+    ],
+)
+def test_sigkill_and_resume(method, options, begun, tmp_path):
+    """Killed as soon as a checkpoint is there, without a chance to tidy up."""
     here = Path(__file__).parent
     environment = {**os.environ, "PYTHONPATH": str(here.parents[1])}
-    process = subprocess.Popen([sys.executable, "-c", SCRIPT, str(here), str(tmp_path)], env=environment)
+    told = [str(here), str(tmp_path), method, json.dumps(options)]
+    process = subprocess.Popen([sys.executable, "-c", SCRIPT, *told], env=environment)
     try:
         deadline = time.monotonic() + 120.0
-        while not (tmp_path / "smc_1.npz").exists() and process.poll() is None and time.monotonic() < deadline:
+        while not (tmp_path / f"{begun}.npz").exists() and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.02)
         assert process.poll() is None, "the run ended before it could be killed"
         process.send_signal(signal.SIGKILL)
@@ -154,8 +170,9 @@ def test_sigkill_and_resume(tmp_path):
     finally:
         process.kill()
         process.wait()
-    whole = methods.run(decay(), "smc", OPTIONS["smc"], KEY)
-    same(whole, methods.run(decay(), "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path, resume=True))
+    problem = problem_for(method)
+    whole = methods.run(problem, method, options, KEY)
+    same(whole, methods.run(problem, method, options, KEY, checkpoint_dir=tmp_path, resume=True))
 
 
 @pytest.mark.parametrize("change", ["options", "key", "data", "prior"])

@@ -105,6 +105,21 @@ def test_a_known_distribution_is_recovered(optimiser):
     assert sum(n * h for n, h in problem.calls) / problem.n_rows == pytest.approx(result.rollouts)
 
 
+def test_an_adaptive_horizon_grows_with_the_agreement_of_the_candidates():
+    """It looks ahead sooner than the line that it must not fall behind, and never back."""
+    problem = Spring()
+    config = RfdropoConfig(rollouts=20000.0, rollouts_per_candidate=20, horizon="adaptive")
+    result = rfdropo.run(problem, config, KEY)
+    horizons = [row["horizon"] for row in result.trace]
+    assert all(np.diff(horizons) >= 0)
+    assert horizons[0] == 1
+    assert horizons[len(horizons) // 2] > 1
+    assert horizons[-1] == 40
+    assert result.phi["frequency"]["mean"] == pytest.approx(2.3, abs=0.03)
+    assert sum(n * h for n, h in problem.calls) / problem.n_rows == pytest.approx(result.rollouts)
+    assert result.rollouts <= 20000.0
+
+
 def test_spread_in_the_data_is_recovered_as_spread():
     """Features of many springs side by side, one parameter each: the spread of phi is theirs, not zero."""
 

@@ -116,8 +116,11 @@ def posterior_of_every_second_row(problem):
 def test_the_rivals_approach_a_posterior_in_closed_form(method, options):
     """NPDR sees every second row; networks of so few simulations are some 1.4 times too wide (measured).
     BayesSim sees only moments of the changes, so that it may be as wide as the prior, but no wider."""
-    problem = LinearRollouts()
+    import torch
+
+    problem, before = LinearRollouts(), torch.get_rng_state()
     result = methods.run(problem, method, options, KEY)
+    assert torch.equal(torch.get_rng_state(), before)  # the caller's random numbers are the caller's
     draws = np.stack([result.draws[name].ravel() for name in problem.names], axis=1)
     assert result.rollouts == 2000
     assert np.isfinite(draws).all()

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.schedules import (
     SPACINGS,
+    adaptive_horizon,
     block_boundaries,
     linear_horizon,
     log_effective_sample_size,
@@ -54,6 +55,18 @@ def test_geometric_blocks_cost_less_than_two_full_looks():
     ends = block_boundaries(1024, 8)
     assert ends == (8, 16, 32, 64, 128, 256, 512, 1024)
     assert sum(ends) < 2 * 1024
+
+
+def test_an_adaptive_horizon_ends_where_candidates_part():
+    """Ten candidates alike up to row 7; from row 8 on one of them is so much better that it alone is left."""
+    scores = np.zeros((10, 20))
+    scores[3, 7:] = 5.0
+    assert adaptive_horizon(scores, 2, 0.5) == 7
+    assert adaptive_horizon(scores, 7, 0.5) == 7
+    assert adaptive_horizon(np.ones((10, 20)), 2, 0.5) == 20
+    failed = np.full((1, 20), -np.inf)
+    assert adaptive_horizon(np.concatenate([scores, failed]), 2, 0.5) == 7
+    assert adaptive_horizon(failed, 5, 0.5) == 5
 
 
 def test_an_unknown_spacing_is_refused():

@@ -8,12 +8,12 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods, starts
-from rfdropo_bayes.inference.gauss_newton import Laplace
 from rfdropo_bayes.inference.horizon_smc import SmcConfig
+from rfdropo_bayes.inference.levenberg import Laplace
 from rfdropo_bayes.inference.mixture import ModeMixture
 from rfdropo_bayes.inference.sharpness import way_from_prior
 
-from .toys import Decay, LinearGaussian, Spring, TwoModes
+from .toys import Decay, LinearGaussian, Ratio, Spring, TwoModes
 
 KEY = jax.random.key(31)
 
@@ -93,6 +93,17 @@ def test_both_modes_survive_a_start_at_the_optima():
     evidence, share = problem.mode_evidence()
     assert result.log_evidence[0] == pytest.approx(evidence, abs=0.25)
     assert np.mean(result.draws["x0"] > 0) == pytest.approx(share, abs=0.2)
+
+
+def test_a_ridge_between_two_bounds_is_filled_from_end_to_end():
+    """The optimum lies at one end of the ridge, and the curvature there knows nothing of its length. A distribution
+    function of 400 draws, of which a quarter count: its mean scatters by 0.03, its deviation by 0.02."""
+    problem = Ratio()
+    result = methods.run(problem, "smc", {"rollouts": 10000, "start": "optimum", "blocks": 1}, KEY)
+    place, evidence = problem.along_the_ridge(result.draws["mass"].ravel())
+    assert place.mean() == pytest.approx(0.5, abs=0.12)
+    assert place.std() == pytest.approx(12.0**-0.5, abs=0.08)
+    assert result.log_evidence[0] == pytest.approx(evidence, abs=0.3)
 
 
 def test_a_small_budget_finishes_one_climb_rather_than_beginning_four():

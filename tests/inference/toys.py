@@ -154,6 +154,61 @@ class TwoModes(LinearGaussian):
         return float(np.logaddexp(plus, minus) + rest), float(1.0 / (1.0 + np.exp(minus - plus)))
 
 
+class Ratio(LinearGaussian):
+    """Data see the ratio of a stiffness and a mass only, to 0.02 %; both priors are uniform, and end on the ridge."""
+
+    low, high = np.array([2.0, 0.005]), np.array([7.0, 1.0])
+
+    def __init__(self, truth: tuple[float, float] = (3.0, 0.9)) -> None:
+        super().__init__(n_rows=40, d=2)
+        self.names = ("stiffness", "mass")
+        self.units = dict.fromkeys(self.names, "1")
+        self.bounds = {"stiffness": (2.0, 7.0), "mass": (0.005, 1.0)}
+        self.gain, self.noise = np.linspace(0.5, 2.0, 40), np.full(40, 2e-3)
+        rng = np.random.default_rng(3)
+        self.data = self.gain * np.log(truth[0] / truth[1]) + self.noise * rng.normal(size=40)
+
+    def sample_prior(self, key, n):
+        return dict(
+            zip(self.names, (self.low + (self.high - self.low) * jax.random.uniform(key, (n, 2))).T, strict=True)
+        )
+
+    def to_unconstrained(self, values):
+        x = jnp.stack([jnp.asarray(values[name]) for name in self.names], axis=-1)
+        return jnp.log(x - self.low) - jnp.log(self.high - x)
+
+    def from_unconstrained(self, u):
+        x = self.low + (self.high - self.low) * jax.nn.sigmoid(u)
+        return {name: x[:, j] for j, name in enumerate(self.names)}
+
+    def log_prior(self, u):
+        return jnp.sum(jax.nn.log_sigmoid(u) + jax.nn.log_sigmoid(-u), axis=1)
+
+    def _row_density(self, u, horizon):
+        values = self.from_unconstrained(u)
+        fit = jnp.log(values["stiffness"] / values["mass"])[:, None] * self.gain[:horizon]
+        return jax.scipy.stats.norm.logpdf(self.data[:horizon], fit, self.noise[:horizon])
+
+    def residuals(self, values, horizon):
+        fit = jnp.log(values["stiffness"] / values["mass"]) * self.gain[:horizon]
+        return (self.data[:horizon] - fit) / self.noise[:horizon]
+
+    def along_the_ridge(self, mass):
+        """Distribution function of the mass given all rows, at given masses, and the log evidence.
+
+        Given the ratio c the prior's density on the ridge goes with the mass, from the end of one range to that of the
+        other; the ratio is known so well that c is a number.
+        """
+        weight = self.gain / self.noise**2
+        log_ratio, information = weight @ self.data / (weight @ self.gain), weight @ self.gain
+        ratio = np.exp(log_ratio)
+        ends = np.array([max(0.005, 2.0 / ratio), min(1.0, 7.0 / ratio)])
+        best = norm.logpdf(self.data, self.gain * log_ratio, self.noise).sum()
+        area = 0.5 * ratio * (ends[1] ** 2 - ends[0] ** 2) / np.prod(self.high - self.low)
+        evidence = best + 0.5 * np.log(2.0 * np.pi / information) + np.log(area)
+        return (mass**2 - ends[0] ** 2) / (ends[1] ** 2 - ends[0] ** 2), float(evidence)
+
+
 class Spring:
     """Features of a damped oscillation whose frequency and damping differ from rollout to rollout, for RF-DROPO."""
 

@@ -1,0 +1,172 @@
+"""Posterior modes by Levenberg-Marquardt in the unconstrained space, and the Laplace approximation around them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+NOISE_GRID = 13  # values of a noise coordinate tried at the start of a climb
+
+
+@runtime_checkable
+class Climbable(Protocol):
+    """A log posterior with what a climb needs of it."""
+
+    @property
+    def noise(self) -> Bool[np.ndarray, " d"]:
+        """Coordinates that are noise parameters, which are looked for on a grid first."""
+        ...
+
+    @property
+    def density(self) -> Any:
+        """Log posterior of a batch (n, d), unnormalised."""
+        ...
+
+    def quadratic(self, u: Float[np.ndarray, " d"]) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient of the log posterior and a positive definite stand-in for minus its Hessian."""
+        ...
+
+    def information(self, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
+        """Minus the Hessian of the log likelihood at a mode, as well as it is known."""
+        ...
+
+    @property
+    def prior_gradient(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Of the log prior, at one point."""
+        ...
+
+    @property
+    def prior_hessian(self) -> Callable[[np.ndarray], np.ndarray]:
+        """Of the log prior, at one point."""
+        ...
+
+
+class LevenbergState(NamedTuple):
+    """Where an optimisation stands.
+
+    Attributes:
+        position: unconstrained point.
+        log_density: log posterior there.
+        damping: Levenberg-Marquardt's, relative to the diagonal of the Hessian.
+        converged: the last step promised less than the tolerance, or little more and delivered less.
+    """
+
+    position: Float[np.ndarray, " d"]
+    log_density: float
+    damping: float
+    converged: bool
+
+
+class StepInfo(NamedTuple):
+    """One step: the gain in log posterior, the gain the quadratic model promised, and the tries it took."""
+
+    gain: float
+    promised: float
+    tries: int
+
+
+class Laplace(NamedTuple):
+    """Normal approximation in unconstrained coordinates.
+
+    Attributes:
+        mean: the mode.
+        covariance: inverse of minus the Hessian.
+        log_density: log posterior, unnormalised, at the mode.
+        information: share of the likelihood in minus the Hessian; None where it is not known.
+        slope: gradient of the log likelihood at the mode, which the prior's cancels; None likewise.
+    """
+
+    mean: Float[np.ndarray, " d"]
+    covariance: Float[np.ndarray, "d d"]
+    log_density: float
+    information: Float[np.ndarray, "d d"] | None = None
+    slope: Float[np.ndarray, " d"] | None = None
+
+    @property
+    def log_evidence(self) -> float:
+        """Log of the integral of the unnormalised posterior, were it normal."""
+        d = len(self.mean)
+        return self.log_density + 0.5 * d * np.log(2.0 * np.pi) + 0.5 * float(np.linalg.slogdet(self.covariance)[1])
+
+
+def init(target: Climbable, u: Float[np.ndarray, " d"]) -> LevenbergState:
+    """State at a starting point."""
+    return LevenbergState(u, float(target.density(u[None])[0]), 1e-3, False)
+
+
+def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[LevenbergState, StepInfo]:
+    """One Levenberg-Marquardt step; damping grows until the log posterior rises.
+
+    Damping acts on the curvature's diagonal (Marquardt's scaling), so that units do not matter. All dampings of a step
+    are tried in one batch of rollouts.
+    """
+    gradient, curvature = target.quadratic(state.position)
+    diagonal = np.diag(np.maximum(np.diag(curvature), 1e-12))
+    dampings = state.damping * 10.0 ** np.arange(-1.0, 5.0)
+    moves = np.stack([np.linalg.solve(curvature + damping * diagonal, gradient) for damping in dampings])
+    # No coordinate moves further than 2: a logistic or a logarithm is beyond any quadratic model there.
+    moves *= np.minimum(1.0, 2.0 / np.maximum(np.abs(moves).max(axis=1, keepdims=True), 1e-300))
+    newton = np.linalg.solve(curvature + 1e-12 * diagonal, gradient)
+    promised = 0.5 * float(gradient @ newton)
+    if promised < tolerance:
+        return state._replace(converged=True), StepInfo(0.0, promised, 0)
+    densities = target.density(state.position + moves)
+    best = int(np.argmax(densities))
+    gain = float(densities[best] - state.log_density)
+    if gain <= 0.0:
+        # The differences left are those of rounding, or the model is useless here: smaller steps next time.
+        stuck = state.damping > 1e8 or promised < 100.0 * tolerance
+        return state._replace(damping=state.damping * 1e5, converged=stuck), StepInfo(0.0, promised, len(dampings))
+    # An engine in single precision has gradients that promise a little for ever; what it delivers tells.
+    idle = gain < tolerance and promised < 100.0 * tolerance
+    moved = LevenbergState(
+        state.position + moves[best], float(densities[best]), float(np.clip(dampings[best], 1e-9, 1e9)), idle
+    )
+    return moved, StepInfo(gain, promised, len(dampings))
+
+
+def with_fitting_noise(target: Climbable, u: Float[np.ndarray, " d"], width: float = 12.0) -> np.ndarray:
+    """The point with its noise coordinates, one after the other, at the best of a wide grid.
+
+    A start drawn from the prior, or the optimum of a shorter horizon, may have a noise that makes its residuals look
+    impossible; every step then answers to the few rows that are hardest to fit.
+    """
+    steps = np.linspace(-0.5 * width, 0.5 * width, NOISE_GRID)
+    for coordinate in np.flatnonzero(target.noise):
+        points = np.tile(u, (len(steps), 1))
+        points[:, coordinate] += steps
+        densities = target.density(points)
+        if np.isfinite(densities).any():
+            u = points[int(np.nanargmax(np.where(np.isfinite(densities), densities, -np.inf)))]
+    return u
+
+
+def maximise(
+    target: Climbable, u: Float[np.ndarray, " d"], *, max_steps: int, tolerance: float
+) -> tuple[LevenbergState, list[dict[str, Any]]]:
+    """Climb from one start, noise first, until a step promises less than ``tolerance`` nats."""
+    state = init(target, with_fitting_noise(target, u))
+    trace: list[dict[str, Any]] = []
+    while not state.converged and len(trace) < max_steps:
+        state, info = step(target, state, tolerance)
+        trace.append({"log_density": state.log_density, "damping": state.damping, **info._asdict()})
+    return state, trace
+
+
+def laplace(target: Climbable, state: LevenbergState) -> Laplace:
+    """Normal approximation at a mode."""
+    u = state.position
+    information = target.information(u)
+    values, vectors = np.linalg.eigh(information + positive_part(-target.prior_hessian(u)))
+    values = np.maximum(values, 1e-12 * values[-1])
+    covariance = (vectors / values) @ vectors.T
+    return Laplace(u, covariance, state.log_density, information, -target.prior_gradient(u))
+
+
+def positive_part(matrix: np.ndarray) -> np.ndarray:
+    """The matrix without what makes it smaller in any direction."""
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T
