@@ -13,7 +13,7 @@ from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.score import likeness
 from rfdropo_bayes.audit.screen import Look, Row
 from rfdropo_bayes.audit.sentence import sentence
-from rfdropo_bayes.audit.verdict import NO_DISCREPANCY
+from rfdropo_bayes.audit.verdict import NO_DISCREPANCY, UNEXPLAINED
 
 SCHEMA_VERSION = 1
 MILLIMETRES = 1e3
@@ -76,6 +76,9 @@ def next_experiment(answer: Answer) -> dict[str, Any] | None:
     if answer.verdict == NO_DISCREPANCY:
         return None
     by_name = {c.name: c.mechanism for c in answer.question.candidates}
+    if answer.verdict == UNEXPLAINED and answer.steps:
+        sentence_ = "No candidate explains it. Look where the residual is large for a cause that the library lacks"
+        return {"sentence": f"{sentence_}; docs/mechanisms.md says how to add one.", "separates": []}
     for step in answer.steps:
         if len(step.members) > 1:
             checks = [f"{m.replace('_', ' ')}: {by_name[m].remedy}" for m in step.members if m in by_name]

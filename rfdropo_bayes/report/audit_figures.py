@@ -89,8 +89,8 @@ def blocks_figure(blocks: Sequence[Sequence[float]], seconds: float, titles: Seq
     """When the models fail: mean square of the block means, 1 where a model is right."""
     figure = Figure(figsize=(style.WIDTH, 2.6))
     axes = figure.subplots()
-    for row, title, colour in zip(blocks, titles, style.AXIS_COLOURS * len(titles), strict=False):
-        axes.stairs(row, seconds * np.arange(len(row) + 1), baseline=None, label=title, color=colour, linewidth=1.4)
+    for row, title in zip(blocks, titles, strict=True):
+        axes.stairs(row, seconds * np.arange(len(row) + 1), baseline=None, label=title, linewidth=1.4)
     axes.axhline(1.0, color=style.MEASURED, linewidth=0.8)
     axes.set_yscale("log")
     for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
