@@ -16,6 +16,7 @@ from scipy.signal import lfilter
 MAX_ORDER = 3
 LEAST_SHARE = 0.05  # of the mean deviation that a channel has at least: a marker that never moves is no certainty
 REPEATS, STATED, RESIDUALS = "repeats", "stated", "residuals"
+SLOW = 0.9  # share that the rows before predict, from which on a model's residuals are not taken for noise alone
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,11 @@ class NoiseModel:
     def order(self) -> int:
         """Rows of memory."""
         return len(self.autocorrelation) - 1
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether it was taken from residuals of a model that change more slowly than the noise of a measurement."""
+        return self.source == RESIDUALS and float(self.predictors[1][-1] ** 2) < 1.0 - SLOW
 
     @cached_property
     def predictors(self) -> tuple[Float[np.ndarray, "rows order"], Float[np.ndarray, " rows"]]:

@@ -120,9 +120,8 @@ def audit(
     extended = steps[-1].fit if steps else base
     gain, stages, held_out, predictions, unseen = _measured(question, target, inquiry, base, steps, rng)
     final = _final_p(question, target, extended, inquiry, steps, last)
-    verdict = decide(
-        question.rules, looks[0].omnibus.p, final if steps else None, [len(s.members) for s in steps], gain
-    )
+    sizes = [len(step.members) for step in steps]
+    verdict = decide(question.rules, looks[0].omnibus.p, final if steps else None, sizes, gain, target.noise.doubtful)
     low, high = question.coordinates.bounds
     return Answer(
         verdict,

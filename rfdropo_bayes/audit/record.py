@@ -75,6 +75,9 @@ def next_experiment(answer: Answer) -> dict[str, Any] | None:
     """What to do next: how to split a class, or how to learn more where nothing was named; None if all is well."""
     if answer.verdict == NO_DISCREPANCY:
         return None
+    if answer.target.noise.doubtful:
+        words = "Repeat one command sequence three times, or state the noise in [noise]: then a slow discrepancy shows."
+        return {"sentence": words, "separates": []}
     by_name = {c.name: c.mechanism for c in answer.question.candidates}
     if answer.verdict == UNEXPLAINED and answer.steps:
         sentence_ = "No candidate explains it. Look where the residual is large for a cause that the library lacks"

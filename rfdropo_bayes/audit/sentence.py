@@ -32,6 +32,13 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
             f"No discrepancy: what the base model leaves is noise as far as these data can tell "
             f"(joint test p = {answer.looks[0].omnibus.p:.2g}{_assumption(answer)})."
         )
+    if not findings and answer.looks[0].omnibus.p > answer.question.rules.base_passes:
+        left = 1e3 * noise_distance(answer.target.noise)
+        return (
+            f"What the base model leaves, {left:.2g} mm, changes too slowly to be the noise of a measurement, but "
+            f"without repeats it cannot be told from noise, and no candidate stands out of it "
+            f"(joint test p = {answer.looks[0].omnibus.p:.2g})."
+        )
     if not findings:
         tail = f"what remains has a standard deviation of {1e3 * answer.remainder.amplitude:.2g} mm"
         return f"Something is wrong with the base model, and no candidate of the library says what: {tail}."

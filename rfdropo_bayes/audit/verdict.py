@@ -16,10 +16,17 @@ NO_DISCREPANCY, EXPLAINED, EQUIVALENT, PARTLY, UNEXPLAINED = (
 )
 
 
-def decide(rules: Rules, base_p: float, extended_p: float | None, class_sizes: Sequence[int], gain: Gain | None) -> str:
+def decide(
+    rules: Rules,
+    base_p: float,
+    extended_p: float | None,
+    class_sizes: Sequence[int],
+    gain: Gain | None,
+    doubtful: bool = False,
+) -> str:
     """Apply the rules.
 
-    - no_discrepancy: the base model passes the joint test (p > .01);
+    - no_discrepancy: the base model passes the joint test (p > .01), under a noise that may be one;
     - unexplained: it does not, and no candidate is significant, or all together explain at most 20 %;
     - explained: the extended model passes (p > .05) and the lower bound of the explained fraction exceeds 80 %;
       equivalent where a named class has several members;
@@ -30,8 +37,9 @@ def decide(rules: Rules, base_p: float, extended_p: float | None, class_sizes: S
         base_p, extended_p: p-values of the joint tests; None without an extension.
         class_sizes: members of each named class.
         gain: on unseen trajectories; None where it could not be measured.
+        doubtful: see `NoiseModel.doubtful`.
     """
-    if base_p > rules.base_passes:
+    if base_p > rules.base_passes and not doubtful:
         return NO_DISCREPANCY
     if not class_sizes or extended_p is None:
         return UNEXPLAINED

@@ -13,7 +13,7 @@ from rfdropo_bayes.audit.bootstrap import tail
 from rfdropo_bayes.audit.coordinates import Support
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.gain import Gain, Unseen, _floor_error, _noise_power, explained_fraction
-from rfdropo_bayes.audit.noise import REPEATS, STATED, NoiseModel, estimate_noise, levinson, rows_before
+from rfdropo_bayes.audit.noise import REPEATS, RESIDUALS, STATED, NoiseModel, estimate_noise, levinson, rows_before
 from rfdropo_bayes.audit.omnibus import joint_test, statistics
 from rfdropo_bayes.audit.score import likeness, signature, span, statistic
 from rfdropo_bayes.audit.verdict import decide
@@ -218,3 +218,11 @@ def gain(explained: float, low: float) -> Gain:
 )
 def test_the_verdict_follows_its_rules(base, extended, sizes, measured, verdict):
     assert decide(Rules(), base, extended, sizes, measured) == verdict
+
+
+def test_residuals_that_change_slowly_are_not_called_noise():
+    """An autoregression of one tenth innovations is a discrepancy; where repeats show such a noise, it is noise."""
+    slow, fast = np.array([1.0, 0.97]), np.array([1.0, 0.8])
+    for source, memory, doubtful in ((RESIDUALS, slow, True), (RESIDUALS, fast, False), (REPEATS, slow, False)):
+        assert NoiseModel(np.ones(3), memory, source, 100.0).doubtful is doubtful
+    assert decide(Rules(), 0.2, None, [], None, doubtful=True) == "unexplained"
