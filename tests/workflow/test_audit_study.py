@@ -1,0 +1,73 @@
+"""Counting what audits of hidden effects have said; the audits themselves are tested in tests/hidden_effects."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.workflow.audit_study import LEDGER, TABLE, judge, run_study
+from rfdropo_bayes.workflow.hidden_effects import Hidden
+
+CONTENT = {
+    "verdict": "equivalent",
+    "gain": {"explained_fraction": 0.97},
+    "seconds": 50.0,
+    "findings": [
+        {
+            "mechanism": "payload",
+            "equivalence_class": ["payload", "base_tilt"],
+            "parameters": {"payload_mass": {"q05": 0.2, "q95": 0.3}},
+            "relative": {
+                "payload_mass_over_young_modulus": {
+                    "parameter": "payload_mass",
+                    "power": 1,
+                    "q05": 0.9e-8,
+                    "q95": 1.1e-8,
+                }
+            },
+        }
+    ],
+}
+
+
+def hidden(mass: float) -> Hidden:
+    return Hidden({"payload_mass": mass, "young_modulus": 2e6}, {"discretisation": 0.01}, Path(), np.zeros((6, 1, 1)))
+
+
+def test_a_size_is_judged_in_the_form_that_can_be_known():
+    found = judge(CONTENT, ["payload"], hidden(0.02))
+    assert found["covered"] == {"payload_mass_over_young_modulus": True}  # though 0.02 kg is not in [0.2, 0.3]
+    assert found["named_first"]
+    assert not judge(CONTENT, ["payload"], hidden(0.03))["covered"]["payload_mass_over_young_modulus"]
+    other = judge(CONTENT, ["base_tilt"], hidden(0.02))
+    assert other["named_first"]
+    assert other["covered"] == {}
+    assert not judge(CONTENT, ["backlash"], hidden(0.02))["named_first"]
+
+
+def test_a_study_counts_what_its_ledger_holds_and_lists_confusions(tmp_path):
+    def line(index: int, name: str, ratio: float | None, seed: int = 7) -> str:
+        judged = judge(CONTENT, [name], hidden(0.02))
+        result = {"hidden": [name], "rho": {"discretisation": 0.01 * index}, **judged}
+        job = {"condition": "rho_0.5", "index": index, "seed": seed}
+        return json.dumps({"job": job, "result": {**result, "error_over_oracle": ratio, "seconds": 36.0}})
+
+    rows = [line(0, "payload", 1.0), line(1, "payload", 1.5), line(2, "backlash", 3.0), line(0, "payload", 1.0, seed=8)]
+    (tmp_path / LEDGER).write_text("\n".join(rows) + "\n")
+    found = run_study(tmp_path, 0, 7, conditions=["rho_0.5"], exclude=["end_stop"])
+    row = found["conditions"]["rho_0.5"]
+    assert row["datasets"] == 3
+    assert row["verdicts"] == {"equivalent": 3}
+    assert row["named_first"] == 2
+    assert row["within_1.3_of_the_oracle"] == 0.5
+    assert row["confusions"] == {"backlash -> payload": 1}
+    assert found["hours"] == pytest.approx(0.03)
+    table = (tmp_path / TABLE).read_text()
+    assert "| rho_0.5 | 3 | equivalent 3 | 2 | 2 | 2.0 | 100 % | 50 % | 0.020 |" in table
+    assert "backlash -> payload (1)" in table
+    with pytest.raises(InputError, match="unknown condition"):
+        run_study(tmp_path, 0, 7, conditions=["rho_9"])
