@@ -163,16 +163,18 @@ def lead(target: Target, fit: Fit, probe: Probe, lm: float) -> tuple[float, Floa
     """What a candidate may take from the sum of squares, and the point from which a refit should start.
 
     The score statistic is the drop that an amplitude brings. A shape alone has none: its effect has the size it has,
-    and may be too large where it was tried. The way there from its null value is searched.
+    and may be too large where it was tried. The way there from its null value is searched, with places and times held
+    where there is also a size.
     """
     if probe.amplitudes:
         return lm, probe.start(fit)
-    base = span(fit.jacobian)
+    base, coordinates = span(fit.jacobian), target.forward.coordinates
     points = np.repeat(fit.x[None], len(WAY), axis=0)
-    null = target.forward.coordinates.null
+    sizes = [i for i in probe.point if coordinates.affine[i] and not coordinates.space.parameters[i].spec.grid]
     for index, value in probe.point.items():
-        points[:, index] = null[index] + WAY * (value - null[index])
-    points = np.clip(points, *target.forward.coordinates.bounds)
+        null = coordinates.null[index]
+        points[:, index] = null + WAY * (value - null) if index in sizes or not sizes else value
+    points = np.clip(points, *coordinates.bounds)
     found = target.recall("way", [points], lambda: {"residual": target.residual(points)})["residual"]
     left = np.sum(project_out(base, found.T) ** 2, axis=0)
     best = int(np.argmin(left))

@@ -52,7 +52,7 @@ class Measurements:
         """Residuals (..., group, time, channel) of the means as independent unit normals, flattened."""
         valid = np.broadcast_to(self.valid, residual.shape)
         white = noise.whiten(residual, valid) * np.sqrt(self.count)
-        return white.reshape(*residual.shape[:-3], -1)
+        return white.reshape(*residual.shape[:-3], int(np.prod(residual.shape[-3:])))
 
     def mean_of(self, single: Float[np.ndarray, "recording time channel"]) -> Float[np.ndarray, "group time channel"]:
         """Mean over the repeats of series like the recordings."""

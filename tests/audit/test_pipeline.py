@@ -57,6 +57,13 @@ def test_a_shape_that_means_nothing_at_null_is_found_on_its_grid():
     assert abs(time["mean"] - 0.6) < 4 * time["sd"]
 
 
+def test_a_small_effect_at_a_place_is_found_though_larger_ones_were_tried():
+    content = found({"wall": 0.15, "wall_place": 0.4}, 6)
+    assert content["findings"][0]["mechanism"] == "wall"
+    place = content["findings"][0]["parameters"]["wall_place"]
+    assert abs(place["mean"] - 0.4) < 4 * place["sd"]
+
+
 def test_two_effects_are_both_named():
     content = found({"play": 1.0, "creep": 0.6, "creep_time": 0.6}, 4)
     assert {f["mechanism"] for f in content["findings"]} == {"play", "creep"}

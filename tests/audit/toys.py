@@ -22,7 +22,7 @@ from rfdropo_bayes.simulators.protocol import Observation
 STEP = 0.05
 ROWS = 80
 NOISE, MEMORY = 5e-4, 0.6
-WEIGHTS = np.random.default_rng(7).normal(size=(6, 4, 3)) * 1e-2
+WEIGHTS = np.random.default_rng(7).normal(size=(7, 4, 3)) * 1e-2
 WIDE = {"distribution": "Normal", "loc": 0.0, "scale": 1.0}
 
 
@@ -40,6 +40,11 @@ CANDIDATES = {
         spec("creep_time", 0.01, {"distribution": "LogNormal", "median": 1.0, "sigma": 1.0}, 1.0, (0.3, 1.0, 3.0)),
     ),
     "imitable": (spec("imitable"),),
+    # Nothing reaches the place at null: size and place are tried on a grid, and only the size can be small.
+    "wall": (
+        spec("wall", 0.0, {"distribution": "HalfNormal", "scale": 1.0}),
+        spec("wall_place", nominal=5.0, grid=(0.2, 0.5, 0.8)),
+    ),
 }
 
 
@@ -69,8 +74,11 @@ class Toy:
             (values["delay"], rate[:, 1]),
             (values["lag"], rate[:, 1]),
             (values["creep"], slow[:, 0]),
+            (values["wall"], jnp.maximum(level[:, 0] - values["wall_place"], 0.0)),
         )
-        position = sum(v * s[:, None, None] * w for (v, s), w in zip(shapes, WEIGHTS[[0, 1, 2, 3, 3, 5]], strict=True))
+        position = sum(
+            v * s[:, None, None] * w for (v, s), w in zip(shapes, WEIGHTS[[0, 1, 2, 3, 3, 5, 6]], strict=True)
+        )
         return Observation(position, jnp.zeros((len(level), 2)), None, jnp.asarray(0))
 
 
