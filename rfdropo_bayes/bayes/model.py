@@ -194,9 +194,15 @@ class TrajectoryModel:
     def _physical(self) -> frozenset[str]:
         return frozenset(spec.name for spec in self.simulator.parameters)
 
+    @cached_property
+    def _absent(self) -> dict[str, float]:
+        """Nominal values of parameters that belong to some recordings only: the others have these."""
+        own = {parameter.spec.name for parameter in self.space.parameters if parameter.recording}
+        return {spec.name: spec.nominal for spec in self.simulator.parameters if spec.name in own}
+
     def rollout_values(self, values: Values, recording: str) -> dict[str, Array]:
         """What the simulator is given for one recording: fixed and inferred physical parameters."""
-        chosen = {**self.fixed, **self.space.for_recording(values, recording)}
+        chosen = {**self._absent, **self.fixed, **self.space.for_recording(values, recording)}
         return {name: jnp.asarray(value) for name, value in chosen.items() if name in self._physical}
 
     def simulate(self, values: Values, steps: Int[Array, ""] | None = None) -> Observation:

@@ -21,7 +21,15 @@ from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
 from rfdropo_bayes.workflow.experiment import Experiment, describe, load_experiment
 from rfdropo_bayes.workflow.files import output_folder
-from rfdropo_bayes.workflow.prediction import MARKER_ERRORS, Batch, marker_errors, predict_fitted, predict_new, thin
+from rfdropo_bayes.workflow.prediction import (
+    FITTED,
+    MARKER_ERRORS,
+    Batch,
+    marker_errors,
+    predict_fitted,
+    predict_new,
+    thin,
+)
 
 PREDICTIVE_DRAWS = 200
 PRIOR_DRAWS = 2000
@@ -97,9 +105,11 @@ def record_posterior(
     values = thin(result.draws, PREDICTIVE_DRAWS)
     before = {name: column[:PRIOR_PREDICTIVE_DRAWS] for name, column in prior.items()}
     predictions: list[RecordingPrediction] = predict_fitted(problem, values, fit_key, prior=before)
-    errors = marker_errors(predictions)
+    errors, fitted = marker_errors(predictions), list(problem.model.recordings.names)
     if tested:
-        predictions += predict_new(problem.model, tested, values, test_key, chunk=problem.chunk, errors=errors)
+        predictions += predict_new(
+            problem.model, tested, values, test_key, chunk=problem.chunk, fitted=fitted, errors=errors
+        )
     record = PosteriorRecord(
         tuple(
             ParameterInfo(p.name, p.spec.unit, p.spec.low, p.spec.high, dict(p.table or {}), p.spec.description)
@@ -111,7 +121,7 @@ def record_posterior(
         trace=result.trace,
         block_scores=result.block_scores,
         log_likelihood=result.log_likelihood,
-        attrs={**attributes, MARKER_ERRORS: errors},
+        attrs={**attributes, FITTED: fitted, MARKER_ERRORS: errors},
     )
     return record.with_derived(scale_free_ratios(problem.names))
 

@@ -17,7 +17,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import RecordingPrediction
 
 OFFSETS = ("offset_x", "offset_y", "offset_z")
-MARKER_ERRORS = "marker_errors_m"  # among the attributes of a posterior
+FITTED, MARKER_ERRORS = "fitted_recordings", "marker_errors_m"  # among the attributes of a posterior
 SMALLEST_ERROR = 1e-6  # [m]
 
 Batch = dict[str, Float[np.ndarray, " n"]]
@@ -55,6 +55,7 @@ def predict_new(
     key: PRNGKeyArray,
     *,
     chunk: int,
+    fitted: Sequence[str],
     errors: Mapping[str, float] | None = None,
 ) -> list[RecordingPrediction]:
     """Predictions of recordings that no fit has seen, from their commands and at most their first row.
@@ -64,13 +65,16 @@ def predict_new(
     first row: each draw is shifted so that the weighted mean over the markers agrees there, and a marker weighs as
     little as the model is wrong about it. A further piece of a fitted recording keeps the parameters of that recording.
 
+    A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone.
+
     Args:
+        fitted: names of the recordings that were fitted.
         errors: `marker_errors` of the fit; all markers weigh the same without.
     """
-    space, extended = _for_new_recordings(model.space, values, [t.name for t in trajectories], key)
+    space, extended = _for_new_recordings(model.space, values, [t.name for t in trajectories], fitted, key)
     fresh = replace(model, space=space, recordings=gather_recordings(model.simulator, trajectories))
     problem = CalibrationProblem(fresh, chunk=chunk)
-    own = {_whole(p.recording) for p in model.space.parameters if p.recording}
+    own = {_whole(name) for name in fitted}
     shifted = [t.name for t in trajectories if _whole(t.name) not in own]
     if any(p.recording in shifted and p.spec.name in OFFSETS for p in space.parameters):
         extended = _offsets_from_first_row(problem, extended, shifted, errors or {})
@@ -83,9 +87,10 @@ def _whole(name: str) -> str:
 
 
 def _for_new_recordings(
-    space: ParameterSpace, values: Batch, names: Sequence[str], key: PRNGKeyArray
+    space: ParameterSpace, values: Batch, names: Sequence[str], fitted: Sequence[str], key: PRNGKeyArray
 ) -> tuple[ParameterSpace, Batch]:
     """The space with its per-recording parameters renamed to the new recordings, and values for them."""
+    own = {_whole(recording) for recording in fitted}
     shared = [p for p in space.parameters if not p.recording]
     families: dict[str, list[Parameter]] = {}
     for parameter in space.parameters:
@@ -98,7 +103,11 @@ def _for_new_recordings(
         # One fitted recording is chosen per draw for all families at once: its values belong together.
         chosen = np.asarray(jax.random.randint(jax.random.fold_in(key, index), (count,), 0, 2**31 - 1))
         for name, family in families.items():
-            members = [p for p in family if _whole(p.recording) == _whole(recording)] or family
+            members = [p for p in family if _whole(p.recording) == _whole(recording)]
+            if not members and len(family) == len(fitted) and _whole(recording) not in own:
+                members = family
+            if not members:
+                continue
             pool = np.stack([values[member.name] for member in members])
             extended[f"{name}{SEPARATOR}{recording}"] = pool[chosen % len(members), np.arange(count)]
             parameters.append(replace(members[0], recording=recording))

@@ -24,7 +24,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values
 from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.files import output_folder
-from rfdropo_bayes.workflow.prediction import MARKER_ERRORS, predict_new, thin
+from rfdropo_bayes.workflow.prediction import FITTED, MARKER_ERRORS, predict_new, thin
 
 DRAWS = 200
 LEVELS = {"q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
@@ -72,8 +72,9 @@ def run_prediction(
     model = TrajectoryModel(simulator, space, fixed, experiment.model.noise, gather_recordings(simulator, [unseen]))
     values = thin({info.name: record.posterior[info.name] for info in record.free}, DRAWS)
     key = jax.random.key(experiment.seed if seed is None else seed)
-    errors = record.attrs.get(MARKER_ERRORS)
-    predicted = predict_new(model, [unseen], values, key, chunk=simulator.lanes, errors=errors)[0]
+    belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
+    fitted, errors = record.attrs.get(FITTED, belonging), record.attrs.get(MARKER_ERRORS)
+    predicted = predict_new(model, [unseen], values, key, chunk=simulator.lanes, fitted=fitted, errors=errors)[0]
     out = output_folder(out)
     table = summarise(predicted)
     table.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": simulator.robot.name, "recording": unseen.name}

@@ -142,3 +142,19 @@ def test_what_cannot_be_used_is_refused():
     other.cable_names = ("push",)
     with pytest.raises(InputError, match="no cables of the robot"):
         gather_tension(other, [recording()], 15)
+
+
+def test_a_parameter_of_the_second_recording_alone_acts_there_and_is_nominal_in_the_first():
+    """The order of the recordings does not matter: whichever lacks the parameter has its nominal value."""
+    simulator, first = HangingMass(), recording()
+    second = Trajectory(first.dataset.assign_attrs(name="s"))
+    for order in ([first, second], [second, first]):
+        recordings = gather_recordings(simulator, order)
+        specs = simulator.parameters + noise_specs("white")
+        priors = {"stiffness": {}, "mass": {}, "observation_noise": {}}
+        space = build_space(specs, priors, {"mass": ["s"]}, list(recordings.names))
+        model = TrajectoryModel(simulator, space, {}, "white", recordings)
+        values = {"stiffness": jnp.asarray(200.0), "mass@s": jnp.asarray(0.4), "observation_noise": jnp.asarray(1e-4)}
+        position = np.asarray(model.simulate(values).position)
+        sag = dict(zip(recordings.names, np.abs(position[:, 0, 0]).max(axis=-1), strict=True))
+        assert sag["s"] - sag["r"] == pytest.approx(9.81 * (0.4 - 0.1) / 200.0)

@@ -6,15 +6,18 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import jax
 import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
 
+from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
-from rfdropo_bayes.workflow.prediction import MARKER_ERRORS
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.workflow.prediction import MARKER_ERRORS, _for_new_recordings
 from rfdropo_bayes.workflow.unseen import run_prediction
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
@@ -97,6 +100,30 @@ def test_a_piece_of_a_fitted_recording_keeps_its_frame(posterior, tmp_path):
     here = predict(tmp_path / "same", COMMANDS, tmp_path / "a", rows=(20, 30))
     there = predict(tmp_path / "same", str(tmp_path / "moved.nc"), tmp_path / "b", rows=(20, 30))
     np.testing.assert_array_equal(here["mean"].values, there["mean"].values)
+
+
+def test_what_one_recording_alone_had_free_is_not_carried_to_a_new_one():
+    """Offsets of every fitted recording are drawn from for a new one; a payload of one of two is not, nor for itself
+    lost."""
+    names = ("offset_x@a", "offset_x@b[0:9]", "payload@b[0:9]")
+    specs = {
+        "offset_x": ParameterSpec(
+            "offset_x", "m", -1.0, 1.0, 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 1.0}, ""
+        )
+    }
+    specs["payload"] = ParameterSpec("payload", "kg", 0.0, 1.0, 0.0, {"distribution": "HalfNormal", "scale": 1.0}, "")
+    space = build_space(
+        tuple(specs.values()),
+        {"offset_x": {}, "payload": {}},
+        {"offset_x": ["a", "b[0:9]"], "payload": ["b[0:9]"]},
+        ["a", "b[0:9]"],
+    )
+    values = {name: np.full(3, 0.1 * k) for k, name in enumerate(names)}
+    found, drawn = _for_new_recordings(space, values, ["new", "b[20:30]", "a[3:4]"], ["a", "b[0:9]"], jax.random.key(0))
+    assert set(drawn) == {"offset_x@new", "offset_x@b[20:30]", "payload@b[20:30]", "offset_x@a[3:4]"}
+    assert set(found.names) == set(drawn)
+    np.testing.assert_array_equal(drawn["offset_x@b[20:30]"], 0.1)
+    assert set(drawn["offset_x@new"]) <= {0.0, 0.1}
 
 
 def test_bands_are_those_of_what_would_be_measured(posterior, tmp_path):
