@@ -221,12 +221,14 @@ def _wiener(pattern: Float[np.ndarray, "group time component"], rows: int) -> Fl
     place = np.arange(len(power)) / len(power)
     edges = np.concatenate([[0.0], np.geomspace(1.5 / len(power), 1.0, BANDS)])
     band = np.clip(np.searchsorted(edges, place, side="right") - 1, 0, BANDS - 1)
-    excess = np.zeros_like(power)
+    mean, error = np.ones_like(power), np.ones_like(power)
     for index in range(BANDS):
         own = band == index
         if own.any():
-            mean, error = power[own].mean(axis=0), np.sqrt(2.0 / (len(pattern) * own.sum()))
-            excess[own] = np.where(mean > 1.0 + SURE * error, mean - 1.0, 0.0)
+            mean[own], error[own] = power[own].mean(axis=0), np.sqrt(2.0 / (len(pattern) * own.sum()))
+    surprise = (mean - 1.0) / error
+    # Where nothing is sure, the surest is all there is to go by.
+    excess = np.where(surprise >= min(SURE, surprise.max()), np.maximum(mean - 1.0, 0.0), 0.0)
     share = excess / (excess + 1.0) if excess.any() else np.ones_like(excess)
     at = np.minimum((np.arange(rows) / rows * len(power)).astype(int), len(power) - 1)
     return share[at]
