@@ -3,7 +3,10 @@
 The nine incompatible modes of Wilson, with the gradients of Taylor, Beresford and Wilson (1976), "A non-conforming
 element for stress analysis", Int. J. Numer. Meth. Engng 10:1211-1219: taken at the centre and scaled by the Jacobian,
 so that distorted elements pass the patch test; the enhanced-strain element of Simo and Rifai (1990) with the same modes
-coincides with it. The modes are condensed in the reference configuration.
+coincides with it. Three enhanced stretches follow, one for every pair of axes and linear in both: without them an
+element that is bent more at one end than at the other resists any change of the strain across, and locks as Poisson's
+ratio nears 1/2 (Andelfinger and Ramm 1993, Int. J. Numer. Meth. Engng 36:1311-1337). All twelve are condensed in the
+reference configuration.
 
 Local nodes are numbered ``iz * 4 + iy * 2 + ix`` (x runs fastest); the degrees of freedom ``node * 3 + axis``.
 """
@@ -20,6 +23,9 @@ GAUSS_POINTS = CORNERS / np.sqrt(3.0)
 """Points of the 2 x 2 x 2 rule, (8, 3); every weight is one."""
 # Voigt order xx, yy, zz, xy, yz, zx: the displacement component and the derivative that enter each engineering strain.
 _STRAIN_TERMS = ((0, 0, 0), (1, 1, 1), (2, 2, 2), (3, 0, 1), (3, 1, 0), (4, 1, 2), (4, 2, 1), (5, 2, 0), (5, 0, 2))
+# Pairs of axes, and with the second of each that along which the enhanced stretch acts. In a section that follows no
+# stretch along z it thus changes nothing.
+_PAIRS = np.array([[0, 1], [0, 2], [1, 2]])
 
 
 def shape_functions(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 8"]:
@@ -78,6 +84,13 @@ def _strain_operator(gradient: Float[Array, "point function 3"]) -> Float[Array,
     return operator.reshape(points, 6, functions * 3)
 
 
+def _stretches(inverse: Float[Array, "3 3"]) -> Float[Array, "3 6"]:
+    """Engineering strain of the stretch of every pair along the gradient of its second natural coordinate."""
+    normal = inverse[:, _PAIRS[:, 1]].T
+    normal = normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
+    return jnp.concatenate([normal**2, 2.0 * normal * jnp.roll(normal, -1, axis=1)], axis=1)
+
+
 def stiffness(
     coordinates: Float[Array, "8 3"], young_modulus: Float[Array, ""], poisson_ratio: Float[Array, ""]
 ) -> Float[Array, "24 24"]:
@@ -86,7 +99,7 @@ def stiffness(
 
 
 def elastic_stiffness(coordinates: Float[Array, "8 3"], moduli: Float[Array, "6 6"]) -> Float[Array, "24 24"]:
-    """Stiffness [N/m] of one element, its nine incompatible modes condensed; any non-degenerate coordinates [m]."""
+    """Stiffness [N/m] of one element, its twelve modes condensed; any non-degenerate coordinates [m]."""
     local = shape_gradients(GAUSS_POINTS)
     jacobian = jnp.einsum("gna,nb->gab", local, coordinates)
     volume = determinant(jacobian)
@@ -98,7 +111,9 @@ def elastic_stiffness(coordinates: Float[Array, "8 3"], moduli: Float[Array, "6 
     # d(1 - xi_i^2)/d(xi_j) = -2 xi_i delta_ij. With the factor j0 / j the strain of every mode integrates to zero.
     modes = -2.0 * GAUSS_POINTS[:, :, None] * np.eye(3)
     scaled = jnp.einsum("ab,gnb->gna", centre_inverse, modes) * (centre_volume / volume)[:, None, None]
-    incompatible = _strain_operator(scaled)
+    stretched = jnp.einsum("gp,pk->gkp", GAUSS_POINTS[:, _PAIRS].prod(axis=2), _stretches(centre_inverse))
+    stretched = stretched * (centre_volume / volume)[:, None, None]
+    incompatible = jnp.concatenate([_strain_operator(scaled), stretched], axis=2)
     stress = moduli * volume[:, None, None]
     regular = jnp.einsum("gik,gij,gjl->kl", compatible, stress, compatible)
     coupling = jnp.einsum("gik,gij,gjl->kl", incompatible, stress, compatible)

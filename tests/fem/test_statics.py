@@ -139,12 +139,14 @@ def test_beam_twists_by_torque_times_length_over_torsional_stiffness(beam):
     assert twist == pytest.approx(1e-6 * LENGTH / (SOFT / 2.9 * 0.140577 * SIDE**4), rel=tolerance)
 
 
-def test_nearly_incompressible_beam_hardly_locks(beam):
-    """At a Poisson ratio of 0.499 the beam sags little less than at 0.45; beyond that limit nothing changes."""
+def test_nearly_incompressible_beam_does_not_lock(beam):
+    """At a Poisson ratio of 0.499 the beam sags little less than at 0.45, as quadratic bricks do (30 x 3 x 3 of them:
+    0.979 times as much); beyond that limit nothing changes."""
     _, _, load = beam
     usual, near, limit, beyond = (-1e3 * load(ratio, 1.0)[0][1] for ratio in (0.45, 0.49, 0.499, 0.5))
     assert limit == beyond
-    assert 86.0 < limit < near < usual
+    assert limit < near < usual
+    assert limit == pytest.approx(0.979 * 94.4, rel=0.03)
 
 
 def dense_beam(layers: int) -> tuple[np.ndarray, np.ndarray]:

@@ -2,9 +2,9 @@
 
 The virtual hexahedra of a layer are boxes. Reflections split the 24 degrees of freedom of a box into eight families of
 three: family p (one bit for each axis) moves component i by the monomial that is odd where p is, with bit i flipped.
-Strains of different families are orthogonal, and the incompatible modes live in the three families of one odd axis
-only. There they take up all of the shear, and leave 2 lambda mu / (lambda + 2 mu) of lambda. So the stiffness is linear
-in three moduli, and no element has to be integrated.
+Strains of different families are orthogonal. The incompatible modes live in the three families of one odd axis, where
+they take up all of the shear, and the enhanced stretches in those of two; in both they leave 2 lambda mu / (lambda +
+2 mu) of lambda. So the stiffness is linear in three moduli, and no element has to be integrated.
 
 With ``fem.hexahedron.sectional_elasticity`` these are E, mu and E nu / (1 - nu^2): along z there is E and nothing else,
 across there are mu and 2 lambda mu / (lambda + 2 mu), which is the third; and where one of two lateral strains is
@@ -43,14 +43,14 @@ def _family(odd: np.ndarray, half: Float[np.ndarray, "boxes 3"], sectional: bool
     volume = 8.0 * np.prod(half, axis=1)[:, None, None]
     stretch = (1 - odd) / half
     energy = np.zeros((3, len(half), 3, 3))
-    condensed = 2 if odd.sum() == 1 else 0
+    condensed = 2 if odd.sum() in (1, 2) else 0
     share = volume / 3.0 ** odd.sum()
     if sectional:
         energy = _sectional_stretch(odd, stretch, share)
     else:
         energy[condensed] = share * stretch[:, :, None] * stretch[:, None, :]
         energy[1] = share * 2.0 * stretch[:, :, None] ** 2 * np.eye(3)
-    if not condensed:
+    if odd.sum() != 1:
         for i, j in itertools.combinations(range(3), 2):
             shear = odd[j] * _AXES[i] / half[:, j : j + 1] + odd[i] * _AXES[j] / half[:, i : i + 1]
             degree = np.sum(odd ^ _AXES[i] ^ _AXES[j])
@@ -60,7 +60,7 @@ def _family(odd: np.ndarray, half: Float[np.ndarray, "boxes 3"], sectional: bool
 
 def box_moduli(half: Float[np.ndarray, "boxes 3"], sectional: bool = False) -> Float[np.ndarray, "3 boxes 8 3 8 3"]:
     """Stiffness [m] of boxes of half widths ``half`` [m] per lambda, mu and 2 lambda mu / (lambda + 2 mu), or of
-    sectional ones per E, mu and E nu / (1 - nu^2); nine incompatible modes condensed; nodes as in
+    sectional ones per E, mu and E nu / (1 - nu^2); twelve modes condensed; nodes as in
     ``fem.hexahedron``."""
     stiffness = np.zeros((3, len(half), 8, 3, 8, 3))
     for family in itertools.product((0, 1), repeat=3):
