@@ -9,6 +9,9 @@ the repeats is. The JAX engine uses as many processors as XLA likes; the Numba e
 With `--peers`, MuJoCo's flex and PyElastica follow on the same bar, one rollout of a second at a time, where they are
 installed.
 
+`--push` times instead the trunk with plate and cube, and without them at the same commands, which bring it onto the
+cube; with `--mesh FILE` also SOFA's mesh, with and without. The rate is that of processor time: of one core.
+
 The last column is how far the tip of the bar, held at one end, sags under its own weight, against the heavy elastica.
 """
 
@@ -39,11 +42,25 @@ from rfdropo_bayes.workflow.experiment import Experiment, SimulatorTable
 SOLVES = 100
 TIME_STEP = 0.01  # [s]
 TRUNK = "trunk_sofa"
+CUBE = " + cube"
+MESH = "mesh"
 LENGTH, HALF_WIDTH, LAYERS, CABLES = 0.195, 0.01, 20, 8
 SAG = 0.0948  # [m] of the tip, heavy elastica of the bar's length, section, modulus and density
 
 Values = dict[str, jax.Array]
 Run = Callable[[Values], jax.Array]  # number of rollouts that failed
+
+
+SOFA: dict[str, Any] = {
+    "unit": "mm",
+    "clamp_height": 0.02,
+    "frames": "edges",
+    "masses": "equal",
+    "drives": "sofa",
+    "drive_rate": 0.001,
+    "marker_cables": ("long_0", "long_1", "long_2", "long_3"),
+}
+"""How SOFA simulates its mesh, as experiments/sofa_push.toml says."""
 
 
 class Case(NamedTuple):
@@ -54,12 +71,16 @@ class Case(NamedTuple):
     precision: str
     threads: int | None
     batch: int
+    mesh: str | None = None
+    pushing: bool = False
 
     @property
     def table(self) -> SimulatorTable:
         """What an experiment says of the engine."""
         threads = {"threads": self.threads} if self.engine == "numba" else {}
-        return SimulatorTable(engine=self.engine, precision=self.precision, **threads)
+        body = {"body": "tetrahedra", "tetrahedra": SOFA | {"mesh": self.mesh}} if self.mesh else {}
+        push = self.body.endswith(CUBE)
+        return SimulatorTable(engine=self.engine, precision=self.precision, push=push, **threads, **body)
 
 
 def cases(batch: int) -> Iterator[Case]:
@@ -69,6 +90,15 @@ def cases(batch: int) -> Iterator[Case]:
         for precision in ("float64", "float32"):
             for threads in sorted({1, os.cpu_count() or 1}):
                 yield Case(body, "numba", precision, threads, batch)
+
+
+def pushing_cases(batch: int, mesh: str | None) -> Iterator[Case]:
+    """The trunk without and with cube, in layers and, where there is one, as a mesh; on one thread."""
+    for file in (None, mesh) if mesh else (None,):
+        for precision in ("float64", "float32"):
+            for cube in ("", CUBE):
+                name = (MESH if file else TRUNK) + cube
+                yield Case(name, "numba", precision, 1, batch // 8 if file else batch, file, True)
 
 
 def drawn(nominal: dict[str, float], batch: int) -> Values:
@@ -134,11 +164,15 @@ def sag_error(case: Case) -> float:
 
 def trunk_rollouts(case: Case) -> tuple[Run, Values]:
     """Rollouts of the trunk at the simulator."""
-    trunk = build_simulator(Experiment(robot=TRUNK, simulator=case.table), load_robot(TRUNK))
+    robot = "trunk_sofa_mesh" if case.mesh else TRUNK
+    trunk = build_simulator(Experiment(robot=robot, simulator=case.table), load_robot(robot))
     step = trunk.description["time_step_s"]
     channels, clock = len(trunk.channel_names), np.arange(0, SOLVES, 10) * step
     ends = np.array([0.0, SOLVES * step])
-    commands = trunk.commands(clock, pulls(channels, len(clock)), np.zeros(channels), ends)
+    value = pulls(channels, len(clock))
+    if case.pushing:
+        value[:, 2] += 0.05 * np.arange(1, len(clock) + 1) / len(clock)  # the cable on the cube's side
+    commands = trunk.commands(clock, value, np.zeros(channels), ends)
     nominal = {spec.name: float(spec.nominal) for spec in trunk.parameters}
 
     def failed(values: Values) -> jax.Array:
@@ -153,14 +187,15 @@ def trunk_rollouts(case: Case) -> tuple[Run, Values]:
 def measure(case: Case, seconds: float) -> dict[str, Any]:
     """Best rate of a case over repeats that fill ``seconds``, with its first call and its failures."""
     run, values = bar_rollouts(case) if case.body == "bar" else trunk_rollouts(case)
-    started = time.perf_counter()
+    clock = time.process_time if case.pushing else time.perf_counter
+    started = clock()
     failed = int(jax.block_until_ready(run(values)))
-    first_call = time.perf_counter() - started
+    first_call = clock() - started
     best, spent = float("inf"), 0.0
     while spent < seconds:
-        started = time.perf_counter()
+        started = clock()
         jax.block_until_ready(run(values))
-        elapsed = time.perf_counter() - started
+        elapsed = clock() - started
         best, spent = min(best, elapsed), spent + elapsed
     row = case._asdict() | {"rollouts_per_second": case.batch / best, "first_call_s": first_call, "failed": failed}
     return row | ({"sag_error": sag_error(case)} if case.body == "bar" else {})
@@ -172,18 +207,21 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file to write the table to")
     parser.add_argument("--seconds", type=float, default=5.0, help="time spent on each row")
     parser.add_argument("--batch", type=int, default=512, help="rollouts in a batch")
+    parser.add_argument("--push", action="store_true", help="the trunk with plate and cube, and nothing else")
+    parser.add_argument("--mesh", help="a mesh of the trunk, for --push")
     parser.add_argument("--peers", action="store_true", help="other simulators too, where they are installed")
     options = parser.parse_args()
     print(f"{SOLVES} solves a rollout, {os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}")
-    print(f"{'body':12}{'engine':8}{'precision':11}{'threads':>8}", end="")
+    print(f"{'body':18}{'engine':8}{'precision':11}{'threads':>8}", end="")
     print(f"{'rollouts/s':>12}{'first call':>12}{'failed':>8}{'sag':>9}")
     rows = []
-    for case in cases(options.batch):
+    chosen = pushing_cases(options.batch, options.mesh) if options.push else cases(options.batch)
+    for case in chosen:
         row = measure(case, options.seconds)
         rows.append(row)
         sag = f"{100 * row['sag_error']:+8.2f}%" if "sag_error" in row else ""
         print(
-            f"{case.body:12}{case.engine:8}{case.precision:11}{case.threads or 'all':>8}"
+            f"{case.body:18}{case.engine:8}{case.precision:11}{case.threads or 'all':>8}"
             f"{row['rollouts_per_second']:12.1f}{row['first_call_s']:10.1f} s{row['failed']:8d}{sag:>9}",
             flush=True,
         )

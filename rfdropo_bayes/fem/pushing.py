@@ -117,12 +117,12 @@ def push_scene(
 
 
 def _nearest(scene: PushScene, gap: Float[Array, " points"], count: int) -> Int[Array, " contacts"]:
-    """The nearest point of each of the nearest bands."""
+    """The nearest point of each of the nearest bands, in ascending order, which rounding does not change."""
     banded = gap[scene.band]
     chosen = jnp.argmin(banded, axis=1)
     best = jnp.take_along_axis(banded, chosen[:, None], axis=1)[:, 0]
     band = lax.top_k(-lax.stop_gradient(best), count)[1]
-    return jnp.asarray(scene.band)[band, chosen[band]]
+    return jnp.sort(jnp.asarray(scene.band)[band, chosen[band]])
 
 
 def find_contacts(scene: PushScene, cube: Cube, state: CubeState, position: Float[Array, "nodes 3"]) -> Touch:
@@ -130,7 +130,7 @@ def find_contacts(scene: PushScene, cube: Cube, state: CubeState, position: Floa
     turn, up = rotation_matrix(state.orientation), jnp.asarray(scene.plate_normal)
     corner = cube.side * CORNERS @ turn.T
     clearance = corner @ up + state.position @ up - scene.plate_height
-    lowest = lax.top_k(-lax.stop_gradient(clearance), RESTING)[1]
+    lowest = jnp.sort(lax.top_k(-lax.stop_gradient(clearance), RESTING)[1])
     points = point_positions(scene.surface, position)
     distance, normal = distance_to_box(points, state.position, turn, cube.side)
     height = points @ up - scene.plate_height

@@ -37,6 +37,8 @@ EFFECT_SIZES = BodyEffects(
     drag=100.0,
     wall=Wall(1e3, 0.01, 0.1),
     cable_compliance=1e-4,
+    coulomb_friction=0.05,
+    capstan_friction=0.1,
 )
 """Sizes of effects, whose null values are zero; units as in ``BodyEffects``."""
 

@@ -99,6 +99,16 @@ def input_sizes(inputs: Inputs) -> Inputs:
     return magnitudes, jnp.full_like(displacement, LENGTH)
 
 
+def with_start(
+    assembly: MeshAssembly, position: Float[np.ndarray, "batch rows marker 3"], tension: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Recorded markers and tensions with the body at rest before them."""
+    markers, count = assembly.markers, len(position)
+    first = np.einsum("pk,pki->pi", markers.weight, assembly.system.body.rest[markers.node])
+    start = np.broadcast_to(first, (count, 1, *first.shape)), np.zeros((count, 1, tension.shape[-1]))
+    return np.concatenate([start[0], position], axis=1), np.concatenate([start[1], tension], axis=1)
+
+
 @dataclass(frozen=True)
 class CompiledMeshEngine:
     """The Numba engine: SIMD lanes and threads over the batch; the same numbers as the reference engine.
@@ -163,10 +173,7 @@ class CompiledMeshEngine:
             flattened(np.asarray(displacement), len(batch), count)[:, : int(np.max(limit))],
             time_step=self.time_step,
         )
-        markers, rest = self.assembly.markers, self.assembly.system.body.rest
-        first = np.einsum("pk,pki->pi", markers.weight, rest[markers.node])
-        position = np.concatenate([np.broadcast_to(first, (count, 1, *first.shape)), found.position], axis=1)
-        tension = np.concatenate([np.zeros((count, 1, displacement.shape[-1])), found.tension], axis=1)
+        position, tension = with_start(self.assembly, found.position, found.tension)
         return MeshMotion(
             padded(position, rows).reshape(*batch, rows, -1, 3),
             padded(tension, rows).reshape(*batch, rows, displacement.shape[-1]),

@@ -1,4 +1,4 @@
-"""Engines for a trunk that pushes a cube, in JAX: double precision, on whatever device JAX finds."""
+"""Engines for a trunk that pushes a cube, in JAX: double precision, differentiable, on whatever device JAX finds."""
 
 from __future__ import annotations
 
@@ -45,6 +45,20 @@ def _motion(
     )
 
 
+def mesh_scene(trunk: MeshTrunkSimulator) -> PushScene:
+    """Cube, plate and the surface of a trunk's mesh."""
+    body = trunk.assembly.system.body
+    return scene_of(trunk.robot, tetrahedral_pushing.surface_points(body), body.rest)
+
+
+def layered_scene(trunk: TrunkSimulator) -> PushScene:
+    """Cube, plate and the outline of a layered trunk, without its notches."""
+    body = trunk.assembly.system.body
+    rings = bands_along(float(body.station[-1] - body.station[0])) + 1
+    outline = layered_pushing.outline_points(body, body.half_width, rings)
+    return scene_of(trunk.robot, outline, rest_positions(body))
+
+
 @dataclass(frozen=True)
 class MeshPushEngine:
     """A body of tetrahedra and a cube.
@@ -64,8 +78,7 @@ class MeshPushEngine:
     @cached_property
     def scene(self) -> PushScene:
         """Cube, plate and the trunk's surface."""
-        body = self.trunk.assembly.system.body
-        return scene_of(self.trunk.robot, tetrahedral_pushing.surface_points(body), body.rest)
+        return mesh_scene(self.trunk)
 
     def describe(self) -> dict[str, object]:
         """Name and precision."""
@@ -102,10 +115,7 @@ class LayeredPushEngine:
     @cached_property
     def scene(self) -> PushScene:
         """Cube, plate and the trunk's outline."""
-        body = self.trunk.assembly.system.body
-        rings = bands_along(float(body.station[-1] - body.station[0])) + 1
-        outline = layered_pushing.outline_points(body, body.half_width, rings)
-        return scene_of(self.trunk.robot, outline, rest_positions(body))
+        return layered_scene(self.trunk)
 
     def describe(self) -> dict[str, object]:
         """Name and precision."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import logging
-
 import jax
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.compiled import CompiledEngine
+from rfdropo_bayes.simulators.compiled_push import CompiledLayeredPushEngine, CompiledMeshPushEngine
 from rfdropo_bayes.simulators.mesh_body import MeshAssembly
 from rfdropo_bayes.simulators.mesh_engines import CompiledMeshEngine, MeshEngine, ReferenceMeshEngine
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
@@ -22,11 +21,8 @@ from rfdropo_bayes.workflow.experiment import SimulatorTable
 def build_engine(
     table: SimulatorTable, assembly: Assembly, discretisation: Discretisation, from_equilibrium: bool
 ) -> Engine:
-    """The engine that [simulator] asks for; "auto" takes the compiled one where JAX has only a CPU."""
-    name = table.engine
-    if name == "auto":
-        name = "numba" if jax.default_backend() == "cpu" else "jax"
-    if name == "jax":
+    """The engine that [simulator] asks for."""
+    if _layered_engine(table) == "jax":
         return ReferenceEngine(assembly, discretisation.time_step, from_equilibrium)
     return CompiledEngine(assembly, discretisation.time_step, from_equilibrium, table.precision, table.threads)
 
@@ -39,18 +35,25 @@ def build_mesh_engine(table: SimulatorTable, assembly: MeshAssembly, time_step: 
 
 
 def build_push_simulator(table: SimulatorTable, trunk: RobotSimulator) -> PushSimulator:
-    """The trunk with the robot's cube and plate before it.
-
-    Contacts run on the JAX engine; where [simulator] asks for another, this says so.
+    """The trunk with the robot's cube and plate before it, on the engine that [simulator] asks for.
 
     Raises:
         InputError: a robot without a cube, or a trunk of another kind.
     """
     push_table(trunk.robot)
-    if table.engine == "numba" or table.precision == "float32":
-        logging.getLogger("rfdropo_bayes").warning("contacts run on the JAX engine, in double precision")
     if isinstance(trunk, MeshTrunkSimulator):
-        return PushSimulator(MeshPushEngine(trunk))
+        if table.engine == "jax":
+            return PushSimulator(MeshPushEngine(trunk))
+        return PushSimulator(CompiledMeshPushEngine(trunk, table.precision, table.threads))
     if isinstance(trunk, TrunkSimulator):
-        return PushSimulator(LayeredPushEngine(trunk))
+        if _layered_engine(table) == "jax":
+            return PushSimulator(LayeredPushEngine(trunk))
+        return PushSimulator(CompiledLayeredPushEngine(trunk, table.precision, table.threads))
     raise InputError("no contacts for this kind of trunk", where="[simulator] push", remedy="use push = false")
+
+
+def _layered_engine(table: SimulatorTable) -> str:
+    """Name of the engine for layers; "auto" takes the compiled one where JAX has only a CPU."""
+    if table.engine != "auto":
+        return table.engine
+    return "numba" if jax.default_backend() == "cpu" else "jax"

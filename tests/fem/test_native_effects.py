@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes import fem
-from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.effects import BodyEffects
 from rfdropo_bayes.fem.native.layered import NativeLayered
 
@@ -136,7 +135,80 @@ def test_batch_and_threads_do_not_matter():
         np.testing.assert_array_equal(one[3:4], two)
 
 
-def test_unknown_effects_are_refused():
-    material, displacement = case(9)
-    with pytest.raises(InputError, match="capstan_friction"):
-        native("float64").rollout(material._replace(effects=BodyEffects(capstan_friction=0.1)), displacement)
+@functools.cache
+def guided_body() -> tuple[fem.System, fem.PointMap]:
+    """The tapering body with cables of eight, five and two guides."""
+    body = tapering_body()[0].body
+    height = np.linspace(0.005, body.station[-1], 8)[:, None] * np.array([0.0, 0.0, 1.0])
+    places = np.array([[0.008, 0.0, 0.0], [-0.003, 0.007, 0.0], [-0.007, -0.004, 0.0]])
+    guides = [height[:count] + place for count, place in zip((8, 5, 2), places, strict=True)]
+    system = fem.System(body, fem.cable_layout(body, 1.2 * places - [0.0, 0.0, 0.01], guides))
+    return system, tapering_body()[1]
+
+
+def friction_case(seed: int) -> tuple[fem.Material, np.ndarray]:
+    """Materials whose cables rub in both ways and stretch, one of each kind at its null value, and commands."""
+    random = np.random.default_rng(seed)
+    coulomb, capstan, give = (random.uniform(0.0, high, BATCH) for high in (0.3, 0.6, 3e-3))
+    coulomb[0], capstan[1] = 0.0, 0.0
+    effects = BodyEffects(coulomb_friction=coulomb, capstan_friction=capstan, cable_compliance=give)
+    return case(seed)[0]._replace(effects=effects), 2e-3 + np.cumsum(
+        1e-3 * random.normal(size=(BATCH, STEPS, 3)), axis=1
+    )
+
+
+@pytest.mark.slow
+def test_friction_agrees_with_the_reference():
+    """Both kinds at once, random coefficients, materials and commands, from equilibrium, in both precisions."""
+    system, points = guided_body()
+    material, displacement = friction_case(11)
+
+    @jax.jit
+    @jax.vmap
+    def expected(material, displacement, start):
+        prepared = fem.prepare(system, material)
+        state, _ = fem.static_equilibrium(system, prepared, start)
+        motion = fem.simulate(system, prepared, state, displacement[:, None], TIME_STEP, points)
+        return motion.position, motion.tension, motion.cables_converged
+
+    start = displacement[:, 0]
+    position, tension, solved = expected(material, displacement, start)
+    for precision, tolerance in AGREEMENT.items():
+        engine = NativeLayered(system, points, TIME_STEP, precision=precision, threads=1)
+        found = engine.rollout(material, displacement, start=start)
+        np.testing.assert_allclose(found.position[:, 1:], position, rtol=0.0, atol=tolerance)
+        np.testing.assert_allclose(found.tension[:, 1:], tension, rtol=0.0, atol=1e5 * tolerance)
+        np.testing.assert_array_equal(found.cables_converged, solved)
+        plain = engine.rollout(material._replace(effects=BodyEffects()), displacement, start=start)
+        assert np.abs(plain.position - found.position).max() > 1e-3, "friction does nothing"
+
+
+@pytest.mark.slow
+def test_friction_alone_null_and_in_any_batch():
+    """One kind gives what both give with the other null; null values are those of no friction; lanes never mix."""
+    system, points = guided_body()
+    material, displacement = friction_case(12)
+    engine = NativeLayered(system, points, TIME_STEP, threads=1)
+
+    def rolled(**effects):
+        return engine.rollout(material._replace(effects=BodyEffects(**effects)), displacement)
+
+    nothing = np.zeros(BATCH)
+    for name in ("coulomb_friction", "capstan_friction"):
+        value = getattr(material.effects, name)
+        one, both = (
+            rolled(**{name: value}),
+            rolled(**({"coulomb_friction": nothing, "capstan_friction": nothing} | {name: value})),
+        )
+        np.testing.assert_allclose(one.position, both.position, rtol=0.0, atol=1e-12)
+    none, null = rolled(), rolled(coulomb_friction=nothing, capstan_friction=nothing)
+    np.testing.assert_allclose(null.position, none.position, rtol=0.0, atol=1e-12)
+    # Differences about zero ask for strengths below it.
+    below = rolled(coulomb_friction=nothing - 1e-6, capstan_friction=nothing - 1e-6)
+    np.testing.assert_allclose(below.position, none.position, rtol=0.0, atol=1e-7)
+    whole = engine.rollout(material, displacement)
+    order = np.random.default_rng(13).permutation(BATCH)
+    shuffled = jax.tree.map(lambda value: value[order], material)
+    other = NativeLayered(system, points, TIME_STEP, threads=2).rollout(shuffled, displacement[order])
+    for one, two in zip(whole, other, strict=True):
+        np.testing.assert_array_equal(one[order], two)

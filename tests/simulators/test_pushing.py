@@ -15,6 +15,7 @@ from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators import Result, Simulator
 from rfdropo_bayes.simulators.compiled import CompiledEngine
+from rfdropo_bayes.simulators.compiled_push import CompiledLayeredPushEngine, CompiledMeshPushEngine
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
 from rfdropo_bayes.simulators.mesh_engines import CompiledMeshEngine
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
@@ -98,6 +99,39 @@ def test_the_trunk_pushes_the_cube_and_the_cube_holds_the_trunk(rollout, trunk, 
     assert np.asarray(light.object_pose)[:, 1].min() > REST_HEIGHT - 1e-5
 
 
+CUBES = {"cube_x": [-0.02, -0.02, 0.25, 0.005], "cube_mass": [0.02, 5.0, 0.05, 0.05], "friction": [0.05, 0.9, 0.3, 0.3]}
+"""A light cube that slides away under the trunk, a heavy one that stays, one far from it, one in the middle."""
+AGREEMENT = {"float64": 1e-9, "float32": 3e-5}  # [m]
+
+
+def agree(found, expected, k: int, precision: str) -> None:
+    """Rollout k of ``CUBES`` is the one expected."""
+    tolerance = AGREEMENT[precision]
+    np.testing.assert_allclose(found.position[k], expected.position, rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose(found.object_pose[k, :, :3], expected.object_pose[:, :3], rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose(found.object_pose[k, :, 3:], expected.object_pose[:, 3:], rtol=0.0, atol=30 * tolerance)
+    assert int(found.status[k]) == int(expected.status) == Result.OK
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", list(AGREEMENT))
+def test_the_compiled_engine_gives_the_same_numbers(rollout, trunk, commands, precision):
+    """Cubes of all kinds, as a batch; and bit for bit the same alone and on two threads."""
+    scene = {name: jnp.asarray(value) for name, value in (SOFT | {"cube_y": REST_HEIGHT}).items()}
+    batch = {name: jnp.asarray(values) for name, values in CUBES.items()}
+    engines = [PushSimulator(CompiledMeshPushEngine(trunk, precision, threads)) for threads in (1, 2)]
+    one, two = (jax.jit(lambda values, e=e: e.rollout(values | scene, commands)) for e in engines)
+    found = jax.vmap(one)(batch)
+    for k in range(4):
+        cube = {name: float(values[k]) for name, values in CUBES.items()}
+        agree(found, rollout(**cube, cube_y=REST_HEIGHT), k, precision)
+        alone = one({name: values[k] for name, values in batch.items()})
+        np.testing.assert_array_equal(alone.position, found.position[k])
+        np.testing.assert_array_equal(alone.object_pose, found.object_pose[k])
+    again = jax.vmap(two)({name: jnp.tile(values, 5) for name, values in batch.items()})
+    np.testing.assert_array_equal(again.object_pose[4:8], found.object_pose)
+
+
 def test_touching_surfaces_keep_their_distance(pushing, rollout):
     """The trunk lies on the cube: no point comes nearer than the contact distance, beyond the step's linearisation."""
     found = rollout(cube_mass=5.0, friction=0.9, cube_y=REST_HEIGHT)
@@ -134,14 +168,19 @@ def test_a_layered_body_pushes_too():
     discretisation = Discretisation(TIME_STEP)
     assembly = assemble(ROBOT, discretisation)
     trunk = TrunkSimulator(ROBOT, CompiledEngine(assembly, TIME_STEP, False), assembly, discretisation)
-    pushing = PushSimulator(LayeredPushEngine(trunk))
+    pushing, compiled = PushSimulator(LayeredPushEngine(trunk)), PushSimulator(CompiledLayeredPushEngine(trunk))
     rows = 8
     value = np.zeros((rows, 8))
     value[:, 2] = 3e-3 * np.arange(1, rows + 1)
     commands = trunk.commands(0.05 * np.arange(rows), value, np.zeros(8), 0.05 * np.arange(rows + 1))
     run = jax.jit(lambda values: pushing.rollout(values, commands))
     scene = {"cube_mass": 5.0, "friction": 0.9, "cube_y": REST_HEIGHT, "young_modulus": 4.5e6}
-    aside, below = (run({name: jnp.asarray(v) for name, v in (scene | {"cube_x": x}).items()}) for x in (0.25, 0.0))
+    cases = [{name: jnp.asarray(v) for name, v in (scene | {"cube_x": x}).items()} for x in (0.25, 0.0)]
+    aside, below = map(run, cases)
+    for case, expected in zip(cases, (aside, below), strict=True):
+        found = compiled.rollout(case, commands)
+        np.testing.assert_allclose(found.position, expected.position, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(found.object_pose, expected.object_pose, rtol=0.0, atol=1e-9)
     alone = trunk.rollout({}, commands)
     assert int(aside.status) == int(below.status) == Result.OK
     before = np.asarray(alone.position)[..., 1].min(axis=1) > PLATE + 0.025
@@ -216,15 +255,15 @@ def test_a_rollout_says_how_it_ended(trunk, commands, ending, result):
     assert simulator.description["object"] == "cube"
 
 
-def test_an_engine_without_contacts_is_replaced_and_says_so(trunk, caplog):
-    assert isinstance(build_push_simulator(SimulatorTable(push=True), trunk).engine, MeshPushEngine)
-    assert not caplog.messages
-    for asked in ({"engine": "numba"}, {"precision": "float32"}):
-        caplog.clear()
+def test_the_engine_is_the_one_that_was_asked_for(trunk):
+    for asked, engine in (
+        ({}, CompiledMeshPushEngine),
+        ({"engine": "numba", "precision": "float32"}, CompiledMeshPushEngine),
+        ({"engine": "jax"}, MeshPushEngine),
+    ):
         built = build_push_simulator(SimulatorTable(push=True, **asked), trunk)
-        assert built.description["engine"] == "jax"
-        assert built.description["precision"] == "float64"
-        assert len(caplog.messages) == 1
+        assert isinstance(built.engine, engine)
+        assert built.description["precision"] == asked.get("precision", "float64")
 
 
 def test_a_robot_without_a_cube_is_refused():

@@ -21,7 +21,7 @@ import scipy.sparse as sparse
 from jaxtyping import Int
 from scipy.sparse.linalg import splu
 
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, load, square_root, store
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_root, store
 
 
 class BlockPattern(NamedTuple):
@@ -272,3 +272,72 @@ def back_substitute(pattern, pivot, lower, weight, solution, token):
         store(solution, 3 * column, fma(load(pivot, j, token), x, fma(load(pivot, j + 1, token), y, i20 * z)))
         store(solution, 3 * column + 1, fma(load(pivot, j + 2, token), y, i21 * z))
         store(solution, 3 * column + 2, i22 * z)
+
+
+@kernel
+def extend_border(pattern, pivot, lower, rows, panels, reached, count, token):
+    """Turn further block rows b', (column, panel) by blocks of nine, into (L^-1 b)' after `factor`.
+
+    ``reached`` holds 1 for the columns in which a row is not zero, before and after; there are ``count``.
+    """
+    for column in range(count):
+        if reached[column] == 0:
+            continue
+        j = 6 * column
+        i00, i10, i11 = load(pivot, j, token), load(pivot, j + 1, token), load(pivot, j + 2, token)
+        i20, i21, i22 = load(pivot, j + 3, token), load(pivot, j + 4, token), load(pivot, j + 5, token)
+        for r in range(3 * panels):
+            t = 9 * panels * column + 3 * r
+            x, y, z = load(rows, t, token), load(rows, t + 1, token), load(rows, t + 2, token)
+            store(rows, t, x * i00)
+            store(rows, t + 1, fma(x, i10, y * i11))
+            store(rows, t + 2, fma(x, i20, fma(y, i21, z * i22)))
+        for block in range(pattern.first[column], pattern.first[column + 1] - pattern.border):
+            below = pattern.row[block]
+            reached[below] = 1
+            for r in range(3 * panels):
+                t, s = 9 * panels * column + 3 * r, 9 * panels * below + 3 * r
+                x, y, z = load(rows, t, token), load(rows, t + 1, token), load(rows, t + 2, token)
+                for a in range(3):
+                    k = 9 * block + 3 * a
+                    value = fnma(x, load(lower, k, token), load(rows, s + a, token))
+                    value = fnma(y, load(lower, k + 1, token), value)
+                    store(rows, s + a, fnma(z, load(lower, k + 2, token), value))
+
+
+@kernel
+def condense_rows(pattern, target, rows, panels, others, other_panels, own, reached, count, token):
+    """``target`` = products of `extend_border`'s rows and others, in tiles by columns: the same rows if ``own``, else
+    those of the factor's border."""
+    zero = fill(0.0, target, token)
+    for tile in range(panels * other_panels):
+        i, j = tile // other_panels, tile % other_panels
+        c0, c1, c2, c3, c4, c5, c6, c7, c8 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+        for column in range(count):
+            if reached[column] == 0:
+                continue
+            t, s = 9 * (panels * column + i), 9 * (other_panels * column + j)
+            if not own:
+                s = 9 * (pattern.first[column + 1] - pattern.border + j)
+            for m in range(3):
+                x, y, z = (
+                    load(rows, t + m, token),
+                    load(rows, t + 3 + m, token),
+                    load(rows, t + 6 + m, token),
+                )
+                w = load(others, s + m, token)
+                c0, c1, c2 = fma(x, w, c0), fma(y, w, c1), fma(z, w, c2)
+                w = load(others, s + 3 + m, token)
+                c3, c4, c5 = fma(x, w, c3), fma(y, w, c4), fma(z, w, c5)
+                w = load(others, s + 6 + m, token)
+                c6, c7, c8 = fma(x, w, c6), fma(y, w, c7), fma(z, w, c8)
+        t = 9 * tile
+        store(target, t, c0)
+        store(target, t + 1, c1)
+        store(target, t + 2, c2)
+        store(target, t + 3, c3)
+        store(target, t + 4, c4)
+        store(target, t + 5, c5)
+        store(target, t + 6, c6)
+        store(target, t + 7, c7)
+        store(target, t + 8, c8)

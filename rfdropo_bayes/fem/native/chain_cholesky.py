@@ -120,6 +120,36 @@ def eliminate(pivot, coupling, border, condensed, station, last, tiles, panels, 
 
 
 @kernel
+def extend_border(pivot, coupling, extra, first, top, tiles, panels, token):
+    """Turn further border rows b', zero above the station ``top``, into (L^-1 b)' after all stations are eliminated."""
+    size = 3 * tiles
+    panel = 3 * size
+    for station in range(top, first - 1, -1):
+        p, b = station * tiles * panel, station * panels * panel
+        for i in range(panels):
+            for k in range(tiles):
+                _factor_tile(extra, b + i * panel, pivot, p + k * panel, 3 * k, token)
+            if station > first:
+                for j in range(tiles):
+                    t = b - panels * panel + i * panel + 9 * j
+                    subtract_product(extra, t, extra, b + i * panel, coupling, p + j * panel, size, token)
+
+
+@kernel
+def condense_rows(target, rows, panels, others, other_panels, first, top, size, token):
+    """``target`` = minus the products of border rows and others, in tiles; both are zero above the station ``top``."""
+    zero, panel = fill(0.0, target, token), 3 * size
+    for i in range(panels):
+        for j in range(other_panels):
+            t = 9 * (i * other_panels + j)
+            for k in range(9):
+                store(target, t + k, zero)
+            for station in range(first, top + 1):
+                a, b = (station * panels + i) * panel, (station * other_panels + j) * panel
+                subtract_product(target, t, rows, a, others, b, size, token)
+
+
+@kernel
 def combine_border(border, weight, values, first, stations, size, panels, token):
     """``values`` = sum_i weight_i L^-1 b_i over the border rows b_i, after all stations >= ``first`` are eliminated."""
     for station in range(first, stations):

@@ -19,9 +19,9 @@ MAX_EXCHANGES = 60
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def solve_for_active(matrix, offset, active, count, work, tension, token):
-    """Tensions of the active set by Cholesky; the others are zero. ``work`` is (count * count, lanes)."""
-    one, zero = fill(1.0, matrix, token), fill(0.0, matrix, token)
+def factor_active(matrix, active, count, work, token):
+    """Cholesky factor of the active set's matrix into ``work`` (count * count, lanes)."""
+    one = fill(1.0, matrix, token)
     for i in range(count):
         here = load(active, i, token)
         for j in range(i + 1):
@@ -34,16 +34,29 @@ def solve_for_active(matrix, offset, active, count, work, tension, token):
                 store(work, i * count + i, one / square_root(value))
             else:
                 store(work, i * count + j, value * load(work, j * count + j, token))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def substitute_active(offset, first, active, count, work, tension, token):
+    """Tensions of the active set for the offsets from row ``first`` on, after `factor_active`; the others are zero."""
+    zero = fill(0.0, work, token)
     for i in range(count):
-        value = zero - load(active, i, token) * load(offset, i, token)
+        value = zero - load(active, i, token) * load(offset, first + i, token)
         for k in range(i):
-            value = fnma(load(work, i * count + k, token), load(tension, k, token), value)
-        store(tension, i, value * load(work, i * count + i, token))
+            value = fnma(load(work, i * count + k, token), load(tension, first + k, token), value)
+        store(tension, first + i, value * load(work, i * count + i, token))
     for i in range(count - 1, -1, -1):
-        value = load(tension, i, token)
+        value = load(tension, first + i, token)
         for k in range(i + 1, count):
-            value = fnma(load(work, k * count + i, token), load(tension, k, token), value)
-        store(tension, i, value * load(work, i * count + i, token))
+            value = fnma(load(work, k * count + i, token), load(tension, first + k, token), value)
+        store(tension, first + i, value * load(work, i * count + i, token))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def solve_for_active(matrix, offset, active, count, work, tension, token):
+    """Tensions of the active set by Cholesky; the others are zero. ``work`` is (count * count, lanes)."""
+    factor_active(matrix, active, count, work, token)
+    substitute_active(offset, 0, active, count, work, tension, token)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

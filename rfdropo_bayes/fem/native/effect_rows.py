@@ -14,9 +14,14 @@ from rfdropo_bayes.fem.layered import LayeredBody
 from rfdropo_bayes.fem.native.layered_effects import (
     BENDING,
     BRANCH,
+    CAPSTAN,
+    COULOMB,
     DECAY,
     DISTANCE,
     DRAG,
+    EFFECTS,
+    FLAGS,
+    FRICTION,
     GAIN,
     GIVE,
     LAW,
@@ -27,8 +32,24 @@ from rfdropo_bayes.fem.native.layered_effects import (
     WALL,
 )
 
-COMPILED_EFFECTS = frozenset({"bending", "viscoelasticity", "softening_rate", "drag", "wall", "cable_compliance"})
+COMPILED_EFFECTS = frozenset(
+    {
+        "bending",
+        "viscoelasticity",
+        "softening_rate",
+        "drag",
+        "wall",
+        "cable_compliance",
+        "coulomb_friction",
+        "capstan_friction",
+    }
+)
 """Names of the effects that the kernels know."""
+
+
+def has_friction(effects: BodyEffects) -> bool:
+    """Whether cables rub in their guides."""
+    return effects.coulomb_friction is not None or effects.capstan_friction is not None
 
 
 def _each(function: Callable[[float], float], values: ArrayLike, count: int) -> Float[np.ndarray, " batch"]:
@@ -38,7 +59,7 @@ def _each(function: Callable[[float], float], values: ArrayLike, count: int) -> 
 
 def effect_rows(effects: BodyEffects, count: int, time_step: float) -> Float[np.ndarray, "batch rows"]:
     """Numbers of the effects beside the bending law, null where there are none."""
-    rows = np.zeros((count, GIVE + 1))
+    rows = np.zeros((count, EFFECTS))
     rows[:, DECAY] = 1.0
     if effects.viscoelasticity is not None:
         fraction, time = (np.asarray(value, float) for value in effects.viscoelasticity)
@@ -54,6 +75,10 @@ def effect_rows(effects: BodyEffects, count: int, time_step: float) -> Float[np.
         rows[:, NORMAL_Y] = _each(math.sin, effects.wall.azimuth, count)
     if effects.cable_compliance is not None:
         rows[:, GIVE] = effects.cable_compliance
+    if effects.coulomb_friction is not None:
+        rows[:, COULOMB] = effects.coulomb_friction
+    if effects.capstan_friction is not None:
+        rows[:, CAPSTAN] = effects.capstan_friction
     return rows
 
 
@@ -84,8 +109,10 @@ def law_rows(
 
 def effect_flags(effects: BodyEffects) -> Int[np.ndarray, " flags"]:
     """Which effects a batch has, as far as they are skipped where it has not."""
-    flags = np.zeros(3, dtype=np.int64)
+    flags = np.zeros(FLAGS, dtype=np.int64)
     flags[BENDING] = effects.bending is not None
     flags[BRANCH] = effects.viscoelasticity is not None
     flags[SURROUNDED] = effects.drag is not None or effects.wall is not None
+    flags[FRICTION] = effects.coulomb_friction is not None
+    flags[FRICTION + 1] = effects.capstan_friction is not None
     return flags

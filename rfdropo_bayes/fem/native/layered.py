@@ -6,13 +6,11 @@ nothing of the others: a rollout's result does not depend on its batch, on its p
 
 from __future__ import annotations
 
-import hashlib
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -22,10 +20,13 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
 from rfdropo_bayes.fem.equilibrium import ITERATIONS
 from rfdropo_bayes.fem.layered import PointMap
-from rfdropo_bayes.fem.native.effect_rows import COMPILED_EFFECTS, effect_flags, effect_rows, law_rows
+from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, has_friction, law_rows
+from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
+from rfdropo_bayes.fem.native.layered_friction import compile_rollout as compile_friction_rollout
 from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, Storage, compile_rollout, storage
 from rfdropo_bayes.fem.native.section_modes import layered_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
+from rfdropo_bayes.fem.native.slip_records import Friction, friction_storage, runs_of
 
 Precision = Literal["float64", "float32"]
 # Tolerance of the tension problem and relative compliance added to every cable, as far as the precision resolves them;
@@ -48,9 +49,14 @@ class NativeRollout(NamedTuple):
 
 @cache
 def _kernel() -> Callable:
-    """The rollout kernel. Numba's cache looks at one source file only, hence the digest of all of them."""
-    sources = sorted(Path(__file__).parent.glob("*.py"))
-    return compile_rollout(hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest())
+    """The rollout kernel."""
+    return compile_rollout(kernel_sources("layered_rollout"))
+
+
+@cache
+def _friction_kernel() -> Callable:
+    """The rollout kernel of bodies whose cables rub."""
+    return compile_friction_rollout(kernel_sources("layered_friction"))
 
 
 def available_threads() -> int:
@@ -93,6 +99,7 @@ class NativeLayered:
         self.lanes = lanes or native_lanes(self.dtype)
         self.points = len(points.node)
         self._tables = layered_tables(system, points, self.dtype.type)
+        self._runs = runs_of(system.cables)
         self._token = lane_token(self.lanes)
         self._local = threading.local()
 
@@ -123,24 +130,43 @@ class NativeLayered:
         Raises:
             InputError: shapes that do not fit.
         """
+        state = {"start": start, "position": position, "tension": tension}
+        batch, schedule, output = self._inputs(material, displacement, state, steps, stride)
+        rubs = has_friction(material.effects)
+        kernel, tables, token = _friction_kernel() if rubs else _kernel(), self._tables, self._token
+
+        def block(first: int) -> None:
+            friction = (self._runs, self._friction()) if rubs else ()
+            kernel(tables, batch, *self._storage(), *friction, schedule, output, first, token)
+
+        in_blocks(block, batch.count, self.lanes, self.threads)
+        codes = output.diverged.view(bool), output.cables_converged.view(bool)
+        return NativeRollout(output.position, output.tension, *codes, output.residual)
+
+    def _inputs(
+        self,
+        material: Material,
+        displacement: np.ndarray,
+        given: Mapping[str, np.ndarray | None],
+        steps: int | None,
+        stride: int,
+    ) -> tuple[Batch, Schedule, Output]:
+        """What the kernels read and write; ``given`` holds the states that `rollout` takes, by name."""
         displacement = np.asarray(displacement, dtype=float)
         cables = self._tables.cables
         if displacement.ndim not in (2, 3) or displacement.shape[-1] != cables:
             raise InputError(f"displacement has shape {displacement.shape} for {cables} cables", where="rollout")
         state = {
-            "position": self._modes(position),
-            "tension": _cable_rows(tension, cables, "tension"),
-            "start": _cable_rows(start, cables, "start"),
+            "position": self._modes(given["position"]),
+            "tension": _cable_rows(given["tension"], cables, "tension"),
+            "start": _cable_rows(given["start"], cables, "start"),
             "displacement": displacement.reshape(-1, displacement.shape[-2] * cables),
         }
         batch = self._batch(material, state)
         steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
-        settling = 0 if start is None else ITERATIONS
+        settling = 0 if given["start"] is None else ITERATIONS
         schedule = Schedule(self.time_step, steps, int(stride), settling, *_NUMERICS[self.precision])
-        output = _empty_output(batch.count, 1 + steps // stride, self.points, cables)
-        self._run(batch, schedule, output)
-        codes = output.diverged.view(bool), output.cables_converged.view(bool)
-        return NativeRollout(output.position, output.tension, *codes, output.residual)
+        return batch, schedule, _empty_output(batch.count, 1 + steps // stride, self.points, cables)
 
     def _modes(self, position: np.ndarray | None) -> np.ndarray:
         """Node positions as section modes, one row a rollout."""
@@ -156,9 +182,6 @@ class NativeLayered:
         width = {"gravity": (3,), "stiffness_scale": (layers,), "point_mass": (layers + 1,)}
         given, effects = material._asdict(), material.effects
         del given["effects"]
-        lacking = [name for name, value in effects._asdict().items() if value is not None]
-        if set(lacking) - COMPILED_EFFECTS:
-            raise InputError(f"unknown to this engine: {', '.join(lacking)}", where="material")
         values = {name: np.asarray(value, dtype=float) for name, value in given.items()}
         sizes = {len(value) for name, value in values.items() if value.ndim > len(width.get(name, ()))}
         sizes |= {len(value) for value in state.values()}
@@ -190,26 +213,28 @@ class NativeLayered:
         pitches = {f"{name}_pitch": value.shape[1] if len(value) > 1 else 0 for name, value in state.items()}
         return Batch(**arrays, present=effect_flags(effects), count=count, **pitches)
 
-    def _run(self, batch: Batch, schedule: Schedule, output: Output) -> None:
-        """All lane blocks, in this thread or in several."""
-        kernel, tables, token = _kernel(), self._tables, self._token
-
-        def block(first: int) -> None:
-            kernel(tables, batch, *self._storage(), schedule, output, first, token)
-
-        firsts = range(0, batch.count, self.lanes)
-        if min(self.threads, len(firsts)) < 2:
-            for first in firsts:
-                block(first)
-            return
-        with ThreadPoolExecutor(min(self.threads, len(firsts))) as pool:
-            list(pool.map(block, firsts))
-
     def _storage(self) -> Storage:
         """Storage of the calling thread."""
         if not hasattr(self._local, "storage"):
             self._local.storage = storage(self._tables, self.lanes, self.dtype.type)
         return self._local.storage
+
+    def _friction(self) -> Friction:
+        """Friction of the calling thread."""
+        if not hasattr(self._local, "friction"):
+            self._local.friction = friction_storage(self._tables, self._runs, self.lanes, self.dtype.type)
+        return self._local.friction
+
+
+def in_blocks(block: Callable[[int], None], count: int, lanes: int, threads: int) -> None:
+    """Call for the first rollout of every lane block, in this thread or in several."""
+    firsts = range(0, count, lanes)
+    if min(threads, len(firsts)) < 2:
+        for first in firsts:
+            block(first)
+        return
+    with ThreadPoolExecutor(min(threads, len(firsts))) as pool:
+        list(pool.map(block, firsts))
 
 
 def _cable_rows(values: np.ndarray | None, cables: int, name: str) -> Float[np.ndarray, "rows cables"]:

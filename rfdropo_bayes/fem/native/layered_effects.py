@@ -10,10 +10,12 @@ from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_
 from rfdropo_bayes.fem.native.tension_stiffening import add_dyad
 from rfdropo_bayes.fem.surroundings import STILL, WALL_SOFTNESS
 
-BENDING, BRANCH, SURROUNDED = range(3)
-"""Flags in ``samples.present``."""
-GAIN, SHARE, DECAY, DRAG, WALL, DISTANCE, NORMAL_X, NORMAL_Y, GIVE = range(9)
+BENDING, BRANCH, SURROUNDED, FRICTION = range(4)
+"""Flags in ``samples.present``; the last one is Coulomb's friction, that of the capstan follows it."""
+FLAGS = FRICTION + 2
+GAIN, SHARE, DECAY, DRAG, WALL, DISTANCE, NORMAL_X, NORMAL_Y, GIVE, COULOMB, CAPSTAN = range(11)
 """Rows of ``samples.effects``; gain and share are those of a step, decay that of the moduli in a step."""
+EFFECTS = CAPSTAN + 1
 LAW = 9
 """Rows of ``samples.law`` for each layer: linear 00, 01, 02, 11, 12, 22, then EI / L about x and y, then cubic."""
 

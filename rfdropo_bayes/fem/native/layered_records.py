@@ -66,6 +66,7 @@ class Work(NamedTuple):
     pivoting: Float[np.ndarray, "scratch lanes"]
     commanded: Float[np.ndarray, "cables lanes"]
     unsolved: Float[np.ndarray, "1 lanes"]  # 1 where the tensions were not found
+    accepted: Float[np.ndarray, "1 lanes"]  # 1 where the last step was taken
     lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken
     failed: Float[np.ndarray, "1 lanes"]  # 1 once tensions were not found
     points: Float[np.ndarray, "point_values lanes"]

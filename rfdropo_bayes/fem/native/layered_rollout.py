@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from rfdropo_bayes.fem.native.layered_assembly import clear
-from rfdropo_bayes.fem.native.layered_effects import DECAY, GAIN, GIVE, LAW, SHARE
+from rfdropo_bayes.fem.native.layered_effects import DECAY, EFFECTS, FLAGS, GAIN, GIVE, LAW, SHARE
 from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
 from rfdropo_bayes.fem.native.layered_step import point, refine_increment, solve_increment, take_step
@@ -92,8 +92,8 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         gravity=rows(3),
         damping=rows(2),
         law=rows(LAW * layers),
-        effects=rows(GIVE + 1),
-        present=np.zeros(3, dtype=np.int64),
+        effects=rows(EFFECTS),
+        present=np.zeros(FLAGS, dtype=np.int64),
     )
     work = Work(
         position=rows(stations * size),
@@ -118,26 +118,21 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         tension=rows(cables),
         pivoting=rows(cables * (cables + 1)),
         commanded=rows(cables),
-        unsolved=rows(1),
-        lost=rows(1),
-        failed=rows(1),
         points=rows(3 * tables.points),
         before=rows(stations * size),
-        relaxation=rows(1),
         beyond=rows(3 * layers),
-        imbalance=rows(1),
         twist=rows(layers),
         string=rows(layers),
-        softness=rows(1),
         branch=rows(layers * 2 * size),
         slope=rows(6 * layers),
         around=rows(2 * stations),
+        **{name: rows(1) for name in ("unsolved", "accepted", "lost", "failed", "relaxation", "imbalance", "softness")},
     )
     return Storage(samples, Factors(*(rows(1) for _ in Factors._fields)), work)
 
 
 @kernel
-def _fill_lanes(source, pitch, offset, width, first, count, target, token):
+def fill_lanes(source, pitch, offset, width, first, count, target, token):
     """Spread rows of a batch, ``pitch`` apart, over lanes; lanes beyond the batch repeat its last row."""
     lanes = len(token)
     for lane in range(lanes):
@@ -169,22 +164,22 @@ def _prepare(tables, samples, token):
 
 
 @inlined
-def _start(tables, batch, samples, work, first, token):
+def start_rollouts(tables, batch, samples, work, first, token):
     """Parameters and initial state of a block's rollouts, not moving."""
     count, values = batch.count, 3 * tables.modes * tables.stations
-    _fill_lanes(batch.moduli, 3, 0, 3, first, count, samples.moduli, token)
-    _fill_lanes(batch.density, 1, 0, 1, first, count, samples.density, token)
-    _fill_lanes(batch.damping, 2, 0, 2, first, count, samples.damping, token)
-    _fill_lanes(batch.gravity, 3, 0, 3, first, count, samples.gravity, token)
+    fill_lanes(batch.moduli, 3, 0, 3, first, count, samples.moduli, token)
+    fill_lanes(batch.density, 1, 0, 1, first, count, samples.density, token)
+    fill_lanes(batch.damping, 2, 0, 2, first, count, samples.damping, token)
+    fill_lanes(batch.gravity, 3, 0, 3, first, count, samples.gravity, token)
     layers = tables.stations - 1
-    _fill_lanes(batch.layer_scale, layers, 0, layers, first, count, samples.layer_scale, token)
-    _fill_lanes(batch.point_mass, layers + 1, 0, layers + 1, first, count, samples.point_mass, token)
-    _fill_lanes(batch.law, LAW * layers, 0, LAW * layers, first, count, samples.law, token)
-    _fill_lanes(batch.effects, GIVE + 1, 0, GIVE + 1, first, count, samples.effects, token)
-    for flag in range(3):
+    fill_lanes(batch.layer_scale, layers, 0, layers, first, count, samples.layer_scale, token)
+    fill_lanes(batch.point_mass, layers + 1, 0, layers + 1, first, count, samples.point_mass, token)
+    fill_lanes(batch.law, LAW * layers, 0, LAW * layers, first, count, samples.law, token)
+    fill_lanes(batch.effects, EFFECTS, 0, EFFECTS, first, count, samples.effects, token)
+    for flag in range(FLAGS):
         samples.present[flag] = batch.present[flag]
-    _fill_lanes(batch.position, batch.position_pitch, 0, values, first, count, work.position, token)
-    _fill_lanes(batch.tension, batch.tension_pitch, 0, tables.cables, first, count, work.tension, token)
+    fill_lanes(batch.position, batch.position_pitch, 0, values, first, count, work.position, token)
+    fill_lanes(batch.tension, batch.tension_pitch, 0, tables.cables, first, count, work.tension, token)
     _prepare(tables, samples, token)
     clear(work.velocity, 0, values, token)
     clear(work.branch, 0, 6 * tables.modes * layers, token)
@@ -196,7 +191,7 @@ def _start(tables, batch, samples, work, first, token):
 
 
 @inlined
-def _step_factors(samples, factors, work, length, first, token):
+def step_factors(samples, factors, work, length, first, token):
     """Factors of an implicit Euler step; ``first``: the dashpots of the Prony branches start without tension."""
     time_step, drag = fill(length, samples.damping, token), load(samples.damping, 0, token)
     one, gain = fill(1.0, drag, token), load(samples.effects, GAIN, token)
@@ -216,7 +211,7 @@ def _step_factors(samples, factors, work, length, first, token):
 
 
 @kernel
-def _record(tables, work, output, row, first, count, token):
+def record_body(tables, work, output, row, first, count, token):
     """Write points and tensions of the lanes that belong to the batch."""
     points, cables, lanes = tables.points, tables.cables, len(token)
     for p in range(points):
@@ -233,7 +228,7 @@ def _record(tables, work, output, row, first, count, token):
 
 
 @kernel
-def _finish(work, output, first, count, token):
+def finish_rollouts(work, output, first, count, token):
     """Write the result codes of the lanes that belong to the batch."""
     for lane in range(min(len(token), count - first)):
         output.diverged[first + lane] = 1 if work.lost[lane] > 0.0 else 0
@@ -251,21 +246,21 @@ def compile_rollout(sources: str) -> Callable:
         tables, batch, output = addresses(tables), addresses(batch), addresses(output)
         samples, factors, work = addresses(samples), addresses(factors), addresses(work)
         count, cables, static_iterations = batch.count, tables.cables, schedule.static_iterations
-        _start(tables, batch, samples, work, first, token)
+        start_rollouts(tables, batch, samples, work, first, token)
         start_settling(tables, samples, factors, work, token)
-        _fill_lanes(batch.start, batch.start_pitch, 0, cables, first, count, work.commanded, token)
+        fill_lanes(batch.start, batch.start_pitch, 0, cables, first, count, work.commanded, token)
         # Static iterations come first. They and the steps share one call, which would else be compiled twice.
         for step in range(-static_iterations, schedule.steps + 1):
             if step == 0 and static_iterations > 0:
                 finish_settling(tables, samples, factors, work, token)
             if step >= 0:
                 if step % schedule.stride == 0:
-                    _record(tables, work, output, step // schedule.stride, first, count, token)
+                    record_body(tables, work, output, step // schedule.stride, first, count, token)
                 if step == schedule.steps:
                     break
-                _step_factors(samples, factors, work, schedule.time_step, step == 0, token)
+                step_factors(samples, factors, work, schedule.time_step, step == 0, token)
                 pitch, offset = batch.displacement_pitch, step * cables
-                _fill_lanes(batch.displacement, pitch, offset, cables, first, count, work.commanded, token)
+                fill_lanes(batch.displacement, pitch, offset, cables, first, count, work.commanded, token)
             rate = 1.0 / schedule.time_step if step >= 0 else 1.0
             solve_increment(tables, samples, factors, work, rate, schedule, token)
             if step >= 0:
@@ -274,6 +269,6 @@ def compile_rollout(sources: str) -> Callable:
                 take_step(tables, work, schedule.time_step, token)
             else:
                 take_increment(tables, work, token)
-        _finish(work, output, first, count, token)
+        finish_rollouts(work, output, first, count, token)
 
     return rollout

@@ -101,7 +101,7 @@ def _condensed_entry(condensed, i, j, panels, token):
 
 
 @inlined
-def _scale_problem(cables, panels, work, regularisation, token):
+def scale_problem(cables, panels, work, regularisation, token):
     """Tension problem with unit diagonal; a cable that no motion of the body can shorten takes no part."""
     one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
     largest = zero
@@ -125,18 +125,30 @@ def _scale_problem(cables, panels, work, regularisation, token):
 
 
 @inlined
-def _tensions(cables, panels, work, rate, tolerance, regularisation, token):
-    """Unilateral tensions; leaves the weights of the border rows in ``weight`` and failed lanes in ``unsolved``."""
-    one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
-    _scale_problem(cables, panels, work, regularisation, token)
-    unsolved = zero
-    if not solve_unilateral(
+def find_tensions(cables, work, tolerance, token):
+    """Unilateral tensions of the scaled problem; leaves failed lanes in ``unsolved``."""
+    found = solve_unilateral(
         work.compliance, work.slack, cables, tolerance, work.active, work.pivoting, work.tension, token
-    ):
+    )
+    mark_unsolved(cables, work, found, token)
+
+
+@inlined
+def mark_unsolved(cables, work, found, token):
+    """Lanes whose tensions were not found, in ``unsolved``."""
+    one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
+    unsolved = zero
+    if not found:
         for c in range(cables):
             unsolved = where_greater(load(work.pivoting, cables * cables + c, token), zero, one, unsolved)
     store(work.unsolved, 0, unsolved)
-    store(work.weight, 0, one)
+
+
+@inlined
+def weigh_border(cables, work, rate, token):
+    """Tensions [N] from those of the scaled problem, and the weights of the border rows in ``weight``."""
+    zero = fill(0.0, work.weight, token)
+    store(work.weight, 0, fill(1.0, work.weight, token))
     for c in range(cables):
         impulse = load(work.scale, c, token) * load(work.tension, c, token)
         impulse = where_greater(zero, impulse, zero, impulse)
@@ -145,8 +157,8 @@ def _tensions(cables, panels, work, rate, tolerance, regularisation, token):
 
 
 @inlined
-def solve_increment(tables, samples, factors, work, rate, schedule, token):
-    """``solution`` = A^-1 (r - J' T) and the tensions; the matrix is assembled and eliminated station by station."""
+def condense_increment(tables, samples, factors, work, rate, schedule, token):
+    """Assemble and eliminate the matrix station by station, and set up the problem of the tensions."""
     tiles, stations, cables, held = tables.modes, tables.stations, tables.cables, tables.held
     size, panels = 3 * tiles, (cables + 3) // 3
     frame, block = 3 * panels * size, 3 * tiles * size
@@ -177,9 +189,24 @@ def solve_increment(tables, samples, factors, work, rate, schedule, token):
             store(work.border, t, load(work.border, t, token) + load(work.field, station * size + k, token))
         eliminate(work.pivot, work.coupling, work.border, work.condensed, station, last, tiles, panels, token)
     stretch_cables(cables, panels, factors, work, token)
-    _tensions(cables, panels, work, rate, schedule.tolerance, schedule.regularisation, token)
-    combine_border(work.border, work.weight, work.solution, held, stations, size, panels, token)
+    scale_problem(cables, panels, work, schedule.regularisation, token)
+
+
+@inlined
+def substitute_increment(tables, work, token):
+    """``solution`` = A^-1 times the weighted sum of the border rows."""
+    tiles, stations, held, panels = tables.modes, tables.stations, tables.held, (tables.cables + 3) // 3
+    combine_border(work.border, work.weight, work.solution, held, stations, 3 * tiles, panels, token)
     substitute_back(work.pivot, work.coupling, work.solution, held, stations, tiles, token)
+
+
+@inlined
+def solve_increment(tables, samples, factors, work, rate, schedule, token):
+    """``solution`` = A^-1 (r - J' T) and the tensions."""
+    condense_increment(tables, samples, factors, work, rate, schedule, token)
+    find_tensions(tables.cables, work, schedule.tolerance, token)
+    weigh_border(tables.cables, work, rate, token)
+    substitute_increment(tables, work, token)
 
 
 @kernel
@@ -246,6 +273,7 @@ def take_step(tables, work, length, token):
     """Take the step x += length * (v + solution); where it is lost, stay in place at rest without tension."""
     zero, time_step = fill(0.0, work.position, token), fill(length, work.position, token)
     accepted = near(tables, work, time_step, token)
+    store(work.accepted, 0, accepted)
     for row in range(3 * tables.modes * tables.stations):
         x = load(work.position, row, token)
         v = load(work.velocity, row, token) + load(work.solution, row, token)

@@ -96,9 +96,7 @@ def _both_faces(shape: np.ndarray) -> Float[np.ndarray, "nodes2 modes2"]:
     return np.kron(np.eye(2), shape)
 
 
-def _sparse_points(
-    node: np.ndarray, weight: np.ndarray, shape: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sparse_points(node: np.ndarray, weight: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points given by nodes as sparse sums of modes: first, place, weight."""
     section = len(shape)
     first, place, value = [0], [], []
@@ -117,7 +115,7 @@ def _sparse_points(
 
 def _guides(layout: CableLayout, shape: np.ndarray) -> dict[str, np.ndarray]:
     used, size = layout.guide_used, 3 * len(shape)
-    first, place, weight = _sparse_points(layout.guide_node[used], layout.guide_weight[used], shape)
+    first, place, weight = sparse_points(layout.guide_node[used], layout.guide_weight[used], shape)
     return {
         "cable_first": np.concatenate([[0], np.cumsum(used.sum(axis=1))]).astype(np.int64),
         "guide_first": first,
@@ -153,7 +151,7 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
         station_mass[:-1, k] += mass[:, m, n]
         station_mass[1:, k] += mass[:, modes + m, modes + n]
     rest = rest_positions(body)
-    point_first, point_place, point_weight = _sparse_points(points.node, points.weight, shape)
+    point_first, point_place, point_weight = sparse_points(points.node, points.weight, shape)
     gradient = np.einsum("am,lai->lmi", faces, centre_gradient(body)).reshape(layers, 2, modes, 3)
     axis = np.array([2, 0, 1, 2])[parity]
     slopes = gradient[:, :, np.arange(modes), axis] * (parity != 3)

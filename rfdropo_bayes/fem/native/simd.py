@@ -34,8 +34,18 @@ ALIGNMENT = 64
 """Bytes to which work arrays are aligned: one cache line, and the widest vector register."""
 
 
-kernel = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
-"""Decorator of functions that only kernels call: wrappers for calls from Python take a quarter of the compilation."""
+def kernel(function: Callable) -> Callable:
+    """Decorator of functions that only kernels call.
+
+    They have no wrappers for calls from Python, which take a quarter of the compilation, and are compiled once for
+    every type: Numba on its own compiles a function anew for every number that stands in a call.
+    """
+    dispatcher = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
+    resolve = dispatcher.get_call_template
+    dispatcher.get_call_template = lambda arguments, named: resolve(tuple(map(types.unliteral, arguments)), named)
+    return dispatcher
+
+
 inlined = numba.njit(inline="always")
 """Decorator of functions that call kernels from one place: a level of calls is compiled into every level above it."""
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +17,7 @@ from rfdropo_bayes.fem.dynamics import LOST, POISSON_LIMIT
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
+from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
 from rfdropo_bayes.fem.native.layered import available_threads
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
 from rfdropo_bayes.fem.native.tetrahedral import Mesh, Samples, Work
@@ -88,6 +87,29 @@ class TetrahedralEngine:
         """
         samples = len(parameters["young_modulus"])
         commands = np.broadcast_to(commands, (samples, *commands.shape[-2:]))
+
+        def kernel_of(lane: Int[np.ndarray, " lanes"]) -> Callable:
+            return self._roll
+
+        return self._rolled(kernel_of, parameters, commands, time_step, stride)
+
+    def _roll(self, displacement, inputs, work, schedule, output) -> None:
+        """Rollouts of a lane block without contacts."""
+        self._kernel(
+            self._pattern, self._mesh, self._cables, self._rest, displacement, inputs, work, schedule, output,
+            lane_token(self.lanes),
+        )  # fmt: skip
+
+    def _rolled(
+        self,
+        kernel_of: Callable[[Int[np.ndarray, " lanes"]], Callable],
+        parameters: Mapping[str, np.ndarray],
+        commands: Float[np.ndarray, "samples steps cables"],
+        time_step: float,
+        stride: int,
+    ) -> Rollouts:
+        """Rollouts of all lane blocks; ``kernel_of`` the samples of a block is what computes them."""
+        samples = len(commands)
         chunks = [np.arange(first, first + self.lanes) for first in range(0, samples, self.lanes)]
         rows, points = commands.shape[1] // stride, len(self._nodes)
         result = Rollouts(
@@ -98,20 +120,19 @@ class TetrahedralEngine:
         )
 
         def run(chunk: Int[np.ndarray, " lanes"]) -> None:
-            self._run(
-                np.minimum(chunk, samples - 1), chunk[chunk < samples], parameters, commands, time_step, stride, result
-            )
+            lane, kept = np.minimum(chunk, samples - 1), chunk[chunk < samples]
+            self._run(kernel_of(chunk), lane, kept, parameters, commands, time_step, stride, result)
 
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(run, chunks))
         return result
 
-    def _run(self, lane, kept, parameters, commands, time_step, stride, result: Rollouts) -> None:
+    def _run(self, kernel, lane, kept, parameters, commands, time_step, stride, result: Rollouts) -> None:
         """One lane block: samples ``lane`` (the last one repeated to fill the lanes), of which ``kept`` are wanted."""
         inputs = self._samples({name: np.asarray(value)[lane] for name, value in parameters.items()})
         displacement = self._lanes_last(commands[lane])
         work = self._work()
-        rows, token = displacement.shape[0] // stride, lane_token(self.lanes)
+        rows = displacement.shape[0] // stride
         output = kernels.Output(
             self._nodes,
             self._weights,
@@ -120,9 +141,7 @@ class TetrahedralEngine:
         )
         single = self.dtype.itemsize == 4
         schedule = kernels.Schedule(float(time_step), stride, _TOLERANCE[self.dtype.name], self._reach, single)
-        self._kernel(
-            self._pattern, self._mesh, self._cables, self._rest, displacement, inputs, work, schedule, output, token
-        )  # fmt: skip
+        kernel(displacement, inputs, work, schedule, output)
         count = len(kept)
         result.position[kept] = np.moveaxis(output.position, 3, 0)[:count]
         result.tension[kept] = np.moveaxis(output.tension, 2, 0)[:count]
@@ -168,10 +187,8 @@ class TetrahedralEngine:
 
 @cache
 def _kernel() -> Callable:
-    """The rollout kernel. Numba's cache looks at one source file only, hence the digest of all of them."""
-    names = ("block_cholesky", "complementarity", "simd", "tetrahedral", "tetrahedral_rollout")
-    sources = b"".join((Path(__file__).parent / f"{name}.py").read_bytes() for name in names)
-    return kernels.compile_rollout(hashlib.sha256(sources).hexdigest())
+    """The rollout kernel."""
+    return kernels.compile_rollout(kernel_sources("tetrahedral_rollout"))
 
 
 def _numbering(body: TetrahedralBody) -> tuple[Int[np.ndarray, " nodes"], Int[np.ndarray, " nodes"]]:

@@ -133,7 +133,7 @@ def gather_cables(pattern, mesh, cables, work, time_step, token):
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _substitute(pattern, mesh, work, pull, count, time_step, token):
+def substitute(pattern, mesh, work, pull, count, time_step, token):
     """Add A^-1 (border row 0 + h sum pull_i J_i) to the velocity."""
     clear(work.weight, token)
     store(work.weight, 0, fill(1.0, work.weight, token))
@@ -145,12 +145,19 @@ def _substitute(pattern, mesh, work, pull, count, time_step, token):
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _tensions(count, work, tolerance, token):
+def find_tensions(count, work, tolerance, token):
     """Unilateral tensions; lanes without a solution are marked in ``unsolved``."""
-    one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
-    if not solve_unilateral(
+    found = solve_unilateral(
         work.compliance, work.slack, count, tolerance, work.active, work.pivoting, work.tension, token
-    ):
+    )
+    mark_unsolved(count, work, found, token)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def mark_unsolved(count, work, found, token):
+    """Mark lanes whose tensions were not found in ``unsolved``."""
+    one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
+    if not found:
         for c in range(count):
             bad = load(work.pivoting, count * count + c, token)
             store(work.unsolved, 0, where_greater(bad, zero, one, load(work.unsolved, 0, token)))
@@ -167,8 +174,9 @@ def _keep_border(pattern, work, token):
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _residual(pattern, mesh, samples, work, count, time_step, token):
+def unbalance(pattern, mesh, samples, work, count, time_step, token):
     """Write what the step leaves unbalanced to border row 0, and the slack that it leaves the cables."""
+    elastic_forces(mesh, samples, work, time_step, token)
     drag, size = load(samples.rayleigh_mass, 0, token), 9 * pattern.border
     for c in range(count):
         store(work.slack, c, load(work.measured, c, token) - load(work.target, c, token))
@@ -186,10 +194,8 @@ def _residual(pattern, mesh, samples, work, count, time_step, token):
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _refine(pattern, mesh, samples, work, count, time_step, token):
+def correct(pattern, mesh, work, count, time_step, token):
     """Solve once more, for what the step's solution leaves unbalanced; which cables pull stays as it is."""
-    elastic_forces(mesh, samples, work, time_step, token)
-    _residual(pattern, mesh, samples, work, count, time_step, token)
     forward_substitute(pattern, work.pivot, work.lower, token)
     for i in range(count):
         free = load(work.slack, i, token) + time_step * condensed_entry(pattern, work.lower, i + 1, 0, token)
@@ -197,11 +203,11 @@ def _refine(pattern, mesh, samples, work, count, time_step, token):
     solve_for_active(work.compliance, work.slack, work.active, count, work.pivoting, work.change, token)
     for i in range(count):
         store(work.tension, i, load(work.tension, i, token) + load(work.change, i, token))
-    _substitute(pattern, mesh, work, work.change, count, time_step, token)
+    substitute(pattern, mesh, work, work.change, count, time_step, token)
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _accept(rest, count, work, schedule, token):
+def accept(rest, count, work, schedule, token):
     """Take the step x += h v; in the lanes where it is lost, stay in place at rest without tension."""
     one, zero = fill(1.0, work.position, token), fill(0.0, work.position, token)
     accepted, reach = one, fill(schedule.reach, work.position, token)
@@ -216,13 +222,13 @@ def _accept(rest, count, work, schedule, token):
         store(work.position, i, where_greater(accepted, zero, x + schedule.time_step * v, x))
     for c in range(count):
         store(work.tension, c, where_greater(accepted, zero, load(work.tension, c, token), zero))
+    store(work.accepted, 0, accepted)
     store(work.lost, 0, where_greater(accepted, zero, load(work.lost, 0, token), one))
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def solve_step(pattern, mesh, cables, rest, commanded, samples, work, schedule, token):
-    """One implicit Euler step; marks lanes that diverge in ``lost``, and those whose tensions were not found in
-    ``unsolved``."""
+def condense_step(pattern, mesh, cables, commanded, samples, work, schedule, token):
+    """Assemble and factorise the matrix of a step, and set up the problem of its tensions."""
     count, rows, time_step = len(cables.limit), 3 * pattern.border, schedule.time_step
     assemble(pattern, mesh, samples, work, time_step, token)
     set_targets(cables, commanded, work, token)
@@ -237,15 +243,24 @@ def solve_step(pattern, mesh, cables, rest, commanded, samples, work, schedule, 
         store(work.slack, i, free)
         for j in range(count):
             store(work.compliance, i * count + j, square * load(work.condensed, (i + 1) * rows + j + 1, token))
-    _tensions(count, work, schedule.tolerance, token)
-    _substitute(pattern, mesh, work, work.tension, count, time_step, token)
-    if schedule.refined:
-        _refine(pattern, mesh, samples, work, count, time_step, token)
-    _accept(rest, count, work, schedule, token)
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _record(work, output, row, token):
+def solve_step(pattern, mesh, cables, rest, commanded, samples, work, schedule, token):
+    """One implicit Euler step; marks lanes that diverge in ``lost``, and those whose tensions were not found in
+    ``unsolved``."""
+    count, time_step = len(cables.limit), schedule.time_step
+    condense_step(pattern, mesh, cables, commanded, samples, work, schedule, token)
+    find_tensions(count, work, schedule.tolerance, token)
+    substitute(pattern, mesh, work, work.tension, count, time_step, token)
+    if schedule.refined:
+        unbalance(pattern, mesh, samples, work, count, time_step, token)
+        correct(pattern, mesh, work, count, time_step, token)
+    accept(rest, count, work, schedule, token)
+
+
+@numba.njit(nogil=True, error_model="numpy")
+def record_body(work, output, row, token):
     for p in range(output.node.shape[0]):
         for i in range(3):
             total = fill(0.0, work.position, token)
@@ -270,6 +285,6 @@ def compile_rollout(sources: str) -> Callable:
         for step in range(commands.shape[0]):
             solve_step(pattern, mesh, cables, rest, commands[step], samples, work, schedule, token)
             if (step + 1) % schedule.stride == 0:
-                _record(work, output, (step + 1) // schedule.stride - 1, token)
+                record_body(work, output, (step + 1) // schedule.stride - 1, token)
 
     return rollout
