@@ -50,6 +50,13 @@ def effects_lacking(effects: BodyEffects) -> tuple[str, ...]:
     return tuple(name for name in given if name not in COMPILED_EFFECTS)
 
 
+def effects_costly(effects: BodyEffects) -> bool:
+    """Whether an effect is present that slows every rollout down, even at its null value: one that the compiled engine
+    lacks, or friction, which solves for stick and slip in every step."""
+    friction = (effects.coulomb_friction, effects.capstan_friction)
+    return bool(effects_lacking(effects)) or any(value is not None for value in friction)
+
+
 @cache
 def _say_once(lacking: tuple[str, ...]) -> None:
     names = ", ".join(name.replace("_", " ") for name in lacking)

@@ -30,7 +30,7 @@ from rfdropo_bayes.report.audit_page import render_audit
 from rfdropo_bayes.report.summary import combined_hash
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands
-from rfdropo_bayes.simulators.compiled import CompiledEngine, effects_lacking
+from rfdropo_bayes.simulators.compiled import CompiledEngine, effects_costly
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism
 from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -194,12 +194,12 @@ def _lanes(
     coordinates: Coordinates,
     made: Lanes | None,
 ) -> tuple[Lanes, Commands]:
-    """The simulator with all candidates; those that the compiled engine lacks get an engine of their own."""
+    """The simulator with all candidates; those that would slow every rollout down get a simulator of their own."""
     whole = build_simulator(_with(experiment, names), robot, folder)
     recordings = gather_recordings(whole, trajectories)
     if made is not None:
         return made, recordings.commands
-    slow = {m.name for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _lacking(whole, m)}
+    slow = {m.name for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _costly(whole, m)}
     added = whole.mechanisms[len(experiment.model.mechanisms) :]
     kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
     if len(kept) == len(names):
@@ -210,13 +210,13 @@ def _lanes(
     return routed, recordings.commands
 
 
-def _lacking(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
-    """Whether a mechanism acts on the body in a way that the compiled engine does not know."""
+def _costly(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
+    """Whether a mechanism acts on the body in a way that slows the compiled engine down, or that it does not know."""
     if not isinstance(mechanism, BodyMechanism) or not isinstance(simulator.engine, CompiledEngine):
         return False
     values = simulator.complete({})
     plain = replace(simulator, mechanisms=()).material(values)
-    return bool(effects_lacking(mechanism.embody(values, plain, simulator.assembly.system.body).effects))
+    return effects_costly(mechanism.embody(values, plain, simulator.assembly.system.body).effects)
 
 
 def _finer(experiment: Experiment, robot: Robot) -> Experiment | None:
