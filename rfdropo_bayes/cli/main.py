@@ -57,6 +57,8 @@ def calibrate(
 
     folder = folder_for(experiment, out)
     if check is not None:
+        if start is not None:
+            raise InputError("a check has no start", where="--from", remedy="leave it out")
         inference.check(experiment, folder, check, datasets, overrides or [], resume)
         return
     report = run_calibration(experiment, folder, overrides=overrides or [], resume=resume, start=start)

@@ -12,6 +12,7 @@ import numpy as np
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.data import Trajectory, noise_floor
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.methods import make_config, method_named, run
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
@@ -35,6 +36,7 @@ PREDICTIVE_DRAWS = 200
 PRIOR_DRAWS = 2000
 PRIOR_PREDICTIVE_DRAWS = 64
 START_DRAWS = 1000
+CLIMBING = ("laplace", "bridge", "smc")  # smc where it starts at the optima
 
 
 def run_calibration(
@@ -61,8 +63,8 @@ def run_calibration(
     fitted = load_data(experiment, folder, "fit")
     tested = load_data(experiment, folder, "test")
     simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
-    problem = build_problem(build_model(experiment, simulator, fitted), earlier_draws(start))
     method = experiment.inference.method
+    problem = build_problem(build_model(experiment, simulator, fitted), earlier_draws(start, method))
     config = make_config(method, inference_options(experiment))
     out = output_folder(out)
     key, predicting = jax.random.split(jax.random.key(experiment.seed))
@@ -73,14 +75,20 @@ def run_calibration(
     return write_run(out, record, facts, describe(tables))
 
 
-def earlier_draws(folder: Path | None) -> Batch | None:
+def earlier_draws(folder: Path | None, method: str) -> Batch | None:
     """Draws of an earlier calibration, chains joined; None without one.
 
     Raises:
-        InputError: a folder that holds no posterior.
+        InputError: a folder that holds no posterior, or a method that does not climb.
     """
     if folder is None:
         return None
+    if method not in CLIMBING:
+        raise InputError(
+            f"method {method!r} does not climb: it has no use for a start",
+            where="--from",
+            remedy=f"leave it out, or use one of {', '.join(CLIMBING)}",
+        )
     record = PosteriorRecord.load(Path(folder) / POSTERIOR)
     return thin({info.name: record.posterior[info.name] for info in record.free}, START_DRAWS)
 

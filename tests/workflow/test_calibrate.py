@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import PosteriorRecord
-from rfdropo_bayes.workflow.calibration import run_calibration
+from rfdropo_bayes.workflow.calibration import earlier_draws, run_calibration
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEMO = REPOSITORY / "experiments" / "demo.toml"
@@ -63,3 +64,11 @@ def test_a_killed_run_resumes_to_the_same_posterior(tmp_path):
     first, second = (PosteriorRecord.load(folder / "posterior.nc") for folder in (whole, killed))
     for parameter in first.parameters:
         np.testing.assert_array_equal(first.flat(parameter.name), second.flat(parameter.name))
+
+
+def test_a_start_is_refused_where_it_would_be_ignored_or_is_not_there(tmp_path):
+    with pytest.raises(InputError, match="does not climb"):
+        earlier_draws(tmp_path, "nested")
+    with pytest.raises(InputError, match="no such file"):
+        earlier_draws(tmp_path, "laplace")
+    assert earlier_draws(None, "nested") is None
