@@ -20,6 +20,9 @@ from rfdropo_bayes.fem.rigid_body import Cube, cube_at, solid_gyration_radius
 
 BATCH, STEPS, TIME_STEP, LENGTH, LAYERS, SIDE, PLATE = 11, 60, 0.01, 0.12, 6, 0.03, -0.055
 AGREEMENT = {"float64": 1e-9, "float32": 3e-5}  # [m]
+UNSOLVED = 1e-5
+"""[m] Agreement of rollouts that say that the contacts of a step were left unsolved: both stop where their sweeps end,
+and the reference also sweeps over points that do not touch."""
 
 
 @functools.cache
@@ -93,12 +96,14 @@ def test_agrees_with_the_reference():
     assert np.sum(slid > 5e-4) >= 5
     plain = NativeLayered(system, points, TIME_STEP, threads=1).rollout(material, displacement)
     lifted = np.abs(plain.position[:, 1:] - wanted.position).max(axis=(1, 2, 3))
-    assert np.sum(lifted > 2e-3) >= 5
+    solved = np.asarray(wanted.status.contacts_converged)
+    assert np.sum(solved & (lifted > 2e-3)) >= 5
     for precision, tolerance in AGREEMENT.items():
         found = engine(precision).push(material, displacement, state, values)
-        np.testing.assert_allclose(found.body.position[:, 1:], wanted.position, rtol=0.0, atol=tolerance)
-        np.testing.assert_allclose(found.pose[:, 1:, :3], wanted.pose[..., :3], rtol=0.0, atol=tolerance)
-        np.testing.assert_array_equal(found.contacts_converged, wanted.status.contacts_converged)
+        allowed = np.where(solved, tolerance, max(tolerance, UNSOLVED))[:, None]
+        assert np.all(np.abs(found.body.position[:, 1:] - wanted.position).max(axis=(2, 3)) < allowed)
+        assert np.all(np.abs(found.pose[:, 1:, :3] - wanted.pose[..., :3]).max(axis=2) < allowed)
+        np.testing.assert_array_equal(found.contacts_converged, solved)
         assert not found.body.diverged.any()
     np.testing.assert_array_equal(found.pose[:, 0], state[:, :7].astype(np.float32))
 

@@ -85,22 +85,35 @@ def _velocity(matrix, free, impulse, row, n, token):
 
 
 @kernel
-def _updated(matrix, free, impulse, friction, contact, n, token):
+def _ease_contacts(matrix, ease, contacts, token):
+    """What divides the normal and the tangential velocity of every contact: its own compliance, the tangents' mean."""
+    n, one, two = 3 * contacts, fill(1.0, matrix, token), fill(2.0, matrix, token)
+    for contact in range(contacts):
+        d = 3 * contact * (n + 1)
+        store(ease, 2 * contact, one / load(matrix, d, token))
+        tangential = load(matrix, d + n + 1, token) + load(matrix, d + 2 * n + 2, token)
+        store(ease, 2 * contact + 1, two / tangential)
+
+
+@kernel
+def _updated(matrix, free, impulse, ease, friction, contact, n, token):
     """Impulse of a contact, given all others; see ``fem.contact``."""
     i, zero, one = 3 * contact, fill(0.0, matrix, token), fill(1.0, matrix, token)
     v = _velocity(matrix, free, impulse, i, n, token)
     v1 = _velocity(matrix, free, impulse, i + 1, n, token)
     v2 = _velocity(matrix, free, impulse, i + 2, n, token)
     old, d = load(impulse, i, token), i * n + i
-    normal = old - v / load(matrix, d, token)
+    normal = fnma(v, load(ease, 2 * contact, token), old)
     normal = where_greater(normal, zero, normal, zero)
     change = normal - old
     v1 = fma(load(matrix, d + n, token), change, v1)
     v2 = fma(load(matrix, d + 2 * n, token), change, v2)
-    scale = fill(2.0, matrix, token) / (load(matrix, d + n + 1, token) + load(matrix, d + 2 * n + 2, token))
+    scale = load(ease, 2 * contact + 1, token)
     t1 = fnma(v1, scale, load(impulse, i + 1, token))
     t2 = fnma(v2, scale, load(impulse, i + 2, token))
     square, limit = fma(t1, t1, t2 * t2), friction * normal
+    if not any_greater(square, limit * limit):
+        return normal, t1, t2
     beyond = where_greater(square, limit * limit, one, zero)
     shrink = where_greater(beyond, zero, limit / square_root(where_greater(beyond, zero, square, one)), one)
     return normal, t1 * shrink, t2 * shrink
@@ -118,12 +131,13 @@ def sweep(touch, matrix, free, contacts, sweeps, settled, token):
     """Gauss-Seidel sweeps over ``impulse`` in the lanes that are ``going``; leaves it 0 in those that have settled."""
     zero, n = fill(0.0, touch.cube, token), 3 * contacts
     friction, going = load(touch.values, 3, token), load(touch.going, 0, token)
+    _ease_contacts(matrix, touch.ease, contacts, token)
     for _ in range(sweeps):
         if not any_greater(going, zero):
             break
         change, largest = zero, zero
         for contact in range(contacts):
-            x, y, z = _updated(matrix, free, touch.impulse, friction, contact, n, token)
+            x, y, z = _updated(matrix, free, touch.impulse, touch.ease, friction, contact, n, token)
             i = 3 * contact
             a, b, c = (
                 load(touch.impulse, i, token),
@@ -147,18 +161,18 @@ def sweep(touch, matrix, free, contacts, sweeps, settled, token):
 @kernel
 def _reduce(touch, work, cables, contacts, token):
     """``reduced`` problem of the contacts, the cables that pull held at their lengths; ``held`` their answers."""
-    n = 3 * contacts
+    first, n = 3 * RESTING, 3 * contacts
     substitute_active(work.slack, 0, work.active, cables, work.pivoting, touch.offset, token)
-    for i in range(n):
+    for i in range(first, n):
         substitute_active(touch.pull, i * cables, work.active, cables, work.pivoting, touch.held, token)
     for i in range(n):
         rate = load(touch.free, i, token)
-        for c in range(cables):
+        for c in range(cables if i >= first else 0):
             rate = fma(load(touch.pull, i * cables + c, token), load(touch.offset, c, token), rate)
         store(touch.reduced_free, i, rate)
         for j in range(n):
             value = load(touch.matrix, i * n + j, token)
-            for c in range(cables):
+            for c in range(cables if min(i, j) >= first else 0):
                 pull, answer = load(touch.pull, i * cables + c, token), load(touch.held, j * cables + c, token)
                 value = fma(pull, answer, value)
             store(touch.reduced, i * n + j, value)
@@ -169,7 +183,7 @@ def _pulled(touch, work, cables, contacts, tolerance, token):
     """Tensions at the impulses of the contacts; returns whether all were found."""
     for c in range(cables):
         value = load(work.slack, c, token)
-        for i in range(3 * contacts):
+        for i in range(3 * RESTING, 3 * contacts):
             value = fma(load(touch.pull, i * cables + c, token), load(touch.impulse, i, token), value)
         store(touch.offset, c, value)
     return solve_unilateral(
@@ -198,14 +212,15 @@ def judge_contacts(touch, work, cables, contacts, token):
     zero, one, n = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token), 3 * contacts
     for i in range(n):
         rate = load(touch.free, i, token)
-        for c in range(cables):
+        for c in range(cables if i >= 3 * RESTING else 0):
             tension = load(work.tension, c, token)
             tension = where_greater(tension, zero, tension, zero)
             rate = fma(load(touch.pull, i * cables + c, token), tension, rate)
         store(touch.reduced_free, i, rate)
     change, largest, friction = zero, zero, load(touch.values, 3, token)
+    _ease_contacts(touch.matrix, touch.ease, contacts, token)
     for contact in range(contacts):
-        x, y, z = _updated(touch.matrix, touch.reduced_free, touch.impulse, friction, contact, n, token)
+        x, y, z = _updated(touch.matrix, touch.reduced_free, touch.impulse, touch.ease, friction, contact, n, token)
         i = 3 * contact
         a, b, c = load(touch.impulse, i, token), load(touch.impulse, i + 1, token), load(touch.impulse, i + 2, token)
         change = _larger(x - a, _larger(y - b, _larger(z - c, change, zero), zero), zero)
@@ -231,7 +246,7 @@ def solve_contacts(touch, work, cables, contacts, tolerance, settled, token):
 
 @kernel
 def stop_cube(touch, contacts, token):
-    """Let the contacts' impulses act on the cube's twist."""
+    """The cube's twist ``after`` the contacts' impulses."""
     light = fill(1.0, touch.cube, token) / load(touch.values, 0, token)
     gyration = load(touch.values, 2, token)
     for k in range(6):
@@ -239,4 +254,4 @@ def stop_cube(touch, contacts, token):
         for i in range(3 * contacts):
             total = fma(load(touch.on_cube, 6 * i + k, token), load(touch.impulse, i, token), total)
         share = light if k < 3 else light / (gyration * gyration)
-        store(touch.twist, k, fma(share, total, load(touch.twist, k, token)))
+        store(touch.after, k, fma(share, total, load(touch.twist, k, token)))

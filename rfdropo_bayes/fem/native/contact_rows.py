@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from rfdropo_bayes.fem.native.contact_records import SPACE
 from rfdropo_bayes.fem.native.simd import kernel
 from rfdropo_bayes.fem.pushing import ALARM, LYING, PUSHING, RESTING
 
@@ -157,38 +158,58 @@ def _outward(touch, x, y, z, lane, lanes):
 
 
 @kernel
-def place_pushing(scene, touch, position, time_step, lane, lanes):
-    """Contacts of the trunk with the cube, in the order of the points."""
-    previous = -0.5
+def _list_candidate(touch, slot, p, gap, normal, arm, lane, lanes):
+    """Write a candidate."""
+    touch.candidate[slot * lanes + lane] = p
+    t = SPACE * slot * lanes + lane
+    touch.space[t] = gap
+    touch.space[t + lanes], touch.space[t + 2 * lanes], touch.space[t + 3 * lanes] = normal
+    touch.space[t + 4 * lanes], touch.space[t + 5 * lanes], touch.space[t + 6 * lanes] = arm
+
+
+@kernel
+def list_pushing(scene, touch, position, lane, lanes):
+    """The trunk's points near the cube, in ascending order."""
+    p = -0.5
     for s in range(touch.count[0]):
-        contact, t = RESTING + s, s * lanes + lane
-        previous = _next_point(touch, 0, PUSHING, ALARM, previous, lane, lanes)
-        touch.point[t] = previous if previous < NONE else -1.0
+        p = _next_point(touch, 0, PUSHING, ALARM, p, lane, lanes)
         x, y, z, nx, ny, nz, gap = 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, APART
-        if previous < NONE:
-            x, y, z = surface_point(scene, int(previous), position, lane, lanes)
+        if p < NONE:
+            x, y, z = surface_point(scene, int(p), position, lane, lanes)
             x, y, z = x - touch.cube[lane], y - touch.cube[lanes + lane], z - touch.cube[2 * lanes + lane]
             distance, nx, ny, nz = _outward(touch, x, y, z, lane, lanes)
             # The contact lies on the cube, below the trunk's point.
             x, y, z = x - distance * nx, y - distance * ny, z - distance * nz
             gap = distance - scene.distance
-        _place(touch, contact, -1.0, (nx, ny, nz), (x, y, z), gap, time_step, lane, lanes)
+        _list_candidate(touch, s, p if p < NONE else -1.0, gap, (nx, ny, nz), (x, y, z), lane, lanes)
 
 
 @kernel
-def place_lying(scene, touch, position, time_step, lane, lanes):
-    """Contacts of the trunk with the plate, in the order of the points."""
-    up, previous = (scene.up[0], scene.up[1], scene.up[2]), -0.5
-    for s in range(touch.count[1]):
-        contact, t = RESTING + touch.count[0] + s, (touch.count[0] + s) * lanes + lane
-        previous = _next_point(touch, PUSHING, LYING, ALARM, previous, lane, lanes)
-        touch.point[t] = previous if previous < NONE else -1.0
+def list_lying(scene, touch, position, lane, lanes):
+    """The trunk's points near the plate, in ascending order."""
+    nx, ny, nz, p = 1.0 * scene.up[0], 1.0 * scene.up[1], 1.0 * scene.up[2], -0.5
+    for s in range(touch.count[0], touch.count[0] + touch.count[1]):
+        p = _next_point(touch, PUSHING, LYING, ALARM, p, lane, lanes)
         gap = APART
-        if previous < NONE:
-            x, y, z = surface_point(scene, int(previous), position, lane, lanes)
-            gap = scene.up[0] * x + scene.up[1] * y + scene.up[2] * z - scene.height - scene.distance
-        zero = 0.0 * up[0]
-        _place(touch, contact, 0.0, up, (zero, zero, zero), gap, time_step, lane, lanes)
+        if p < NONE:
+            x, y, z = surface_point(scene, int(p), position, lane, lanes)
+            gap = nx * x + ny * y + nz * z - scene.height - scene.distance
+        _list_candidate(touch, s, p if p < NONE else -1.0, gap, (nx, ny, nz), (0.0, 0.0, 0.0), lane, lanes)
+
+
+@kernel
+def place_candidate(touch, slot, contact, time_step, lane, lanes):
+    """Make a candidate a contact; without one (``slot`` negative), one that exerts nothing."""
+    point, sign, gap = -1.0, 0.0, APART
+    nx, ny, nz, x, y, z = 1.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if slot >= 0:
+        t = SPACE * slot * lanes + lane
+        point, gap = 1.0 * touch.candidate[slot * lanes + lane], 1.0 * touch.space[t]
+        sign = -1.0 if slot < touch.count[0] else 0.0
+        nx, ny, nz = touch.space[t + lanes], touch.space[t + 2 * lanes], touch.space[t + 3 * lanes]
+        x, y, z = touch.space[t + 4 * lanes], touch.space[t + 5 * lanes], touch.space[t + 6 * lanes]
+    touch.point[(contact - RESTING) * lanes + lane] = point
+    _place(touch, contact, sign, (nx, ny, nz), (x, y, z), gap, time_step, lane, lanes)
 
 
 @kernel
@@ -203,11 +224,11 @@ def free_cube(touch, gravity, drag, time_step, lane, lanes):
 
 @kernel
 def move_cube(touch, time_step, lane, lanes):
-    """Let the cube move on with ``twist``; see ``fem.rigid_body.moved``. Returns False if that leads nowhere."""
+    """Let the cube move on with ``after``; see ``fem.rigid_body.moved``. Returns False if that leads nowhere."""
     wx, wy, wz = (
-        0.5 * time_step * touch.twist[3 * lanes + lane],
-        0.5 * time_step * touch.twist[4 * lanes + lane],
-        0.5 * time_step * touch.twist[5 * lanes + lane],
+        0.5 * time_step * touch.after[3 * lanes + lane],
+        0.5 * time_step * touch.after[4 * lanes + lane],
+        0.5 * time_step * touch.after[5 * lanes + lane],
     )
     square = wx * wx + wy * wy + wz * wz
     angle = math.sqrt(square)
@@ -220,14 +241,14 @@ def move_cube(touch, time_step, lane, lanes):
     qz = scalar * z + w * wz + wx * y - wy * x
     qw = scalar * w - wx * x - wy * y - wz * z
     length = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
-    px = touch.cube[lane] + time_step * touch.twist[lane]
-    py = touch.cube[lanes + lane] + time_step * touch.twist[lanes + lane]
-    pz = touch.cube[2 * lanes + lane] + time_step * touch.twist[2 * lanes + lane]
+    px = touch.cube[lane] + time_step * touch.after[lane]
+    py = touch.cube[lanes + lane] + time_step * touch.after[lanes + lane]
+    pz = touch.cube[2 * lanes + lane] + time_step * touch.after[2 * lanes + lane]
     if not math.isfinite(px + py + pz + length):
         return False
     touch.cube[lane], touch.cube[lanes + lane], touch.cube[2 * lanes + lane] = px, py, pz
     touch.cube[3 * lanes + lane], touch.cube[4 * lanes + lane] = qx / length, qy / length
     touch.cube[5 * lanes + lane], touch.cube[6 * lanes + lane] = qz / length, qw / length
     for i in range(6):
-        touch.cube[(7 + i) * lanes + lane] = touch.twist[i * lanes + lane]
+        touch.cube[(7 + i) * lanes + lane] = touch.after[i * lanes + lane]
     return True

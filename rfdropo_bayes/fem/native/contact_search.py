@@ -1,6 +1,6 @@
 """Where a trunk comes near a cube and a plate, in SIMD lanes: what ``fem.pushing.find_contacts`` looks for.
 
-Bands of the surface that are far from both in every lane are passed over: what is further than ``ALARM`` exerts
+Bands of the surface whose mean is far from both in every lane are passed over: what is further than ``ALARM`` exerts
 nothing, so that lanes do not see what their neighbours have looked at.
 """
 
@@ -84,14 +84,11 @@ def search(scene, position, touch, token):
     for s in range(PUSHING + LYING):
         store(touch.gap, s, far)
         store(touch.nearest, s, none)
-    radius = 0.8661 * load(touch.values, 1, token)  # half the cube's diagonal
     for band in range(scene.bands):
-        p = scene.member[scene.band_first[band]]
-        x, y, z = point(scene.first, scene.place, scene.weight, p, position, token)
-        dx, dy, dz = x - load(touch.cube, 0, token), y - load(touch.cube, 1, token), z - load(touch.cube, 2, token)
-        limit = radius + scene.reach[band]
-        cube_near = any_greater(limit * limit, fma(dx, dx, fma(dy, dy, dz * dz)))
-        plate_near = any_greater(fill(scene.reach[band], touch.cube, token), _plate_height(scene, x, y, z, token))
+        x, y, z = point(scene.first, scene.place, scene.weight, scene.points + band, position, token)
+        reach = fill(scene.reach[band], touch.cube, token)
+        cube_near = any_greater(reach, _box_distance(touch, x, y, z, token))
+        plate_near = any_greater(reach, _plate_height(scene, x, y, z, token))
         if cube_near or plate_near:
             _search_band(scene, band, position, touch, cube_near, token)
     touch.count[0] = _near(touch, 0, PUSHING, token)

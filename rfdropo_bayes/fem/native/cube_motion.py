@@ -5,9 +5,9 @@ from __future__ import annotations
 from rfdropo_bayes.fem.native.contact_records import CUBE_STATE, CUBE_VALUES
 from rfdropo_bayes.fem.native.contact_rows import (
     free_cube,
+    list_lying,
+    list_pushing,
     move_cube,
-    place_lying,
-    place_pushing,
     place_resting,
     turn_cube,
 )
@@ -17,8 +17,8 @@ from rfdropo_bayes.fem.native.simd import kernel
 
 
 @kernel
-def find_contacts(scene, position, gravity, drag, touch, time_step, token):
-    """Contacts of a step from the body's position and the cube's state; returns how many the trunk takes part in."""
+def find_candidates(scene, position, gravity, drag, touch, time_step, token):
+    """The cube's contacts, and the trunk's candidates, from positions; returns how many candidates there are."""
     lanes = len(token)
     for lane in range(lanes):
         turn_cube(touch, lane, lanes)
@@ -26,8 +26,8 @@ def find_contacts(scene, position, gravity, drag, touch, time_step, token):
         place_resting(scene, touch, time_step, lane, lanes)
     search(scene, position, touch, token)
     for lane in range(lanes):
-        place_pushing(scene, touch, position, time_step, lane, lanes)
-        place_lying(scene, touch, position, time_step, lane, lanes)
+        list_pushing(scene, touch, position, lane, lanes)
+        list_lying(scene, touch, position, lane, lanes)
     return touch.count[0] + touch.count[1]
 
 

@@ -13,7 +13,9 @@ from jaxtyping import Bool, Float
 from rfdropo_bayes.fem.dynamics import Material, System
 from rfdropo_bayes.fem.layered import PointMap, rest_positions
 from rfdropo_bayes.fem.layered_pushing import check_effects
+from rfdropo_bayes.fem.native.chain_cholesky import substitute_back
 from rfdropo_bayes.fem.native.contact_records import (
+    MISSED,
     SETTLED,
     TRUNK_MOST,
     PushOutput,
@@ -23,7 +25,7 @@ from rfdropo_bayes.fem.native.contact_records import (
     scene_tables,
     touch_storage,
 )
-from rfdropo_bayes.fem.native.contact_step import touch_step
+from rfdropo_bayes.fem.native.contact_step import add_forces, add_impulses, add_missed, press, start_contacts
 from rfdropo_bayes.fem.native.cube_motion import finish_cubes, record_cubes, start_cubes, take_cube_step
 from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
 from rfdropo_bayes.fem.native.layered import NativeLayered, NativeRollout, Precision, in_blocks
@@ -39,9 +41,9 @@ from rfdropo_bayes.fem.native.layered_step import (
     condense_increment,
     find_tensions,
     refine_increment,
-    substitute_increment,
     take_step,
     weigh_border,
+    weigh_rows,
 )
 from rfdropo_bayes.fem.native.section_modes import border_panels
 from rfdropo_bayes.fem.native.simd import addresses, inlined
@@ -57,8 +59,10 @@ class NativePush(NamedTuple):
 
 
 @inlined
-def _take(tables, samples, factors, touch, work, schedule, token):
+def _take(tables, scene, samples, factors, touch, work, panels, schedule, token):
     """Refine the step's solution, and move body and cube."""
+    for lane in range(len(token) if schedule.refinements > 0 else 0):
+        add_forces(scene, touch, panels, work.field, lane, len(token))
     for _ in range(schedule.refinements):
         refine_increment(tables, samples, factors, work, token)
     take_step(tables, work, schedule.time_step, token)
@@ -72,8 +76,9 @@ def compile_rollout(sources: str) -> Callable:
 
     @numba.njit(nogil=True, cache=True, error_model="numpy")
     def rollout(
-        tables, scene, batch, cubes, samples, factors, work, touch, schedule, settled, output, poses, first, token
-    ):
+        tables, scene, batch, cubes, samples, factors, work, touch, schedule, settled, missed, output, poses, first,
+        token,
+    ):  # fmt: skip
         _ = sources
         tables, scene, batch, cubes = addresses(tables), addresses(scene), addresses(batch), addresses(cubes)
         samples, factors, work, touch = addresses(samples), addresses(factors), addresses(work), addresses(touch)
@@ -98,15 +103,28 @@ def compile_rollout(sources: str) -> Callable:
                 fill_lanes(batch.displacement, pitch, offset, cables, first, count, work.commanded, token)
             rate = 1.0 / schedule.time_step if step >= 0 else 1.0
             condense_increment(tables, samples, factors, work, rate, schedule, token)
+            step_length, tolerance, candidates, panels, top = schedule.time_step, schedule.tolerance, 0, 0, 0
             if step >= 0:
-                step_length, tolerance = schedule.time_step, schedule.tolerance
-                touch_step(tables, scene, samples, touch, work, step_length, tolerance, settled, token)
-            else:
-                find_tensions(cables, work, schedule.tolerance, token)
-            weigh_border(cables, work, rate, token)
-            substitute_increment(tables, work, token)
+                candidates = start_contacts(scene, samples, touch, work, cables, step_length, token)
+            solves, again = 0, True
+            while again:
+                if step >= 0:
+                    panels, top = press(tables, scene, touch, work, candidates, step_length, tolerance, settled, token)
+                else:
+                    find_tensions(cables, work, tolerance, token)
+                weigh_border(cables, work, rate, token)
+                weigh_rows(tables, work, token)
+                if panels > 0:
+                    add_impulses(tables, touch, work, panels, top, token)
+                substitute_back(
+                    work.pivot, work.coupling, work.solution, tables.held, tables.stations, tables.modes, token
+                )
+                solves += 1
+                again = candidates > 0 and add_missed(
+                    scene, touch, work, candidates, solves, step_length, missed, len(token)
+                )
             if step >= 0:
-                _take(tables, samples, factors, touch, work, schedule, token)
+                _take(tables, scene, samples, factors, touch, work, panels, schedule, token)
             else:
                 take_increment(tables, work, token)
         finish_rollouts(work, output, first, count, token)
@@ -164,13 +182,13 @@ class NativeLayeredPush(NativeLayered):
         batch, schedule, output = self._inputs(material, displacement, given, steps, 1)
         cubes = cube_rows(state, values, batch.count, self.dtype)
         poses = PushOutput(np.zeros((batch.count, output.records, 7)), np.zeros(batch.count, dtype=np.uint8))
-        kernel, settled = _kernel(), SETTLED[self.precision]
+        kernel, settled, missed = _kernel(), SETTLED[self.precision], MISSED[self.precision]
 
         def block(first: int) -> None:
             samples, factors, work = self._storage()
             kernel(
                 self._tables, self._scene, batch, cubes, samples, factors, work, self._touch(), schedule, settled,
-                output, poses, first, self._token,
+                missed, output, poses, first, self._token,
             )  # fmt: skip
 
         in_blocks(block, batch.count, self.lanes, self.threads)

@@ -193,11 +193,17 @@ def condense_increment(tables, samples, factors, work, rate, schedule, token):
 
 
 @inlined
+def weigh_rows(tables, work, token):
+    """``solution`` = the weighted sum of the border rows, where the back substitution starts."""
+    size, stations, panels = 3 * tables.modes, tables.stations, (tables.cables + 3) // 3
+    combine_border(work.border, work.weight, work.solution, tables.held, stations, size, panels, token)
+
+
+@inlined
 def substitute_increment(tables, work, token):
     """``solution`` = A^-1 times the weighted sum of the border rows."""
-    tiles, stations, held, panels = tables.modes, tables.stations, tables.held, (tables.cables + 3) // 3
-    combine_border(work.border, work.weight, work.solution, held, stations, 3 * tiles, panels, token)
-    substitute_back(work.pivot, work.coupling, work.solution, held, stations, tiles, token)
+    weigh_rows(tables, work, token)
+    substitute_back(work.pivot, work.coupling, work.solution, tables.held, tables.stations, tables.modes, token)
 
 
 @inlined

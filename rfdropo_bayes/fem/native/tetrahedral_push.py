@@ -15,6 +15,7 @@ from rfdropo_bayes.fem.contact import CABLE_CHOICES, SWEEPS
 from rfdropo_bayes.fem.drives import DriveLimits
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native.block_cholesky import condense_rows, extend_border
+from rfdropo_bayes.fem.native.contact_choice import choose_all, place_chosen
 from rfdropo_bayes.fem.native.contact_problem import (
     cube_compliance,
     judge_contacts,
@@ -33,7 +34,7 @@ from rfdropo_bayes.fem.native.contact_records import (
     touch_storage,
 )
 from rfdropo_bayes.fem.native.cube_motion import (
-    find_contacts,
+    find_candidates,
     finish_cubes,
     record_cubes,
     start_cubes,
@@ -105,8 +106,6 @@ def _condense_contacts(pattern, scene, touch, work, panels, free, reached, cable
     extend_border(pattern, work.pivot, work.lower, touch.border, panels, reached, free, token)
     condense_rows(pattern, touch.own, touch.border, panels, touch.border, panels, True, reached, free, token)
     condense_rows(pattern, touch.across, touch.border, panels, work.lower, others, False, reached, free, token)
-    for i in range(3 * RESTING * cables):
-        store(touch.pull, i, zero)
     for i in range(3 * panels):
         t, row = 9 * (i // 3 * others) + i % 3, 3 * RESTING + i
         store(touch.moving, row, load(touch.moving, row, token) + load(touch.across, t, token))
@@ -153,7 +152,10 @@ def _touch_step(pattern, scene, samples, touch, work, free, cables, reached, sch
     """Tensions and impulses between the factorisation and the back substitution of a step; returns how many contacts
     the trunk takes part in."""
     time_step, tolerance = schedule.time_step, schedule.tolerance
-    panels = find_contacts(scene, work.position, samples.gravity, samples.rayleigh_mass, touch, time_step, token)
+    candidates = find_candidates(scene, work.position, samples.gravity, samples.rayleigh_mass, touch, time_step, token)
+    for lane in range(len(token)):
+        choose_all(touch, candidates, lane, len(token))
+    panels = place_chosen(touch, candidates, time_step, len(token))
     contacts = RESTING + panels
     _condense_contacts(pattern, scene, touch, work, panels, free, reached, cables, time_step, token)
     cube_compliance(touch, contacts, token)
@@ -162,8 +164,6 @@ def _touch_step(pattern, scene, samples, touch, work, free, cables, reached, sch
         find_tensions(cables, work, tolerance, token)
         store(touch.going, 0, fill(1.0, touch.cube, token))
         sweep(touch, touch.matrix, touch.free, contacts, CABLE_CHOICES * SWEEPS, settled, token)
-        for i in range(3 * RESTING * cables):
-            store(touch.pull, i, fill(0.0, touch.pull, token))
     else:
         trunk_compliance(touch, contacts, 1.0, token)
         open_contacts(touch, contacts, token)
