@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.noise import STATED, NoiseModel
+from rfdropo_bayes.audit.noise import RESIDUALS, STATED, NoiseModel
 from rfdropo_bayes.audit.score import project_out
 
 
@@ -18,18 +18,41 @@ def null_residuals(
     measurements: Measurements,
     noise: NoiseModel,
     base: Float[np.ndarray, "n rank"],
+    parameters: int,
     rng: np.random.Generator,
     count: int,
 ) -> Float[np.ndarray, "count n"]:
-    """Whitened residuals of ``count`` data sets without discrepancy, after the base model is fitted to each."""
+    """Whitened residuals of ``count`` data sets without discrepancy, after the base model is fitted to each.
+
+    Args:
+        measurements: the data, for their times, gaps and repeats.
+        noise: that is drawn.
+        base: orthonormal basis of what the base parameters do to whitened data.
+        parameters: how many of them were fitted.
+        rng: of the noise.
+        count: data sets.
+    """
     found = np.empty((count, len(base)))
-    for row in range(count):
-        single = noise.draw(rng, measurements.single.shape)
+    drawn = noise.draw(rng, (count, *measurements.single.shape))
+    if noise.source == RESIDUALS:
+        drawn = _fitted(measurements, noise, base, drawn)
+    for row, single in enumerate(drawn):
         estimated = noise
         if noise.source != STATED:
-            estimated = measurements.noise(single, base.shape[1], noise)
+            estimated = measurements.noise(single, parameters, noise)
         found[row] = measurements.whiten(measurements.mean_of(single), estimated)
     return project_out(base, found.T).T
+
+
+def _fitted(measurements: Measurements, noise: NoiseModel, base: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """What the base model leaves of data sets without repeats: where the noise is estimated from that, it is estimated
+    from that here, too; the noise before a fit would be a little larger in most of them, and give itself away."""
+    order = [group[0] for group in measurements.members]
+    white = measurements.whiten(drawn[:, order], noise)
+    left = project_out(base, white.T).T.reshape(len(drawn), *measurements.position.shape)
+    fitted = np.empty_like(drawn)
+    fitted[:, order] = noise.colour(left, measurements.valid)
+    return fitted
 
 
 def tail(observed: float, simulated: Float[np.ndarray, " count"]) -> float:

@@ -89,16 +89,23 @@ class Inquiry:
     report: Callable[[str], None] = lambda line: None
 
     def look_at(self, fit: Fit, without: Sequence[str] = ()) -> tuple[Look, list[Probe]]:
-        """Test a fit and screen the candidates that are not in it."""
+        """Test a fit and screen the candidates that are not in it.
+
+        An error of the mesh or time step that is too small to be named is no discrepancy either: where the residuals
+        of the finer simulator pass more easily, it is they that count.
+        """
         free = [c for c in self.candidates if c.name not in without]
         names = [c.name for c in free]
+        finer = None
         probes = probe_all(self.target, fit, free)
         if self.finer is not None and DISCRETISATION not in without:
             refined = replace(self.target, forward=self.finer)
             finer = refined.recall("finer", [fit.x], lambda: {"left": refined.residual(fit.x[None])[0]})["left"]
             probes.append(discretisation_probe(fit, DISCRETISATION, finer, span(fit.jacobian)))
             names.append(DISCRETISATION)
-        found = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps)
+        found = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer)
+        if found.finer is not None and found.row(DISCRETISATION).adjusted_p > self.rules.family:
+            found = replace(found, omnibus=max(found.omnibus, found.finer, key=lambda test: test.p))
         return found, probes
 
     def name_causes(self, base: Fit) -> tuple[list[Step], Look]:

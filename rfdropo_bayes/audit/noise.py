@@ -64,6 +64,19 @@ class NoiseModel:
             innovation -= coefficients[memory, lag - 1] * before
         return np.where(valid, innovation / (deviation[memory] * self.scale), 0.0)
 
+    def colour(
+        self, white: Float[np.ndarray, "*batch time channel"], valid: Bool[np.ndarray, "*batch time channel"]
+    ) -> Float[np.ndarray, "*batch time channel"]:
+        """The series that `whiten` makes ``white`` of; zero where not valid."""
+        coefficients, deviation = self.predictors
+        memory = np.minimum(rows_before(valid), self.order)
+        series = np.where(valid, white * deviation[memory] * self.scale, 0.0)
+        for row in range(1, series.shape[-2]):
+            for lag in range(1, min(self.order, row) + 1):
+                share = coefficients[memory[..., row, :], lag - 1]
+                series[..., row, :] += np.where(valid[..., row, :], share * series[..., row - lag, :], 0.0)
+        return series
+
     def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "*batch time channel"]:
         """A realisation of shape (..., time, channel)."""
         coefficients, deviation = self.predictors

@@ -190,7 +190,12 @@ def _parameters(answer: Answer, free: np.ndarray, x: np.ndarray) -> dict[str, fl
 
 
 def _omnibus(look: Look) -> dict[str, Any]:
-    return {"p": look.omnibus.p, "tests": look.omnibus.single, "blocks": look.omnibus.blocks.tolist()}
+    return {
+        "p": look.omnibus.p,
+        "finer_mesh": look.refined,
+        "tests": look.omnibus.single,
+        "blocks": look.omnibus.blocks.tolist(),
+    }
 
 
 def _candidates(answer: Answer) -> list[dict[str, Any]]:

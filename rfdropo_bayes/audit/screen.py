@@ -12,8 +12,9 @@ from jaxtyping import Float
 from rfdropo_bayes.audit.bootstrap import null_residuals, tail
 from rfdropo_bayes.audit.candidates import Probe
 from rfdropo_bayes.audit.fit import Fit, Target
+from rfdropo_bayes.audit.noise import RESIDUALS
 from rfdropo_bayes.audit.omnibus import Omnibus, block_means, joint_test, statistics
-from rfdropo_bayes.audit.score import span, statistic
+from rfdropo_bayes.audit.score import project_out, span, statistic
 
 CHUNK_NUMBERS = 2e7  # of simulated residuals in memory at a time
 DIRECTED = "candidates"
@@ -43,18 +44,36 @@ class Row:
 
 @dataclass(frozen=True)
 class Look:
-    """A model, the joint test of its residuals, and the screen of what it might lack (best first)."""
+    """A model, the joint test of its residuals, and the screen of what it might lack (best first).
+
+    ``finer`` is the joint test of the residuals on a finer mesh and time step, None where there is none; ``omnibus``
+    is the same where the model is let pass by it.
+    """
 
     fit: Fit
     omnibus: Omnibus
     rows: tuple[Row, ...]
+    finer: Omnibus | None = None
+
+    @property
+    def refined(self) -> bool:
+        """Whether it is on the finer mesh and time step that the model was tested."""
+        return self.omnibus is self.finer
 
     def row(self, name: str) -> Row:
         """That of one candidate."""
         return next(row for row in self.rows if row.name == name)
 
 
-def look(target: Target, fit: Fit, probes: Sequence[Probe], names: Sequence[str], seed: Any, bootstraps: int) -> Look:
+def look(
+    target: Target,
+    fit: Fit,
+    probes: Sequence[Probe],
+    names: Sequence[str],
+    seed: Any,
+    bootstraps: int,
+    finer: Float[np.ndarray, " n"] | None = None,
+) -> Look:
     """Test a fitted model and screen candidates against it, calibrated by parametric bootstrap.
 
     Args:
@@ -64,19 +83,26 @@ def look(target: Target, fit: Fit, probes: Sequence[Probe], names: Sequence[str]
         names: of all candidates, those without a probe among them.
         seed: of the bootstrap.
         bootstraps: simulated data sets.
+        finer: residuals of the finer simulator with the same parameters.
     """
-    base = span(fit.jacobian)
     seen = [probe for probe in probes if probe.mark.rank > 0]
-    observed, surprises = _statistics(target, fit.residual[None], seen)
-    simulated, reference = _simulated(target, base, seen, np.random.default_rng(seed), bootstraps)
+    residuals = [fit.residual]
+    if finer is not None:
+        residuals.append(fit.residual + project_out(span(fit.jacobian), (finer - fit.residual)[:, None])[:, 0])
+    observed, surprises = _statistics(target, np.stack(residuals), seen)
+    simulated, reference = _simulated(target, fit, seen, np.random.default_rng(seed), bootstraps)
+    if target.noise.source == RESIDUALS:  # whose mean square is that of the residuals by construction
+        del observed["variance"], simulated["variance"]
     most = reference.max(axis=1) if seen else np.zeros(bootstraps)
-    observed[DIRECTED] = surprises.max(axis=1) if seen else np.zeros(1)
+    observed[DIRECTED] = surprises.max(axis=1) if seen else np.zeros(len(residuals))
     simulated[DIRECTED] = most
-    white = fit.residual.reshape(target.measurements.position.shape)
-    blocks = np.nanmean(block_means(white) ** 2, axis=(0, 2))
-    test = joint_test({name: float(value[0]) for name, value in observed.items()}, simulated, blocks)
+    tests = []
+    for index, residual in enumerate(residuals):
+        white = residual.reshape(target.measurements.position.shape)
+        blocks = np.nanmean(block_means(white) ** 2, axis=(0, 2))
+        tests.append(joint_test({name: float(v[index]) for name, v in observed.items()}, simulated, blocks))
     rows = [_row(name, seen, surprises[0], most, fit) for name in names]
-    return Look(fit, test, tuple(sorted(rows, key=lambda row: -row.score)))
+    return Look(fit, tests[0], tuple(sorted(rows, key=lambda row: -row.score)), tests[1] if len(tests) > 1 else None)
 
 
 def _row(name: str, seen: Sequence[Probe], surprises: np.ndarray, most: np.ndarray, fit: Fit) -> Row:
@@ -100,12 +126,14 @@ def _statistics(
 
 
 def _simulated(
-    target: Target, base: np.ndarray, probes: Sequence[Probe], rng: np.random.Generator, count: int
+    target: Target, fit: Fit, probes: Sequence[Probe], rng: np.random.Generator, count: int
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    base = span(fit.jacobian)
     chunk = max(1, min(count, int(CHUNK_NUMBERS / base.shape[0])))
     parts: list[tuple[Mapping[str, np.ndarray], np.ndarray]] = []
     for start in range(0, count, chunk):
-        residuals = null_residuals(target.measurements, target.noise, base, rng, min(chunk, count - start))
+        size = min(chunk, count - start)
+        residuals = null_residuals(target.measurements, target.noise, base, len(fit.free), rng, size)
         parts.append(_statistics(target, residuals, probes))
     joined = {name: np.concatenate([part[0][name] for part in parts]) for name in parts[0][0]}
     return joined, np.concatenate([part[1] for part in parts])

@@ -30,7 +30,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if answer.verdict == NO_DISCREPANCY:
         return (
             f"No discrepancy: what the base model leaves is noise as far as these data can tell "
-            f"(joint test p = {answer.looks[0].omnibus.p:.2g}{_assumption(answer)})."
+            f"(joint test p = {answer.looks[0].omnibus.p:.2g}{_resolution(answer)}{_assumption(answer)})."
         )
     if not findings and answer.looks[0].omnibus.p > answer.question.rules.base_passes:
         left = 1e3 * noise_distance(answer.target.noise)
@@ -96,6 +96,12 @@ def _remains(answer: Answer) -> str:
     if answer.target.noise.source == REPEATS:
         return f"{remain}, {1e3 * noise_distance(answer.target.noise):.2g} mm of it noise"
     return remain
+
+
+def _resolution(answer: Answer) -> str:
+    if answer.looks[0].refined:
+        return " on a mesh and time step twice as fine, which differ too little to be named"
+    return ""
 
 
 def _assumption(answer: Answer) -> str:

@@ -83,6 +83,26 @@ def test_a_cause_outside_the_library_is_not_called_explained_and_a_gain_is_invis
     assert {c["mechanism"] for c in content["candidates"]} == set(CANDIDATES) - {"play"}
 
 
+@pytest.mark.parametrize(("family", "named"), [(0.02, ["discretisation"]), (0.0, [])])
+def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(family, named):
+    """An error of the audit's own simulator, which a finer one lacks; where nothing may be named, it is let pass."""
+
+    class Coarse(Toy):
+        def rollout(self, parameters, commands, steps=None):
+            found = super().rollout(parameters, commands, steps)
+            return found._replace(position=found.position * (1.0 + 3.0 * found.position))
+
+    asked = question(TRUTH, 102)
+    finer = (asked.lanes, asked.recordings.commands)
+    rules = replace(asked.rules, family=family)
+    answer = audit(replace(asked, lanes=Lanes(Coarse(), np.arange(4)), finer=finer, rules=rules))
+    assert [step.name for step in answer.steps] == named
+    assert answer.verdict == ("explained" if named else "no_discrepancy")
+    assert answer.looks[0].refined is not bool(named)
+    if not named:
+        assert "twice as fine" in record(answer, versions={}, data_sha256="", next_experiment=None)["sentence"]
+
+
 def test_the_same_seed_gives_the_same_audit():
     first, second = (found({}, 100) for _ in range(2))
     assert {k: v for k, v in first.items() if k != "seconds"} == {k: v for k, v in second.items() if k != "seconds"}
