@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.pipeline import Answer, simulated
 from rfdropo_bayes.audit.record import STIFFNESS
+from rfdropo_bayes.audit.verdict import EQUIVALENT, EXPLAINED, NO_DISCREPANCY, PARTLY, UNEXPLAINED
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.mechanisms import REGISTRY
@@ -25,17 +27,27 @@ from rfdropo_bayes.workflow.hidden_effects import Hidden, Setting, hide
 
 RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
 NEAR = 1.3  # times the error of the model that knows what is hidden
+ONCE = 'data.fit=["fit_1.nc", "screen.nc"]'  # an override that leaves the repeats out
 TRIES = 8  # mechanisms that are tried until one reaches the wanted size
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One kind of data set: how many effects of which size, and whether the library has them."""
+    """One kind of data set: how many effects of which size, whether the library has them, and whether the audit is
+    given repeats, from which it takes the noise."""
 
     name: str
     effects: int
     rho: float
     removed: bool = False
+    repeats: bool = True
+
+    @property
+    def right(self) -> tuple[str, ...]:
+        """Verdicts that are right."""
+        if self.effects == 0:
+            return (NO_DISCREPANCY,)
+        return (PARTLY, UNEXPLAINED) if self.removed else (EXPLAINED, EQUIVALENT)
 
 
 CONDITIONS = (
@@ -44,6 +56,7 @@ CONDITIONS = (
     Condition("rho_0.15", 1, 0.15),
     Condition("two_effects_rho_1", 2, 1.0),
     Condition("removed_rho_0.5", 1, 0.5, removed=True),
+    Condition("null_without_repeats", 0, 0.0, repeats=False),
 )
 
 
@@ -87,9 +100,10 @@ def run_study(
         content = {
             "seed": seed,
             "hours": round(sum(row["seconds"] for row in done) / 3600.0, 3),
+            "core_hours": round(sum(row["core_seconds"] for row in done) / 3600.0, 3),
             "library": library,
             "excluded": list(exclude),
-            "conditions": {c.name: summarise([r for r in done if r["condition"] == c.name]) for c in chosen},
+            "conditions": {c.name: summarise(c, [r for r in done if r["condition"] == c.name]) for c in chosen},
             "schema_version": 1,
         }
         (out / RESULT).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
@@ -118,40 +132,59 @@ _WORKSHOP: Workshop = {}  # of this process
 def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path) -> dict[str, Any]:
     """One data set: hidden, audited, judged."""
     condition, index = _conditions([job["condition"]])[0], int(job["index"])
-    began = time.monotonic()
+    began, processor = time.monotonic(), time.process_time()
     place = folder / f"{condition.name}_{index}"
     number = int(np.random.SeedSequence([job["seed"], index, CONDITIONS.index(condition)]).generate_state(1)[0])
-    found = _hidden(condition, number, library, exclude, place, _WORKSHOP)
-    if found is None:
-        raise InputError("no mechanism reaches the wanted size", where=condition.name)
-    hidden, names = found
+    turn = _turn(library, condition.effects, [job["seed"], CONDITIONS.index(condition)], index)
+    hidden, names, unreached = _hidden(condition, turn, number, library, exclude, place, _WORKSHOP)
     answers: list[Answer] = []
-    content = run_audit(hidden.experiment, place / "audit", workshop=_WORKSHOP, inspect=answers.append)
+    given = [] if condition.repeats else [ONCE]
+    content = run_audit(hidden.experiment, place / "audit", workshop=_WORKSHOP, overrides=given, inspect=answers.append)
     if condition.removed:
         content = run_audit(
             hidden.experiment, place / "removed", workshop=_WORKSHOP, overrides=[_without(content, names, exclude)]
         )
     return {
         "hidden": names,
+        "unreached": unreached,
         "rho": hidden.rho,
         "truth": hidden.values,
         **judge(content, names, hidden),
         "error_over_oracle": None if condition.removed else error_over_oracle(answers[0], names, hidden),
         "seconds": round(time.monotonic() - began, 1),
+        "core_seconds": round(time.process_time() - processor, 1),
     }
 
 
+def _turn(library: Sequence[str], effects: int, seed: Sequence[int], index: int) -> list[str]:
+    """The mechanisms of a data set: each of the library has its turn before any has its second."""
+    places = range(index * effects, (index + 1) * effects)
+    count = len(library)
+    return [np.random.default_rng([*seed, p // count]).permutation(library)[p % count].item() for p in places]
+
+
 def _hidden(
-    condition: Condition, seed: int, library: Sequence[str], exclude: Sequence[str], place: Path, workshop: Workshop
-) -> tuple[Hidden, list[str]] | None:
-    """A data set with mechanisms of the library chosen at random, among those that can reach the size."""
+    condition: Condition,
+    turn: Sequence[str],
+    seed: int,
+    library: Sequence[str],
+    exclude: Sequence[str],
+    place: Path,
+    workshop: Workshop,
+) -> tuple[Hidden, list[str], list[str]]:
+    """A data set with the mechanisms whose turn it is, or with others at random where these cannot reach the size; what
+    is hidden; and what could not be."""
     rng = np.random.default_rng(seed)
+    chosen, unreached = list(turn), []
     for _ in range(TRIES):
-        names = sorted(rng.choice(library, condition.effects, replace=False).tolist(), key=list(REGISTRY).index)
-        found = hide(Setting(), names, condition.rho, seed, place, exclude=exclude, workshop=workshop)
-        if found is not None:
-            return found, names
-    return None
+        names = sorted(set(chosen), key=list(REGISTRY).index)
+        if len(names) == condition.effects:
+            found = hide(Setting(), names, condition.rho, seed, place, exclude=exclude, workshop=workshop)
+            if found is not None:
+                return found, names, unreached
+            unreached.append(" + ".join(names))
+        chosen = rng.choice(library, condition.effects, replace=False).tolist()
+    raise InputError("no mechanism reaches the wanted size", where=condition.name)
 
 
 def _without(content: Mapping[str, Any], names: Sequence[str], exclude: Sequence[str]) -> str:
@@ -212,7 +245,7 @@ def error_over_oracle(answer: Answer, names: Sequence[str], hidden: Hidden) -> f
     return error(answer.predictions[1].mean) / error(predicted)
 
 
-def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def summarise(condition: Condition, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Counts over the data sets of one condition; ``confusions`` counts hidden -> named first."""
     verdicts: dict[str, int] = {}
     confusions: dict[str, int] = {}
@@ -227,6 +260,8 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {
         "datasets": len(rows),
         "verdicts": verdicts,
+        "right_verdict": sum(row["verdict"] in condition.right for row in rows),
+        "unreached": sorted({name for row in rows for name in row["unreached"]}),
         "named_first": sum(row["named_first"] for row in rows),
         "all_named": sum(row["all_named"] for row in rows),
         "median_class_size": float(np.median(sizes)) if sizes else None,
@@ -242,11 +277,12 @@ def as_table(content: Mapping[str, Any]) -> str:
     """The study as a Markdown table."""
     without = ", ".join(content["excluded"]) or "none"
     lines = [
-        f"Seed {content['seed']}; {content['hours']} hours; mechanisms neither hidden nor tried: {without}.",
+        f"Seed {content['seed']}; {content['hours']} hours, {content['core_hours']} of them processor time; mechanisms "
+        f"neither hidden nor tried: {without}. In brackets: exact 95 % intervals of the rates, in %.",
         "",
-        "| condition | data sets | verdicts | named first | all named | median class | 90 % intervals cover | "
-        "error within 1.3 of the oracle's | largest discretisation rho |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| condition | data sets | verdicts | right verdict | named first | all named | median class | "
+        "90 % intervals cover | error within 1.3 of the oracle's | largest discretisation rho |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, row in content["conditions"].items():
         verdicts = ", ".join(f"{verdict} {count}" for verdict, count in sorted(row["verdicts"].items()))
@@ -255,10 +291,19 @@ def as_table(content: Mapping[str, Any]) -> str:
             for key in ("interval_coverage", "within_1.3_of_the_oracle")
         )
         rho = max(row["discretisation_rho"], default=0.0)
+        right, first, every = (_rate(row, key) for key in ("right_verdict", "named_first", "all_named"))
         lines.append(
-            f"| {name} | {row['datasets']} | {verdicts} | {row['named_first']} | {row['all_named']} | "
+            f"| {name} | {row['datasets']} | {verdicts} | {right} | {first} | {every} | "
             f"{row['median_class_size'] or '-'} | {share} | {near} | {rho:.3f} |"
         )
     confusions = ((name, row["confusions"]) for name, row in content["conditions"].items())
     wrong = [f"- {name}: {pair} ({count})" for name, pairs in confusions for pair, count in pairs.items()]
     return "\n".join([*lines, "", "Not named first (hidden -> named):", "", *(wrong or ["- none"])]) + "\n"
+
+
+def _rate(row: Mapping[str, Any], what: str) -> str:
+    """A count with its exact binomial interval."""
+    if row["datasets"] == 0:
+        return "-"
+    interval = binomtest(row[what], row["datasets"]).proportion_ci(0.95, "exact")
+    return f"{row[what]} [{100 * interval.low:.0f}, {100 * interval.high:.0f}]"

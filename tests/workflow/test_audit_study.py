@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.workflow.audit_study import LEDGER, TABLE, judge, run_study
+from rfdropo_bayes.workflow.audit_study import LEDGER, TABLE, _turn, judge, run_study
 from rfdropo_bayes.workflow.hidden_effects import Hidden
 
 CONTENT = {
@@ -49,12 +49,29 @@ def test_a_size_is_judged_in_the_form_that_can_be_known():
     assert not judge(CONTENT, ["backlash"], hidden(0.02))["named_first"]
 
 
+def test_every_mechanism_has_its_turn_before_one_has_its_second():
+    turns = [name for index in range(6) for name in _turn(["a", "b", "c", "d"], 2, [7, 1], index)]
+    assert all(sorted(turns[k : k + 4]) == ["a", "b", "c", "d"] for k in (0, 4, 8))
+    assert turns[:4] != turns[4:8] or turns[4:8] != turns[8:]
+
+
 def test_a_study_counts_what_its_ledger_holds_and_lists_confusions(tmp_path):
     def line(index: int, name: str, ratio: float | None, seed: int = 7) -> str:
         judged = judge(CONTENT, [name], hidden(0.02))
         result = {"hidden": [name], "rho": {"discretisation": 0.01 * index}, **judged}
         job = {"condition": "rho_0.5", "index": index, "seed": seed}
-        return json.dumps({"job": job, "result": {**result, "error_over_oracle": ratio, "seconds": 36.0}})
+        return json.dumps(
+            {
+                "job": job,
+                "result": {
+                    **result,
+                    "error_over_oracle": ratio,
+                    "seconds": 36.0,
+                    "core_seconds": 18.0,
+                    "unreached": [],
+                },
+            }
+        )
 
     rows = [line(0, "payload", 1.0), line(1, "payload", 1.5), line(2, "backlash", 3.0), line(0, "payload", 1.0, seed=8)]
     (tmp_path / LEDGER).write_text("\n".join(rows) + "\n")
@@ -66,8 +83,9 @@ def test_a_study_counts_what_its_ledger_holds_and_lists_confusions(tmp_path):
     assert row["within_1.3_of_the_oracle"] == 0.5
     assert row["confusions"] == {"backlash -> payload": 1}
     assert found["hours"] == pytest.approx(0.03)
+    assert found["core_hours"] == pytest.approx(0.015)
     table = (tmp_path / TABLE).read_text()
-    assert "| rho_0.5 | 3 | equivalent 3 | 2 | 2 | 2.0 | 100 % | 50 % | 0.020 |" in table
+    assert "| rho_0.5 | 3 | equivalent 3 | 3 [29, 100] | 2 [9, 99] | 2 [9, 99] | 2.0 | 100 % | 50 % | 0.020 |" in table
     assert "backlash -> payload (1)" in table
     with pytest.raises(InputError, match="unknown condition"):
         run_study(tmp_path, 0, 7, conditions=["rho_9"])
