@@ -66,13 +66,18 @@ def calibrate(
 
 
 @app.command()
-def simulate(experiment: ExperimentFile, out: OutFolder = None, overrides: Overrides = None) -> None:
+def simulate(
+    experiment: ExperimentFile,
+    out: OutFolder = None,
+    balance: Annotated[bool, typer.Option(help="also write base reaction, energies and work to the NetCDF")] = False,
+    overrides: Overrides = None,
+) -> None:
     """Simulate the experiment's commands: writes NetCDF and CSV, prints the error against the recording as JSON."""
     from rfdropo_bayes.workflow.experiment import load_experiment
     from rfdropo_bayes.workflow.simulation import run_simulation
 
     loaded, _ = load_experiment(experiment, overrides or [])
-    report = run_simulation(loaded, experiment.resolve().parent, folder_for(experiment, out))
+    report = run_simulation(loaded, experiment.resolve().parent, folder_for(experiment, out), balance)
     typer.echo(json.dumps(report, indent=2))
 
 

@@ -109,6 +109,41 @@ def element_rotations(body: TetrahedralBody, position: Float[Array, "nodes 3"]) 
     return rotation(jnp.einsum("eai,eaj->eij", corners, body.gradient))
 
 
+def _slope(
+    body: TetrahedralBody,
+    turn: Float[Array, "elements 3 3"],
+    field: Float[Array, "nodes 3"],
+    rest: Float[Array, "nodes 3"] | float,
+) -> Float[Array, "elements 3 3"]:
+    """Gradient of Q' field - rest in every element."""
+    corners = field[body.element]
+    local = jnp.einsum("eji,eaj->eai", turn, corners - corners[:, :1])
+    if not isinstance(rest, float):
+        corners = rest[body.element]
+        local = local - (corners - corners[:, :1])
+    return jnp.einsum("eai,eaj->eij", local, body.gradient)
+
+
+def _stress(
+    slope: Float[Array, "elements 3 3"], lame: tuple[Float[Array, "..."], Float[Array, "..."]]
+) -> Float[Array, "elements 3 3"]:
+    """Hooke's law, with Lame constants of the body or of each element."""
+    first, shear = (jnp.broadcast_to(value, slope.shape[:1])[:, None, None] for value in lame)
+    trace = jnp.trace(slope, axis1=1, axis2=2)[:, None, None]
+    return first * trace * jnp.eye(3) + shear * (slope + jnp.swapaxes(slope, 1, 2))
+
+
+def elastic_energy(
+    body: TetrahedralBody,
+    turn: Float[Array, "elements 3 3"],
+    position: Float[Array, "nodes 3"],
+    lame: tuple[Float[Array, "..."], Float[Array, "..."]],
+) -> Float[Array, ""]:
+    """Energy of the elements' strain [J]."""
+    slope = _slope(body, turn, position, jnp.asarray(body.rest))
+    return 0.5 * jnp.einsum("e,eij,eij->", body.volume, _stress(slope, lame), slope)
+
+
 def nodal_force(
     body: TetrahedralBody,
     turn: Float[Array, "elements 3 3"],
@@ -121,15 +156,7 @@ def nodal_force(
 
     ``lame`` are the Lame constants [Pa], of the body or of each element.
     """
-    first, shear = (jnp.broadcast_to(value, body.volume.shape)[:, None, None] for value in lame)
-    corners = field[body.element]
-    local = jnp.einsum("eji,eaj->eai", turn, corners - corners[:, :1])
-    if not isinstance(rest, float):
-        corners = rest[body.element]
-        local = local - (corners - corners[:, :1])
-    slope = jnp.einsum("eai,eaj->eij", local, body.gradient)
-    trace = jnp.trace(slope, axis1=1, axis2=2)[:, None, None]
-    stress = first * trace * jnp.eye(3) + shear * (slope + jnp.swapaxes(slope, 1, 2))
+    stress = _stress(_slope(body, turn, field, rest), lame)
     force = -jnp.einsum("e,eij,ejk,eak->eai", body.volume, turn, stress, body.gradient)
     return jnp.zeros_like(body.rest).at[body.element].add(force)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import ClassVar, Literal
 
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.fem import BendingLaw, BodyEffects, Material, Viscoelasticity, Wall
+from rfdropo_bayes.fem import BendingLaw, BodyEffects, Material, PointMap, Viscoelasticity, Wall
 from rfdropo_bayes.fem.native.effect_rows import COMPILED_EFFECTS
 from rfdropo_bayes.fem.native.layered import NativeLayered
 from rfdropo_bayes.simulators.differences import (
@@ -113,6 +113,10 @@ class CompiledEngine:
     def describe(self) -> dict[str, object]:
         """Name and precision."""
         return {"engine": "numba", "precision": self.precision, "device": "cpu"}
+
+    def recording(self, points: PointMap) -> CompiledEngine:
+        """See `Engine.recording`."""
+        return replace(self, assembly=self.assembly._replace(markers=points), precision="float64")
 
     def motion(
         self,

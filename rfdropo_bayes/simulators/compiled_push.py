@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal
 
@@ -109,6 +109,13 @@ class CompiledLayeredPushEngine:
         """Name and precision."""
         return {"engine": "numba", "precision": self.precision, "device": "cpu"}
 
+    def recording(self, points: PointMap) -> CompiledLayeredPushEngine:
+        """See `PushEngine.recording`."""
+        trunk = self.trunk
+        return replace(
+            self, trunk=replace(trunk, assembly=trunk.assembly._replace(markers=points)), precision="float64"
+        )
+
     def motion(self, values: Values, commands: Commands, cube: CubeInputs) -> PushMotion:
         """See `PushEngine.motion`. Derivatives are central differences along each tangent.
 
@@ -173,6 +180,13 @@ class CompiledMeshPushEngine:
     def describe(self) -> dict[str, object]:
         """Name and precision."""
         return {"engine": "numba", "precision": self.precision, "device": "cpu"}
+
+    def recording(self, points: PointMap) -> CompiledMeshPushEngine:
+        """See `PushEngine.recording`."""
+        trunk = self.trunk
+        return replace(
+            self, trunk=replace(trunk, assembly=trunk.assembly._replace(markers=points)), precision="float64"
+        )
 
     def motion(self, values: Values, commands: Commands, cube: CubeInputs) -> PushMotion:
         """See `PushEngine.motion`. Derivatives are central differences along each tangent."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Literal, NamedTuple, Protocol
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rfdropo_bayes.fem import point_positions
+from rfdropo_bayes.fem import PointMap, point_positions
 from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, simulate, state_at_rest
 from rfdropo_bayes.simulators.compiled import flattened, padded
@@ -54,6 +54,9 @@ class MeshEngine(Protocol):
     ) -> MeshMotion:
         """Roll out; ``steps`` limits the steps computed, later rows hold no meaning."""
 
+    def recording(self, points: PointMap) -> MeshEngine:
+        """The same engine in double precision, recording these points of the body in place of the markers."""
+
 
 @dataclass(frozen=True)
 class ReferenceMeshEngine:
@@ -71,6 +74,10 @@ class ReferenceMeshEngine:
     def describe(self) -> dict[str, object]:
         """Name and precision."""
         return {"engine": "jax", "precision": "float64", "device": jax.devices()[0].platform}
+
+    def recording(self, points: PointMap) -> ReferenceMeshEngine:
+        """See `MeshEngine.recording`."""
+        return replace(self, assembly=self.assembly._replace(markers=points))
 
     def motion(
         self, material: TetrahedralMaterial, displacement: Float[Array, "step cable"], steps: Int[Array, ""] | None
@@ -141,6 +148,10 @@ class CompiledMeshEngine:
     def describe(self) -> dict[str, object]:
         """Name and precision."""
         return {"engine": "numba", "precision": self.precision, "device": "cpu"}
+
+    def recording(self, points: PointMap) -> CompiledMeshEngine:
+        """See `MeshEngine.recording`."""
+        return replace(self, assembly=self.assembly._replace(markers=points), precision="float64")
 
     def motion(
         self, material: TetrahedralMaterial, displacement: Float[Array, "step cable"], steps: Int[Array, ""] | None

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import LayeredBody, Material
+from rfdropo_bayes.fem.balance import Balance, tetrahedral_balance
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, animated_on_grid, commands_on_grid, observed_at, sample
@@ -19,7 +20,7 @@ from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_
 from rfdropo_bayes.simulators.mesh_body import MeshAssembly, TetrahedraTable
 from rfdropo_bayes.simulators.mesh_engines import MeshEngine
 from rfdropo_bayes.simulators.protocol import Observation, Result
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values, every_node, sampled
 from rfdropo_bayes.simulators.trunk import refined_body
 
 
@@ -104,6 +105,25 @@ class MeshTrunkSimulator(RobotSimulator):
         )
         position = self.measured(values, sample(motion.position, commands), observed_at(commands, self.time_step))
         return Observation(position, sample(motion.tension, commands), None, status)
+
+    def balance(self, parameters: Values, commands: Commands) -> Balance:
+        """See `RobotSimulator.balance`."""
+        values = self.complete(parameters)
+        material, displacement = self.material(values), self.displacements(values, commands)
+        nodes = every_node(len(self.assembly.system.body.rest))
+        motion = self.engine.recording(nodes).motion(material, displacement, None)
+        return self.balance_of(material, motion.position, motion.tension, commands)
+
+    def balance_of(
+        self,
+        material: TetrahedralMaterial,
+        position: Float[Array, "row node 3"],
+        tension: Float[Array, "row cable"],
+        commands: Commands,
+    ) -> Balance:
+        """As `TrunkSimulator.balance_of`."""
+        found = tetrahedral_balance(self.assembly.system, material, position, tension, self.time_step)
+        return sampled(found, commands)
 
     def displacements(self, values: Values, commands: Commands) -> Float[Array, "step cable"]:
         """Commanded cable displacements [m] at the end of every step; SOFA's limits are those of the engine."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -17,7 +17,7 @@ from rfdropo_bayes.fem.pushing import PushRollout, PushScene
 from rfdropo_bayes.fem.tetrahedral_dynamics import state_at_rest as mesh_at_rest
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
-from rfdropo_bayes.simulators.pushing import CubeInputs, PushMotion, bands_along, scene_of
+from rfdropo_bayes.simulators.pushing import CubeInputs, PushMotion, bands_along, scene_of, with_markers
 from rfdropo_bayes.simulators.robot_simulator import Values
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 
@@ -84,6 +84,10 @@ class MeshPushEngine:
         """Name and precision."""
         return _describe()
 
+    def recording(self, points: PointMap) -> MeshPushEngine:
+        """See `PushEngine.recording`."""
+        return replace(self, trunk=with_markers(self.trunk, points))
+
     def motion(self, values: Values, commands: Commands, cube: CubeInputs) -> PushMotion:
         """See `PushEngine.motion`."""
         system, markers = self.trunk.assembly.system, self.trunk.assembly.markers
@@ -120,6 +124,10 @@ class LayeredPushEngine:
     def describe(self) -> dict[str, object]:
         """Name and precision."""
         return _describe()
+
+    def recording(self, points: PointMap) -> LayeredPushEngine:
+        """See `PushEngine.recording`."""
+        return replace(self, trunk=with_markers(self.trunk, points))
 
     def motion(self, values: Values, commands: Commands, cube: CubeInputs) -> PushMotion:
         """See `PushEngine.motion`."""

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.balance import Balance
+from rfdropo_bayes.fem.layered import LayeredBody, PointMap, rest_positions
 from rfdropo_bayes.fem.pushing import PushScene, push_scene
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState, cube_at, solid_gyration_radius
 from rfdropo_bayes.robots import PushScene as PushTable
@@ -22,7 +23,7 @@ from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation, Result
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values, every_node
 from rfdropo_bayes.simulators.trunk import EQUILIBRIUM_TOLERANCE, TrunkSimulator
 
 BANDS_PER_METRE = 230.0
@@ -72,6 +73,9 @@ class PushEngine(Protocol):
     def motion(self, values: Values, commands: Commands, cube: CubeInputs) -> PushMotion:
         """Roll out with these parameters of the trunk."""
 
+    def recording(self, points: PointMap) -> PushEngine:
+        """The same engine in double precision, recording these points of the body in place of the markers."""
+
 
 def push_table(robot: Robot) -> PushTable:
     """The robot's cube and plate.
@@ -108,6 +112,20 @@ def scene_of(robot: Robot, surface: PointMap, rest: Float[np.ndarray, "nodes 3"]
         plate_height=table.plate_height_m,
         contact_distance=table.contact_distance_m,
     )
+
+
+Trunk = TypeVar("Trunk", TrunkSimulator, MeshTrunkSimulator)
+
+
+def with_markers(trunk: Trunk, points: PointMap) -> Trunk:
+    """The trunk with other recorded points."""
+    return replace(trunk, assembly=trunk.assembly._replace(markers=points))
+
+
+def rest_nodes(trunk: TrunkSimulator | MeshTrunkSimulator) -> Float[np.ndarray, "nodes 3"]:
+    """Nodes of a trunk's undeformed body [m]."""
+    body = trunk.assembly.system.body
+    return rest_positions(body) if isinstance(body, LayeredBody) else body.rest
 
 
 @dataclass(frozen=True)
@@ -173,6 +191,15 @@ class PushSimulator(RobotSimulator):
             jnp.asarray(values["friction"], float),
             cube_at(centre, values["cube_yaw"], plate_normal(self.robot)),
         )
+
+    def balance(self, parameters: Values, commands: Commands) -> Balance:
+        """See `RobotSimulator.balance`; the energies are those of the trunk."""
+        values = self.complete(parameters)
+        own = {spec.name: values[spec.name] for spec in self.trunk.parameters}
+        nodes = len(rest_nodes(self.trunk))
+        motion = self.engine.recording(every_node(nodes)).motion(own, commands, self.cube(values))
+        material: Any = self.trunk.material(own)
+        return self.trunk.balance_of(material, motion.position, motion.tension, commands)
 
     def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
         """Simulate from the initial state to the last observation; all steps are computed, whatever ``steps`` says.

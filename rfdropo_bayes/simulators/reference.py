@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.fem import Material, point_positions, prepare, simulate, simulate_prefix, state_at_rest
+from rfdropo_bayes.fem import Material, PointMap, point_positions, prepare, simulate, simulate_prefix, state_at_rest
 from rfdropo_bayes.fem import static_equilibrium as find_equilibrium
 from rfdropo_bayes.simulators.trunk import Assembly, Motion
 
@@ -32,6 +32,10 @@ class ReferenceEngine:
     def describe(self) -> dict[str, object]:
         """Name and precision."""
         return {"engine": "jax", "precision": "float64", "device": jax.devices()[0].platform}
+
+    def recording(self, points: PointMap) -> ReferenceEngine:
+        """See `Engine.recording`."""
+        return replace(self, assembly=self.assembly._replace(markers=points))
 
     def motion(
         self,

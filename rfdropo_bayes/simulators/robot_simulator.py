@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from rfdropo_bayes.fem.balance import Balance
+from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.commands import Commands, sample
 from rfdropo_bayes.simulators.mechanisms import (
     ActuationMechanism,
     Mechanism,
@@ -22,6 +24,16 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
 from rfdropo_bayes.simulators.protocol import Observation
 
 Values = Mapping[str, Float[Array, ""]]
+
+
+def every_node(count: int) -> PointMap:
+    """All nodes of a body as recorded points."""
+    return PointMap(np.arange(count)[:, None], np.ones((count, 1)))
+
+
+def sampled(balance: Balance, commands: Commands) -> Balance:
+    """The rows of the observation times."""
+    return Balance(*(sample(series, commands) for series in balance))
 
 
 class RobotSimulator:
@@ -57,6 +69,17 @@ class RobotSimulator:
 
     def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
         """Simulate from the initial state to the last observation, or ``steps`` time steps."""
+        raise NotImplementedError
+
+    def balance(self, parameters: Values, commands: Commands) -> Balance:
+        """Forces on the body, energies, work and losses of a rollout at the observation times; see `fem.balance`.
+
+        Always in double precision. Mechanisms of sensing have no part in it; a rollout that diverged says so only in
+        `rollout`.
+
+        Raises:
+            InputError: a name that is not a parameter of this simulator, or cables with friction.
+        """
         raise NotImplementedError
 
     @cached_property

@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, cable_layout, profile_body
+from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, cable_layout, prepare, profile_body
+from rfdropo_bayes.fem.balance import Balance, layered_balance
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms
 from rfdropo_bayes.simulators.protocol import Observation, Result
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values, every_node, sampled
 
 # Static equilibrium counts as found when the unbalanced force is below this share of the largest force.
 EQUILIBRIUM_TOLERANCE = 1e-3
@@ -51,6 +52,9 @@ class Engine(Protocol):
         steps: Int[Array, ""] | None,
     ) -> Motion:
         """Roll out from the initial state; ``steps`` limits the steps computed, later rows hold no meaning."""
+
+    def recording(self, points: PointMap) -> Engine:
+        """The same engine in double precision, recording these points of the body in place of the markers."""
 
 
 @dataclass(frozen=True)
@@ -181,6 +185,26 @@ class TrunkSimulator(RobotSimulator):
         seen = observed_at(commands, self.discretisation.time_step)
         position = self.measured(values, sample(motion.position, commands), seen)
         return Observation(position, sample(motion.tension, commands), None, status)
+
+    def balance(self, parameters: Values, commands: Commands) -> Balance:
+        """See `RobotSimulator.balance`."""
+        values = self.complete(parameters)
+        start, displacement = self.wound(values, commands, self.discretisation.time_step)
+        material, system = self.material(values), self.assembly.system
+        motion = self.engine.recording(every_node(system.body.nodes)).motion(material, start, displacement, None)
+        return self.balance_of(material, motion.position, motion.tension, commands)
+
+    def balance_of(
+        self,
+        material: Material,
+        position: Float[Array, "row node 3"],
+        tension: Float[Array, "row cable"],
+        commands: Commands,
+    ) -> Balance:
+        """Forces and energies of a motion of all nodes [m], recorded after every step."""
+        system = self.assembly.system
+        found = layered_balance(system, prepare(system, material), position, tension, self.discretisation.time_step)
+        return sampled(found, commands)
 
     def material(self, values: Values) -> Material:
         """Material of the body for these values, body mechanisms included."""

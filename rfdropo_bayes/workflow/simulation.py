@@ -19,6 +19,7 @@ from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values, load_data
+from rfdropo_bayes.workflow.balance import append_balance
 from rfdropo_bayes.workflow.commands import random_walk
 from rfdropo_bayes.workflow.experiment import CommandsTable, Experiment, NoiseTable
 from rfdropo_bayes.workflow.files import output_folder
@@ -29,11 +30,12 @@ CUBE_COLUMNS = tuple(f"cube_{name}" for name in ("x", "y", "z", "qx", "qy", "qz"
 """Of the cube's pose, as in SOFA's and OptiTrack's recordings."""
 
 
-def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str, Any]:
+def run_simulation(experiment: Experiment, folder: Path, out: Path, balance: bool = False) -> dict[str, Any]:
     """Simulate every recording of the experiment, or the command sequences of its [commands] table.
 
     Writes, per recording, ``<name>.nc`` (`Trajectory`) and ``<name>.csv`` (time in s, markers in mm, in the source's
-    column names), called ``trajectory`` where there is only one recording.
+    column names), called ``trajectory`` where there is only one recording. With ``balance``, forces and energies follow
+    in a group of that name in the NetCDF file.
 
     Returns:
         per recording: result code, files, and the error against the measurement [mm]; and that over all recordings.
@@ -71,6 +73,9 @@ def run_simulation(experiment: Experiment, folder: Path, out: Path) -> dict[str,
             "files": [str(out / f"{stem}.nc"), str(out / f"{stem}.csv")],
             "error_mm": _errors([distances[-1]]) if experiment.data else None,
         }
+        if balance:
+            written = append_balance(simulator, values, commands, source.time, out / f"{stem}.nc")
+            report["recordings"][source.name]["balance"] = written
         if pose is not None and source.object_pose is not None:
             report["recordings"][source.name]["object_error"] = _object_errors(pose, source.object_pose)
     report["error_mm"] = _errors(distances) if experiment.data else None

@@ -1,0 +1,217 @@
+"""What a rollout did to its surroundings: the force of the clamp, contact forces, energies, work and losses.
+
+All of it follows from the states of a rollout, whatever engine computed them: the equation of motion of a step
+(``fem.dynamics``, ``fem.tetrahedral_dynamics``) holds exactly on the free nodes once contacts are added to it, and what
+it leaves on the held nodes is the clamp. Nothing is solved again.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem import corotational
+from rfdropo_bayes.fem.blocktridiagonal import multiply
+from rfdropo_bayes.fem.cables import CableLayout, lengths_and_jacobian
+from rfdropo_bayes.fem.dynamics import (
+    Prepared,
+    State,
+    System,
+    frames_and_displacements,
+    linearised,
+    mass_times,
+    remembering,
+    resistance,
+)
+from rfdropo_bayes.fem.effects import BodyEffects, Scalar
+from rfdropo_bayes.fem.energies import Energies, energies
+from rfdropo_bayes.fem.tetrahedra import (
+    elastic_energy,
+    element_rotations,
+    lame_constants,
+    nodal_force,
+)
+from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem
+
+
+class Balance(NamedTuple):
+    """Forces and energies of a rollout; rows are states, row 0 is the initial one, forces those of the step before.
+
+    Work and losses are summed from row 0 on.
+    """
+
+    base_force: Float[Array, "rows 3"]  # of the clamp on the body [N]; cables pull on their anchors besides
+    base_moment: Float[Array, "rows 3"]  # about the origin of the robot's frame [N m]
+    contact_force: Float[Array, "rows 3"]  # of what touches the body on it [N]
+    kinetic_energy: Float[Array, " rows"]  # [J]
+    elastic_energy: Float[Array, " rows"]  # [J]
+    gravitational_energy: Float[Array, " rows"]  # [J]; zero with every node at the origin
+    cable_work: Float[Array, " rows"]  # done by the cables on the body [J]
+    contact_work: Float[Array, " rows"]  # done on the body by what touches it [J]
+    damping_loss: Float[Array, " rows"]  # to Rayleigh damping [J]
+
+    @property
+    def total_energy(self) -> Float[Array, " rows"]:
+        """Kinetic, elastic and gravitational [J]."""
+        return self.kinetic_energy + self.elastic_energy + self.gravitational_energy
+
+    @property
+    def other_loss(self) -> Float[Array, " rows"]:
+        """Energy that went elsewhere [J]: into the damping of implicit Euler, which vanishes with the time step, and
+        into effects that hold or dissipate energy (a Prony branch, softening, a wall, drag, compliant cables)."""
+        given = self.cable_work + self.contact_work - self.damping_loss
+        return given - (self.total_energy - self.total_energy[0])
+
+
+UNITS = dict.fromkeys(Balance._fields, "J") | {"base_force": "N", "base_moment": "N m", "contact_force": "N"}
+
+
+class _Step(NamedTuple):
+    """Forces [N] and powers [W] of one step."""
+
+    residual: Float[Array, "nodes 3"]  # what the equation of motion lacks
+    cable: Float[Array, ""]
+    damping: Float[Array, ""]
+
+
+def check_effects(effects: BodyEffects) -> None:
+    """Raise InputError for friction of the cables: their pull is then not given by one tension each."""
+    for name in ("coulomb_friction", "capstan_friction"):
+        if getattr(effects, name) is not None:
+            raise InputError(
+                f"forces and energies are not available with {name.replace('_', ' ')}", where="balance",
+                remedy="remove the mechanism, or do without them",
+            )  # fmt: skip
+
+
+def _pull(
+    layout: CableLayout,
+    guides: Float[Array, "cables guides nodes"],
+    position: Float[Array, "nodes 3"],
+    tension: Float[Array, " cables"],
+) -> Float[Array, "nodes 3"]:
+    """Forces of the cables on the nodes [N]."""
+    jacobian = lengths_and_jacobian(layout, guides, position)[1]
+    return -jnp.einsum("cni,c->ni", jacobian, tension)
+
+
+def _gathered(
+    held: Bool[Array, " nodes"],
+    position: Float[Array, "rows nodes 3"],
+    velocity: Float[Array, "rows nodes 3"],
+    steps: _Step,
+    stored: Energies,
+    time_step: Scalar,
+) -> Balance:
+    """Sums over the nodes and over time; row k of ``steps`` leads to state k, its forces act where the step begins."""
+    clamp = jnp.where(held[:, None], steps.residual, 0.0)
+    touch = (steps.residual - clamp).at[0].set(0.0)  # no step leads to the initial state: it may be about to fall
+    start = jnp.concatenate([position[:1], position[:-1]])
+
+    def done(power: Float[Array, " rows"]) -> Float[Array, " rows"]:
+        return time_step * jnp.cumsum(power.at[0].set(0.0))
+
+    return Balance(
+        base_force=clamp.sum(axis=1),
+        base_moment=jnp.cross(start, clamp).sum(axis=1),
+        contact_force=touch.sum(axis=1),
+        kinetic_energy=stored.kinetic,
+        elastic_energy=stored.elastic,
+        gravitational_energy=stored.gravitational,
+        cable_work=done(steps.cable),
+        contact_work=done(jnp.sum(touch * velocity, axis=(1, 2))),
+        damping_loss=done(steps.damping),
+    )
+
+
+def _velocities(
+    position: Float[Array, "rows nodes 3"], start: Float[Array, "nodes 3"] | float, time_step: Scalar
+) -> Float[Array, "rows nodes 3"]:
+    """Implicit Euler moves x by h v: velocities follow from positions, but for the first."""
+    first = jnp.broadcast_to(jnp.asarray(start, float), position.shape[1:])
+    return jnp.concatenate([first[None], jnp.diff(position, axis=0) / time_step])
+
+
+def layered_balance(
+    system: System,
+    prepared: Prepared,
+    position: Float[Array, "rows nodes 3"],
+    tension: Float[Array, "rows cables"],
+    time_step: Scalar,
+    velocity: Float[Array, "nodes 3"] | float = 0.0,
+) -> Balance:
+    """Forces and energies of a rollout of a layered body, recorded after every step.
+
+    Args:
+        position: of all nodes [m]; row 0 is the initial state, in which the body has ``velocity`` [m/s].
+        tension: of the cables [N], of the step that leads to each row.
+
+    Raises:
+        InputError: cables with friction.
+    """
+    check_effects(prepared.effects)
+    velocities = _velocities(position, velocity, time_step)
+    stations = len(system.body.station)
+
+    def one(state: State, reached: tuple[Array, Array, Array]) -> tuple[State, _Step]:
+        after, moving, pulling = reached
+        linear = linearised(system, prepared, state, time_step)
+        change = (moving - state.velocity).reshape(stations, -1, 1)
+        cable = _pull(system.cables, prepared.guides, state.position, pulling)
+        residual = (multiply(linear.matrix, change).reshape(-1, 3) - linear.right) / time_step - cable
+        frame, local = frames_and_displacements(system, prepared, state.position)
+        tangent = corotational.tangent(resistance(prepared, local)[1], frame)
+        strained = multiply(tangent, moving.reshape(stations, -1, 1)).reshape(-1, 3)
+        dragged = prepared.rayleigh_mass * mass_times(system, prepared, moving)
+        damping = jnp.sum(moving * (dragged + prepared.rayleigh_stiffness * strained))
+        return State(after, moving, pulling, linear.memory), _Step(residual, jnp.sum(cable * moving), damping)
+
+    first = remembering(system, prepared, State(position[0], velocities[0], tension[0]))
+    begin = one(first, (position[0], velocities[0], tension[0]))[1]
+    later = lax.scan(one, first, (position[1:], velocities[1:], tension[1:]))[1]
+    steps = jax.tree.map(lambda row, rows: jnp.concatenate([row[None], rows]), begin, later)
+    stored = jax.vmap(lambda x, v, t: energies(system, prepared, State(x, v, t)))(position, velocities, tension)
+    held = jnp.arange(position.shape[1]) < system.clamped_stations * system.body.section_nodes
+    return _gathered(held, position, velocities, steps, stored, time_step)
+
+
+def tetrahedral_balance(
+    system: TetrahedralSystem,
+    material: TetrahedralMaterial,
+    position: Float[Array, "rows nodes 3"],
+    tension: Float[Array, "rows cables"],
+    time_step: Scalar,
+    velocity: Float[Array, "nodes 3"] | float = 0.0,
+) -> Balance:
+    """Forces and energies of a rollout of a tetrahedral body; arguments as `layered_balance`."""
+    body, mass = system.body, material.node_mass[:, None]
+    velocities = _velocities(position, velocity, time_step)
+    first, shear = lame_constants(material.young_modulus, material.poisson_ratio)
+    lame = first * material.stiffness_scale, shear * material.stiffness_scale
+    guides = jnp.asarray(system.guides)
+
+    def one(_: None, at: tuple[Array, ...]) -> tuple[None, tuple[_Step, Energies]]:
+        before, slower, after, moving, pulling = at
+        turn = element_rotations(body, before)
+        viscous = nodal_force(body, turn, moving, 0.0, lame)
+        cable = _pull(system.cables, guides, before, pulling)
+        inertia = mass * ((moving - slower) / time_step - material.gravity + material.rayleigh_mass * moving)
+        lookahead = time_step + material.rayleigh_stiffness
+        elastic = nodal_force(body, turn, before, jnp.asarray(body.rest), lame) + lookahead * viscous
+        lost = material.rayleigh_mass * mass * moving - material.rayleigh_stiffness * viscous
+        step = _Step(inertia - elastic - cable, jnp.sum(cable * moving), jnp.sum(lost * moving))
+        stored = Energies(
+            kinetic=0.5 * jnp.sum(mass * moving**2),
+            elastic=elastic_energy(body, element_rotations(body, after), after, lame),
+            gravitational=-jnp.sum(mass * material.gravity * after),
+        )
+        return None, (step, stored)
+
+    before = (jnp.concatenate([part[:1], part[:-1]]) for part in (position, velocities))
+    steps, stored = lax.scan(one, None, (*before, position, velocities, tension))[1]
+    return _gathered(jnp.asarray(body.fixed), position, velocities, steps, stored, time_step)

@@ -1,0 +1,99 @@
+"""Forces and energies of whole simulators: the weight of a mesh, the push on a cube, the same on both engines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots.meshes import read_tetrahedra
+from rfdropo_bayes.simulators.compiled import CompiledEngine
+from rfdropo_bayes.simulators.compiled_push import CompiledMeshPushEngine
+from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
+from rfdropo_bayes.simulators.mesh_engines import CompiledMeshEngine
+from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
+from rfdropo_bayes.simulators.pushing import PushSimulator
+from rfdropo_bayes.simulators.reference import ReferenceEngine
+from rfdropo_bayes.simulators.robot_simulator import every_node
+from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
+
+TIME_STEP, PLATE = 0.01, -0.075
+SOFA = load_robot("trunk_sofa_mesh")
+ROBOT = SOFA.model_copy(update={"push": SOFA.push.model_copy(update={"plate_height_m": PLATE})})
+SOFT = {"young_modulus": jnp.asarray(2e5), "rayleigh_mass": jnp.asarray(0.3)}
+
+
+@pytest.fixture(scope="module")
+def trunk(bar_mesh) -> MeshTrunkSimulator:
+    options = TetrahedraTable(mesh="bar.vtk", unit="mm", clamp_height=0.02)
+    assembly = assemble_mesh(ROBOT, read_tetrahedra(bar_mesh, "mm"), options)
+    return MeshTrunkSimulator(ROBOT, CompiledMeshEngine(assembly, TIME_STEP, "float32"), assembly, options, TIME_STEP)
+
+
+def every_step(simulator, rows: int):
+    """The long cable at -y, pulled by 4 mm every five steps, observed in every step."""
+    value = np.zeros((rows // 5, 8))
+    value[:, 2] = 4e-3 * np.arange(1, rows // 5 + 1)
+    return simulator.commands(0.05 * np.arange(rows // 5), value, np.zeros(8), TIME_STEP * np.arange(rows + 1))
+
+
+def test_the_base_of_a_mesh_holds_what_moves_it(trunk):
+    """The change of momentum of all nodes is what base, cables, weight and drag make of it; energy comes from work."""
+    commands, values = every_step(trunk, 20), trunk.complete(SOFT)
+    found = jax.jit(trunk.balance)(SOFT, commands)
+    material, assembly = trunk.material(values), trunk.assembly
+    engine = trunk.engine.recording(every_node(len(assembly.system.body.rest)))
+    motion = engine.motion(material, trunk.displacements(values, commands), None)
+    mass, position = np.asarray(material.node_mass), np.asarray(motion.position)
+    momentum = np.einsum("n,rni->ri", mass, np.diff(position, axis=0, prepend=position[:1]) / TIME_STEP)
+    layout = assembly.system.cables
+    guide = np.einsum("ck,rcki->rci", layout.guide_weight[:, 0], position[:-1, layout.guide_node[:, 0]])
+    towards = layout.anchor - guide
+    towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    cables = np.einsum("rc,rci->ri", np.asarray(motion.tension)[1:], towards)
+    weight = mass.sum() * np.asarray(material.gravity)
+    expected = np.diff(momentum, axis=0) / TIME_STEP + 0.3 * momentum[1:] - weight - cables
+    assert np.abs(cables).max() > 0.05
+    np.testing.assert_allclose(found.base_force[1:], expected, atol=1e-8)
+    assert np.abs(found.contact_force).max() < 1e-8
+    given = np.asarray(found.cable_work - (found.total_energy - found.total_energy[0]))
+    assert given[-1] > float(found.damping_loss[-1]) > 0.0
+    assert np.all(np.diff(given) > -1e-9)
+
+
+@pytest.mark.slow
+def test_what_the_cube_is_pushed_by_pushes_the_trunk_back(trunk):
+    """Without friction only the trunk moves a cube along the plate."""
+    pushing = PushSimulator(CompiledMeshPushEngine(trunk))
+    commands = every_step(pushing, 50)
+    height = PLATE + 0.0175 + 0.005
+    values = SOFT | {"friction": jnp.asarray(0.0), "cube_x": jnp.asarray(-0.02), "cube_y": jnp.asarray(height)}
+    found, seen = pushing.balance(values, commands), pushing.rollout(values, commands)
+    velocity = np.diff(np.asarray(seen.object_pose)[:, :3], axis=0, prepend=np.asarray(seen.object_pose)[:1, :3])
+    velocity /= TIME_STEP
+    mass = float(pushing.complete({})["cube_mass"])
+    pushed = mass * (velocity[1:] - velocity[:-1] / (1.0 + 0.3 * TIME_STEP)) / TIME_STEP
+    along = np.asarray(found.contact_force)[1:, [0, 2]]
+    assert np.abs(along).max() > 0.01
+    np.testing.assert_allclose(pushed[:, [0, 2]], -along, atol=1e-8)
+    assert found.contact_force[:, 1].max() > 0.1
+
+
+@pytest.mark.slow
+def test_both_engines_balance_alike():
+    robot, discretisation = load_robot("smooth_arm"), Discretisation(TIME_STEP)
+    assembly = assemble(robot, discretisation)
+    fast = TrunkSimulator(robot, CompiledEngine(assembly, TIME_STEP, True), assembly, discretisation)
+    slow = replace(fast, engine=ReferenceEngine(assembly, TIME_STEP, True))
+    channels = len(robot.channel_names)
+    value = 2e-3 * np.outer(np.arange(4), np.arange(channels) % 2)
+    commands = fast.commands(0.05 * np.arange(4), value, np.zeros(channels), 0.05 * np.arange(5))
+    one, other = (jax.jit(simulator.balance)({}, commands) for simulator in (fast, slow))
+    for name, ours, theirs in zip(one._fields, one, other, strict=True):
+        scale = max(1e-3, float(np.abs(theirs).max()))
+        np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-6 * scale, err_msg=name)
+    assert np.abs(one.base_force).max() > 0.1
