@@ -9,7 +9,7 @@ from rfdropo_bayes.audit.extension import DISCRETISATION
 from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.noise import REPEATS, STATED
 from rfdropo_bayes.audit.pipeline import Answer
-from rfdropo_bayes.audit.verdict import EXPLAINED, NO_DISCREPANCY, UNEXPLAINED
+from rfdropo_bayes.audit.verdict import EXPLAINED, NO_DISCREPANCY, UNEXPLAINED, unclear
 
 MOST_EXCLUDED = 3
 CLEARLY_WORSE = 10.0  # nats
@@ -48,7 +48,13 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         return f"{named}; how much it explains could not be measured."
     low, high = (100.0 * min(max(x, 0.0), 1.0) for x in gain.interval)
     share = f"{100 * max(gain.explained, 0.0):.0f} % [{low:.0f}, {high:.0f}] of the discrepancy"
-    if answer.verdict == UNEXPLAINED:
+    if unclear(answer.question.rules, gain):
+        verb, likelier = "is" if len(findings) == 1 else "are", "" if gain.elpd_difference > 0.0 else "no "
+        head = (
+            f"{named} {verb} named, but the discrepancy is too small to say how much of it that explains "
+            f"([{low:.0f}, {high:.0f}] %); unseen recordings are {likelier}likelier with it"
+        )
+    elif answer.verdict == UNEXPLAINED:
         head = f"Unexplained: the best of the library, {named}, explains only {share}"
     elif answer.verdict in (EXPLAINED, "equivalent"):
         head = f"{named} explain{'s' if len(findings) == 1 else ''} {share}"

@@ -16,6 +16,12 @@ NO_DISCREPANCY, EXPLAINED, EQUIVALENT, PARTLY, UNEXPLAINED = (
 )
 
 
+def unclear(rules: Rules, gain: Gain) -> bool:
+    """Whether the discrepancy is too small on unseen trajectories to say how much of it is explained: the interval of
+    the fraction reaches from "none" to "all"."""
+    return gain.interval[0] <= rules.significant and gain.interval[1] >= rules.explained
+
+
 def decide(
     rules: Rules,
     base_p: float,
@@ -27,7 +33,8 @@ def decide(
     """Apply the rules.
 
     - no_discrepancy: the base model passes the joint test (p > .01), under a noise that may be one;
-    - unexplained: it does not, and no candidate is significant, or all together explain at most 20 %;
+    - unexplained: it does not, and no candidate is significant, or all together explain at most 20 %, unless that
+      cannot be told (`unclear`) and unseen trajectories are likelier under the extended model;
     - explained: the extended model passes (p > .05) and the lower bound of the explained fraction exceeds 80 %;
       equivalent where a named class has several members;
     - partly_explained: a significant gain, but one of these fails.
@@ -45,7 +52,7 @@ def decide(
         return UNEXPLAINED
     if gain is None:
         return PARTLY
-    if gain.explained <= rules.significant:
+    if gain.explained <= rules.significant and not (unclear(rules, gain) and gain.elpd_difference > 0.0):
         return UNEXPLAINED
     if extended_p > rules.extended_passes and gain.interval[0] > rules.explained:
         return EQUIVALENT if max(class_sizes) > 1 else EXPLAINED

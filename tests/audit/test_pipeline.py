@@ -43,6 +43,14 @@ def test_a_lone_effect_is_explained_with_its_size():
     assert "play" in content["sentence"]
 
 
+def test_an_effect_too_small_to_say_how_much_it_explains_is_named_and_not_belittled():
+    content = found({"play": 0.03}, 12)
+    assert content["findings"][0]["mechanism"] == "play"
+    assert content["gain"]["explained_fraction"] < 0.2  # by chance: the interval goes from 0 to 100 %
+    assert content["verdict"] == "partly_explained"
+    assert "too small to say how much" in content["sentence"]
+
+
 def test_effects_that_look_the_same_are_one_class():
     content = found({"delay": 1.0}, 2)
     assert content["verdict"] == "equivalent"
