@@ -163,7 +163,7 @@ def sample_from_modes(
         rollouts=ledger.rollouts + sampled.rollouts,
         evaluations=evaluations,
         excluded=dict(excluded),
-        warnings=[*kept, *bound_warnings(draws, problem.bounds), *exclusion_warnings(excluded, evaluations)],
+        warnings=[*kept, *bound_warnings(problem, draws), *exclusion_warnings(excluded, evaluations)],
         seconds=found.climbs.seconds + sampled.seconds,
         optimum=mode_values(problem, found.modes[0]),
         details=sampled.details

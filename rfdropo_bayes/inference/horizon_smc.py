@@ -342,7 +342,7 @@ def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcSta
         evaluations=evaluations,
         excluded=dict(excluded),
         warnings=[
-            *bound_warnings(draws, problem.bounds),
+            *bound_warnings(problem, draws),
             *exclusion_warnings(excluded, evaluations),
             *_stage_warnings(trace, config),
         ],

@@ -17,13 +17,16 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.checkpoints import UNSAVED, Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
+from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES
 from rfdropo_bayes.inference.levenberg import NOISE_GRID, Climbable, Laplace, LevenbergState, laplace, maximise
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.newton import SmoothTarget, log_likelihood_derivatives
 from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains, exclusion_warnings
 from rfdropo_bayes.inference.schedules import block_boundaries
+from rfdropo_bayes.inference.survey import survey
 
 JACOBIANS = ("auto", "forward", "central")
+SURVEYING = 0.6  # share of the budget of climbs that a survey before them may take
 RIVAL = 30.0  # [nat]: an optimum that far below the best matters to no posterior
 
 
@@ -35,16 +38,20 @@ class LaplaceConfig:
         starts: number of climbs at the first horizon; half of them go on to each longer one.
         screen: draws, from the prior or from where the problem says that climbs may start, judged at the first
             horizon: the best is the first start, the others lie apart from it among the best quarter.
+        survey: particles of a tempered population that finds the starts instead, for posteriors with many summits; it
+            takes the place of the climbs at short horizons; 0 for none. Only for problems with residuals.
         blocks: horizons of a climb, doubling; short ones first, because a long recording has many local optima.
         max_steps: most steps of a climb at one horizon.
         tolerance: a climb ends when a step promises less [nat].
         jacobian: "forward", "central" or "auto".
         draws: draws from the normal approximation.
-        rollouts: budget in full-length rollouts, of which every climb gets its share; None for no limit.
+        rollouts: budget in full-length rollouts, of which every climb gets its share, and a survey at most
+            `SURVEYING`; None for no limit.
     """
 
     starts: int = 4
     screen: int = 64
+    survey: int = 0
     blocks: int = 3
     max_steps: int = 60
     tolerance: float = 1e-4
@@ -56,6 +63,8 @@ class LaplaceConfig:
         for name in ("starts", "screen", "blocks", "max_steps", "draws"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)} is less than 1", where="[inference]")
+        if self.survey and self.survey < FEWEST_PARTICLES:
+            raise InputError(f"survey = {self.survey} is neither 0 nor {FEWEST_PARTICLES} or more", where="[inference]")
         if self.tolerance <= 0.0 or (self.rollouts is not None and self.rollouts <= 0.0):
             raise InputError("tolerance and rollouts must be positive", where="[inference]")
         if self.jacobian not in JACOBIANS:
@@ -110,7 +119,7 @@ def find_modes(
     """
     horizons, target_at = _targets(problem, config)
     saved = checkpoint.load()
-    climbs = _screen(problem, config, key, horizons[0]) if saved is None else _unpack(*saved)
+    climbs = _first(problem, config, key, horizons[0], logbook) if saved is None else _unpack(*saved)
     target = None
     while climbs.level < len(horizons):
         began = time.monotonic()
@@ -138,7 +147,10 @@ def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], 
         def by_residuals(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
             return make_target(problem, horizon, ledger, u, prior, config.jacobian, noise)
 
-        return block_boundaries(problem.n_rows, config.blocks), by_residuals
+        horizons = block_boundaries(problem.n_rows, config.blocks)
+        if config.survey:
+            horizons = (_surveyed(problem, config)[-1], problem.n_rows)
+        return tuple(sorted(set(horizons))), by_residuals
     if hasattr(problem, "log_likelihood_at"):
         derivatives = log_likelihood_derivatives(problem)
         return (problem.n_rows,), lambda horizon, ledger, u, noise: SmoothTarget(problem, ledger, derivatives, *prior)
@@ -149,17 +161,44 @@ def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], 
     )
 
 
+def _surveyed(problem: Problem, config: LaplaceConfig) -> tuple[int, ...]:
+    """Horizons of the survey: from one block shorter than climbs would begin with to the last but one."""
+    horizons = block_boundaries(problem.n_rows, config.blocks + 1)
+    return horizons[:-1] or horizons
+
+
 def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizons: tuple[int, ...], noise: int) -> int:
-    """Steps the present climb may take: what is left of the budget is shared among climbs by their horizons."""
+    """Steps the present climb may take: what is left of the budget is shared among climbs by their horizons.
+
+    Of the climbs of a horizon half are expected at the next, see `_record`.
+    """
     if config.rollouts is None:
         return config.max_steps
     starts, d = climbs.positions.shape
     now = horizons[climbs.level]
-    shares = now * (starts - climbs.done) + starts * sum(horizons[climbs.level + 1 :])
-    allowed = (config.rollouts - climbs.ledger.rollouts) * now / shares
+    later = sum(-(-starts // 2**ahead) * rows for ahead, rows in enumerate(horizons[climbs.level + 1 :], start=1))
+    allowed = (config.rollouts - climbs.ledger.rollouts) * now / (now * (starts - climbs.done) + later)
     # The grid of the noise; then a Jacobian by central differences, two more rows per noise, six dampings tried.
     left = allowed * n_rows / now - NOISE_GRID * noise
     return int(np.clip(left / (4.0 * d + 7.0), 0, config.max_steps))
+
+
+def _first(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int, logbook: Logbook) -> Climbs:
+    """Where climbs start: at survivors of a survey, or at screened draws."""
+    if not config.survey or not isinstance(problem, ResidualProblem):
+        return _screen(problem, config, key, horizon)
+    ledger, began = Ledger(), time.monotonic()
+    budget = None if config.rollouts is None else SURVEYING * config.rollouts
+    found = survey(problem, _surveyed(problem, config), config.survey, budget, key, ledger, logbook)
+    order = _spread_starts(found.positions, found.log_density, config.starts)
+    return _at_starts(found.positions[order], found.log_density[order], ledger, began)
+
+
+def _at_starts(
+    u: Float[np.ndarray, "start d"], density: Float[np.ndarray, " start"], ledger: Ledger, began: float
+) -> Climbs:
+    seconds = time.monotonic() - began
+    return Climbs(u, density, np.zeros(len(u), dtype=bool), 0, 0, None, ledger, [], seconds)
 
 
 def _screen(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int) -> Climbs:
@@ -176,8 +215,7 @@ def _screen(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon:
             where="[model.priors]",
             remedy="widen the priors, or look at what the simulator reports for them",
         )
-    seconds = time.monotonic() - began
-    return Climbs(u[order], density[order], np.zeros(len(order), dtype=bool), 0, 0, None, ledger, [], seconds)
+    return _at_starts(u[order], density[order], ledger, began)
 
 
 def _spread_starts(u: Float[np.ndarray, "n d"], density: Float[np.ndarray, " n"], count: int) -> Int[np.ndarray, " k"]:
@@ -294,7 +332,7 @@ def run(
         excluded=dict(ledger.excluded),
         warnings=[
             *found.warnings,
-            *bound_warnings(draws, problem.bounds),
+            *bound_warnings(problem, draws),
             *exclusion_warnings(ledger.excluded, ledger.evaluations),
         ],
         seconds=found.climbs.seconds,

@@ -93,7 +93,7 @@ def run(
         trace=[{"rollouts": ledger.rollouts, "log_evidence": evidence[0], "steps": len(dead)}],
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
-        warnings=[*short, *bound_warnings(draws, problem.bounds)],
+        warnings=[*short, *bound_warnings(problem, draws)],
         seconds=time.monotonic() - began,
         details={"live": config.live, "steps": len(dead), "rollouts_are_estimated": True},
     )

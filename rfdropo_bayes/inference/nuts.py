@@ -125,7 +125,7 @@ def run(
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
-        warnings=[*warnings, *bound_warnings(draws, problem.bounds)],
+        warnings=[*warnings, *bound_warnings(problem, draws)],
         seconds=time.monotonic() - began,
         details={"diverging": diverging, "gradients": steps},
     )

@@ -6,11 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import skew
 
 from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.posteriors import piled_at
+
+PRIOR_DRAWS = 1000  # that tell whether a prior is one of logarithms
 
 Draws = dict[str, Float[np.ndarray, "chain draw"]]
 
@@ -60,41 +65,27 @@ def chains(problem: Problem, positions: list[np.ndarray]) -> Draws:
     return {name: np.stack([np.asarray(v[name], dtype=float) for v in values]) for name in problem.names}
 
 
-def bound_warnings(
-    draws: Mapping[str, np.ndarray],
-    bounds: Mapping[str, tuple[float, float]],
-    *,
-    edge: float = 0.01,
-    share: float = 0.1,
-    reached: float = 4.0,
-) -> list[str]:
-    """A sentence for every parameter with more than ``share`` of its draws within ``edge`` of its range from a bound,
-    and that bound within ``reached`` standard deviations.
+def bound_warnings(problem: Problem, draws: Draws) -> list[str]:
+    """A sentence for every parameter whose posterior is cut off by a bound at its mode: there the bound decides.
 
-    Draws that pile up on a bound say that the bound, not the data, decides: a uniform posterior has 1 % there. Bounds
-    that lie decades apart are compared in logarithms: a linear range would put every ordinary value at the lower one.
+    A prior that is more even in logarithms has its posterior compared in logarithms: a scale that ranges over decades
+    has much of a linear range's mass at the lower end.
     """
     sentences = []
     for name, values in draws.items():
-        low, high = bounds[name]
-        if not np.isfinite(high - low):
-            continue
-        if low > 0.0 and high > 100.0 * low:
-            values, start, end = np.log(values), np.log(low), np.log(high)
-        else:
-            start, end = low, high
-        reach = edge * (end - start)
-        away, spread = np.mean(values), reached * np.std(values)
-        for side, near, gap in (
-            ("lower", values < start + reach, away - start),
-            ("upper", values > end - reach, end - away),
-        ):
-            if np.mean(near) > share and gap < spread:
-                bound = low if side == "lower" else high
-                sentences.append(
-                    f"{name} sits on its {side} bound {bound:g}: {np.mean(near):.0%} of the draws are there"
-                )
+        values, (low, high) = np.ravel(values), problem.bounds[name]
+        side = piled_at(values, low, high)
+        if side and _even_in_logarithms(problem, name):
+            side = piled_at(values, low, high, logarithmic=True)
+        if side:
+            word, bound = ("lower", low) if side == "low" else ("upper", high)
+            sentences.append(f"{name} sits on its {word} bound {bound:g}, which decides there, and not the data")
     return sentences
+
+
+def _even_in_logarithms(problem: Problem, name: str) -> bool:
+    prior = np.asarray(problem.sample_prior(jax.random.key(0), PRIOR_DRAWS)[name], dtype=float)
+    return bool(np.all(prior > 0.0) and abs(skew(np.log(prior))) < abs(skew(prior)))
 
 
 def exclusion_warnings(excluded: Mapping[str, int], evaluations: int, *, share: float = 0.05) -> list[str]:

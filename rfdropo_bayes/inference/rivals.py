@@ -262,7 +262,7 @@ def _run(
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
         warnings=[
-            *bound_warnings(draws, problem.bounds),
+            *bound_warnings(problem, draws),
             *exclusion_warnings(ledger.excluded, ledger.evaluations),
         ],
         seconds=time.monotonic() - began,

@@ -29,7 +29,13 @@ from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.schedules import block_boundaries
 from rfdropo_bayes.inference.sharpness import Way, way_from_prior
 
-CLIMBING = 0.25  # share of the budget that looking for optima may take
+CLIMBING = 0.25  # share of the budget that climbs to optima may take
+SURVEYING = 0.4  # and the survey before them
+PER_SURVEYOR = 32.0  # rollouts that a particle of the survey takes, typically
+MOST_SURVEYORS, FEWEST_SURVEYORS = (
+    128,
+    64,
+)  # with fewer, more than half of the surveys of a rugged ridge missed the summit
 STEPS = 12.0  # that a climb takes at each horizon, typically
 SCORING = 0.1  # and the evidence of the blocks
 MARGIN = 3.0  # what real posteriors cost over the estimate, which takes them to be normal and data to be even
@@ -57,7 +63,7 @@ def run(
             remedy='start = "prior", or method = "bridge"',
         )
     climb_key, way_key, sample_key = jax.random.split(key, 3)
-    climbing = _climbing(config, len(problem.names))
+    climbing = _climbing(problem, config)
     digest = run_digest(problem, "smc_climbs", config, key)
     checkpoint = logbook.checkpoint("smc_climbs", digest)
     try:
@@ -76,14 +82,19 @@ def run(
     return _from_optima(problem, config, found, way, sample_key, logbook)
 
 
-def _climbing(config: SmcConfig, d: int) -> LaplaceConfig:
-    """As many climbs as the budget can bring to an optimum: one that stops on the way misleads what starts from it."""
+def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
+    """A survey, where the budget allows one and no earlier posterior knows where to start; and as many climbs as the
+    budget can bring to an optimum: one that stops on the way misleads what starts from it."""
     if config.rollouts is None:
         return LaplaceConfig()
+    surveyors = min(int(SURVEYING * config.rollouts / PER_SURVEYOR), MOST_SURVEYORS)
+    if surveyors < FEWEST_SURVEYORS or getattr(problem, "earlier", None):
+        surveyors = 0
     budget = CLIMBING * config.rollouts
-    # Three horizons that double cost 1.75 times the last; a step is a Jacobian by differences and six dampings.
-    whole = 1.75 * STEPS * (4.0 * d + 7.0)
-    return LaplaceConfig(starts=int(np.clip(budget / whole, 1, LaplaceConfig().starts)), rollouts=budget)
+    # Three horizons that double cost 1.75 times the last, two 1.5; a step is a Jacobian by differences and 6 dampings.
+    whole = (1.5 if surveyors else 1.75) * STEPS * (4.0 * len(problem.names) + 7.0)
+    starts = int(np.clip(budget / whole, 1, LaplaceConfig().starts))
+    return LaplaceConfig(starts=starts, survey=surveyors, rollouts=budget + surveyors * PER_SURVEYOR)
 
 
 def _worth_climbing(problem: Problem, config: SmcConfig) -> bool:

@@ -1,5 +1,6 @@
 """Draws and predictions on disk: the one room that knows ArviZ and its version."""
 
+from rfdropo_bayes.posteriors.bounds import piled_at
 from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
 from rfdropo_bayes.posteriors.inference_data import load_posterior, save_posterior, summarise, to_inference_data
 from rfdropo_bayes.posteriors.record import ParameterInfo, PosteriorRecord, RecordingPrediction
@@ -11,6 +12,7 @@ __all__ = [
     "RecordingPrediction",
     "evaluate_products",
     "load_posterior",
+    "piled_at",
     "save_posterior",
     "summarise",
     "to_inference_data",

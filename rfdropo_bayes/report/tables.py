@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, summarise
-
-PILED = 0.13  # of a standard deviation, between a half-normal (0.10) and a uniform distribution (0.17)
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, piled_at, summarise
 
 
 @dataclass(frozen=True)
@@ -91,21 +89,11 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
 def bound_reached(draws: Float[np.ndarray, " n"], info: ParameterInfo) -> str | None:
     """The bound, "low" or "high", that a posterior is piled up at; None if it is not.
 
-    Bounds are the hard ones, or the ends of a uniform prior inside them.
-
-    A posterior that a bound cuts off at its mode has its outer 5 % quantile within a tenth of a standard deviation of
-    that bound, however wide the bounds are. Where the prior is logarithmic the comparison is in logarithms.
+    Bounds are the hard ones, or the ends of a uniform prior inside them. Where the prior is logarithmic the comparison
+    is in logarithms; see `piled_at`.
     """
     low, high = max(info.low, info.prior.get("low", -np.inf)), min(info.high, info.prior.get("high", np.inf))
-    if info.logarithmic and np.all(draws > 0):
-        draws = np.log(draws)
-        low = np.log(low) if low > 0 else -np.inf
-        high = np.log(high) if high > 0 else -np.inf
-    q05, q95 = np.quantile(draws, [0.05, 0.95])
-    reach = PILED * draws.std()
-    if q05 - low <= reach:
-        return "low"
-    return "high" if high - q95 <= reach else None
+    return piled_at(draws, low, high, logarithmic=info.logarithmic)
 
 
 def _contraction(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"], *, log: bool) -> float | None:

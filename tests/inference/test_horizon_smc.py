@@ -13,7 +13,6 @@ import pytest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import horizon_smc
 from rfdropo_bayes.inference.horizon_smc import SmcConfig
-from rfdropo_bayes.inference.result import bound_warnings
 
 from .toys import Decay, LinearGaussian, TwoModes
 
@@ -164,31 +163,6 @@ def test_a_budget_that_allows_nothing_is_refused():
 def test_settings_are_checked(wrong):
     with pytest.raises(InputError, match=str(next(iter(wrong)))):
         SmcConfig(**wrong)
-
-
-def test_draws_on_a_bound_are_warned_of():
-    class Bounded(LinearGaussian):
-        def __init__(self):
-            super().__init__()
-            mean, covariance = self.posterior()
-            edge = mean[0] + 3.0 * np.sqrt(covariance[0, 0])
-            self.bounds = {**self.bounds, "x0": (edge - 1000.0 * np.sqrt(covariance[0, 0]), edge)}
-
-    result = horizon_smc.run(Bounded(), SmcConfig(particles=200), KEY)
-    assert any("x0 sits on its upper bound" in sentence for sentence in result.warnings)
-
-
-def test_a_wide_positive_range_is_measured_in_decades():
-    spread = np.linspace(0.5, 1.5, 50)[None]
-    draws = {
-        "noise": 2e-3 * spread,
-        "mass": 1e-3 + 1e-5 * spread,
-        "tilt": 2e-3 * spread,
-        "damping": 2e-3 + 1e-5 * spread,
-    }
-    bounds = {"noise": (1e-6, 1.0), "mass": (1e-3, 1e3), "tilt": (0.0, 1.0), "damping": (0.0, 2.0)}
-    sentences = bound_warnings(draws, bounds)
-    assert [sentence.split()[0] for sentence in sentences] == ["mass", "tilt"]
 
 
 def test_a_ridge_is_followed_by_few_particles():

@@ -209,6 +209,34 @@ class Ratio(LinearGaussian):
         return (mass**2 - ends[0] ** 2) / (ends[1] ** 2 - ends[0] ** 2), float(evidence)
 
 
+class Washboard(LinearGaussian):
+    """A valley with a ripple of 20 nats across it: climbs end on the nearest of thousands of crests, and the highest
+    holds the posterior. Each row has an equal share."""
+
+    width, ripple = 0.25, 10.0
+
+    def __init__(self, d: int = 4) -> None:
+        super().__init__(n_rows=8, d=d)
+        self.mean, self.sd, self.centre = np.full(d, 2.0), np.full(d, 3.0), np.linspace(-1.3, 3.4, d)
+
+    def _shape(self, away):
+        return -0.5 * (away / self.width) ** 2 - self.ripple * (1.0 - jnp.cos(2.0 * jnp.pi * away))
+
+    def _row_density(self, u, horizon):
+        whole = self._shape(u - self.centre).sum(axis=1)
+        return jnp.tile(whole[:, None] / self.n_rows, (1, horizon))
+
+    def residuals(self, values, horizon):
+        away = jnp.stack([values[name] for name in self.names]) - self.centre
+        parts = [away / self.width, 2.0 * jnp.sqrt(self.ripple) * jnp.sin(jnp.pi * away)]
+        return jnp.sqrt(horizon / self.n_rows) * jnp.concatenate(parts)
+
+    def log_evidence(self):
+        away = np.linspace(-4.0, 4.0, 80001)
+        shape = np.exp(self._shape(away))
+        return sum(np.log(np.trapezoid(shape * norm.pdf(c + away, 2.0, 3.0), away)) for c in self.centre)
+
+
 class Spring:
     """Features of a damped oscillation whose frequency and damping differ from rollout to rollout, for RF-DROPO."""
 
