@@ -14,6 +14,7 @@ from rfdropo_bayes.audit.score import likeness, span
 from rfdropo_bayes.audit.screen import Look, Row, look
 
 DISCRETISATION = "discretisation"
+SHARES = np.array([1.0, 0.5, 0.2, 0.05])
 
 
 @dataclass(frozen=True)
@@ -194,8 +195,24 @@ class Inquiry:
             return climb(replace(self.target, forward=self.finer), start, fit.free)
         candidate = next(c for c in self.candidates if c.name == row.name)
         free = np.array([*fit.free, *candidate.indices], dtype=int)
-        low, high = self.target.forward.coordinates.bounds
-        return climb(self.target, np.clip(start, low, high), free)
+        found = climb(self.target, self._on_the_way(fit, row, start), free)
+        # The model without the candidate is among those with it: a climb that ends at a worse one went astray.
+        if found.residual @ found.residual > fit.residual @ fit.residual:
+            found = max(found, climb(self.target, fit.x, free), key=lambda end: end.log_evidence)
+        return found
+
+    def _on_the_way(self, fit: Fit, row: Row, start: np.ndarray) -> np.ndarray:
+        """The best point between a fit and the linear extrapolation from it, which a large misfit carries too far."""
+        assert row.probe is not None
+        coordinates = self.target.forward.coordinates
+        points = fit.x + SHARES[:, None] * (start - fit.x)
+        held = list(row.probe.point)  # places and times mean the same however large the effect is
+        points[:, held] = start[held]
+        points = np.clip(points, *coordinates.bounds)
+        residual = self.target.recall("shares", [points], lambda: {"residual": self.target.residual(points)})
+        z = (points - coordinates.prior_mean) / coordinates.prior_sd
+        cost = np.sum(residual["residual"] ** 2, axis=1) + np.sum(z**2, axis=1)
+        return points[int(np.nanargmin(np.where(np.isfinite(cost), cost, np.inf)))]
 
     def _reconsider(self, base: Fit, steps: list[Step]) -> list[Step]:
         """With the last mechanism in the model, was the first one named rightly? Take it out and ask again."""

@@ -10,6 +10,7 @@ from rfdropo_bayes.audit.extension import DISCRETISATION, Step
 from rfdropo_bayes.audit.gain import LEVELS, noise_distance
 from rfdropo_bayes.audit.noise import REPEATS
 from rfdropo_bayes.audit.pipeline import Answer
+from rfdropo_bayes.audit.prequential import in_words, prequential
 from rfdropo_bayes.audit.score import likeness
 from rfdropo_bayes.audit.screen import Look, Row
 from rfdropo_bayes.audit.sentence import sentence
@@ -60,6 +61,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
             "length_scale_s": answer.remainder.memory,
             "log_likelihood_ratio": answer.remainder.log_likelihood_ratio,
         },
+        "where": _where(answer),
         "base_parameters": _parameters(answer, answer.base.free, answer.base.x),
         "next_experiment": None if answer.verdict == NO_DISCREPANCY else next_experiment,
         "rollouts": answer.rollouts,
@@ -195,6 +197,20 @@ def _omnibus(look: Look) -> dict[str, Any]:
         "finer_mesh": look.refined,
         "tests": look.omnibus.single,
         "blocks": look.omnibus.blocks.tolist(),
+    }
+
+
+def _where(answer: Answer) -> dict[str, Any]:
+    """When and where the base model fails."""
+    found, question = prequential(answer.target, answer.base), answer.question
+    markers = question.recordings.markers
+    misfit = np.sqrt(found.misfit.reshape(-1, 3).mean(axis=1))
+    return {
+        "sentence": in_words(found, markers, question.rules.base_passes),
+        "block_edges_s": found.edges.tolist(),
+        "prequential_score": found.score.tolist(),
+        "block_p": found.p.tolist(),
+        "marker_misfit": dict(zip(markers, misfit.tolist(), strict=True)),
     }
 
 
