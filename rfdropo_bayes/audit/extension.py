@@ -26,7 +26,8 @@ class Rules:
         class_cosine: signatures more alike than this are one class.
         classes: leading classes that are refitted; members: candidates refitted in all.
         effects: most mechanisms that are added.
-        evidence: log Bayes factor a mechanism must bring to be added.
+        evidence: log Bayes factor a mechanism must bring to be added; one after the first must bring the logarithm of
+            the number of candidates more, since with so many to choose from a few together imitate most things.
         bootstraps: simulated data sets behind every p-value.
         minutes: of processor time for a candidate that only a slower simulator knows; one that needs more is not
             examined.
@@ -140,7 +141,8 @@ class Inquiry:
             fits[row.name] = self._refit(found.fit, row, leads[row.name][1])
             refits[row.name] = fits[row.name].log_evidence - found.fit.log_evidence
             self.report(f"refit with {row.name}: log Bayes factor {refits[row.name]:.1f}")
-        if not refits or max(refits.values()) < self.rules.evidence:
+        further = np.log(len(self.candidates)) if named else 0.0
+        if not refits or max(refits.values()) < self.rules.evidence + further:
             return None
         best = max(refits, key=lambda name: refits[name])
         enough = self.rules.class_cosine**2 * leads[best][0]

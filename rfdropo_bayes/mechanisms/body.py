@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
+import numpy as np
 
 from rfdropo_bayes.fem import LayeredBody, Material
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+AXES = ("x", "y", "z")
 
 
 class Payload:
@@ -56,25 +62,38 @@ class StiffnessGradient:
 
 
 class BaseTilt:
-    """The base is mounted at an angle: gravity turns about the base's x and y axes; zero is the base simulator."""
+    """The base is mounted at an angle: gravity turns about axes of the base; zero is the base simulator.
+
+    Args:
+        axes: that it turns about, one after the other.
+    """
 
     name = "base_tilt"
     stage = "body"
     cause = "a mount that is not level, or a motion-capture frame that is not plumb"
     remedy = "level the base and recalibrate the frame's vertical"
-    parameters = (
-        ParameterSpec(
-            "base_tilt_x", "rad", -0.8, 0.8, 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 0.05}, "tilt about x"
-        ),
-        ParameterSpec(
-            "base_tilt_y", "rad", -0.8, 0.8, 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 0.05}, "tilt about y"
-        ),
-    )
+
+    def __init__(self, axes: Sequence[str] = AXES) -> None:
+        self.axes = tuple(axes)
+        prior = {"distribution": "Normal", "loc": 0.0, "scale": 0.05}
+        self.parameters = tuple(
+            ParameterSpec(f"base_tilt_{axis}", "rad", -0.8, 0.8, 0.0, dict(prior), f"tilt about {axis}")
+            for axis in self.axes
+        )
+
+    @classmethod
+    def for_robot(cls, robot: Robot) -> BaseTilt:
+        """The two axes across a robot's gravity: about the one that is most along it, a tilt changes nothing."""
+        along = int(np.argmax(np.abs(robot.gravity)))
+        return cls([axis for k, axis in enumerate(AXES) if k != along])
 
     def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
         """Rotate gravity into the tilted base."""
-        cx, sx = jnp.cos(values["base_tilt_x"]), jnp.sin(values["base_tilt_x"])
-        cy, sy = jnp.cos(values["base_tilt_y"]), jnp.sin(values["base_tilt_y"])
-        about_x = jnp.stack([jnp.array([1.0, 0.0, 0.0]), jnp.stack([0 * cx, cx, sx]), jnp.stack([0 * cx, -sx, cx])])
-        about_y = jnp.stack([jnp.stack([cy, 0 * cy, -sy]), jnp.array([0.0, 1.0, 0.0]), jnp.stack([sy, 0 * cy, cy])])
-        return material._replace(gravity=about_y @ (about_x @ material.gravity))
+        gravity = material.gravity
+        for axis in self.axes:
+            angle = values[f"base_tilt_{axis}"]
+            first, second = ((AXES.index(axis) + k) % 3 for k in (1, 2))
+            c, s = jnp.cos(angle), jnp.sin(angle)
+            turned = gravity.at[first].set(c * gravity[first] + s * gravity[second])
+            gravity = turned.at[second].set(c * gravity[second] - s * gravity[first])
+        return material._replace(gravity=gravity)

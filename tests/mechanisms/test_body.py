@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rfdropo_bayes.fem import Material
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism
@@ -15,6 +16,7 @@ from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assem
 
 BODY = sorted(name for name, kind in REGISTRY.items() if isinstance(kind(), BodyMechanism))
 PLACED = {"wall_distance": 0.005, "prony_time": 0.3}  # where they are felt
+NOTHING = [name for name in Material._fields if name != "gravity"]
 UNSEEN = {"base_tilt_y"}  # turns gravity about itself, as the arm's is along y
 STEP = {"coulomb_friction": 1e-7, "cable_compliance": 1e-9}  # of a difference; 1e-5 for others
 
@@ -38,8 +40,8 @@ def test_all_at_once_null_values_and_derivatives():
     """Every mechanism of the body present in one simulator: null values change nothing, derivatives are differences."""
     base, extended = simulator(), simulator(*BODY)
     commands = recorded(base)
-    names = [spec.name for name in BODY for spec in REGISTRY[name].parameters]
-    free = [spec.name for name in BODY for spec in REGISTRY[name].parameters if not spec.grid]
+    names = [spec.name for name in BODY for spec in REGISTRY[name]().parameters]
+    free = [spec.name for name in BODY for spec in REGISTRY[name]().parameters if not spec.grid]
 
     def position(values):
         return extended.rollout(PLACED | dict(zip(free, values, strict=True)), commands).position
@@ -62,6 +64,19 @@ def test_all_at_once_null_values_and_derivatives():
 
 @pytest.mark.parametrize("name", BODY)
 def test_parameters_state_their_null_value(name):
-    for spec in REGISTRY[name].parameters:
+    for spec in REGISTRY[name]().parameters:
         assert spec.nominal == 0.0 or spec.grid
         assert all(spec.low < value < spec.high for value in spec.grid)
+
+
+@pytest.mark.parametrize(("robot", "axes"), [("smooth_arm", "xz"), ("asl_trunk", "xy")])
+def test_a_base_tilts_about_the_axes_across_gravity(robot, axes):
+    described = load_robot(robot)
+    tilt = REGISTRY["base_tilt"].for_robot(described)
+    assert [spec.name for spec in tilt.parameters] == [f"base_tilt_{axis}" for axis in axes]
+    gravity = jnp.asarray(described.gravity)
+    for spec in tilt.parameters:
+        values = {s.name: jnp.asarray(0.3 if s is spec else 0.0) for s in tilt.parameters}
+        turned = tilt.embody(values, Material(gravity=gravity, **dict.fromkeys(NOTHING)), None).gravity
+        assert float(jnp.linalg.norm(turned)) == pytest.approx(9.81)
+        assert float(turned @ gravity) == pytest.approx(9.81**2 * np.cos(0.3))
