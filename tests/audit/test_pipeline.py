@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -193,3 +194,24 @@ def test_rollouts_go_to_the_simulator_that_knows_their_candidates():
     np.testing.assert_array_equal(
         routed.differentiate(theta, tangent, commands, lane), whole.differentiate(theta, tangent, commands, lane)
     )
+
+
+def test_a_refit_finds_back_from_an_extrapolation_at_which_rollouts_fail(monkeypatch):
+    """A large misfit makes the linear extrapolation a poor start; here no rollout ends well beyond a tenth of it."""
+
+    class Brittle(Toy):
+        def rollout(self, parameters, commands, steps=None):
+            observed = super().rollout(parameters, commands, steps)
+            return observed._replace(status=jnp.where(jnp.abs(parameters["play"]) > 4.0, 1, 0))
+
+    asked = replace(question({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Brittle(), np.arange(4)))
+    target, base = base_model(asked, np.random.default_rng(0))
+    inquiry = Inquiry(target, asked.candidates, asked.rules, 0)
+    look, _ = inquiry.look_at(base)
+    index = asked.coordinates.space.names.index("play")
+    far = base.x.copy()
+    far[index] += 45.0
+    monkeypatch.setattr(Inquiry, "_lead", lambda *given: (1.0, far))
+    fit = inquiry.refit(base, look.row("play"))
+    assert fit.log_evidence > base.log_evidence + 10.0
+    assert asked.coordinates.named(fit.x)["play"] == pytest.approx(1.0, abs=0.2)
