@@ -25,7 +25,7 @@ from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes, mo
 from rfdropo_bayes.inference.levenberg import Laplace
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.mixture import ModeMixture, covering
-from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, exclusion_warnings
+from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, exclusion_warnings, replicate_warnings
 from rfdropo_bayes.inference.straight import StraightProblem
 
 
@@ -150,7 +150,10 @@ def sample_from_modes(
     excluded = ledger.excluded + Counter(sampled.excluded)
     evaluations = ledger.evaluations + sampled.evaluations
     # Several optima are what the mixture is for: no warning here, unlike in Laplace alone.
-    kept = [sentence for sentence in sampled.warnings if "got no weight" not in sentence]
+    # What the sampler says of coordinates, and of its share of rollouts, is said below of parameters and of all.
+    again = ("got no weight", "scatter by", "disagree about")
+    kept = [sentence for sentence in sampled.warnings if not any(words in sentence for words in again)]
+    kept += replicate_warnings(draws, np.asarray(sampled.details["log_evidence_replicates"]))
     kept += [sentence for sentence in found.warnings if "converged" in sentence]
     return replace(
         sampled,

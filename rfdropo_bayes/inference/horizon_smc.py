@@ -9,22 +9,28 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
-from scipy.special import logsumexp
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.hamiltonian import MOST_LEAPS, Flow, chosen_kernel, flow_of
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.proposals import KERNELS, initial_scale
-from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains, exclusion_warnings
+from rfdropo_bayes.inference.result import (
+    InferenceResult,
+    bound_warnings,
+    chains,
+    exclusion_warnings,
+    replicate_warnings,
+)
 from rfdropo_bayes.inference.schedules import SPACINGS, block_boundaries
 from rfdropo_bayes.inference.tempering import Population, StageInfo, Tuning, refresh, stage
 
@@ -46,7 +52,8 @@ class SmcConfig:
         blocks: number of times the horizon is lengthened.
         spacing: of the blocks: "geometric", "linear" or "every" (row).
         target_ess: share of effective particles kept from one target to the next; closer to 1 is slower and more exact.
-        kernel: "crank_nicolson" (adapts between independent draws and small steps) or "random_walk".
+        kernel: "crank_nicolson" (adapts between independent draws and small steps), "random_walk", "hamiltonian"
+            (follows gradients), or "auto": see `hamiltonian.chosen_kernel`.
         degrees: degrees of freedom of the Student-t behind "crank_nicolson".
         acceptance: acceptance rate that the step size is adapted to.
         correlation: moves of a stage end once no direction is more correlated than this with its start.
@@ -60,7 +67,7 @@ class SmcConfig:
     blocks: int = 6
     spacing: str = "geometric"
     target_ess: float = 0.5
-    kernel: str = "crank_nicolson"
+    kernel: str = "auto"
     degrees: float = 8.0
     acceptance: float = 0.3
     correlation: float = 0.3
@@ -99,11 +106,13 @@ class Plan(NamedTuple):
         particles: number of particles.
         horizons: prefix lengths at the ends of the blocks.
         budget: rollouts of this replicate; infinite for no limit.
+        flow: of trajectories; None for moves without gradients.
     """
 
     particles: int
     horizons: tuple[int, ...]
     budget: float
+    flow: Flow | None = None
 
 
 class SmcState(NamedTuple):
@@ -154,7 +163,7 @@ def make_plan(problem: Problem, config: SmcConfig) -> Plan:
             where="[inference] rollouts",
             remedy=f"allow at least {config.replicates * least * (looks + 1.0):.0f}, or use fewer particles",
         )
-    return Plan(least, horizons, budget)
+    return Plan(least, horizons, budget, flow_of(problem) if config.kernel == "hamiltonian" else None)
 
 
 def init(key: PRNGKeyArray, problem: Problem, plan: Plan, config: SmcConfig) -> SmcState:
@@ -198,7 +207,11 @@ def step(
     horizon = plan.horizons[state.block]
     evaluate = partial(_evaluate, problem, horizon, state.ledger)
     moves = _affordable_moves(state, plan, horizon, problem.n_rows)
-    population, info = stage(key, state.population, float(horizon), evaluate, config.tuning, moves)
+    tuning = config.tuning
+    if plan.flow is not None:
+        charge = partial(state.ledger.charge, problem, horizon=horizon)
+        tuning = tuning._replace(follow=partial(plan.flow, charge=charge))
+    population, info = stage(key, state.population, float(horizon), evaluate, tuning, moves)
     if not np.isfinite(info.log_evidence_increment):
         raise _nothing_left(state, horizon)
     finished = population.progress == problem.n_rows
@@ -210,7 +223,7 @@ def step(
     if finished:
         moves = max(1, _affordable_moves(state, plan, horizon, problem.n_rows, last=True))
         last_key = jax.random.fold_in(key, 1)
-        population, done = refresh(last_key, population, info, evaluate, config.tuning, moves)
+        population, done = refresh(last_key, population, info, evaluate, tuning, moves)
         state.trace.append(facts | _facts(done) | {"rollouts": state.ledger.rollouts, "final": True})
     state = state._replace(
         population=population,
@@ -242,7 +255,7 @@ def _affordable_moves(state: SmcState, plan: Plan, horizon: int, n_rows: int, *,
         return 10**9
     looks = sum(plan.horizons[state.block + 1 :]) / n_rows
     left = plan.budget - state.ledger.rollouts - (0.0 if last else plan.particles * (looks + 1.0))
-    cost = plan.particles * horizon / n_rows
+    cost = plan.particles * horizon / n_rows * (1 if plan.flow is None else MOST_LEAPS + 2)
     if left < cost:
         return 0
     return max(1, int((left if last else 0.5 * left) / cost + 1e-9))
@@ -273,8 +286,9 @@ def run(
     Raises:
         InputError: a budget that is too small, a prior that excludes the data, a checkpoint of another run.
     """
-    plan = make_plan(problem, config)
     digest = run_digest(problem, "smc", config, key)
+    config = replace(config, kernel=chosen_kernel(config.kernel, problem, config.rollouts))
+    plan = make_plan(problem, config)
     states = []
     for replicate in range(config.replicates):
         checkpoint = logbook.checkpoint(f"smc_{replicate}", digest)
@@ -345,6 +359,7 @@ def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcSta
             *bound_warnings(problem, draws),
             *exclusion_warnings(excluded, evaluations),
             *_stage_warnings(trace, config),
+            *replicate_warnings(draws, values),
         ],
         seconds=sum(state.seconds for state in states),
         details={"log_evidence_replicates": values.tolist(), "particles": plan.particles, "horizons": plan.horizons},
@@ -378,8 +393,3 @@ def _stage_warnings(trace: list[dict[str, Any]], config: SmcConfig) -> list[str]
             "that the moves cannot follow; compare replicates"
         )
     return sentences
-
-
-def log_mean_evidence(values: Float[np.ndarray, " r"]) -> float:
-    """Logarithm of the mean of replicate evidences, which unlike their mean logarithm is unbiased before the log."""
-    return float(logsumexp(values) - np.log(len(values)))

@@ -140,6 +140,12 @@ class NumpyroProblem:
         sites = constrain_fn(self.model, self.args, self.kwargs, self._ravelled(u))
         return self._single_rows({name: sites[name] for name in self._shapes}).sum()
 
+    def path_density(self, u: Float[Array, " d"], shares: Float[Array, " n_rows"]) -> Float[Array, ""]:
+        """Log prior plus the log density of every row times its share, at one unconstrained point; traceable."""
+        sites = constrain_fn(self.model, self.args, self.kwargs, self._ravelled(u))
+        rows = self._single_rows({name: sites[name] for name in self._shapes})
+        return self.log_prior(u[None])[0] + jnp.sum(jnp.where(shares > 0.0, shares * rows, 0.0))
+
     def sites(self, draws: Mapping[str, Float[np.ndarray, "*batch"]]) -> dict[str, Float[np.ndarray, "*batch *shape"]]:
         """Draws of components as draws of the model's own sites, in their shapes, with those of ``deterministic``
         sites computed from them: ``problem.sites(result.draws)["theta"]`` is (chain, draw, *shape of theta)."""

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 from scipy.linalg import solve_triangular
 
-KERNELS = ("crank_nicolson", "random_walk")
+KERNELS = ("auto", "crank_nicolson", "random_walk", "hamiltonian")
+FOLLOWED = 0.75  # acceptance that trajectories are adapted to
 
 
 class Reference(NamedTuple):
@@ -43,15 +44,18 @@ def fit_reference(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray,
 
 
 def initial_scale(kernel: str, d: int) -> float:
-    """Step before anything is known of the acceptance: 2.38 / sqrt(d) for a random walk, at most 1 for the other."""
+    """Step before anything is known of the acceptance: 2.38 / sqrt(d) for a random walk, d^(-1/4) for a trajectory, at
+    most 1 for Crank-Nicolson."""
+    if kernel == "hamiltonian":
+        return float(d**-0.25)
     walk = 2.38 / np.sqrt(d)
     return float(walk if kernel == "random_walk" else min(walk, 1.0))
 
 
 def adapt_scale(kernel: str, scale: float, acceptance: float, target: float) -> float:
     """Next step size from the acceptance of the whole population (Robbins-Monro on its logarithm)."""
-    longer = scale * np.exp(1.5 * (acceptance - target))
-    return float(np.clip(longer, 1e-4, 1.0 if kernel == "crank_nicolson" else 10.0))
+    longer = scale * np.exp(1.5 * (acceptance - (FOLLOWED if kernel == "hamiltonian" else target)))
+    return float(np.clip(longer, 1e-4, 10.0 if kernel == "random_walk" else 1.0))
 
 
 def host_generator(key: PRNGKeyArray) -> np.random.Generator:

@@ -15,6 +15,8 @@ from scipy.stats import skew
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.posteriors import piled_at
 
+SCATTERED = 0.5  # nats
+APART = 1.1  # R-hat: the means of replicates scatter by nearly half of the posterior's width
 PRIOR_DRAWS = 1000  # that tell whether a prior is one of logarithms
 
 Draws = dict[str, Float[np.ndarray, "chain draw"]]
@@ -86,6 +88,31 @@ def bound_warnings(problem: Problem, draws: Draws) -> list[str]:
 def _even_in_logarithms(problem: Problem, name: str) -> bool:
     prior = np.asarray(problem.sample_prior(jax.random.key(0), PRIOR_DRAWS)[name], dtype=float)
     return bool(np.all(prior > 0.0) and abs(skew(np.log(prior))) < abs(skew(prior)))
+
+
+def replicate_warnings(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) -> list[str]:
+    """What independent repetitions do not agree about: the evidence, or where parameters lie (R-hat)."""
+    if len(log_evidence) < 2:
+        return []
+    sentences, sd = [], float(np.std(log_evidence, ddof=1))
+    if sd > SCATTERED:
+        sentences.append(
+            f"the log evidences of {len(log_evidence)} replicates scatter by {sd:.2g}: compare models only where they "
+            "differ by several times that, or take more particles or a target_ess closer to 1"
+        )
+    apart = {}
+    for name, values in draws.items():
+        within = float(np.mean(np.var(values, axis=1, ddof=1)))
+        if within > 0.0:
+            apart[name] = float(np.sqrt(1.0 + np.var(values.mean(axis=1), ddof=1) / within))
+    worst = sorted((name for name in apart if apart[name] > APART), key=lambda name: -apart[name])
+    if worst:
+        others = f" and {len(worst) - 3} more" if len(worst) > 3 else ""
+        sentences.append(
+            f"replicates disagree about {', '.join(worst[:3])}{others} (R-hat {apart[worst[0]]:.2f}): some have "
+            "not seen all of the posterior"
+        )
+    return sentences
 
 
 def exclusion_warnings(excluded: Mapping[str, int], evaluations: int, *, share: float = 0.05) -> list[str]:

@@ -56,11 +56,13 @@ class Tuning(NamedTuple):
 
     Attributes:
         target_ess: effective sample size kept from one target to the next, as a share of the live particles.
-        kernel: ``"crank_nicolson"`` or ``"random_walk"``.
+        kernel: ``"crank_nicolson"``, ``"random_walk"`` or ``"hamiltonian"``.
         degrees: degrees of freedom of the Student-t behind ``crank_nicolson``.
         acceptance: acceptance that step sizes are adapted to.
         correlation: moves go on until no direction is more correlated than this with where the stage began.
         max_moves: and no longer than this.
+        follow: proposals of ``"hamiltonian"``: from the generator, positions, progress, references, second half and
+            scale.
     """
 
     target_ess: float
@@ -69,6 +71,7 @@ class Tuning(NamedTuple):
     acceptance: float
     correlation: float
     max_moves: int
+    follow: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None
 
 
 class StageInfo(NamedTuple):
@@ -214,10 +217,11 @@ def move(
     correlation = 1.0
     for count in range(max(1, min(moves, tuning.max_moves))):
         generator = host_generator(jax.random.fold_in(key, count))
-        proposal, ratio = np.empty_like(first), np.empty(len(first))
-        for members, reference in zip((~second, second), references, strict=True):
-            proposal[members], ratio[members] = propose(
-                generator, population.position[members], reference, scale, tuning.degrees, tuning.kernel
+        if tuning.follow is None:
+            proposal, ratio = _by_halves(generator, population.position, references, second, scale, tuning)
+        else:
+            proposal, ratio = tuning.follow(
+                generator, population.position, population.progress, references, second, scale
             )
         base, rows = evaluate(proposal)
         proposed = base + path_density(rows, population.progress)
@@ -235,6 +239,22 @@ def move(
             break
     done = {"moves": len(rates), "acceptance": float(np.mean(rates)), "correlation": correlation, "scale": scale}
     return population._replace(scale=scale), done
+
+
+def _by_halves(
+    generator: np.random.Generator,
+    position: Float[np.ndarray, "n d"],
+    references: tuple[Reference, Reference],
+    second: Bool[np.ndarray, " n"],
+    scale: float,
+    tuning: Tuning,
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
+    proposal, ratio = np.empty_like(position), np.empty(len(position))
+    for members, reference in zip((~second, second), references, strict=True):
+        proposal[members], ratio[members] = propose(
+            generator, position[members], reference, scale, tuning.degrees, tuning.kernel
+        )
+    return proposal, ratio
 
 
 def stage(

@@ -1,4 +1,4 @@
-"""Warnings of posteriors that a bound decides, judged by the posterior's own width and in the prior's coordinates."""
+"""Warnings of posteriors that a bound decides, and of replicates that disagree."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.result import bound_warnings
+from rfdropo_bayes.inference.result import bound_warnings, replicate_warnings
 
 from .toys import LinearGaussian, Ratio
 
@@ -53,3 +53,13 @@ def test_methods_say_which_bound_decides():
     """The data want a ratio of stiffness to mass that only the ends of both ranges have."""
     result = methods.run(Ratio(truth=(2.02, 0.995)), "laplace", {"blocks": 1}, jax.random.key(1))
     assert any("stiffness sits on its lower bound 2" in sentence for sentence in result.warnings)
+
+
+def test_replicates_that_disagree_are_named():
+    rng = np.random.default_rng(1)
+    draws = {"a": rng.normal(size=(4, 500)), "b": rng.normal(size=(4, 500)) + np.array([[0.0], [0.0], [0.0], [2.0]])}
+    assert replicate_warnings({"a": draws["a"]}, np.array([1.0, 1.1, 0.9, 1.0])) == []
+    assert replicate_warnings({"b": draws["b"][:1]}, np.array([1.0])) == []
+    scattered, apart = replicate_warnings(draws, np.array([1.0, 2.5, 0.2, 1.0]))
+    assert "4 replicates scatter by 0.96" in scattered
+    assert apart.startswith("replicates disagree about b (R-hat 1.")
