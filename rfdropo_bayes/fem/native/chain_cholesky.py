@@ -9,12 +9,10 @@ all of the work. The factorisation turns a border row b' into (L^-1 b)', and pro
 
 from __future__ import annotations
 
-import numba
-
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, inlined, kernel, load, square_root, store
 
 
-@numba.njit(inline="always")
+@inlined
 def _tile_minus_product(target, t, left, a, right, b, length, token):
     """The tile at ``t`` less the product of ``length`` columns of two panels; nine values, column by column."""
     c0, c1, c2 = load(target, t, token), load(target, t + 1, token), load(target, t + 2, token)
@@ -85,7 +83,7 @@ def _factor_tile(target, row, block, pivot_row, length, token):
     store(target, t + 8, fnma(c5, last, fnma(c2, lower, c8)) * inverse)
 
 
-@inlined
+@kernel
 def eliminate(pivot, coupling, border, condensed, station, last, tiles, panels, token):
     """Factorise one station and carry it over to the next, ``station - 1``, and to the condensed matrix.
 

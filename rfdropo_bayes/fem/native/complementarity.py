@@ -8,9 +8,7 @@ has reached its solution stays there bit for bit while others go on.
 
 from __future__ import annotations
 
-import numba
-
-from rfdropo_bayes.fem.native.simd import any_greater, fill, fma, fnma, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import any_greater, fill, fma, fnma, kernel, load, square_root, store, where_greater
 
 REGULARISATION = 1e-9
 """Relative compliance added to every cable, so that cables which share one route still have a definite tension."""
@@ -18,7 +16,7 @@ FULL_EXCHANGES = 10
 MAX_EXCHANGES = 60
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def factor_active(matrix, active, count, work, token):
     """Cholesky factor of the active set's matrix into ``work`` (count * count, lanes)."""
     one = fill(1.0, matrix, token)
@@ -36,7 +34,7 @@ def factor_active(matrix, active, count, work, token):
                 store(work, i * count + j, value * load(work, j * count + j, token))
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def substitute_active(offset, first, active, count, work, tension, token):
     """Tensions of the active set for the offsets from row ``first`` on, after `factor_active`; the others are zero."""
     zero = fill(0.0, work, token)
@@ -52,14 +50,14 @@ def substitute_active(offset, first, active, count, work, tension, token):
         store(tension, first + i, value * load(work, i * count + i, token))
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def solve_for_active(matrix, offset, active, count, work, tension, token):
     """Tensions of the active set by Cholesky; the others are zero. ``work`` is (count * count, lanes)."""
     factor_active(matrix, active, count, work, token)
     substitute_active(offset, 0, active, count, work, tension, token)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def solve_unilateral(matrix, offset, count, tolerance, active, work, tension, token):
     """Solve for ``tension`` (count, lanes); returns False if a lane is left without a solution.
 

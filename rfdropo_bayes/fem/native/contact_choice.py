@@ -19,7 +19,7 @@ PATIENCE = 4
 
 
 @kernel
-def _closing(scene, touch, slot, field, twist, first, lane, lanes):
+def _opening_rate(scene, touch, slot, field, twist, first, lane, lanes):
     """Velocity at which a candidate opens, by a velocity field of the body and six rows of the cube's twist."""
     t, u = SPACE * slot * lanes + lane, first * lanes + lane
     nx, ny, nz = touch.space[t + lanes], touch.space[t + 2 * lanes], touch.space[t + 3 * lanes]
@@ -48,7 +48,7 @@ def choose_closing(scene, touch, candidates, velocity, time_step, lane, lanes):
         chosen = False
         if _present(touch, slot, lane, lanes):
             opening = touch.space[SPACE * slot * lanes + lane] / time_step
-            chosen = opening + _closing(scene, touch, slot, velocity, touch.cube, 7, lane, lanes) < EAGER
+            chosen = opening + _opening_rate(scene, touch, slot, velocity, touch.cube, 7, lane, lanes) < EAGER
         touch.chosen[slot * lanes + lane] = 1.0 if chosen else 0.0
 
 
@@ -67,7 +67,7 @@ def choose_missed(scene, touch, candidates, velocity, increment, time_step, tole
         if touch.chosen[slot * lanes + lane] > 0.0 or not _present(touch, slot, lane, lanes):
             continue
         opening = touch.space[SPACE * slot * lanes + lane] / time_step
-        opening += _closing(scene, touch, slot, velocity, touch.after, 0, lane, lanes)
+        opening += _opening_rate(scene, touch, slot, velocity, touch.after, 0, lane, lanes)
         x, y, z = surface_point(scene, int(touch.candidate[slot * lanes + lane]), increment, lane, lanes)
         t = SPACE * slot * lanes + lane
         nx, ny, nz = touch.space[t + lanes], touch.space[t + 2 * lanes], touch.space[t + 3 * lanes]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rfdropo_bayes.fem.contact import CABLE_CHOICES, SWEEPS
-from rfdropo_bayes.fem.native.chain_cholesky import condense_rows, extend_border
+from rfdropo_bayes.fem.native.chain_cholesky import condense_rows, extend_border, substitute_back
 from rfdropo_bayes.fem.native.contact_choice import (
     PATIENCE,
     choose_all,
@@ -22,7 +22,7 @@ from rfdropo_bayes.fem.native.contact_problem import (
 )
 from rfdropo_bayes.fem.native.cube_motion import find_candidates
 from rfdropo_bayes.fem.native.layered_assembly import clear
-from rfdropo_bayes.fem.native.layered_step import find_tensions, mark_unsolved
+from rfdropo_bayes.fem.native.layered_step import find_tensions, mark_unsolved, weigh_border, weigh_rows
 from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, store
 from rfdropo_bayes.fem.pushing import RESTING
 
@@ -81,10 +81,10 @@ def _condense_contacts(tables, touch, work, panels, top, token):
 
 
 @kernel
-def add_impulses(tables, touch, work, panels, top, token):
+def _add_impulses(tables, touch, work, panels, top, token):
     """Add the contacts' impulses to what the back substitution starts from."""
     size = 3 * tables.modes
-    for station in range(tables.held, top + 1):
+    for station in range(tables.held, top + 1 if panels > 0 else tables.held):
         for c in range(size):
             value = load(work.solution, station * size + c, token)
             for i in range(3 * panels):
@@ -121,33 +121,34 @@ def start_contacts(scene, samples, touch, work, cables, time_step, token):
 
 
 @kernel
-def press(tables, scene, touch, work, candidates, time_step, tolerance, settled, token):
-    """Tensions of the scaled problem, and impulses, between the factorisation and the back substitution of a step.
-
-    Returns how many of the chosen contacts the trunk takes part in, and the topmost station that they reach.
-    """
-    cables = tables.cables
-    panels = place_chosen(touch, candidates, time_step, len(token))
+def press(tables, scene, touch, work, candidates, schedule, settled, token):
+    """Tensions, impulses and solution of a step whose matrix is factorised; returns how many of the chosen contacts the
+    trunk takes part in."""
+    cables, rate, tolerance = tables.cables, 1.0 / schedule.time_step, schedule.tolerance
+    panels = place_chosen(touch, candidates, schedule.time_step, len(token))
     contacts = RESTING + panels
     top = _gather_contacts(tables, scene, touch, panels, work.velocity, token)
     for c in range(cables):
         store(work.active, c, load(touch.first, c, token))
+    if panels > 0:
+        _condense_contacts(tables, touch, work, panels, top, token)
+    cube_compliance(touch, contacts, token)
+    trunk_compliance(touch, contacts, -1.0, token)
+    open_contacts(touch, contacts, token)
     if panels == 0:
-        cube_compliance(touch, contacts, token)
-        open_contacts(touch, contacts, token)
         find_tensions(cables, work, tolerance, token)
         store(touch.going, 0, fill(1.0, touch.cube, token))
         sweep(touch, touch.matrix, touch.free, contacts, CABLE_CHOICES * SWEEPS, settled, token)
     else:
-        _condense_contacts(tables, touch, work, panels, top, token)
-        cube_compliance(touch, contacts, token)
-        trunk_compliance(touch, contacts, -1.0, token)
-        open_contacts(touch, contacts, token)
         found = solve_contacts(touch, work, cables, contacts, tolerance, settled, token)
         mark_unsolved(cables, work, found, token)
     judge_contacts(touch, work, cables, contacts, token)
     stop_cube(touch, contacts, token)
-    return panels, top
+    weigh_border(cables, work, rate, token)
+    weigh_rows(tables, work, token)
+    _add_impulses(tables, touch, work, panels, top, token)
+    substitute_back(work.pivot, work.coupling, work.solution, tables.held, tables.stations, tables.modes, token)
+    return panels
 
 
 @kernel

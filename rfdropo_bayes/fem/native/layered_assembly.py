@@ -18,7 +18,7 @@ from rfdropo_bayes.fem.native.layered_effects import (
     subtract_law_product,
     subtract_surroundings_product,
 )
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, inlined, kernel, load, store
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store
 from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral, resist_twist
 
 POLAR_ITERATIONS = 6
@@ -200,7 +200,7 @@ def _tangent_block(parity, modes, target, t, stiffness, e, dyads, triangle, add,
     return e
 
 
-@inlined
+@kernel
 def _layer_tangent(parity, modes, stiffness, first, layer, whole, factors, work, token):
     """Add the tangent of a layer to the pivot of its upper station; ``whole``: set the coupling, and start the pivot of
     the lower one."""
@@ -285,7 +285,7 @@ def subtract_tangent_product(tables, samples, factors, change, field, work, toke
         subtract_surroundings_product(tables, samples, change, field, work, token)
 
 
-@inlined
+@kernel
 def assemble_layer(tables, samples, factors, layer, work, whole, token):
     """Frame and force of a layer, and its part of the matrix; see `_layer_tangent` for ``whole``."""
     layer_frame(tables, layer, work, token)

@@ -4,32 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numba
-
 from rfdropo_bayes.fem.native.layered_assembly import clear
-from rfdropo_bayes.fem.native.layered_rollout import (
-    fill_lanes,
-    finish_rollouts,
-    record_body,
-    start_rollouts,
-    step_factors,
-)
-from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
+from rfdropo_bayes.fem.native.layered_rollout import begin_step, finish_rollouts, settle
 from rfdropo_bayes.fem.native.layered_step import (
     condense_increment,
-    find_tensions,
     refine_increment,
     substitute_increment,
     take_step,
     weigh_border,
 )
-from rfdropo_bayes.fem.native.simd import addresses, fill, fma, fnma, inlined, kernel, load, store, where_greater
+from rfdropo_bayes.fem.native.simd import addresses, fill, fma, fnma, kernel, load, store, where_greater, whole
 from rfdropo_bayes.fem.native.slip_problem import solve_slip
 from rfdropo_bayes.fem.native.slip_records import KINDS
 from rfdropo_bayes.fem.native.slip_rows import gather_slip, kinds_present
 
 
-@inlined
+@kernel
 def _start_slip(tables, runs, friction, work, token):
     """Friction that is not mobilised yet, tensions the same all along a cable."""
     clear(friction.mobilised, 0, KINDS * runs.count, token)
@@ -102,7 +92,7 @@ def _remember(tables, friction, work, rows, rate, token):
             left = load(work.tension, c, token) - rate * load(friction.lost, g, token)
 
 
-@inlined
+@kernel
 def _rub(tables, runs, samples, friction, work, rate, schedule, token):
     """Tensions and friction between the factorisation and the back substitution; returns the number of runs."""
     rows = gather_slip(tables, runs, samples, friction, work, schedule.time_step, token)
@@ -117,44 +107,26 @@ def compile_rollout(sources: str) -> Callable:
     """The kernel of one lane block; ``sources``, a digest of the kernels' sources, is part of the key it is cached
     under."""
 
-    @numba.njit(nogil=True, cache=True, error_model="numpy")
+    @whole
     def rollout(tables, batch, samples, factors, work, runs, friction, schedule, output, first, token):
         _ = sources
         tables, batch, output, runs = addresses(tables), addresses(batch), addresses(output), addresses(runs)
         samples, factors, work = addresses(samples), addresses(factors), addresses(work)
         friction = addresses(friction)
-        count, cables, static_iterations, rows = batch.count, tables.cables, schedule.static_iterations, 0
-        start_rollouts(tables, batch, samples, work, first, token)
-        start_settling(tables, samples, factors, work, token)
-        fill_lanes(batch.start, batch.start_pitch, 0, cables, first, count, work.commanded, token)
-        for step in range(-static_iterations, schedule.steps + 1):
-            if step == 0:
-                if static_iterations > 0:
-                    finish_settling(tables, samples, factors, work, token)
-                _start_slip(tables, runs, friction, work, token)
-            if step >= 0:
-                if step % schedule.stride == 0:
-                    record_body(tables, work, output, step // schedule.stride, first, count, token)
-                if step == schedule.steps:
-                    break
-                step_factors(samples, factors, work, schedule.time_step, step == 0, token)
-                pitch, offset = batch.displacement_pitch, step * cables
-                fill_lanes(batch.displacement, pitch, offset, cables, first, count, work.commanded, token)
-            rate = 1.0 / schedule.time_step if step >= 0 else 1.0
+        rate = 1.0 / schedule.time_step
+        settle(tables, batch, samples, factors, work, schedule, first, token)
+        _start_slip(tables, runs, friction, work, token)
+        step = 0
+        while begin_step(tables, batch, samples, factors, work, schedule, output, step, first, token):
             condense_increment(tables, samples, factors, work, rate, schedule, token)
-            if step >= 0:
-                rows = _rub(tables, runs, samples, friction, work, rate, schedule, token)
-            else:
-                find_tensions(cables, work, schedule.tolerance, token)
-            weigh_border(cables, work, rate, token)
+            rows = _rub(tables, runs, samples, friction, work, rate, schedule, token)
+            weigh_border(tables.cables, work, rate, token)
             substitute_increment(tables, work, token)
-            if step >= 0:
-                for _ in range(schedule.refinements):
-                    refine_increment(tables, samples, factors, work, token)
-                take_step(tables, work, schedule.time_step, token)
-                _remember(tables, friction, work, rows, rate, token)
-            else:
-                take_increment(tables, work, token)
-        finish_rollouts(work, output, first, count, token)
+            for _ in range(schedule.refinements):
+                refine_increment(tables, samples, factors, work, token)
+            take_step(tables, work, schedule.time_step, token)
+            _remember(tables, friction, work, rows, rate, token)
+            step += 1
+        finish_rollouts(work, output, first, batch.count, token)
 
     return rollout

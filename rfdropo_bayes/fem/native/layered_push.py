@@ -6,14 +6,12 @@ from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.fem.dynamics import Material, System
 from rfdropo_bayes.fem.layered import PointMap, rest_positions
 from rfdropo_bayes.fem.layered_pushing import check_effects
-from rfdropo_bayes.fem.native.chain_cholesky import substitute_back
 from rfdropo_bayes.fem.native.contact_records import (
     MISSED,
     SETTLED,
@@ -25,28 +23,14 @@ from rfdropo_bayes.fem.native.contact_records import (
     scene_tables,
     touch_storage,
 )
-from rfdropo_bayes.fem.native.contact_step import add_forces, add_impulses, add_missed, press, start_contacts
+from rfdropo_bayes.fem.native.contact_step import add_forces, add_missed, press, start_contacts
 from rfdropo_bayes.fem.native.cube_motion import finish_cubes, record_cubes, start_cubes, take_cube_step
 from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
 from rfdropo_bayes.fem.native.layered import NativeLayered, NativeRollout, Precision, in_blocks
-from rfdropo_bayes.fem.native.layered_rollout import (
-    fill_lanes,
-    finish_rollouts,
-    record_body,
-    start_rollouts,
-    step_factors,
-)
-from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
-from rfdropo_bayes.fem.native.layered_step import (
-    condense_increment,
-    find_tensions,
-    refine_increment,
-    take_step,
-    weigh_border,
-    weigh_rows,
-)
+from rfdropo_bayes.fem.native.layered_rollout import begin_step, finish_rollouts, settle
+from rfdropo_bayes.fem.native.layered_step import condense_increment, refine_increment, take_step
 from rfdropo_bayes.fem.native.section_modes import border_panels
-from rfdropo_bayes.fem.native.simd import addresses, inlined
+from rfdropo_bayes.fem.native.simd import addresses, kernel, whole
 from rfdropo_bayes.fem.pushing import PushScene
 
 
@@ -58,7 +42,7 @@ class NativePush(NamedTuple):
     contacts_converged: Bool[np.ndarray, " batch"]
 
 
-@inlined
+@kernel
 def _take(tables, scene, samples, factors, touch, work, panels, schedule, token):
     """Refine the step's solution, and move body and cube."""
     for lane in range(len(token) if schedule.refinements > 0 else 0):
@@ -74,7 +58,7 @@ def compile_rollout(sources: str) -> Callable:
     """The kernel of one lane block; ``sources``, a digest of the kernels' sources, is part of the key it is cached
     under."""
 
-    @numba.njit(nogil=True, cache=True, error_model="numpy")
+    @whole
     def rollout(
         tables, scene, batch, cubes, samples, factors, work, touch, schedule, settled, missed, output, poses, first,
         token,
@@ -83,50 +67,24 @@ def compile_rollout(sources: str) -> Callable:
         tables, scene, batch, cubes = addresses(tables), addresses(scene), addresses(batch), addresses(cubes)
         samples, factors, work, touch = addresses(samples), addresses(factors), addresses(work), addresses(touch)
         output, poses = addresses(output), addresses(poses)
-        count, cables, static_iterations = batch.count, tables.cables, schedule.static_iterations
-        start_rollouts(tables, batch, samples, work, first, token)
+        rate, count, lanes = 1.0 / schedule.time_step, batch.count, len(token)
+        settle(tables, batch, samples, factors, work, schedule, first, token)
         start_cubes(cubes, count, touch, first, token)
-        start_settling(tables, samples, factors, work, token)
-        fill_lanes(batch.start, batch.start_pitch, 0, cables, first, count, work.commanded, token)
-        for step in range(-static_iterations, schedule.steps + 1):
-            if step == 0 and static_iterations > 0:
-                finish_settling(tables, samples, factors, work, token)
-            if step >= 0:
-                if step % schedule.stride == 0:
-                    row = step // schedule.stride
-                    record_body(tables, work, output, row, first, count, token)
-                    record_cubes(touch, poses, output.records, row, first, count, token)
-                if step == schedule.steps:
-                    break
-                step_factors(samples, factors, work, schedule.time_step, step == 0, token)
-                pitch, offset = batch.displacement_pitch, step * cables
-                fill_lanes(batch.displacement, pitch, offset, cables, first, count, work.commanded, token)
-            rate = 1.0 / schedule.time_step if step >= 0 else 1.0
+        step = 0
+        while begin_step(tables, batch, samples, factors, work, schedule, output, step, first, token):
+            if step % schedule.stride == 0:
+                record_cubes(touch, poses, output.records, step // schedule.stride, first, count, token)
             condense_increment(tables, samples, factors, work, rate, schedule, token)
-            step_length, tolerance, candidates, panels, top = schedule.time_step, schedule.tolerance, 0, 0, 0
-            if step >= 0:
-                candidates = start_contacts(scene, samples, touch, work, cables, step_length, token)
-            solves, again = 0, True
+            candidates = start_contacts(scene, samples, touch, work, tables.cables, schedule.time_step, token)
+            panels, solves, again = 0, 0, True
             while again:
-                if step >= 0:
-                    panels, top = press(tables, scene, touch, work, candidates, step_length, tolerance, settled, token)
-                else:
-                    find_tensions(cables, work, tolerance, token)
-                weigh_border(cables, work, rate, token)
-                weigh_rows(tables, work, token)
-                if panels > 0:
-                    add_impulses(tables, touch, work, panels, top, token)
-                substitute_back(
-                    work.pivot, work.coupling, work.solution, tables.held, tables.stations, tables.modes, token
-                )
+                panels = press(tables, scene, touch, work, candidates, schedule, settled, token)
                 solves += 1
-                again = candidates > 0 and add_missed(
-                    scene, touch, work, candidates, solves, step_length, missed, len(token)
-                )
-            if step >= 0:
-                _take(tables, scene, samples, factors, touch, work, panels, schedule, token)
-            else:
-                take_increment(tables, work, token)
+                again = add_missed(scene, touch, work, candidates, solves, schedule.time_step, missed, lanes)
+            _take(tables, scene, samples, factors, touch, work, panels, schedule, token)
+            step += 1
+        if schedule.steps % schedule.stride == 0:
+            record_cubes(touch, poses, output.records, schedule.steps // schedule.stride, first, count, token)
         finish_rollouts(work, output, first, count, token)
         finish_cubes(touch, poses, first, count, token)
 

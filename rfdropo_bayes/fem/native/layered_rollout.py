@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
@@ -15,7 +14,7 @@ from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
 from rfdropo_bayes.fem.native.layered_step import point, refine_increment, solve_increment, take_step
 from rfdropo_bayes.fem.native.section_modes import LayeredTables, border_panels
-from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, inlined, kernel, load, store
+from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store, whole
 
 
 class Batch(NamedTuple):
@@ -141,7 +140,7 @@ def fill_lanes(source, pitch, offset, width, first, count, target, token):
             target[i * lanes + lane] = source[row + i]
 
 
-@inlined
+@kernel
 def _prepare(tables, samples, token):
     """Stiffness and mass of a block's rollouts."""
     for layer in range(tables.stations - 1):
@@ -163,7 +162,7 @@ def _prepare(tables, samples, token):
         store(samples.layer_mass, p, density * tables.layer_mass[p])
 
 
-@inlined
+@kernel
 def start_rollouts(tables, batch, samples, work, first, token):
     """Parameters and initial state of a block's rollouts, not moving."""
     count, values = batch.count, 3 * tables.modes * tables.stations
@@ -190,7 +189,7 @@ def start_rollouts(tables, batch, samples, work, first, token):
     store(work.softness, 0, fill(1.0, work.softness, token))
 
 
-@inlined
+@kernel
 def step_factors(samples, factors, work, length, first, token):
     """Factors of an implicit Euler step; ``first``: the dashpots of the Prony branches start without tension."""
     time_step, drag = fill(length, samples.damping, token), load(samples.damping, 0, token)
@@ -236,39 +235,50 @@ def finish_rollouts(work, output, first, count, token):
         output.residual[first + lane] = work.imbalance[lane]
 
 
+@kernel
+def settle(tables, batch, samples, factors, work, schedule, first, token):
+    """Parameters and initial state of a block's rollouts: as given, or in equilibrium."""
+    start_rollouts(tables, batch, samples, work, first, token)
+    if schedule.static_iterations == 0:
+        return
+    start_settling(tables, samples, factors, work, token)
+    fill_lanes(batch.start, batch.start_pitch, 0, tables.cables, first, batch.count, work.commanded, token)
+    for _ in range(schedule.static_iterations):
+        solve_increment(tables, samples, factors, work, 1.0, schedule, token)
+        take_increment(tables, work, token)
+    finish_settling(tables, samples, factors, work, token)
+
+
+@kernel
+def begin_step(tables, batch, samples, factors, work, schedule, output, step, first, token):
+    """Record the state that a step starts from, and take the step's commands; returns False after the last step."""
+    if step % schedule.stride == 0:
+        record_body(tables, work, output, step // schedule.stride, first, batch.count, token)
+    if step == schedule.steps:
+        return False
+    step_factors(samples, factors, work, schedule.time_step, step == 0, token)
+    pitch, offset = batch.displacement_pitch, step * tables.cables
+    fill_lanes(batch.displacement, pitch, offset, tables.cables, first, batch.count, work.commanded, token)
+    return True
+
+
 def compile_rollout(sources: str) -> Callable:
     """The kernel of one lane block; ``sources``, a digest of the kernels' sources, is part of the key it is cached
     under."""
 
-    @numba.njit(nogil=True, cache=True, error_model="numpy")
+    @whole
     def rollout(tables, batch, samples, factors, work, schedule, output, first, token):
         _ = sources
         tables, batch, output = addresses(tables), addresses(batch), addresses(output)
         samples, factors, work = addresses(samples), addresses(factors), addresses(work)
-        count, cables, static_iterations = batch.count, tables.cables, schedule.static_iterations
-        start_rollouts(tables, batch, samples, work, first, token)
-        start_settling(tables, samples, factors, work, token)
-        fill_lanes(batch.start, batch.start_pitch, 0, cables, first, count, work.commanded, token)
-        # Static iterations come first. They and the steps share one call, which would else be compiled twice.
-        for step in range(-static_iterations, schedule.steps + 1):
-            if step == 0 and static_iterations > 0:
-                finish_settling(tables, samples, factors, work, token)
-            if step >= 0:
-                if step % schedule.stride == 0:
-                    record_body(tables, work, output, step // schedule.stride, first, count, token)
-                if step == schedule.steps:
-                    break
-                step_factors(samples, factors, work, schedule.time_step, step == 0, token)
-                pitch, offset = batch.displacement_pitch, step * cables
-                fill_lanes(batch.displacement, pitch, offset, cables, first, count, work.commanded, token)
-            rate = 1.0 / schedule.time_step if step >= 0 else 1.0
-            solve_increment(tables, samples, factors, work, rate, schedule, token)
-            if step >= 0:
-                for _ in range(schedule.refinements):
-                    refine_increment(tables, samples, factors, work, token)
-                take_step(tables, work, schedule.time_step, token)
-            else:
-                take_increment(tables, work, token)
-        finish_rollouts(work, output, first, count, token)
+        settle(tables, batch, samples, factors, work, schedule, first, token)
+        step = 0
+        while begin_step(tables, batch, samples, factors, work, schedule, output, step, first, token):
+            solve_increment(tables, samples, factors, work, 1.0 / schedule.time_step, schedule, token)
+            for _ in range(schedule.refinements):
+                refine_increment(tables, samples, factors, work, token)
+            take_step(tables, work, schedule.time_step, token)
+            step += 1
+        finish_rollouts(work, output, first, batch.count, token)
 
     return rollout

@@ -6,7 +6,7 @@ from rfdropo_bayes.fem.equilibrium import LONGEST_STEP, SMALLEST_RELAXATION
 from rfdropo_bayes.fem.native.layered_assembly import add_layer_force, clear, layer_frame, start_loads
 from rfdropo_bayes.fem.native.layered_effects import GIVE, SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.layered_step import gather_cables, near
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, inlined, kernel, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_root, store, where_greater
 
 UNBOUNDED = 1e30
 """Relative force out of balance of a lane whose equilibrium was lost."""
@@ -82,7 +82,7 @@ def _add_cable_forces(tables, work, token):
                 store(work.field, f, fnma(tension, load(work.border, t, token), load(work.field, f, token)))
 
 
-@inlined
+@kernel
 def _imbalance(tables, samples, factors, work, token):
     """Largest nodal force out of balance relative to the sum of the loads."""
     modes, zero = tables.modes, fill(0.0, work.position, token)
@@ -113,7 +113,7 @@ def _imbalance(tables, samples, factors, work, token):
     return largest / where_greater(loads, tiny, loads, tiny)
 
 
-@inlined
+@kernel
 def start_settling(tables, samples, factors, work, token):
     """Make the solves those of a static iteration."""
     one, zero = fill(1.0, factors.force, token), fill(0.0, factors.force, token)
@@ -131,7 +131,7 @@ def start_settling(tables, samples, factors, work, token):
     store(work.relaxation, 0, one)
 
 
-@inlined
+@kernel
 def finish_settling(tables, samples, factors, work, token):
     """Measure the force out of balance; lanes that are lost go back to rest, with an imbalance beyond any tolerance."""
     values, zero = 3 * tables.modes * tables.stations, fill(0.0, work.position, token)

@@ -13,7 +13,7 @@ from rfdropo_bayes.fem.native.layered_assembly import (
     subtract_tangent_product,
 )
 from rfdropo_bayes.fem.native.layered_effects import SURROUNDED, add_surroundings, stretch_cables
-from rfdropo_bayes.fem.native.simd import fill, fma, inlined, kernel, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, square_root, store, where_greater
 from rfdropo_bayes.fem.native.tension_stiffening import (
     resist_lateral,
     resist_twist,
@@ -100,7 +100,7 @@ def _condensed_entry(condensed, i, j, panels, token):
     return -load(condensed, 9 * (i // 3 * panels + j // 3) + 3 * (j % 3) + i % 3, token)
 
 
-@inlined
+@kernel
 def scale_problem(cables, panels, work, regularisation, token):
     """Tension problem with unit diagonal; a cable that no motion of the body can shorten takes no part."""
     one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
@@ -124,7 +124,7 @@ def scale_problem(cables, panels, work, regularisation, token):
         store(work.active, c, usable * where_greater(load(work.tension, c, token), zero, one, zero))
 
 
-@inlined
+@kernel
 def find_tensions(cables, work, tolerance, token):
     """Unilateral tensions of the scaled problem; leaves failed lanes in ``unsolved``."""
     found = solve_unilateral(
@@ -133,7 +133,7 @@ def find_tensions(cables, work, tolerance, token):
     mark_unsolved(cables, work, found, token)
 
 
-@inlined
+@kernel
 def mark_unsolved(cables, work, found, token):
     """Lanes whose tensions were not found, in ``unsolved``."""
     one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
@@ -144,7 +144,7 @@ def mark_unsolved(cables, work, found, token):
     store(work.unsolved, 0, unsolved)
 
 
-@inlined
+@kernel
 def weigh_border(cables, work, rate, token):
     """Tensions [N] from those of the scaled problem, and the weights of the border rows in ``weight``."""
     zero = fill(0.0, work.weight, token)
@@ -156,7 +156,7 @@ def weigh_border(cables, work, rate, token):
         store(work.tension, c, impulse * rate)
 
 
-@inlined
+@kernel
 def condense_increment(tables, samples, factors, work, rate, schedule, token):
     """Assemble and eliminate the matrix station by station, and set up the problem of the tensions."""
     tiles, stations, cables, held = tables.modes, tables.stations, tables.cables, tables.held
@@ -192,21 +192,21 @@ def condense_increment(tables, samples, factors, work, rate, schedule, token):
     scale_problem(cables, panels, work, schedule.regularisation, token)
 
 
-@inlined
+@kernel
 def weigh_rows(tables, work, token):
     """``solution`` = the weighted sum of the border rows, where the back substitution starts."""
     size, stations, panels = 3 * tables.modes, tables.stations, (tables.cables + 3) // 3
     combine_border(work.border, work.weight, work.solution, tables.held, stations, size, panels, token)
 
 
-@inlined
+@kernel
 def substitute_increment(tables, work, token):
     """``solution`` = A^-1 times the weighted sum of the border rows."""
     weigh_rows(tables, work, token)
     substitute_back(work.pivot, work.coupling, work.solution, tables.held, tables.stations, tables.modes, token)
 
 
-@inlined
+@kernel
 def solve_increment(tables, samples, factors, work, rate, schedule, token):
     """``solution`` = A^-1 (r - J' T) and the tensions."""
     condense_increment(tables, samples, factors, work, rate, schedule, token)

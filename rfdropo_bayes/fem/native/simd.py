@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -30,24 +31,37 @@ from numba.extending import (
     register_model,
 )
 
+from rfdropo_bayes.fem.native.compilation import DeferredCompiler, WholeCompiler
+
 ALIGNMENT = 64
 """Bytes to which work arrays are aligned: one cache line, and the widest vector register."""
 
 
-def kernel(function: Callable) -> Callable:
+def kernel(function: Callable, **options: bool) -> Callable:
     """Decorator of functions that only kernels call.
 
-    They have no wrappers for calls from Python, which take a quarter of the compilation, and are compiled once for
-    every type: Numba on its own compiles a function anew for every number that stands in a call.
+    They have no wrappers for calls from Python, are compiled once for every type (Numba on its own compiles a function
+    anew for every number that stands in a call), and become machine code only in the `whole` that they are part of.
     """
-    dispatcher = numba.njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
-    resolve = dispatcher.get_call_template
+    dispatcher = numba.njit(
+        nogil=True,
+        error_model="numpy",
+        no_cpython_wrapper=True,
+        no_cfunc_wrapper=True,
+        pipeline_class=DeferredCompiler,
+        **options,
+    )(function)
+    overloads, resolve = dispatcher.overloads, dispatcher.get_call_template
+    dispatcher.add_overload = lambda result: overloads.update({tuple(result.signature.args): result})
     dispatcher.get_call_template = lambda arguments, named: resolve(tuple(map(types.unliteral, arguments)), named)
     return dispatcher
 
 
-inlined = numba.njit(inline="always")
-"""Decorator of functions that call kernels from one place: a level of calls is compiled into every level above it."""
+inlined = partial(kernel, forceinline=True)
+"""Decorator of kernels that are compiled into their callers, whatever their size: they return many values."""
+
+whole = numba.njit(nogil=True, cache=True, error_model="numpy", pipeline_class=WholeCompiler)
+"""Decorator of the kernel at the top, which Python calls."""
 
 
 class SimdType(types.Type):

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from functools import cache
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -41,7 +40,7 @@ from rfdropo_bayes.fem.native.cube_motion import (
     take_cube_step,
 )
 from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
-from rfdropo_bayes.fem.native.simd import addresses, fill, fma, kernel, lane_token, load, store
+from rfdropo_bayes.fem.native.simd import addresses, fill, fma, kernel, lane_token, load, store, whole
 from rfdropo_bayes.fem.native.tetrahedral_engine import Rollouts, TetrahedralEngine
 from rfdropo_bayes.fem.native.tetrahedral_rollout import (
     accept,
@@ -179,7 +178,7 @@ def compile_rollout(sources: str) -> Callable:
     """The kernel of one lane block; ``sources``, a digest of the kernels' sources, is part of the key it is cached
     under. As ``tetrahedral_rollout.compile_rollout``, with cubes."""
 
-    @numba.njit(nogil=True, cache=True, error_model="numpy")
+    @whole
     def rollout(
         pattern, mesh, cables, scene, rest, commands, cubes, samples, work, touch, reached, schedule, settled, output,
         poses, first, count, token,

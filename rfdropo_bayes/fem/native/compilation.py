@@ -1,0 +1,80 @@
+"""Compilation of a kernel with all functions that it calls as one program: optimised once, compiled once.
+
+Numba on its own optimises every function together with all that it calls, and makes machine code of it, then does the
+same again in each of its callers. Here a function that only kernels call is lowered to LLVM's language and left at
+that. The kernel at the top is optimised in one pass, without a search for loops to vectorise: kernels work on vectors.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba.core.codegen import CPUCodeLibrary
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import register_pass
+from numba.core.typed_passes import NativeLowering
+
+
+def _new_library(state: Any) -> CPUCodeLibrary:
+    library = state.targetctx.codegen().create_library(state.func_id.func_qualname)
+    library.enable_object_caching()
+    library._optimize_functions = lambda module: setattr(module, "data_layout", library._codegen._data_layout)
+    return library
+
+
+def _optimised_once(library: CPUCodeLibrary) -> None:
+    """Run LLVM's passes on a library."""
+    passes, options = library._codegen._module_pass_manager(loop_vectorize=False, slp_vectorize=False)
+    passes.run(library._final_module, options)
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class DeferredLowering(NativeLowering):
+    """Lowering without optimisation and machine code; the result can be called from other compiled functions only."""
+
+    _name = "deferred_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        """See ``NativeLowering``."""
+        state.library, state.flags.no_compile = _new_library(state), True
+        state.library._optimize_final_module = lambda: None
+        state.library._finalize_final_module = lambda: setattr(state.library, "_finalized", True)
+        super().run_pass(state)
+        entry = object()  # by which Numba finds the function; it has no address
+        state.targetctx.insert_user_function(entry, state.cr.fndesc, [state.library])
+        state.cr = state.cr._replace(cfunc=entry)
+        return True
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class WholeLowering(NativeLowering):
+    """Lowering, optimisation and machine code of a function with all that was deferred."""
+
+    _name = "whole_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        """See ``NativeLowering``."""
+        state.library = library = _new_library(state)
+        library._optimize_final_module = lambda: _optimised_once(library)
+        return super().run_pass(state)
+
+
+class DeferredCompiler(CompilerBase):
+    """Numba's own pipeline, with another lowering."""
+
+    lowering = DeferredLowering
+
+    def define_pipelines(self) -> list:
+        """See ``CompilerBase``."""
+        pipeline = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        for index, (step, description) in enumerate(pipeline.passes):
+            if step is NativeLowering:
+                pipeline.passes[index] = self.lowering, description
+        pipeline.finalize()
+        return [pipeline]
+
+
+class WholeCompiler(DeferredCompiler):
+    """As `DeferredCompiler`, for the kernel at the top."""
+
+    lowering = WholeLowering
