@@ -40,8 +40,8 @@ format: $(DEV) ## let ruff mend what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(CORE) ## rollouts per second of the engines, as a table and as JSON
-	$(BIN)/python benchmarks/rollouts.py --json reports/bench/rollouts.json
+bench: $(CORE) ## rollouts per second of the engines beside others, in reports/rollouts (minutes, on an idle machine)
+	$(BIN)/python benchmarks/rollouts.py --push --json reports/rollouts/rollouts.json
 
 validate: $(CORE) ## references and other simulators with ours beside them, in reports/validation (minutes)
 	$(BIN)/python benchmarks/validate.py

@@ -1,16 +1,16 @@
 """Rollouts per second of both engines, 100 solves each: a uniform bar, and the notched trunk behind its simulator.
 
-    python benchmarks/rollouts.py [--json FILE] [--seconds S] [--batch N] [--peers]
+    python benchmarks/rollouts.py [--push] [--json FILE] [--mesh FILE] [--seconds S] [--batch N]
 
 The bar has 20 layers of 4 nodes and 8 cables; it is timed at the engine. The trunk is timed as inference calls it,
 through commands, limits and markers. Parameters differ from rollout to rollout. Compilation is not counted; the best of
 the repeats is. The JAX engine uses as many processors as XLA likes; the Numba engine is timed on one thread and on all.
+Rates of one thread are those of processor time, others of the clock on the wall.
 
-With `--peers`, MuJoCo's flex and PyElastica follow on the same bar, one rollout of a second at a time, where they are
-installed.
-
-`--push` times instead the trunk with plate and cube, and without them at the same commands, which bring it onto the
-cube; with `--mesh FILE` also SOFA's mesh, with and without. The rate is that of processor time: of one core.
+With `--push` follow: the trunk with plate and cube, and without them at the same commands, which bring it onto the
+cube; SOFA's mesh, with and without ($RFDROPO_DATA, or `--mesh`); MuJoCo's flex and PyElastica on the bar, one rollout
+of a second at a time, where they are installed; and the memory of a batch of 10,000. That is the whole table, in six
+minutes after installation and three from then on. Beside FILE the table is written as Markdown.
 
 The last column is how far the tip of the bar, held at one end, sags under its own weight, against the heavy elastica.
 """
@@ -21,6 +21,9 @@ import argparse
 import json
 import os
 import platform
+import resource
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -46,6 +49,10 @@ CUBE = " + cube"
 MESH = "mesh"
 LENGTH, HALF_WIDTH, LAYERS, CABLES = 0.195, 0.01, 20, 8
 SAG = 0.0948  # [m] of the tip, heavy elastica of the bar's length, section, modulus and density
+MESH_FILE = "sofa_trunk/trunk.vtk"
+MANY = 10_000
+KEYS = ("body", "engine", "precision", "threads", "pushing")
+"""What tells one row from another."""
 
 Values = dict[str, jax.Array]
 Run = Callable[[Values], jax.Array]  # number of rollouts that failed
@@ -92,13 +99,15 @@ def cases(batch: int) -> Iterator[Case]:
                 yield Case(body, "numba", precision, threads, batch)
 
 
-def pushing_cases(batch: int, mesh: str | None) -> Iterator[Case]:
-    """The trunk without and with cube, in layers and, where there is one, as a mesh; on one thread."""
+def pushing_cases(batch: int, mesh: Path | None) -> Iterator[Case]:
+    """The trunk without and with cube, in layers and, where there is one, as a mesh."""
     for file in (None, mesh) if mesh else (None,):
         for precision in ("float64", "float32"):
             for cube in ("", CUBE):
-                name = (MESH if file else TRUNK) + cube
-                yield Case(name, "numba", precision, 1, batch // 8 if file else batch, file, True)
+                for threads in sorted({1, os.cpu_count() or 1}):
+                    name = (MESH if file else TRUNK) + cube
+                    size = batch // 8 if file else batch
+                    yield Case(name, "numba", precision, threads, size, str(file) if file else None, True)
 
 
 def drawn(nominal: dict[str, float], batch: int) -> Values:
@@ -187,7 +196,7 @@ def trunk_rollouts(case: Case) -> tuple[Run, Values]:
 def measure(case: Case, seconds: float) -> dict[str, Any]:
     """Best rate of a case over repeats that fill ``seconds``, with its first call and its failures."""
     run, values = bar_rollouts(case) if case.body == "bar" else trunk_rollouts(case)
-    clock = time.process_time if case.pushing else time.perf_counter
+    clock = time.process_time if case.threads == 1 else time.perf_counter
     started = clock()
     failed = int(jax.block_until_ready(run(values)))
     first_call = clock() - started
@@ -201,37 +210,121 @@ def measure(case: Case, seconds: float) -> dict[str, Any]:
     return row | ({"sag_error": sag_error(case)} if case.body == "bar" else {})
 
 
-def main() -> None:
-    """Print the table; write it as JSON where asked."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--json", type=Path, help="file to write the table to")
-    parser.add_argument("--seconds", type=float, default=5.0, help="time spent on each row")
-    parser.add_argument("--batch", type=int, default=512, help="rollouts in a batch")
-    parser.add_argument("--push", action="store_true", help="the trunk with plate and cube, and nothing else")
-    parser.add_argument("--mesh", help="a mesh of the trunk, for --push")
-    parser.add_argument("--peers", action="store_true", help="other simulators too, where they are installed")
-    options = parser.parse_args()
-    print(f"{SOLVES} solves a rollout, {os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}")
-    print(f"{'body':18}{'engine':8}{'precision':11}{'threads':>8}", end="")
+def line(case: Case, row: dict[str, Any]) -> str:
+    """A row of the printed table."""
+    sag = f"{100 * row['sag_error']:+8.2f}%" if "sag_error" in row else ""
+    name = case.body + (" *" if case.pushing else "")
+    return (
+        f"{name:20}{case.engine:8}{case.precision:11}{case.threads or 'all':>8}"
+        f"{row['rollouts_per_second']:12.1f}{row['first_call_s']:10.1f} s{row['failed']:8d}{sag:>9}"
+    )
+
+
+def memory() -> float:
+    """Largest memory [GB] of a process that rolls out `MANY` trunks at once, measured in a process of its own."""
+    command = [sys.executable, __file__, "--memory"]
+    return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+
+def measure_memory() -> None:
+    """Print the largest memory [GB] of this process after `MANY` rollouts of the trunk."""
+    run, values = trunk_rollouts(Case(TRUNK, "numba", "float32", None, MANY))
+    jax.block_until_ready(run(values))
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9)
+
+
+def as_markdown(table: dict[str, Any]) -> str:
+    """The table, with the share of the rate without a cube, and the gain of the threads."""
+    rates = {tuple(row[key] for key in KEYS): row["rollouts_per_second"] for row in table["rows"]}
+    machine = table["machine"]
+    lines = [
+        "# Rollouts per second",
+        "",
+        f"{table['solves']} solves a rollout, on {machine['processors']} processors ({machine['cpu']}); load before "
+        f"the first row {table['load'][0]:.1f}. Written by `make bench`.",
+        "Rows with a star pull the trunk onto a cube; others do not reach one.",
+        "",
+        "| body | engine | precision | threads | rollouts/s | of one thread | of no cube | failed | sag |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in table["rows"]:
+        body, *rest, threads, pushing = (row[key] for key in KEYS)
+        rate = row["rollouts_per_second"]
+        gain = rates.get((body, *rest, 1, pushing)) if threads != 1 else None
+        free = rates.get((body.removesuffix(CUBE), *rest, threads, pushing)) if body.endswith(CUBE) else None
+        shares = [f"{rate / other:.2f}" if other else "" for other in (gain, free)]
+        sag = f"{100 * row['sag_error']:+.2f} %" if "sag_error" in row else ""
+        cells = [body + (" *" if pushing else ""), *rest, threads or "all", f"{rate:.0f}", *shares, row["failed"], sag]
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    for peer in table["peers"]:
+        rate = peer["rollouts_per_second"]
+        if rate is not None:
+            sag = f"{100 * (peer['sag'] / peers.SAG - 1.0):+.1f} %"
+            lines.append(f"| bar | {peer['name']} | | 1 | {rate:.2f} | | | | {sag} |")
+    if table["memory_gb"] is not None:
+        lines += ["", f"{MANY} rollouts of the trunk at once, in single precision: {table['memory_gb']:.2f} GB."]
+    return "\n".join(lines) + "\n"
+
+
+def processor() -> str:
+    """Name of the processor, where the system tells."""
+    try:
+        told = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [row.partition(":")[2].strip() for row in told.splitlines() if row.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def chosen_mesh(given: Path | None) -> Path | None:
+    """The mesh asked for, or SOFA's where it is at hand."""
+    default = Path(os.environ.get("RFDROPO_DATA", "")) / MESH_FILE
+    return given or (default.resolve() if default.is_file() else None)
+
+
+def gather(options: argparse.Namespace) -> dict[str, Any]:
+    """Measure all rows, printing each."""
+    chosen = list(cases(options.batch))
+    if options.push:
+        chosen += pushing_cases(options.batch, chosen_mesh(options.mesh))
+    load, rows = os.getloadavg(), []
+    print(f"{SOLVES} solves a rollout, {os.cpu_count()} processors, load {load[0]:.1f}; *: pulled onto a cube's place")
+    print(f"{'body':20}{'engine':8}{'precision':11}{'threads':>8}", end="")
     print(f"{'rollouts/s':>12}{'first call':>12}{'failed':>8}{'sag':>9}")
-    rows = []
-    chosen = pushing_cases(options.batch, options.mesh) if options.push else cases(options.batch)
     for case in chosen:
-        row = measure(case, options.seconds)
-        rows.append(row)
-        sag = f"{100 * row['sag_error']:+8.2f}%" if "sag_error" in row else ""
-        print(
-            f"{case.body:18}{case.engine:8}{case.precision:11}{case.threads or 'all':>8}"
-            f"{row['rollouts_per_second']:12.1f}{row['first_call_s']:10.1f} s{row['failed']:8d}{sag:>9}",
-            flush=True,
-        )
-    others = peers.settle_all() if options.peers else []
+        rows.append(measure(case, options.seconds))
+        print(line(case, rows[-1]), flush=True)
+    used = memory() if options.push else None
+    if used is not None:
+        print(f"memory of {MANY} rollouts: {used:.2f} GB")
+    others = peers.settle_all() if options.push or options.peers else []
+    machine = {"processors": os.cpu_count(), "cpu": processor(), "python": platform.python_version()}
+    table = {"solves": SOLVES, "machine": machine, "load": load, "rows": rows, "memory_gb": used, "schema_version": 2}
+    table["peers"] = [peer._asdict() | {"rollouts_per_second": peer.rollouts_per_second} for peer in others]
+    return table
+
+
+def main() -> None:
+    """Print the table; write it as JSON and Markdown where asked."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--push", action="store_true", help="the whole table: cubes, the mesh, peers and memory, too")
+    parser.add_argument("--json", type=Path, help="file to write the table to; as Markdown beside it")
+    parser.add_argument(
+        "--mesh", type=Path, help=f"a mesh of the trunk, for --push; by default $RFDROPO_DATA/{MESH_FILE}"
+    )
+    parser.add_argument("--seconds", type=float, default=3.0, help="time spent on each row")
+    parser.add_argument("--batch", type=int, default=512, help="rollouts in a batch")
+    parser.add_argument("--peers", action="store_true", help="other simulators, without all of --push")
+    parser.add_argument("--memory", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.memory:
+        measure_memory()
+        return
+    table = gather(options)
     if options.json:
-        machine = {"processors": os.cpu_count(), "machine": platform.machine(), "python": platform.python_version()}
-        table = {"solves": SOLVES, "machine": machine, "load": os.getloadavg(), "rows": rows, "schema_version": 1}
-        table["peers"] = [peer._asdict() | {"rollouts_per_second": peer.rollouts_per_second} for peer in others]
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(table, indent=2) + "\n")
+        options.json.with_suffix(".md").write_text(as_markdown(table))
 
 
 if __name__ == "__main__":
