@@ -137,7 +137,7 @@ class CalibrationProblem:
         self, values: Batch, horizon: int
     ) -> tuple[Float[np.ndarray, "n horizon feature"], Int[np.ndarray, " n"]]:
         """Simulated marker coordinates [m] of all recordings side by side, without observation noise."""
-        position, status = self._chunked(self._positions, values, horizon)
+        position, _, status = self._chunked(self._positions, values, horizon)
         position = np.moveaxis(position, 1, 2)[:, :horizon]
         return position.reshape(len(position), horizon, -1), status
 
@@ -196,6 +196,12 @@ class CalibrationProblem:
 
     def predict(self, values: Batch) -> tuple[Float[np.ndarray, "n recording time marker 3"], Int[np.ndarray, " n"]]:
         """Simulated marker positions [m] of every recording, without observation noise."""
+        position, _, status = self._chunked(self._positions, values, self.n_rows)
+        return position, status
+
+    def predict_scene(self, values: Batch) -> tuple[np.ndarray, np.ndarray | None, Int[np.ndarray, " n"]]:
+        """As `predict`, with the poses of the object (n, recording, time, 7) in the robot's frame: position [m] and
+        unit quaternion (x, y, z, w); None if the scene has none."""
         return self._chunked(self._positions, values, self.n_rows)
 
     def observe(self, values: Batch) -> tuple[np.ndarray, np.ndarray, Int[np.ndarray, " n"]]:
@@ -227,9 +233,9 @@ class CalibrationProblem:
 
     @cached_property
     def _positions(self) -> Callable:
-        def positions(values: Mapping[str, Array], steps: Int[Array, ""]) -> tuple[Array, Array]:
+        def positions(values: Mapping[str, Array], steps: Int[Array, ""]) -> tuple[Array, Array | None, Array]:
             observation = self.model.simulate(values, steps)
-            return observation.position, jnp.max(observation.status)
+            return observation.position, observation.object_pose, jnp.max(observation.status)
 
         return jax.jit(jax.vmap(positions, in_axes=(0, None)))
 

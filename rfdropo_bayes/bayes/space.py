@@ -68,9 +68,7 @@ class ParameterSpace:
     def __getitem__(self, name: str) -> Parameter:
         return self.parameters[self.names.index(name)]
 
-    def for_recording(
-        self, values: Mapping[str, Float[Array, "..."]], recording: str
-    ) -> dict[str, Float[Array, "..."]]:
+    def for_recording(self, values: Mapping[str, Float[Array | np.ndarray, "..."]], recording: str) -> dict[str, Any]:
         """The physical parameters that hold for one recording, under their physical names."""
         chosen = {p.spec.name: values[p.name] for p in self.parameters if not p.recording}
         chosen |= {p.spec.name: values[p.name] for p in self.parameters if p.recording == recording}

@@ -58,9 +58,12 @@ def load_unseen(
 
 def first_row_only(trajectory: Trajectory) -> Trajectory:
     """The same commands and times with every measurement after the first row taken out."""
-    dataset = trajectory.dataset.drop_vars(["tension", "motor_angle", "object_pose"], errors="ignore").copy()
+    dataset = trajectory.dataset.drop_vars(["tension", "motor_angle"], errors="ignore").copy()
     position, mask = dataset["position"].values.copy(), dataset["position_mask"].values.copy()
     position[1:], mask[1:] = position[:1], False
+    if "object_pose" in dataset:
+        pose = np.broadcast_to(dataset["object_pose"].values[:1], dataset["object_pose"].shape)
+        dataset["object_pose"] = dataset["object_pose"].copy(data=pose.copy())
     return Trajectory(
         dataset.assign(
             position=xr.Variable(dataset["position"].dims, position, dataset["position"].attrs),

@@ -65,6 +65,8 @@ class RecordingPrediction:
         mean: predictive mean without noise [m]; the mean of ``predicted`` if None.
         prior_predicted: the same as ``predicted`` under the prior, or None.
         repeat_group: equal numbers mark repeats of the same commands; -1 marks none.
+        object_pose: draws of where a pushed object is, position [m] and unit quaternion (x, y, z, w), or None. It is
+            not kept in `posterior.nc`.
     """
 
     name: str
@@ -77,6 +79,7 @@ class RecordingPrediction:
     mean: Float[np.ndarray, "time marker 3"] | None = None
     prior_predicted: Float[np.ndarray, "draw time marker 3"] | None = None
     repeat_group: int = -1
+    object_pose: Float[np.ndarray, "draw time 7"] | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.time), len(self.marker_names), 3)

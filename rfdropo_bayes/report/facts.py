@@ -10,6 +10,7 @@ from typing import Any
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.report.baselines import BaselineErrors
+from rfdropo_bayes.report.object_scores import ObjectScore
 
 PACKAGES = ("rfdropo_bayes", "jax", "numpyro", "blackjax", "arviz", "numpy", "scipy", "numba")
 
@@ -75,6 +76,7 @@ class RunFacts:
         noise_floor: noise between repeats of each marker [m]; None without repeats.
         phi: distribution to randomise over, {name: {mean, std, low, high, unit}}; None without.
         optimum: posterior mode; None without.
+        objects: how well the final position of a pushed object is predicted, by recording that was not fitted.
         limits: sentences on what this analysis cannot see, beside those that always hold.
         versions: of the software.
         details: further plain values of the method.
@@ -98,6 +100,7 @@ class RunFacts:
     noise_floor: Mapping[str, float] | None = None
     phi: Mapping[str, Mapping[str, Any]] | None = None
     optimum: Mapping[str, float] | None = None
+    objects: Mapping[str, ObjectScore] = field(default_factory=dict)
     limits: Sequence[str] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)

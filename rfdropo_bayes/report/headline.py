@@ -10,7 +10,14 @@ def headline(summary: Mapping[str, Any]) -> list[str]:
     """What was fitted, how far off it is, against what, what a bound decided, and how many rollouts failed."""
     return [
         sentence
-        for sentence in (_fitted(summary), _errors(summary), _against(summary), _bounds(summary), _excluded(summary))
+        for sentence in (
+            _fitted(summary),
+            _errors(summary),
+            _against(summary),
+            _objects(summary),
+            _bounds(summary),
+            _excluded(summary),
+        )
         if sentence
     ]
 
@@ -63,6 +70,19 @@ def _against(summary: Mapping[str, Any]) -> str:
     floor = summary.get("noise_floor_mm")
     repeats = f"; repeats of one experiment differ by {list(floor.values())[-1]:.3g} mm" if floor else ""
     return f"The best predictor without a simulator ({title}) is off by {error:.3g} mm there: {verdict}{repeats}."
+
+
+def _objects(summary: Mapping[str, Any]) -> str:
+    scores = list((summary.get("objects") or {}).values())
+    if not scores:
+        return ""
+    own, held = (sum(s[key] for s in scores) / len(scores) for key in ("energy_score_mm", "held_mm"))
+    repeats = [s["repeats_mm"] for s in scores if s["repeats_mm"] is not None]
+    against = f", {sum(repeats) / len(repeats):.3g} mm for who has seen its other repeats" if repeats else ""
+    return (
+        f"The final position of the object has an energy score of {own:.3g} mm in test recordings, the mean of "
+        f"{len(scores)}; {held:.3g} mm for who says that it stays{against}."
+    )
 
 
 def _bounds(summary: Mapping[str, Any]) -> str:

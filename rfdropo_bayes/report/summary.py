@@ -95,6 +95,7 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
         "model": dict(facts.model),
         "phi": facts.phi and {name: dict(values) for name, values in facts.phi.items()},
         "optimum": facts.optimum and dict(facts.optimum),
+        "objects": {name: asdict(scores) for name, scores in facts.objects.items()},
         "warnings": list(facts.warnings),
         "limits": list(facts.limits),
         "versions": dict(facts.versions),

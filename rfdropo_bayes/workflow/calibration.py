@@ -18,6 +18,7 @@ from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
 from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, software_versions, write_run
+from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
 from rfdropo_bayes.workflow.experiment import Experiment, describe, load_experiment
@@ -71,7 +72,7 @@ def run_calibration(
     with Progress(method, show=None, log=out / "log.jsonl") as progress:
         result = run(problem, method, config, key, checkpoint_dir=out / "checkpoints", resume=resume, progress=progress)
     record = record_posterior(problem, result, tested, predicting, _attributes(experiment, [*fitted, *tested]))
-    facts = gather_facts(experiment, path.stem, problem, result, fitted, tested)
+    facts = gather_facts(experiment, path.stem, problem, result, fitted, tested, record.recordings)
     return write_run(out, record, facts, describe(tables))
 
 
@@ -156,8 +157,10 @@ def gather_facts(
     result: InferenceResult,
     fitted: Sequence[Trajectory],
     tested: Sequence[Trajectory],
+    predictions: Sequence[RecordingPrediction],
 ) -> RunFacts:
     """What the report says beside the posterior."""
+    unseen = [prediction for prediction in predictions if prediction.split == "test"]
     description = problem.model.simulator.description
     floor = noise_floor([*fitted, *tested])
     return RunFacts(
@@ -188,6 +191,7 @@ def gather_facts(
         noise_floor=floor,
         phi=result.phi,
         optimum=result.optimum,
+        objects=score_objects(unseen, [*fitted, *tested]),
         versions=software_versions(),
         details=result.details,
     )

@@ -15,8 +15,8 @@ from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.workflow.cube_start import OFFSETS, measured_objects, with_measured_starts
 
-OFFSETS = ("offset_x", "offset_y", "offset_z")
 FITTED, MARKER_ERRORS = "fitted_recordings", "marker_errors_m"  # among the attributes of a posterior
 SMALLEST_ERROR = 1e-6  # [m]
 
@@ -65,7 +65,8 @@ def predict_new(
     first row: each draw is shifted so that the weighted mean over the markers agrees there, and a marker weighs as
     little as the model is wrong about it. A further piece of a fitted recording keeps the parameters of that recording.
 
-    A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone.
+    A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone. A cube starts
+    where it was measured in the first row.
 
     Args:
         fitted: names of the recordings that were fitted.
@@ -78,6 +79,9 @@ def predict_new(
     shifted = [t.name for t in trajectories if _whole(t.name) not in own]
     if any(p.recording in shifted and p.spec.name in OFFSETS for p in space.parameters):
         extended = _offsets_from_first_row(problem, extended, shifted, errors or {})
+    placed, extended = with_measured_starts(fresh, trajectories, extended)
+    if placed is not fresh:
+        problem = CalibrationProblem(placed, chunk=chunk)
     return _predictions(problem, extended, key, "test", None)
 
 
@@ -140,7 +144,7 @@ def _predictions(
     problem: CalibrationProblem, values: Batch, key: PRNGKeyArray, split: str, prior: Batch | None
 ) -> list[RecordingPrediction]:
     recordings = problem.model.recordings
-    noisy, mean = _ended_well(problem, values, key)
+    noisy, mean, pose = _ended_well(problem, values, key)
     before = None if prior is None else _ended_well(problem, prior, key)[0]
     return [
         RecordingPrediction(
@@ -153,16 +157,20 @@ def _predictions(
             noisy[:, i, :rows].astype(np.float32),
             mean[i, :rows],
             None if before is None else before[:, i, :rows].astype(np.float32),
+            object_pose=None if pose is None else pose[:, i, :rows],
         )
         for i, (name, rows) in enumerate(zip(recordings.names, recordings.rows, strict=True))
     ]
 
 
-def _ended_well(problem: CalibrationProblem, values: Batch, key: PRNGKeyArray) -> tuple[np.ndarray, np.ndarray]:
-    """Noisy predictions and their noise-free mean over the rollouts that ended well."""
-    position, status = problem.predict(values)
+def _ended_well(
+    problem: CalibrationProblem, values: Batch, key: PRNGKeyArray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Noisy predictions, their noise-free mean and the poses of the object, of the rollouts that ended well."""
+    position, pose, status = problem.predict_scene(values)
     fine = status == 0
     if not fine.any():
         raise InputError("no rollout under the posterior ended well", where="prediction", remedy="narrow the priors")
     noise = problem.draw_noise(key, values)
-    return (position + noise)[fine], position[fine].mean(axis=0)
+    pose = None if pose is None else measured_objects(problem, pose, values)[fine]
+    return (position + noise)[fine], position[fine].mean(axis=0), pose

@@ -29,6 +29,7 @@ from rfdropo_bayes.workflow.prediction import FITTED, MARKER_ERRORS, predict_new
 DRAWS = 200
 LEVELS = {"q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
 SCHEMA_VERSION = 1
+OBJECT, POSE_UNITS = "object", "m, m, m, and unit quaternion x, y, z, w"
 
 
 def run_prediction(
@@ -45,7 +46,8 @@ def run_prediction(
     """Predict what the markers will do under given commands, from at most the start pose.
 
     Writes ``prediction.nc`` (mean and the 5, 25, 75 and 95 % quantiles of what would be measured, in metres, in the
-    robot's base frame), ``prediction.csv`` (the same, one row per time) and ``prediction.json``.
+    robot's base frame), ``prediction.csv`` (the same, one row per time) and ``prediction.json``. Where the robot pushes
+    an object, it starts from its measured pose; its centre is in both files, every draw of its pose in the first.
 
     Args:
         path: the experiment file that was calibrated.
@@ -133,7 +135,17 @@ def summarise(predicted: RecordingPrediction) -> xr.Dataset:
     dataset["time"].attrs["units"] = "s"
     for name in data:
         dataset[name].attrs["units"] = "m"
-    return dataset
+    return dataset if predicted.object_pose is None else dataset.assign(_object(predicted.object_pose))
+
+
+def _object(pose: Float[np.ndarray, "draw time 7"]) -> dict[str, xr.Variable]:
+    """Where a pushed object is: mean and quantiles of its centre, and every draw of its pose."""
+    found = {OBJECT: xr.Variable(("draw", "time", "pose"), pose.astype(np.float32), {"units": POSE_UNITS})}
+    centre = pose[..., :3]
+    quantiles = np.quantile(centre, list(LEVELS.values()), axis=0)
+    for name, value in (("mean", centre.mean(axis=0)), *zip(LEVELS, quantiles, strict=True)):
+        found[f"{OBJECT}_{name}"] = xr.Variable(("time", "axis"), value, {"units": "m"})
+    return found
 
 
 def _columns(table: xr.Dataset) -> pd.DataFrame:
@@ -143,4 +155,7 @@ def _columns(table: xr.Dataset) -> pd.DataFrame:
         for i, marker in enumerate(table["marker"].values):
             for j, axis in enumerate("xyz"):
                 columns[f"{marker}_{axis}_{name}"] = table[name].values[:, i, j]
+        if OBJECT in table:
+            for j, axis in enumerate("xyz"):
+                columns[f"{OBJECT}_{axis}_{name}"] = table[f"{OBJECT}_{name}"].values[:, j]
     return pd.DataFrame(columns)
