@@ -43,10 +43,10 @@ def prequential(target: Target, fit: Fit) -> Prequential:
     coordinates = target.forward.coordinates
     mean = coordinates.prior_mean[fit.free] - fit.x[fit.free]
     precision = np.diag(coordinates.prior_sd[fit.free] ** -2.0)
-    starts = np.arange(0, shape[1], min(BLOCK, shape[1]))
+    starts = BLOCK * np.arange(max(shape[1] // BLOCK, 1))  # the last block has what is left over, too
     scores, p, surprise = [], [], []
-    for start in starts:
-        rows = slice(start, start + BLOCK)
+    for start, end in zip(starts, [*starts[1:], shape[1]], strict=True):
+        rows = slice(start, end)
         used = valid[:, rows]
         r, j = residual[:, rows][used], slopes[:, rows][used]
         left = r - j @ mean

@@ -175,7 +175,7 @@ def _hidden(
     """A data set with the mechanisms whose turn it is, or with others at random where these cannot reach the size; what
     is hidden; and what could not be."""
     rng = np.random.default_rng(seed)
-    chosen, unreached = list(turn), []
+    chosen, unreached = list(turn), list[str]()
     for _ in range(TRIES):
         names = sorted(set(chosen), key=list(REGISTRY).index)
         if len(names) == condition.effects:
