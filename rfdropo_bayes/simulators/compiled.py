@@ -170,7 +170,8 @@ class CompiledEngine:
         found = self._native.rollout(
             body, commands, start=first if self.from_equilibrium else None, steps=int(np.max(limit))
         )
-        found = type(found)(*(part[place] for part in found))
+        if len(chosen) < count:
+            found = type(found)(*(part[place] for part in found))
         rows = displacement.shape[-2] + 1
         return Motion(
             padded(found.position, rows).reshape(*batch, rows, -1, 3),
@@ -195,6 +196,8 @@ def flattened(array: np.ndarray, axes: int, count: int) -> np.ndarray:
 
 def padded(recorded: np.ndarray, rows: int) -> np.ndarray:
     """Zero rows where fewer steps were computed than there are commands."""
+    if recorded.shape[1] == rows:
+        return recorded
     full = np.zeros((recorded.shape[0], rows, *recorded.shape[2:]))
     full[:, : recorded.shape[1]] = recorded
     return full
