@@ -27,6 +27,7 @@ from rfdropo_bayes.inference.survey import survey
 
 JACOBIANS = ("auto", "forward", "central")
 SURVEYING = 0.6  # share of the budget of climbs that a survey before them may take
+FEWEST_STEPS = 4.0  # of a climb at the last horizon that is worth its start
 RIVAL = 30.0  # [nat]: an optimum that far below the best matters to no posterior
 
 
@@ -177,10 +178,14 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
     starts, d = climbs.positions.shape
     now = horizons[climbs.level]
     later = sum(-(-starts // 2**ahead) * rows for ahead, rows in enumerate(horizons[climbs.level + 1 :], start=1))
-    allowed = (config.rollouts - climbs.ledger.rollouts) * now / (now * (starts - climbs.done) + later)
+    waiting = starts - climbs.done
+    share = now * waiting / (now * waiting + later)
+    rows = (config.rollouts - climbs.ledger.rollouts) * share * n_rows / now
     # The grid of the noise; then a Jacobian by central differences, two more rows per noise, six dampings tried.
-    left = allowed * n_rows / now - NOISE_GRID * noise
-    return int(np.clip(left / (4.0 * d + 7.0), 0, config.max_steps))
+    grid, step = NOISE_GRID * noise, 4.0 * d + 7.0
+    # More rivals than expected may have come to the last horizon: the best climb on, rather than none.
+    served = waiting if later else int(np.clip(rows / (grid + FEWEST_STEPS * step), 1, waiting))
+    return int(np.clip((rows / served - grid) / step, 0, config.max_steps))
 
 
 def _first(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int, logbook: Logbook) -> Climbs:

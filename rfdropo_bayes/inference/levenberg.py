@@ -147,8 +147,8 @@ def with_fitting_noise(target: Climbable, u: Float[np.ndarray, " d"], width: flo
 def maximise(
     target: Climbable, u: Float[np.ndarray, " d"], *, max_steps: int, tolerance: float
 ) -> tuple[LevenbergState, list[dict[str, Any]]]:
-    """Climb from one start, noise first, until a step promises less than ``tolerance`` nats."""
-    state = init(target, with_fitting_noise(target, u))
+    """Climb from one start, noise first, until a step promises less than ``tolerance`` nats; no steps, no search."""
+    state = init(target, with_fitting_noise(target, u) if max_steps else u)
     trace: list[dict[str, Any]] = []
     while not state.converged and len(trace) < max_steps:
         state, info = step(target, state, tolerance)
