@@ -223,10 +223,14 @@ class Inquiry:
             return steps
         candidate = next(c for c in self.candidates if c.name == last.name)
         indices = np.array([*base.free, *candidate.indices], dtype=int)
-        start = last.fit.x.copy()
+        # With the first one gone, its place in the fit may be far from the best: the base model's is another start.
+        emptied, plain = last.fit.x.copy(), base.x.copy()
         others = np.setdiff1d(last.fit.free, indices)
-        start[others] = self.target.forward.coordinates.null[others]
-        alone = climb(self.target, start, indices)
+        emptied[others] = self.target.forward.coordinates.null[others]
+        plain[list(candidate.indices)] = last.fit.x[list(candidate.indices)]
+        alone = max(
+            (climb(self.target, start, indices) for start in (emptied, plain)), key=lambda fit: fit.log_evidence
+        )
         found, _ = self.look_at(alone, [last.name])
         again = self._extend(found, [last.name])
         if again is None or again.name in (first.name, *first.members) or again.name == DISCRETISATION:
