@@ -37,16 +37,6 @@ def swaying(position: np.ndarray, recording: Trajectory) -> np.ndarray:
     return np.stack([wave * share, 0.4 * wave * share, 0.0 * share * wave], axis=-1)
 
 
-def overshooting(position: np.ndarray, recording: Trajectory) -> np.ndarray:
-    """A drive of the first cable that rings at 4 Hz after every command to it, seen as a displacement of the arm."""
-    clock, sent = np.asarray(recording.command_time), np.asarray(recording.command)[:, 0]
-    steps = np.diff(sent, prepend=0.0)
-    past = np.asarray(recording.time)[:, None] - clock
-    ringing = np.where(past > 0, np.exp(-np.maximum(past, 0.0) / 0.25) * np.sin(8 * np.pi * past), 0.0) @ steps
-    share = position[:1, :, 2] / position[0, -1, 2]
-    return 1.5 * ringing[:, None, None] * share[..., None] * np.array([1.0, 0.3, 0.0])
-
-
 def change(folder: Path, what: Change) -> None:
     """Put an effect into all recordings of a data set."""
     for path in folder.glob("*.nc"):
@@ -59,7 +49,7 @@ def change(folder: Path, what: Change) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", [warped, swaying, overshooting])
+@pytest.mark.parametrize("what", [warped, swaying])
 def test_what_the_library_lacks_is_never_explained(tmp_path, what):
     found = hide(SETTING, [], 0.0, 11, tmp_path, workshop=SHOP)
     assert found is not None
