@@ -32,10 +32,8 @@ from rfdropo_bayes.inference.sharpness import Way, way_from_prior
 CLIMBING = 0.25  # share of the budget that climbs to optima may take
 SURVEYING = 0.4  # and the survey before them
 PER_SURVEYOR = 32.0  # rollouts that a particle of the survey takes, typically
-MOST_SURVEYORS, FEWEST_SURVEYORS = (
-    128,
-    64,
-)  # with fewer, more than half of the surveys of a rugged ridge missed the summit
+# With fewer, more than half of the surveys of a rugged ridge missed the summit.
+MOST_SURVEYORS, FEWEST_SURVEYORS = 128, 64
 STEPS = 12.0  # that a climb takes at each horizon, typically
 SCORING = 0.1  # and the evidence of the blocks
 MARGIN = 3.0  # what real posteriors cost over the estimate, which takes them to be normal and data to be even
