@@ -69,6 +69,7 @@ def test_from_the_prior_the_same_budget_is_exhausted():
     assert any("ran out" in sentence for sentence in result.warnings)
 
 
+@pytest.mark.slow
 def test_block_scores_are_there_without_having_passed_the_blocks(fitted):
     """Importance draws: each score within five of its own deviations (floored at 0.1) of the closed form."""
     problem = LinearGaussian(n_rows=40, d=6, noise=1e-2)
@@ -96,6 +97,7 @@ def test_both_modes_survive_a_start_at_the_optima():
     assert np.mean(result.draws["x0"] > 0) == pytest.approx(share, abs=0.2)
 
 
+@pytest.mark.slow
 def test_a_ridge_between_two_bounds_is_filled_from_end_to_end():
     """The optimum lies at one end of the ridge, and the curvature there knows nothing of its length. A distribution
     function of 400 draws, of which a quarter count: its mean scatters by 0.03, its deviation by 0.02."""
@@ -137,7 +139,7 @@ def test_climbs_expect_half_of_their_number_at_the_next_horizon():
     assert steps == int(1200.0 / 3.0 / 4.0 * 4.0 / 19.0)
 
 
-@pytest.mark.parametrize("budget", [2500, 4000])
+@pytest.mark.parametrize("budget", [pytest.param(2500, marks=pytest.mark.slow), 4000])
 def test_the_budget_covers_climbs_sampler_and_scores(budget):
     """The whole is within the budget, whatever the parts take; scores are left out before it is exceeded."""
     problem = LinearGaussian(n_rows=40, d=6, noise=1e-2)

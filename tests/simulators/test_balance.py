@@ -41,6 +41,7 @@ def every_step(simulator, rows: int):
     return simulator.commands(0.05 * np.arange(rows // 5), value, np.zeros(8), TIME_STEP * np.arange(rows + 1))
 
 
+@pytest.mark.slow
 def test_the_base_of_a_mesh_holds_what_moves_it(trunk):
     """The change of momentum of all nodes is what base, cables, weight and drag make of it; energy comes from work."""
     commands, values = every_step(trunk, 20), trunk.complete(SOFT)

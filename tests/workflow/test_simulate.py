@@ -110,6 +110,7 @@ def test_sofas_cube_is_pushed_along(sofa, tmp_path, monkeypatch, capsys):
     assert pushed["object_error"]["position_mm"]["last"] < 0.1 * travelled
 
 
+@pytest.mark.slow
 def test_another_recording_by_override_in_single_precision(sofa, tmp_path, monkeypatch, capsys):
     other = tmp_path / "other.csv"
     other.write_bytes((sofa / "push_2.csv").read_bytes())
