@@ -207,6 +207,7 @@ def measure(case: Case, seconds: float) -> dict[str, Any]:
         elapsed = clock() - started
         best, spent = min(best, elapsed), spent + elapsed
     row = case._asdict() | {"rollouts_per_second": case.batch / best, "first_call_s": first_call, "failed": failed}
+    row["mesh"] = case.mesh and Path(case.mesh).name  # where it lies is of no interest elsewhere
     return row | ({"sag_error": sag_error(case)} if case.body == "bar" else {})
 
 
