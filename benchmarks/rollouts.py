@@ -25,6 +25,7 @@ import resource
 import subprocess
 import sys
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -58,16 +59,9 @@ Values = dict[str, jax.Array]
 Run = Callable[[Values], jax.Array]  # number of rollouts that failed
 
 
-SOFA: dict[str, Any] = {
-    "unit": "mm",
-    "clamp_height": 0.02,
-    "frames": "edges",
-    "masses": "equal",
-    "drives": "sofa",
-    "drive_rate": 0.001,
-    "marker_cables": ("long_0", "long_1", "long_2", "long_3"),
-}
-"""How SOFA simulates its mesh, as experiments/sofa_push.toml says."""
+EXPERIMENTS = Path(__file__).resolve().parents[1] / "experiments"
+SOFA: dict[str, Any] = tomllib.loads((EXPERIMENTS / "sofa_push.toml").read_text())["simulator"]["tetrahedra"]
+"""How SOFA simulates its mesh."""
 
 
 class Case(NamedTuple):

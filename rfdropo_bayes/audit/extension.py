@@ -214,7 +214,7 @@ class Inquiry:
         residual = self.target.recall("shares", [points], lambda: {"residual": self.target.residual(points)})
         z = (points - coordinates.prior_mean) / coordinates.prior_sd
         cost = np.sum(residual["residual"] ** 2, axis=1) + np.sum(z**2, axis=1)
-        return points[int(np.nanargmin(np.where(np.isfinite(cost), cost, np.inf)))]
+        return points[int(np.argmin(cost))]
 
     def _reconsider(self, base: Fit, steps: list[Step]) -> list[Step]:
         """With the last mechanism in the model, was the first one named rightly? Take it out and ask again."""

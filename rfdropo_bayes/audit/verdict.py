@@ -33,8 +33,7 @@ def decide(
     """Apply the rules.
 
     - no_discrepancy: the base model passes the joint test (p > .01), under a noise that may be one;
-    - unexplained: it does not, and no candidate is significant, or all together explain at most 20 %, unless that
-      cannot be told (`unclear`) and unseen trajectories are likelier under the extended model;
+    - unexplained: it does not, and no candidate is significant, or all together explain at most 20 %;
     - explained: the extended model passes (p > .05) and the lower bound of the explained fraction exceeds 80 %;
       equivalent where a named class has several members;
     - partly_explained: a significant gain, but one of these fails.
@@ -52,7 +51,7 @@ def decide(
         return UNEXPLAINED
     if gain is None:
         return PARTLY
-    if gain.explained <= rules.significant and not (unclear(rules, gain) and gain.elpd_difference > 0.0):
+    if gain.explained <= rules.significant:
         return UNEXPLAINED
     if extended_p > rules.extended_passes and gain.interval[0] > rules.explained:
         return EQUIVALENT if max(class_sizes) > 1 else EXPLAINED

@@ -10,7 +10,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, solve
 from rfdropo_bayes.fem.cables import lengths_and_jacobian
 from rfdropo_bayes.fem.dynamics import Prepared, State, System, accept, linearised, remembering
@@ -44,12 +43,12 @@ def outline_points(body: LayeredBody, outline: Float[np.ndarray, "stations 2"], 
 
 def check_effects(effects: BodyEffects) -> None:
     """Raise InputError for effects of the cables, which contacts are not solved together with."""
-    for name in ("cable_compliance", "coulomb_friction", "capstan_friction"):
-        if getattr(effects, name) is not None:
-            raise InputError(
-                f"{name.replace('_', ' ')} cannot be combined with a cube", where="[model] mechanisms",
-                remedy="remove the mechanism, or set push = false under [simulator]",
-            )  # fmt: skip
+    effects.refuse(
+        ("cable_compliance", "coulomb_friction", "capstan_friction"),
+        "{} cannot be combined with a cube",
+        where="[model] mechanisms",
+        remedy="remove the mechanism, or set push = false under [simulator]",
+    )
 
 
 def step(

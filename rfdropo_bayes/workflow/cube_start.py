@@ -37,9 +37,9 @@ def with_measured_starts(
     placed = {p.name: values[p.name] for p in kept}
     parameters = list(kept)
     for trajectory in trajectories:
-        own = _place(simulator, model, trajectory, values)
+        known = model.space.for_recording(values, trajectory.name)
+        known |= _place(simulator, model, trajectory, values)
         for name in PLACE:
-            known = {**model.space.for_recording(values, trajectory.name), **own}
             if name in known:
                 prior = prior_from_table(specs[name], dict(specs[name].prior), where=name)
                 parameters.append(Parameter(specs[name], prior, trajectory.name))

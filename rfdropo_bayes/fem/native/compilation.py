@@ -3,6 +3,7 @@
 Numba on its own optimises every function together with all that it calls, and makes machine code of it, then does the
 same again in each of its callers. Here a function that only kernels call is lowered to LLVM's language and left at
 that. The kernel at the top is optimised in one pass, without a search for loops to vectorise: kernels work on vectors.
+Meshes are compiled Numba's way: as one program they ran at half the rate (17 for 36 rollouts a second).
 """
 
 from __future__ import annotations
