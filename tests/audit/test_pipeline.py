@@ -48,7 +48,7 @@ def test_an_effect_too_small_to_say_how_much_it_explains_is_named_and_not_belitt
     content = found({"play": 0.03}, 12)
     assert content["findings"][0]["mechanism"] == "play"
     assert content["gain"]["explained_fraction"] < 0.2  # by chance: the interval goes from 0 to 100 %
-    assert content["verdict"] == "partly_explained"
+    assert content["verdict"] == "unexplained"
     assert "too small to say how much" in content["sentence"]
 
 
