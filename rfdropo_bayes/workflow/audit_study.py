@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from rfdropo_bayes.audit.verdict import EQUIVALENT, EXPLAINED, NO_DISCREPANCY, P
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.mechanisms import REGISTRY
-from rfdropo_bayes.workflow.audit import Workshop, run_audit
+from rfdropo_bayes.workflow.audit import JOURNAL, Workshop, run_audit
 from rfdropo_bayes.workflow.files import output_folder
 from rfdropo_bayes.workflow.fits import Job, run_fits
 from rfdropo_bayes.workflow.hidden_effects import Hidden, Setting, hide
@@ -28,6 +29,7 @@ from rfdropo_bayes.workflow.hidden_effects import Hidden, Setting, hide
 RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
 NEAR = 1.3  # times the error of the model that knows what is hidden
 ONCE = 'data.fit=["fit_1.nc", "screen.nc"]'  # an override that leaves the repeats out
+WHOLE = "with_whole_library"
 TRIES = 8  # mechanisms that are tried until one reaches the wanted size
 
 
@@ -48,6 +50,13 @@ class Condition:
         if self.effects == 0:
             return (NO_DISCREPANCY,)
         return (PARTLY, UNEXPLAINED) if self.removed else (EXPLAINED, EQUIVALENT)
+
+    @property
+    def setting(self) -> Setting:
+        """Meshes and time steps; where nothing is to be found, such that they differ by a rho of at most .02."""
+        if self.effects:
+            return Setting()
+        return Setting(audited={"refine": 4, "time_step": 0.005}, made={"refine": 5, "time_step": 0.05 / 11})
 
 
 CONDITIONS = (
@@ -103,7 +112,7 @@ def run_study(
             "core_hours": round(sum(row["core_seconds"] for row in done) / 3600.0, 3),
             "library": library,
             "excluded": list(exclude),
-            "conditions": {c.name: summarise(c, [r for r in done if r["condition"] == c.name]) for c in chosen},
+            "conditions": {c.name: summarise(c, _rows_of(c, done)) for c in chosen},
             "schema_version": 1,
         }
         (out / RESULT).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
@@ -116,6 +125,13 @@ def _kept(ledger: Path, seed: int) -> list[dict[str, Any]]:
     lines = ledger.read_text(encoding="utf-8").splitlines() if ledger.exists() else []
     rows = [{**row["job"], **row["result"]} for row in map(json.loads, lines)]
     return [row for row in rows if row["seed"] == seed]
+
+
+def _rows_of(condition: Condition, done: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The audits of a condition; those with the whole library that came before one with less are of the first kind."""
+    before = [c.name for c in CONDITIONS if c.removed and replace(c, name=condition.name, removed=False) == condition]
+    whole = [{**row, **row[WHOLE]} for row in done if row["condition"] in before]
+    return [row for row in done if row["condition"] == condition.name] + whole
 
 
 def _conditions(names: Sequence[str]) -> list[Condition]:
@@ -140,17 +156,22 @@ def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path)
     answers: list[Answer] = []
     given = [] if condition.repeats else [ONCE]
     content = run_audit(hidden.experiment, place / "audit", workshop=_WORKSHOP, overrides=given, inspect=answers.append)
+    judged = {
+        **judge(content, names, hidden),
+        "error_over_oracle": error_over_oracle(answers[0], names, hidden),
+    }
     if condition.removed:
-        content = run_audit(
-            hidden.experiment, place / "removed", workshop=_WORKSHOP, overrides=[_without(content, names, exclude)]
-        )
+        # What the base model does is the same in both.
+        shutil.copytree(place / "audit" / JOURNAL, place / "removed" / JOURNAL, dirs_exist_ok=True)
+        less = [_without(content, names, exclude)]
+        content = run_audit(hidden.experiment, place / "removed", workshop=_WORKSHOP, overrides=less, resume=True)
+        judged = {**judge(content, names, hidden), "error_over_oracle": None, WHOLE: judged}
     return {
         "hidden": names,
         "unreached": unreached,
         "rho": hidden.rho,
         "truth": hidden.values,
-        **judge(content, names, hidden),
-        "error_over_oracle": None if condition.removed else error_over_oracle(answers[0], names, hidden),
+        **judged,
         "seconds": round(time.monotonic() - began, 1),
         "core_seconds": round(time.process_time() - processor, 1),
     }
@@ -179,7 +200,7 @@ def _hidden(
     for _ in range(TRIES):
         names = sorted(set(chosen), key=list(REGISTRY).index)
         if len(names) == condition.effects:
-            found = hide(Setting(), names, condition.rho, seed, place, exclude=exclude, workshop=workshop)
+            found = hide(condition.setting, names, condition.rho, seed, place, exclude=exclude, workshop=workshop)
             if found is not None:
                 return found, names, unreached
             unreached.append(" + ".join(names))

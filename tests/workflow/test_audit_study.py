@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.workflow.audit_study import LEDGER, TABLE, _turn, judge, run_study
+from rfdropo_bayes.workflow.audit_study import CONDITIONS, LEDGER, TABLE, WHOLE, _turn, judge, run_study
 from rfdropo_bayes.workflow.hidden_effects import Hidden
 
 CONTENT = {
@@ -89,3 +89,26 @@ def test_a_study_counts_what_its_ledger_holds_and_lists_confusions(tmp_path):
     assert "backlash -> payload (1)" in table
     with pytest.raises(InputError, match="unknown condition"):
         run_study(tmp_path, 0, 7, conditions=["rho_9"])
+
+
+def test_audits_before_a_mechanism_was_removed_count_where_nothing_was_removed(tmp_path):
+    judged = judge(CONTENT, ["payload"], hidden(0.02))
+    shared = {"hidden": ["payload"], "rho": {"discretisation": 0.01}, "seconds": 36.0, "core_seconds": 18.0}
+    without = {**judged, "verdict": "unexplained", "named_first": False, "error_over_oracle": None, "unreached": []}
+    result = {**shared, **without, WHOLE: {**judged, "error_over_oracle": 1.1}}
+    job = {"condition": "removed_rho_0.5", "index": 0, "seed": 7}
+    (tmp_path / LEDGER).write_text(json.dumps({"job": job, "result": result}) + "\n")
+    found = run_study(tmp_path, 0, 7)["conditions"]
+    assert found["removed_rho_0.5"]["verdicts"] == {"unexplained": 1}
+    assert found["rho_0.5"]["verdicts"] == {"equivalent": 1}
+    assert found["rho_0.5"]["named_first"] == 1
+    assert [found[name]["datasets"] for name in ("rho_0.15", "two_effects_rho_1", "null")] == [0, 0, 0]
+
+
+def test_where_nothing_is_to_be_found_the_audit_is_on_a_finer_mesh():
+    """Discretisation's rho is at most .0136 there, over eight truths; at the other conditions' resolution .03."""
+    audited = [c.setting.audited["refine"] for c in CONDITIONS]
+    assert [c.setting.made["refine"] - fine for c, fine in zip(CONDITIONS, audited, strict=True)] == [1] * len(
+        CONDITIONS
+    )
+    assert {c.effects == 0 for c, fine in zip(CONDITIONS, audited, strict=True) if fine == 4} == {True}
