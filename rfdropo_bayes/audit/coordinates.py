@@ -189,7 +189,7 @@ class Coordinates:
         """Where each coordinate goes in a recording's physical parameters; -1 for those of other recordings."""
         index = {name: i for i, name in enumerate(self.physical)}
         return np.array(
-            [[index[p.spec.name] if p.recording in ("", r) else -1 for p in self.space.parameters] for r in recordings]
+            [[index[p.physical] if p.holds_for(r) else -1 for p in self.space.parameters] for r in recordings]
         )
 
     def physical_values(
@@ -197,7 +197,7 @@ class Coordinates:
     ) -> Float[np.ndarray, "n recording physical"]:
         """What the simulator is given for each recording."""
         start = np.array([self.fixed.get(name, self.nominal[name]) for name in self.physical], dtype=float)
-        return _scattered(np.tile(start, (len(x), len(slots), 1)), self.values(x), slots)
+        return self._scattered(np.tile(start, (len(x), len(slots), 1)), self.values(x), slots)
 
     def physical_tangents(
         self,
@@ -207,13 +207,16 @@ class Coordinates:
     ) -> Float[np.ndarray, "n recording physical"]:
         """Derivatives of `physical_values` along directions."""
         zero = np.zeros((len(x), len(slots), len(self.physical)))
-        return _scattered(zero, self.slopes(x) * directions, slots)
+        return self._scattered(zero, self.slopes(x) * directions, slots)
 
-
-def _scattered(theta: np.ndarray, values: np.ndarray, slots: np.ndarray) -> np.ndarray:
-    for recording, places in enumerate(slots):
-        theta[:, recording, places[places >= 0]] = values[:, places >= 0]
-    return theta
+    def _scattered(self, theta: np.ndarray, values: np.ndarray, slots: np.ndarray) -> np.ndarray:
+        added = np.array([bool(p.added_to) for p in self.space.parameters])
+        for recording, places in enumerate(slots):
+            own = (places >= 0) & ~added
+            theta[:, recording, places[own]] = values[:, own]
+            for i in np.flatnonzero((places >= 0) & added):  # what a group's value is off the shared one
+                theta[:, recording, places[i]] += values[:, i]
+        return theta
 
 
 def _spread(parameter: Parameter, draws: np.ndarray) -> float:

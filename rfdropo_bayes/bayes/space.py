@@ -13,6 +13,7 @@ import numpy as np
 import numpyro.distributions as dist
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from rfdropo_bayes.bayes.pooling import Pooled, deviation_spec
 from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
@@ -28,19 +29,32 @@ class Parameter:
     Attributes:
         spec: name, unit, hard bounds and meaning of the physical parameter.
         prior: numpyro distribution, in the parameter's unit, within its hard bounds.
-        recording: name of the only recording it belongs to; empty if all share it.
+        recording: name of the only recording, or group of recordings, that it belongs to; empty if all share it.
         table: the prior as it was written, for the record.
+        members: recordings of the group.
+        added_to: the parameter that it is added to; empty if it is a value of its own.
     """
 
     spec: ParameterSpec
     prior: dist.Distribution
     recording: str = ""
     table: Mapping[str, Any] | None = None
+    members: tuple[str, ...] = ()
+    added_to: str = ""
 
     @property
     def name(self) -> str:
         """Name in posteriors: ``young_modulus``, or ``offset_x@AKLWI_1`` for a parameter of one recording."""
         return f"{self.spec.name}{SEPARATOR}{self.recording}" if self.recording else self.spec.name
+
+    @property
+    def physical(self) -> str:
+        """Name of the simulator's parameter that it sets or adds to."""
+        return self.added_to or self.spec.name
+
+    def holds_for(self, recording: str) -> bool:
+        """Whether it is one of a recording's parameters."""
+        return not self.recording or recording == self.recording or recording in self.members
 
     @cached_property
     def transform(self) -> dist.transforms.Transform:
@@ -70,8 +84,12 @@ class ParameterSpace:
 
     def for_recording(self, values: Mapping[str, Float[Array | np.ndarray, "..."]], recording: str) -> dict[str, Any]:
         """The physical parameters that hold for one recording, under their physical names."""
-        chosen = {p.spec.name: values[p.name] for p in self.parameters if not p.recording}
-        chosen |= {p.spec.name: values[p.name] for p in self.parameters if p.recording == recording}
+        values_of_its_own = [p for p in self.parameters if not p.added_to]
+        chosen = {p.spec.name: values[p.name] for p in values_of_its_own if not p.recording}
+        chosen |= {p.spec.name: values[p.name] for p in values_of_its_own if p.recording and p.holds_for(recording)}
+        for p in self.parameters:
+            if p.added_to and p.holds_for(recording):
+                chosen[p.added_to] = chosen[p.added_to] + values[p.name]
         return chosen
 
     def sample(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
@@ -85,12 +103,13 @@ class ParameterSpace:
         """Prior draws with draws of an earlier posterior in the place of the parameters that it holds.
 
         A parameter of one recording takes the value of the same recording, else that which all recordings shared, else
-        that of another recording.
+        that of another recording; a deviation of one group takes that of the same group or none.
         """
         prior_key, choice = jax.random.split(key)
         values = self.sample(prior_key, n)
         for parameter in self.parameters:
             alike = [name for name in earlier if name.partition(SEPARATOR)[0] == parameter.spec.name]
+            alike = [] if parameter.added_to else alike
             known = [name for name in (parameter.name, parameter.spec.name, *alike) if name in earlier]
             if known:
                 # The same rows for all parameters: their values belong together.
@@ -126,6 +145,7 @@ def build_space(
     per_recording: Mapping[str, Sequence[str]],
     recordings: Sequence[str],
     *,
+    pooled: Mapping[str, Pooled] | None = None,
     where: str = "[model.priors]",
 ) -> ParameterSpace:
     """Join specifications and prior tables.
@@ -136,12 +156,21 @@ def build_space(
             has taken fixed values out), ``{}`` asks for the default prior.
         per_recording: parameters that are free in the named recordings only.
         recordings: names of all recordings.
+        pooled: parameters that differ between groups of recordings, about a value that all share.
 
     Raises:
-        InputError: an unknown name, an unusable prior, or nothing to infer.
+        InputError: an unknown name, an unusable prior, nothing to infer, or a pooled parameter without a shared value.
     """
     by_name = {spec.name: spec for spec in specs}
-    check_names(list(priors) + list(per_recording), specs, where=where)
+    pooled = pooled or {}
+    check_names(list(priors) + list(per_recording) + list(pooled), specs, where=where)
+    for name in pooled:
+        if name not in priors or name in per_recording:
+            raise InputError(
+                f"{name} differs between groups about a value that all share, and has none",
+                where="[model.per_group]",
+                remedy="give it a prior, and take it out of [model.per_recording]",
+            )
     parameters: list[Parameter] = []
     for name, table in priors.items():
         spec = by_name[name]
@@ -155,6 +184,18 @@ def build_space(
                     remedy=f"recordings: {', '.join(recordings)}",
                 )
             parameters.append(Parameter(spec, prior, recording, chosen))
+        if name in pooled:
+            parameters += deviations(spec, pooled[name])
     if not parameters:
         raise InputError("no parameter has a prior", where=where, remedy="give at least one")
     return ParameterSpace(tuple(parameters))
+
+
+def deviations(spec: ParameterSpec, pooled: Pooled) -> list[Parameter]:
+    """What each group's value of a parameter is off the shared one."""
+    own = deviation_spec(spec, pooled.spread)
+    prior = prior_from_table(own, dict(own.prior), where=f"[model.per_group] {spec.name}")
+    return [
+        Parameter(own, prior, group, dict(own.prior), tuple(members), spec.name)
+        for group, members in pooled.groups.items()
+    ]

@@ -10,6 +10,7 @@ from rfdropo_bayes.bayes.calibration import Batch, CalibrationProblem
 from rfdropo_bayes.bayes.forces import Weighed, check_weighed, gather_tension, tension_specs
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
 from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.pooling import Pooled, gather_groups
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory, find_data_file, load_recordings
 from rfdropo_bayes.errors import InputError
@@ -78,6 +79,15 @@ def expand_groups(table: Mapping[str, Entry], specs: Sequence[ParameterSpec]) ->
     return expanded
 
 
+def pooling(
+    experiment: Experiment, specs: Sequence[ParameterSpec], fitted: Sequence[str], others: Sequence[str] = ()
+) -> dict[str, Pooled]:
+    """The parameters of [model.per_group], with the recordings of each group that has one to fit."""
+    groups = gather_groups([*fitted, *others], experiment.model.groups)
+    known = {group: members for group, members in groups.items() if set(members) & set(fitted)}
+    return {name: Pooled(spread, known) for name, spread in expand_groups(experiment.model.per_group, specs).items()}
+
+
 def build_model(
     experiment: Experiment, simulator: RobotSimulator, trajectories: Sequence[Trajectory]
 ) -> TrajectoryModel:
@@ -106,7 +116,8 @@ def build_model(
         name: matching(recordings.names, patterns, where=f"[model.per_recording] {name}")
         for name, patterns in shared.items()
     }
-    space = build_space(specs, priors, scopes, recordings.names)
+    pooled = pooling(experiment, specs, recordings.names)
+    space = build_space(specs, priors, scopes, recordings.names, pooled=pooled)
     weighed = tuple(Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed)
     check_weighed(weighed, space.names)
     tension = gather_tension(simulator, trajectories, recordings.time.shape[1]) if table.tension else None

@@ -41,6 +41,7 @@ from rfdropo_bayes.workflow.assembly import (
     find_robot,
     fixed_values,
     load_data,
+    pooling,
 )
 from rfdropo_bayes.workflow.experiment import Experiment, describe, load_experiment, matching
 from rfdropo_bayes.workflow.files import output_folder
@@ -124,7 +125,8 @@ def build_question(
     trajectories = [*fitted, *tested]
     recordings = gather_recordings(simulator, trajectories)
     added = simulator.mechanisms[len(experiment.model.mechanisms) :]
-    space, base = _space(experiment, simulator, added, recordings.names[: len(fitted)])
+    recorded, count = recordings.names, len(fitted)
+    space, base = _space(experiment, simulator, added, recorded[:count], recorded[count:])
     physical = tuple(spec.name for spec in simulator.parameters)
     known = fixed_values(experiment, simulator)
     coordinates = Coordinates(
@@ -230,7 +232,11 @@ def _finer(experiment: Experiment, robot: Robot) -> Experiment | None:
 
 
 def _space(
-    experiment: Experiment, simulator: RobotSimulator, candidates: Sequence[Mechanism], fitted: Sequence[str]
+    experiment: Experiment,
+    simulator: RobotSimulator,
+    candidates: Sequence[Mechanism],
+    fitted: Sequence[str],
+    others: Sequence[str],
 ) -> tuple[ParameterSpace, int]:
     """Base parameters, then those of the candidates, each with a prior; and how many are base parameters."""
     table = experiment.model
@@ -247,10 +253,11 @@ def _space(
     scopes = {
         name: matching(fitted, patterns, where=f"[model.per_recording] {name}") for name, patterns in shared.items()
     }
-    base = build_space(specs, priors, scopes, fitted)
+    pooled = pooling(experiment, specs, fitted, others)
+    base = build_space(specs, priors, scopes, fitted, pooled=pooled)
     taken = {p.spec.name for p in base.parameters} | set(fixed)
     extra = {name: table.priors.get(name, {}) for name in [s.name for s in specs if s.name in added - taken]}
-    whole = build_space(specs, {**priors, **extra}, scopes, fitted)
+    whole = build_space(specs, {**priors, **extra}, scopes, fitted, pooled=pooled)
     return whole, len(base.parameters)
 
 

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.pooling import Patterns
 from rfdropo_bayes.data import Trajectory, noise_floor
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.methods import make_config, method_named, run
@@ -71,7 +72,8 @@ def run_calibration(
     key, predicting = jax.random.split(jax.random.key(experiment.seed))
     with Progress(method, show=None, log=out / "log.jsonl") as progress:
         result = run(problem, method, config, key, checkpoint_dir=out / "checkpoints", resume=resume, progress=progress)
-    record = record_posterior(problem, result, tested, predicting, _attributes(experiment, [*fitted, *tested]))
+    attributes = _attributes(experiment, [*fitted, *tested])
+    record = record_posterior(problem, result, tested, predicting, attributes, experiment.model.groups)
     facts = gather_facts(experiment, path.stem, problem, result, fitted, tested, record.recordings)
     return write_run(out, record, facts, describe(tables))
 
@@ -107,6 +109,7 @@ def record_posterior(
     tested: Sequence[Trajectory],
     key: jax.Array,
     attributes: dict[str, Any],
+    groups: Patterns,
 ) -> PosteriorRecord:
     """Draws, prior draws and predictions of every recording, with the combinations of parameters that rollouts see."""
     prior_key, fit_key, test_key = jax.random.split(key, 3)
@@ -117,7 +120,7 @@ def record_posterior(
     errors, fitted = marker_errors(predictions), list(problem.model.recordings.names)
     if tested:
         predictions += predict_new(
-            problem.model, tested, values, test_key, chunk=problem.chunk, fitted=fitted, errors=errors
+            problem.model, tested, values, test_key, chunk=problem.chunk, fitted=fitted, errors=errors, groups=groups
         )
     record = PosteriorRecord(
         tuple(

@@ -34,9 +34,12 @@ class ModelTable(Table):
 
     ``priors`` maps parameter names to prior tables (``{}`` asks for the default prior); ``fixed`` sets the values of
     parameters that are not inferred; ``per_recording`` frees a parameter in the named recordings (``"all"``, or names
-    with wildcards) instead of sharing it. ``tension`` uses the recordings' cable tensions as data, with a relative
-    noise ``tension_noise`` that is inferred and a ``tension_gain`` that is 1 unless it has a prior; ``weighed`` lists
-    parameters, or sums of them, known from measurements of their own.
+    with wildcards) instead of sharing it. ``groups`` names recordings that have a set-up in common (a day, a robot), by
+    names or wildcards; a recording in none is a group of its own. ``per_group`` lets a parameter differ between groups
+    about the value they share, with the given standard deviation in its unit (partial pooling). ``tension`` uses the
+    recordings' cable tensions as data, with a relative noise ``tension_noise`` that is inferred and a ``tension_gain``
+    that is 1 unless it has a prior; ``weighed`` lists parameters, or sums of them, known from measurements of their
+    own.
     """
 
     mechanisms: list[str] = Field(default_factory=list)
@@ -44,6 +47,8 @@ class ModelTable(Table):
     priors: dict[str, dict[str, Any]] = Field(default_factory=dict)
     fixed: dict[str, float] = Field(default_factory=dict)
     per_recording: dict[str, str | list[str]] = Field(default_factory=dict)
+    groups: dict[str, str | list[str]] = Field(default_factory=dict)
+    per_group: dict[str, float] = Field(default_factory=dict)
     tension: bool = False
     weighed: list[WeighedTable] = Field(default_factory=list)
 

@@ -11,14 +11,15 @@ from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
+from rfdropo_bayes.bayes.pooling import Patterns, gather_groups, whole
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import RecordingPrediction
-from rfdropo_bayes.workflow.cube_start import OFFSETS, measured_objects, with_measured_starts
+from rfdropo_bayes.workflow.cube_start import measured_objects, with_measured_starts
+from rfdropo_bayes.workflow.first_row import match_first_row
 
 FITTED, MARKER_ERRORS = "fitted_recordings", "marker_errors_m"  # among the attributes of a posterior
-SMALLEST_ERROR = 1e-6  # [m]
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 
@@ -57,13 +58,14 @@ def predict_new(
     chunk: int,
     fitted: Sequence[str],
     errors: Mapping[str, float] | None = None,
+    groups: Patterns | None = None,
 ) -> list[RecordingPrediction]:
     """Predictions of recordings that no fit has seen, from their commands and at most their first row.
 
     A parameter that was free per recording takes, for a new one, the values it had in the fitted recordings, one of
-    them at random for every draw. Where the offset of the measuring frame is such a parameter, it is set from the
-    first row: each draw is shifted so that the weighted mean over the markers agrees there, and a marker weighs as
-    little as the model is wrong about it. A further piece of a fitted recording keeps the parameters of that recording.
+    them at random for every draw; what is of a group of recordings takes, for a new group, values from the spread
+    between groups. The offset of the measuring frame and the deviations of a new group are then conditioned on the
+    first row (`match_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
 
     A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone. A cube starts
     where it was measured in the first row.
@@ -71,34 +73,35 @@ def predict_new(
     Args:
         fitted: names of the recordings that were fitted.
         errors: `marker_errors` of the fit; all markers weigh the same without.
+        groups: which recordings belong together, by name or wildcard; each is a group of its own without.
     """
-    space, extended = _for_new_recordings(model.space, values, [t.name for t in trajectories], fitted, key)
+    names = [t.name for t in trajectories]
+    space, extended = _for_new_recordings(model.space, values, names, fitted, key, groups or {})
     fresh = replace(model, space=space, recordings=gather_recordings(model.simulator, trajectories))
     problem = CalibrationProblem(fresh, chunk=chunk)
-    own = {_whole(name) for name in fitted}
-    shifted = [t.name for t in trajectories if _whole(t.name) not in own]
-    if any(p.recording in shifted and p.spec.name in OFFSETS for p in space.parameters):
-        extended = _offsets_from_first_row(problem, extended, shifted, errors or {})
+    own = {whole(name) for name in fitted}
+    drawn = [p for p in space.parameters if p.added_to and p.name not in values]
+    extended = match_first_row(problem, extended, [n for n in names if whole(n) not in own], drawn, errors or {}, key)
     placed, extended = with_measured_starts(fresh, trajectories, extended)
     if placed is not fresh:
         problem = CalibrationProblem(placed, chunk=chunk)
     return _predictions(problem, extended, key, "test", None)
 
 
-def _whole(name: str) -> str:
-    """The recording that a piece is cut from."""
-    return name.partition("[")[0]
-
-
 def _for_new_recordings(
-    space: ParameterSpace, values: Batch, names: Sequence[str], fitted: Sequence[str], key: PRNGKeyArray
+    space: ParameterSpace,
+    values: Batch,
+    names: Sequence[str],
+    fitted: Sequence[str],
+    key: PRNGKeyArray,
+    groups: Patterns,
 ) -> tuple[ParameterSpace, Batch]:
     """The space with its per-recording parameters renamed to the new recordings, and values for them."""
-    own = {_whole(recording) for recording in fitted}
+    own = {whole(recording) for recording in fitted}
     shared = [p for p in space.parameters if not p.recording]
     families: dict[str, list[Parameter]] = {}
     for parameter in space.parameters:
-        if parameter.recording:
+        if parameter.recording and not parameter.added_to:
             families.setdefault(parameter.spec.name, []).append(parameter)
     extended = {p.name: values[p.name] for p in shared}
     count = len(next(iter(values.values())))
@@ -107,37 +110,26 @@ def _for_new_recordings(
         # One fitted recording is chosen per draw for all families at once: its values belong together.
         chosen = np.asarray(jax.random.randint(jax.random.fold_in(key, index), (count,), 0, 2**31 - 1))
         for name, family in families.items():
-            members = [p for p in family if _whole(p.recording) == _whole(recording)]
-            if not members and len(family) == len(fitted) and _whole(recording) not in own:
+            members = [p for p in family if whole(p.recording) == whole(recording)]
+            if not members and len(family) == len(fitted) and whole(recording) not in own:
                 members = family
             if not members:
                 continue
             pool = np.stack([values[member.name] for member in members])
             extended[f"{name}{SEPARATOR}{recording}"] = pool[chosen % len(members), np.arange(count)]
             parameters.append(replace(members[0], recording=recording))
+    deviating = [p for p in space.parameters if p.added_to]
+    for parameter in _deviations(deviating, gather_groups(names, groups)):
+        drawn = parameter.prior.sample(jax.random.fold_in(key, len(names) + len(parameters)), (count,))
+        extended[parameter.name] = values.get(parameter.name, np.asarray(drawn))
+        parameters.append(parameter)
     return ParameterSpace(tuple(parameters)), extended
 
 
-def _offsets_from_first_row(
-    problem: CalibrationProblem, values: Batch, names: Sequence[str], errors: Mapping[str, float]
-) -> Batch:
-    """Shift each draw's offsets so that simulated and measured markers agree on average in the first row."""
-    recordings = problem.model.recordings
-    position, _ = problem.predict(values)
-    precision = np.array([1.0 / max(errors.get(name, 1.0), SMALLEST_ERROR) ** 2 for name in recordings.markers])
-    shifted = dict(values)
-    for index, name in enumerate(recordings.names):
-        valid = recordings.line.valid[index, 0]
-        if name not in names or not recordings.line.valid[index].any():
-            continue  # commands alone: where the frame lies is as uncertain as it was among the fitted recordings
-        if not valid.any():
-            raise InputError("the first row is masked throughout", where=name, remedy="start the recording later")
-        error = recordings.position[index, 0, valid] - position[:, index, 0, valid]
-        for axis, offset in enumerate(OFFSETS):
-            key = f"{offset}{SEPARATOR}{name}"
-            if key in shifted:
-                shifted[key] = shifted[key] + np.average(error[:, :, axis], axis=1, weights=precision[valid])
-    return shifted
+def _deviations(fitted: Sequence[Parameter], groups: Mapping[str, tuple[str, ...]]) -> list[Parameter]:
+    """The deviations of the groups that new recordings belong to, whether any of a group was fitted or not."""
+    kinds = {p.spec.name: p for p in fitted}
+    return [replace(p, recording=group, members=members) for group, members in groups.items() for p in kinds.values()]
 
 
 def _predictions(

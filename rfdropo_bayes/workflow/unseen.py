@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
 from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
 from rfdropo_bayes.data import load_unseen, start_is_known
 from rfdropo_bayes.errors import InputError
@@ -76,7 +77,10 @@ def run_prediction(
     key = jax.random.key(experiment.seed if seed is None else seed)
     belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
     fitted, errors = record.attrs.get(FITTED, belonging), record.attrs.get(MARKER_ERRORS)
-    predicted = predict_new(model, [unseen], values, key, chunk=simulator.lanes, fitted=fitted, errors=errors)[0]
+    groups = experiment.model.groups
+    predicted = predict_new(
+        model, [unseen], values, key, chunk=simulator.lanes, fitted=fitted, errors=errors, groups=groups
+    )[0]
     out = output_folder(out)
     table = summarise(predicted)
     table.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": simulator.robot.name, "recording": unseen.name}
@@ -107,12 +111,18 @@ def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> Pa
     """
     scopes: dict[str, list[str]] = {}
     priors: dict[str, dict[str, Any]] = {}
+    known = {spec.name for spec in specs}
+    pooled: dict[str, Pooled] = {}
     for info in record.free:
         name, _, recording = info.name.partition(SEPARATOR)
+        shared = name.removesuffix(DEVIATION)
+        if name not in known and shared in known:
+            groups = pooled[shared].groups if shared in pooled else {}
+            pooled[shared] = Pooled(float(dict(info.prior)["scale"]), {**groups, recording: ()})
+            continue
         priors[name] = dict(info.prior)
         if recording:
             scopes.setdefault(name, []).append(recording)
-    known = {spec.name for spec in specs}
     missing = [name for name in priors if name not in known]
     if missing:
         raise InputError(
@@ -121,7 +131,7 @@ def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> Pa
             remedy="predict with the experiment that was calibrated, mechanisms included",
         )
     recordings = sorted({recording for names in scopes.values() for recording in names})
-    return build_space(specs, priors, scopes, recordings, where="posterior")
+    return build_space(specs, priors, scopes, recordings, pooled=pooled, where="posterior")
 
 
 def summarise(predicted: RecordingPrediction) -> xr.Dataset:

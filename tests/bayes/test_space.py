@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rfdropo_bayes.bayes.pooling import Pooled, gather_groups
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -74,3 +75,45 @@ def test_draws_around_an_earlier_posterior_keep_its_rows_together_and_stay_insid
 def test_what_cannot_be_inferred_is_refused(priors, scopes, message):
     with pytest.raises(InputError, match=message):
         build_space(SPECS, priors, scopes, ["a", "b", "c"])
+
+
+DAYS = {"january": ["a*"], "april": "b"}
+
+
+def pooled_space(recordings=("a1", "a2", "b", "c")):
+    pooled = {"offset_x": Pooled(0.002, gather_groups(recordings, DAYS))}
+    return build_space(SPECS, {"young_modulus": {}, "offset_x": {}}, {}, list(recordings), pooled=pooled)
+
+
+def test_groups_of_recordings_deviate_from_what_all_share():
+    """Recordings of one day have one value, one without a group its own; their spread is the one that was given."""
+    chosen = pooled_space()
+    deviations = {f"offset_x_deviation@{group}" for group in ("january", "april", "c")}
+    assert set(chosen.names) == {"young_modulus", "offset_x", *deviations}
+    values = chosen.sample(jax.random.key(0), 4000)
+    own = {r: chosen.for_recording(values, r)["offset_x"] for r in ("a1", "a2", "b", "c")}
+    np.testing.assert_array_equal(own["a1"], own["a2"])
+    np.testing.assert_allclose(own["b"] - own["a1"], sum_of(values, "april") - sum_of(values, "january"), atol=1e-15)
+    assert np.std(own["c"] - values["offset_x"]) == pytest.approx(0.002, rel=0.06)  # 5 standard errors
+    back = chosen.from_unconstrained(chosen.to_unconstrained(values))
+    np.testing.assert_allclose(back["offset_x_deviation@april"], values["offset_x_deviation@april"], rtol=1e-10)
+
+
+def sum_of(values, group):
+    return values["offset_x"] + values[f"offset_x_deviation@{group}"]
+
+
+def test_a_climb_starts_from_a_group_s_own_deviation_and_from_no_other_s():
+    earlier = {"offset_x": np.full(3, 0.01), "offset_x_deviation@january": np.full(3, 0.001)}
+    values = pooled_space().sample_around(earlier, jax.random.key(1), 50)
+    np.testing.assert_allclose(values["offset_x_deviation@january"], 0.001, rtol=1e-12)
+    assert len(np.unique(values["offset_x_deviation@april"])) == 50
+
+
+def test_what_cannot_be_pooled_is_refused():
+    with pytest.raises(InputError, match="a1 is in two groups: january and winter"):
+        gather_groups(["a1"], {**DAYS, "winter": "a1"})
+    with pytest.raises(InputError, match="about a value that all share"):
+        build_space(SPECS, {"young_modulus": {}}, {}, ["b"], pooled={"offset_x": Pooled(0.1, {"april": ("b",)})})
+    with pytest.raises(InputError, match="the spread between groups is 0"):
+        build_space(SPECS, {"offset_x": {}}, {}, ["b"], pooled={"offset_x": Pooled(0.0, {"april": ("b",)})})

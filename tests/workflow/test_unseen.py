@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -12,11 +13,13 @@ import pandas as pd
 import pytest
 import xarray as xr
 
+from rfdropo_bayes.bayes.pooling import Pooled, gather_groups
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.workflow.first_row import match_first_row
 from rfdropo_bayes.workflow.prediction import MARKER_ERRORS, _for_new_recordings
 from rfdropo_bayes.workflow.unseen import run_prediction
 
@@ -119,7 +122,9 @@ def test_what_one_recording_alone_had_free_is_not_carried_to_a_new_one():
         ["a", "b[0:9]"],
     )
     values = {name: np.full(3, 0.1 * k) for k, name in enumerate(names)}
-    found, drawn = _for_new_recordings(space, values, ["new", "b[20:30]", "a[3:4]"], ["a", "b[0:9]"], jax.random.key(0))
+    found, drawn = _for_new_recordings(
+        space, values, ["new", "b[20:30]", "a[3:4]"], ["a", "b[0:9]"], jax.random.key(0), {}
+    )
     assert set(drawn) == {"offset_x@new", "offset_x@b[20:30]", "payload@b[20:30]", "offset_x@a[3:4]"}
     assert set(found.names) == set(drawn)
     np.testing.assert_array_equal(drawn["offset_x@b[20:30]"], 0.1)
@@ -170,3 +175,54 @@ def test_asl_commands_may_come_with_a_start_pose_or_without(datasets):
     unknown = load_unseen(spec, datasets, commands, None, (10000, 10400))
     assert not unknown.position_mask.any()
     np.testing.assert_array_equal(unknown.command, measured.command)
+
+
+def deviating(recordings, groups):
+    """A space of one parameter that deviates between groups with a spread of 2, and draws of it."""
+    spec = ParameterSpec("level", "m", -9.0, 9.0, 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 1.0}, "")
+    pooled = {"level": Pooled(2.0, gather_groups(recordings, groups))}
+    space = build_space([spec], {"level": {}}, {}, recordings, pooled=pooled)
+    return space, {name: np.asarray(v) for name, v in space.sample(jax.random.key(1), 4000).items()}
+
+
+def test_a_new_recording_of_a_known_day_has_that_day_s_values_and_one_of_a_new_day_their_spread():
+    days = {"january": "jan*", "april": "apr*"}
+    space, values = deviating(["jan_1", "jan_2"], days)
+    found, drawn = _for_new_recordings(space, values, ["jan_3", "apr_1"], ["jan_1", "jan_2"], jax.random.key(0), days)
+    january, april = (found.for_recording(drawn, name)["level"] for name in ("jan_3", "apr_1"))
+    np.testing.assert_array_equal(january, values["level"] + values["level_deviation@january"])
+    new = april - values["level"]
+    assert np.std(new) == pytest.approx(2.0, rel=0.06)  # 5 standard errors
+    assert abs(np.corrcoef(new, values["level_deviation@january"])[0, 1]) < 0.08
+
+
+def test_deviations_given_a_first_row_are_draws_from_the_linear_model_s_posterior():
+    """Two markers move by 1 and 3 along x per unit of the deviation; the closed form is that of a linear regression."""
+    space, values = deviating(["new"], {})
+    slope, errors = np.array([1.0, 3.0]), {"a": 2.0, "b": 5.0}
+    measured = np.array([[4.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    recordings = SimpleNamespace(
+        names=("new",),
+        markers=("a", "b"),
+        position=measured[None, None],
+        line=SimpleNamespace(valid=np.ones((1, 1, 2)) > 0),
+    )
+
+    def rollouts(given, horizon):
+        moved = np.zeros((len(given["level"]), horizon, 2, 3))
+        moved[..., 0] = (given["level_deviation@new"][:, None] * slope)[:, None]
+        return moved.reshape(len(moved), horizon, 6), np.zeros(len(moved))
+
+    problem = SimpleNamespace(
+        model=SimpleNamespace(space=space, recordings=recordings), n_recordings=1, rollouts=rollouts
+    )
+    drawn = [p for p in space.parameters if p.added_to]
+    found = match_first_row(problem, values, ["new"], drawn, errors, jax.random.key(2))["level_deviation@new"]
+    weight = 3.0 / np.array([2.0, 5.0]) ** 2  # an error in 3-D is shared by three coordinates
+    precision = 1.0 / 4.0 + np.sum(slope**2 * weight)
+    assert abs(np.mean(found) - np.sum(slope * weight * measured[:, 0]) / precision) < 5.0 / np.sqrt(4000 * precision)
+    assert np.std(found) == pytest.approx(precision**-0.5, rel=0.06)
+    np.testing.assert_array_equal(
+        match_first_row(problem, values, ["new"], drawn, {}, jax.random.key(2))["level_deviation@new"],
+        values["level_deviation@new"],
+    )

@@ -1,0 +1,85 @@
+"""Parameters that differ between groups of recordings (days, robots) about a value that all share: partial pooling."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+DEVIATION = "_deviation"
+
+Patterns = Mapping[str, str | Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """How one parameter is pooled.
+
+    Attributes:
+        spread: standard deviation between groups, in the parameter's unit.
+        groups: recordings of each group, by the group's name.
+    """
+
+    spread: float
+    groups: Mapping[str, tuple[str, ...]]
+
+
+def whole(recording: str) -> str:
+    """The recording that a piece is cut from."""
+    return recording.partition("[")[0]
+
+
+def group_of(recording: str, patterns: Patterns) -> str:
+    """Name of the group a recording belongs to; one that belongs to none is a group of its own.
+
+    Args:
+        recording: its name, or that of a piece of it.
+        patterns: names of recordings, or wildcards, by group.
+
+    Raises:
+        InputError: the recording is in two groups.
+    """
+    name = whole(recording)
+    found = [
+        group
+        for group, entries in patterns.items()
+        if any(fnmatchcase(name, entry) for entry in ([entries] if isinstance(entries, str) else entries))
+    ]
+    if len(found) > 1:
+        raise InputError(
+            f"{name} is in two groups: {found[0]} and {found[1]}", where="[model.groups]", remedy="keep it in one"
+        )
+    return found[0] if found else name
+
+
+def gather_groups(recordings: Sequence[str], patterns: Patterns) -> dict[str, tuple[str, ...]]:
+    """Recordings by group, in the order in which the groups are first met."""
+    groups: dict[str, tuple[str, ...]] = {}
+    for recording in recordings:
+        group = group_of(recording, patterns)
+        groups[group] = (*groups.get(group, ()), recording)
+    return groups
+
+
+def deviation_spec(spec: ParameterSpec, spread: float) -> ParameterSpec:
+    """What a group's value of a parameter is off the shared one, Normal(0, ``spread``), in the parameter's unit.
+
+    Raises:
+        InputError: a spread that is not positive.
+    """
+    if not spread > 0.0:
+        raise InputError(
+            f"the spread between groups is {spread}", where=f"[model.per_group] {spec.name}", remedy="a positive number"
+        )
+    return ParameterSpec(
+        f"{spec.name}{DEVIATION}",
+        spec.unit,
+        -float("inf"),
+        float("inf"),
+        0.0,
+        {"distribution": "Normal", "loc": 0.0, "scale": spread},
+        f"of one group of recordings, from the {spec.name.replace('_', ' ')} that all share",
+    )
