@@ -26,7 +26,7 @@ from rfdropo_bayes.inference.schedules import block_boundaries
 from rfdropo_bayes.inference.survey import survey
 
 JACOBIANS = ("auto", "forward", "central")
-SURVEYING = 0.6  # share of the budget of climbs that a survey before them may take
+SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before them may take
 FEWEST_STEPS = 4.0  # of a climb at the last horizon that is worth its start
 RIVAL = 30.0  # [nat]: an optimum that far below the best matters to no posterior
 
@@ -47,7 +47,7 @@ class LaplaceConfig:
         jacobian: "forward", "central" or "auto".
         draws: draws from the normal approximation.
         rollouts: budget in full-length rollouts, of which every climb gets its share, and a survey at most
-            `SURVEYING`; None for no limit.
+            `SURVEY_OF_CLIMBS`; None for no limit.
     """
 
     starts: int = 4
@@ -193,7 +193,7 @@ def _first(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: 
     if not config.survey or not isinstance(problem, ResidualProblem):
         return _screen(problem, config, key, horizon)
     ledger, began = Ledger(), time.monotonic()
-    budget = None if config.rollouts is None else SURVEYING * config.rollouts
+    budget = None if config.rollouts is None else SURVEY_OF_CLIMBS * config.rollouts
     found = survey(problem, _surveyed(problem, config), config.survey, budget, key, ledger, logbook)
     order = _spread_starts(found.positions, found.log_density, config.starts)
     return _at_starts(found.positions[order], found.log_density[order], ledger, began)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from typing import TypeGuard
 
 import jax
 import numpy as np
@@ -18,9 +19,10 @@ from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import bridge, horizon_smc
+from rfdropo_bayes.inference import bridge, horizon_smc, refinement
 from rfdropo_bayes.inference.checkpoints import run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
+from rfdropo_bayes.inference.hamiltonian import SlopedProblem
 from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES, ROLLOUTS_PER_PARTICLE, SmcConfig
 from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
@@ -30,7 +32,7 @@ from rfdropo_bayes.inference.schedules import block_boundaries
 from rfdropo_bayes.inference.sharpness import Way, way_from_prior
 
 CLIMBING = 0.25  # share of the budget that climbs to optima may take
-SURVEYING = 0.4  # and the survey before them
+SURVEY_OF_ALL = 0.4  # and the survey before them
 PER_SURVEYOR = 32.0  # rollouts that a particle of the survey takes, typically
 # With fewer, more than half of the surveys of a rugged ridge missed the summit.
 MOST_SURVEYORS, FEWEST_SURVEYORS = 128, 64
@@ -52,6 +54,8 @@ def run(
     Raises:
         InputError: as `horizon_smc.run`; or a start at the optima is asked for and the problem has no residuals.
     """
+    if _refinable(problem, config):
+        return refinement.run(problem, config, key, logbook)
     if config.start == "prior" or (config.start == "auto" and not _worth_climbing(problem, config)):
         return horizon_smc.run(problem, config, key, logbook)
     if not isinstance(problem, ResidualProblem):
@@ -85,7 +89,7 @@ def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
     budget can bring to an optimum: one that stops on the way misleads what starts from it."""
     if config.rollouts is None:
         return LaplaceConfig()
-    surveyors = min(int(SURVEYING * config.rollouts / PER_SURVEYOR), MOST_SURVEYORS)
+    surveyors = min(int(SURVEY_OF_ALL * config.rollouts / PER_SURVEYOR), MOST_SURVEYORS)
     if surveyors < FEWEST_SURVEYORS or getattr(problem, "earlier", None):
         surveyors = 0
     budget = CLIMBING * config.rollouts
@@ -93,6 +97,11 @@ def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
     whole = (1.5 if surveyors else 1.75) * STEPS * (4.0 * len(problem.names) + 7.0)
     starts = int(np.clip(budget / whole, 1, LaplaceConfig().starts))
     return LaplaceConfig(starts=starts, survey=surveyors, rollouts=budget + surveyors * PER_SURVEYOR)
+
+
+def _refinable(problem: Problem, config: SmcConfig) -> TypeGuard[SlopedProblem]:
+    """A plain model: it has gradients, and rows that are no rollouts, so that nothing limits a second pass."""
+    return config.start == "auto" and config.rollouts is None and isinstance(problem, SlopedProblem)
 
 
 def _worth_climbing(problem: Problem, config: SmcConfig) -> bool:
