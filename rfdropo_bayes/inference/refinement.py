@@ -1,0 +1,141 @@
+"""Plain models in two passes: from the prior along prefixes of the data, then again from where that arrived.
+
+Data of a plain model are no time series, and a prior a thousand times wider than the posterior makes the first pass
+long: each of its dozens of stages adds to the scatter of the evidence. Where it ended is known well enough, however, to
+fit a distribution that covers the posterior. A second pass from there takes few stages, all with the whole data, and
+what it says of posterior and evidence is as exact as if the distribution had been a lucky guess: it is normalised, and
+a share of it is the prior, which bounds every weight.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+from numpyro.distributions import MultivariateStudentT
+from scipy.special import expit, logit
+
+from rfdropo_bayes.inference import horizon_smc
+from rfdropo_bayes.inference.bridge import BridgeConfig, BridgedProblem
+from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.hamiltonian import SlopedProblem
+from rfdropo_bayes.inference.horizon_smc import SmcConfig
+from rfdropo_bayes.inference.levenberg import Laplace
+from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
+from rfdropo_bayes.inference.mixture import ModeMixture
+from rfdropo_bayes.inference.proposals import fit_reference
+from rfdropo_bayes.inference.result import (
+    Draws,
+    InferenceResult,
+    bound_warnings,
+    exclusion_warnings,
+    replicate_warnings,
+)
+
+REPLICATES = 4  # instead of a single one, whose evidence would have no deviation
+FORGOTTEN, MOST_MOVES = 0.1, 40  # correlation with its start that a stage of the second pass goes on to, if it can
+INFLATION, DEGREES = 1.1, 5.0  # of the Student-t that is fitted
+LEAST_PRIOR = 0.05  # share of the prior beside it
+SHORTER = 0.5  # of the first pass's stages is what a second one may take that has learnt something
+ROUNDS = 30  # of expectation maximisation, for that share
+
+
+class SlopedBridge(BridgedProblem):
+    """A `BridgedProblem` whose way to the posterior JAX can differentiate."""
+
+    def path_density(self, u: Float[Array, " d"], shares: Float[Array, " 1"]) -> Float[Array, ""]:
+        """Log density between the mixture and the posterior, at one point; traceable."""
+        none = jnp.zeros(self.problem.n_rows)
+        parts = [
+            jnp.log(share) + MultivariateStudentT(self.mixture.degrees, mean, factor).log_prob(u)
+            for share, mean, factor in zip(self.mixture.share, self.mixture.means, self.mixture.factors, strict=True)
+        ]
+        prior = self.problem.path_density(u, none)  # type: ignore[attr-defined]
+        mixture = jax.scipy.special.logsumexp(jnp.stack([*parts, np.log(self.mixture.prior_share) + prior]))
+        posterior = self.problem.path_density(u, none + 1.0)  # type: ignore[attr-defined]
+        return mixture + shares[0] * (posterior - mixture)
+
+
+def run(
+    problem: SlopedProblem,
+    config: SmcConfig,
+    key: PRNGKeyArray,
+    logbook: Logbook = UNRECORDED,
+) -> InferenceResult:
+    """Sample a plain model's posterior in two passes, see above; the evidence of prefixes is the first pass's."""
+    first_key, second_key = jax.random.split(key)
+    config = replace(config, replicates=REPLICATES if config.replicates == 1 else config.replicates)
+    first = horizon_smc.run(problem, config, first_key, logbook)
+    bridged = _cover(problem, first.draws)
+    folder = None if logbook.folder is None else logbook.folder / "refined"
+    correlation, moves = min(config.correlation, FORGOTTEN), max(config.max_moves, MOST_MOVES)
+    settings = replace(config, blocks=1, correlation=correlation, max_moves=moves)
+    second = horizon_smc.run(bridged, settings, second_key, Logbook(folder, logbook.resume))
+    if len(second.trace) > SHORTER * len(first.trace):
+        return first  # a shape that the fit does not cover: from the prior the way is as short, and misses no mode
+    return _joined(problem, bridged, first, second)
+
+
+def _cover(problem: SlopedProblem, draws: Draws) -> SlopedBridge:
+    """A Student-t with mean and covariance of draws, all chains together, and as much of the prior as fits them best.
+
+    A posterior as sharp as a normal needs none of the prior, but for defence; one that is the prior in some of its
+    parameters, or ends at bounds, may need more of it than of the Student-t.
+    """
+    u = np.asarray(
+        problem.to_unconstrained({name: jnp.asarray(draws[name].ravel()) for name in problem.names}), dtype=float
+    )
+    u = u[np.isfinite(u).all(axis=1)]
+    mean, factor = fit_reference(u, np.full(len(u), 1.0 / len(u)))
+    mode = Laplace(mean, factor @ factor.T, 0.0)
+    lone = ModeMixture(problem, [mode], INFLATION, DEGREES, 0.0).log_density(u)
+    advantage = evaluate_prior(problem, u) - lone
+    share = 0.5
+    for _ in range(ROUNDS):
+        share = float(np.clip(expit(advantage + logit(share)).mean(), LEAST_PRIOR, 1.0 - LEAST_PRIOR))
+    return SlopedBridge(problem, [mode], BridgeConfig(inflation=INFLATION, degrees=DEGREES, prior_share=share))
+
+
+def _joined(
+    problem: SlopedProblem, bridged: BridgedProblem, first: InferenceResult, second: InferenceResult
+) -> InferenceResult:
+    u = np.stack([second.draws[name] for name in bridged.names], axis=-1)
+    values = problem.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
+    draws = {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in problem.names}
+    ledger = Ledger()
+    rows = evaluate_rows(problem, u.reshape(-1, u.shape[-1]), problem.n_rows, ledger)
+    excluded = Counter(first.excluded) + Counter(second.excluded)
+    evaluations = first.evaluations + second.evaluations + ledger.evaluations
+    assert first.prefix_log_evidence is not None
+    assert second.log_evidence is not None
+    prefixes = first.prefix_log_evidence.copy()
+    prefixes[-1] = second.log_evidence[0]
+    replicates = np.asarray(second.details["log_evidence_replicates"])
+    return replace(
+        first,
+        draws=draws,
+        log_evidence=second.log_evidence,
+        prefix_log_evidence=prefixes,
+        log_likelihood=rows.reshape(*u.shape[:2], -1),
+        trace=[*first.trace, *second.trace],
+        rollouts=first.rollouts + second.rollouts + ledger.rollouts,
+        evaluations=evaluations,
+        excluded=dict(excluded),
+        warnings=[
+            *bound_warnings(problem, draws),
+            *exclusion_warnings(excluded, evaluations),
+            *[sentence for sentence in second.warnings if "last moves" in sentence],
+            *replicate_warnings(draws, replicates),
+        ],
+        seconds=first.seconds + second.seconds,
+        details=first.details
+        | {
+            "log_evidence_replicates": replicates.tolist(),
+            "log_evidence_first_pass": first.log_evidence,
+            "prior_share": bridged.mixture.prior_share,
+        },
+    )
