@@ -13,12 +13,27 @@ import numpy as np
 import numpyro
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from numpyro import handlers
-from numpyro.distributions import Distribution, ImproperUniform, MaskedDistribution, biject_to, constraints
+from numpyro.distributions import (
+    Cauchy,
+    Distribution,
+    ExpandedDistribution,
+    ImproperUniform,
+    Independent,
+    Laplace,
+    Logistic,
+    MaskedDistribution,
+    Normal,
+    StudentT,
+    biject_to,
+    constraints,
+)
 from numpyro.infer import init_to_uniform
 from numpyro.infer.util import compute_log_probs, constrain_fn, potential_energy, unconstrain_fn
 from numpyro.primitives import Messenger
 
 from rfdropo_bayes.errors import InputError
+
+LOCATED = (Normal, StudentT, Cauchy, Laplace, Logistic)  # priors on the whole line with a location and a scale
 
 Batch = Mapping[str, Float[Array, " n"]]
 
@@ -145,6 +160,17 @@ class NumpyroProblem:
         sites = constrain_fn(self.model, self.args, self.kwargs, self._ravelled(u))
         rows = self._single_rows({name: sites[name] for name in self._shapes})
         return self.log_prior(u[None])[0] + jnp.sum(jnp.where(shares > 0.0, shares * rows, 0.0))
+
+    def location_scale(self, u: Float[Array, " d"]) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
+        """Location and scale of each coordinate's prior given the others, at one unconstrained point; traceable.
+
+        0 and 1 where the prior is not one of these two and a shape, on the whole line.
+        """
+        sites = constrain_fn(self.model, self.args, self.kwargs, self._ravelled(u))
+        given = handlers.substitute(handlers.seed(self.model, jax.random.key(0)), data=sites)
+        trace = handlers.trace(given).get_trace(*self.args, **self.kwargs)
+        found = [_location_scale(trace[name]["fn"], shape) for name, shape in self._free_shapes.items()]
+        return jnp.concatenate([part[0] for part in found]), jnp.concatenate([part[1] for part in found])
 
     def sites(self, draws: Mapping[str, Float[np.ndarray, "*batch"]]) -> dict[str, Float[np.ndarray, "*batch *shape"]]:
         """Draws of components as draws of the model's own sites, in their shapes, with those of ``deterministic``
@@ -312,6 +338,15 @@ def _interval(support: Any, shape: tuple[int, ...]) -> list[tuple[float, float]]
     """Bounds of each component of a site."""
     low, high = (np.broadcast_to(np.asarray(end, dtype=float), shape).ravel().tolist() for end in _ends(support))
     return list(zip(low, high, strict=True))
+
+
+def _location_scale(fn: Distribution, shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """Of each component of a site; 0 and 1 unless it has them and no bounds."""
+    while isinstance(fn, Independent | ExpandedDistribution):
+        fn = fn.base_dist
+    if type(fn) not in LOCATED:
+        return jnp.zeros(int(np.prod(shape))), jnp.ones(int(np.prod(shape)))
+    return jnp.ravel(jnp.broadcast_to(fn.loc, shape)), jnp.ravel(jnp.broadcast_to(fn.scale, shape))
 
 
 def _row_count(site: Mapping[str, Any]) -> int:

@@ -11,25 +11,28 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 from numpyro.distributions import MultivariateStudentT
 from scipy.special import expit, logit
 
+from rfdropo_bayes.bayes.problem import Values
 from rfdropo_bayes.inference import horizon_smc
 from rfdropo_bayes.inference.bridge import BridgeConfig, BridgedProblem
+from rfdropo_bayes.inference.centring import CentredProblem, centred
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.hamiltonian import SlopedProblem
+from rfdropo_bayes.inference.hamiltonian import SlopedProblem, chosen_kernel
 from rfdropo_bayes.inference.horizon_smc import SmcConfig
 from rfdropo_bayes.inference.levenberg import Laplace
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.mixture import ModeMixture
+from rfdropo_bayes.inference.numpyro_problem import NumpyroProblem
 from rfdropo_bayes.inference.proposals import fit_reference
 from rfdropo_bayes.inference.result import (
-    Draws,
     InferenceResult,
     bound_warnings,
     exclusion_warnings,
@@ -41,6 +44,7 @@ FORGOTTEN, MOST_MOVES = 0.1, 40  # correlation with its start that a stage of th
 INFLATION, DEGREES = 1.1, 5.0  # of the Student-t that is fitted
 LEAST_PRIOR = 0.05  # share of the prior beside it
 SHORTER = 0.5  # of the first pass's stages is what a second one may take that has learnt something
+LOST = 0.3  # nats that passes may differ by beyond what their replicates explain
 ROUNDS = 30  # of expectation maximisation, for that share
 
 
@@ -60,8 +64,33 @@ class SlopedBridge(BridgedProblem):
         return mixture + shares[0] * (posterior - mixture)
 
 
+class WholeProblem:
+    """A plain model whose data come in together: what its rows say is one row.
+
+    Data that speak of many parameters one after the other, as groups of a hierarchy do, make prefixes a longer way than
+    a temperature of them all.
+    """
+
+    def __init__(self, problem: SlopedProblem) -> None:
+        self.problem, self.n_rows = problem, 1
+        self.names, self.units, self.bounds = problem.names, problem.units, problem.bounds
+        self.fingerprint = f"{getattr(problem, 'fingerprint', '')} whole"
+        self.status_names = getattr(problem, "status_names", {})
+        self.sample_prior, self.log_prior = problem.sample_prior, problem.log_prior
+        self.to_unconstrained, self.from_unconstrained = problem.to_unconstrained, problem.from_unconstrained
+
+    def row_log_likelihood(self, values: Values, horizon: int) -> tuple[Float[Any, "n 1"], Int[Any, " n"]]:
+        """Log likelihood of all rows."""
+        rows, status = self.problem.row_log_likelihood(values, self.problem.n_rows)
+        return np.asarray(rows).sum(axis=1, keepdims=True), status
+
+    def path_density(self, u: Float[Array, " d"], shares: Float[Array, " 1"]) -> Float[Array, ""]:
+        """Log prior plus the log likelihood times a share, at one point; traceable."""
+        return self.problem.path_density(u, jnp.full(self.problem.n_rows, shares[0]))
+
+
 def run(
-    problem: SlopedProblem,
+    problem: NumpyroProblem,
     config: SmcConfig,
     key: PRNGKeyArray,
     logbook: Logbook = UNRECORDED,
@@ -69,27 +98,31 @@ def run(
     """Sample a plain model's posterior in two passes, see above; the evidence of prefixes is the first pass's."""
     first_key, second_key = jax.random.split(key)
     config = replace(config, replicates=REPLICATES if config.replicates == 1 else config.replicates)
-    first = horizon_smc.run(problem, config, first_key, logbook)
-    bridged = _cover(problem, first.draws)
+    whole = chosen_kernel(config.kernel, problem, None) == "hamiltonian"
+    first = horizon_smc.run(WholeProblem(problem) if whole else problem, config, first_key, logbook)
+    values = {name: jnp.asarray(first.draws[name].ravel()) for name in problem.names}
+    view = centred(problem, _finite(problem.to_unconstrained(values)))
+    bridged = _cover(view, _finite(view.to_unconstrained(values)))
     folder = None if logbook.folder is None else logbook.folder / "refined"
     correlation, moves = min(config.correlation, FORGOTTEN), max(config.max_moves, MOST_MOVES)
     settings = replace(config, blocks=1, correlation=correlation, max_moves=moves)
     second = horizon_smc.run(bridged, settings, second_key, Logbook(folder, logbook.resume))
-    if len(second.trace) > SHORTER * len(first.trace):
+    if view is problem and not whole and len(second.trace) > SHORTER * len(first.trace):
         return first  # a shape that the fit does not cover: from the prior the way is as short, and misses no mode
-    return _joined(problem, bridged, first, second)
+    return _joined(problem, view, bridged, first, second)
 
 
-def _cover(problem: SlopedProblem, draws: Draws) -> SlopedBridge:
+def _finite(u: Float[Any, "n d"]) -> Float[np.ndarray, "m d"]:
+    u = np.asarray(u, dtype=float)
+    return u[np.isfinite(u).all(axis=1)]
+
+
+def _cover(problem: SlopedProblem, u: Float[np.ndarray, "n d"]) -> SlopedBridge:
     """A Student-t with mean and covariance of draws, all chains together, and as much of the prior as fits them best.
 
     A posterior as sharp as a normal needs none of the prior, but for defence; one that is the prior in some of its
     parameters, or ends at bounds, may need more of it than of the Student-t.
     """
-    u = np.asarray(
-        problem.to_unconstrained({name: jnp.asarray(draws[name].ravel()) for name in problem.names}), dtype=float
-    )
-    u = u[np.isfinite(u).all(axis=1)]
     mean, factor = fit_reference(u, np.full(len(u), 1.0 / len(u)))
     mode = Laplace(mean, factor @ factor.T, 0.0)
     lone = ModeMixture(problem, [mode], INFLATION, DEGREES, 0.0).log_density(u)
@@ -101,25 +134,33 @@ def _cover(problem: SlopedProblem, draws: Draws) -> SlopedBridge:
 
 
 def _joined(
-    problem: SlopedProblem, bridged: BridgedProblem, first: InferenceResult, second: InferenceResult
+    problem: NumpyroProblem,
+    view: SlopedProblem,
+    bridged: BridgedProblem,
+    first: InferenceResult,
+    second: InferenceResult,
 ) -> InferenceResult:
     u = np.stack([second.draws[name] for name in bridged.names], axis=-1)
-    values = problem.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
+    values = view.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
     draws = {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in problem.names}
     ledger = Ledger()
-    rows = evaluate_rows(problem, u.reshape(-1, u.shape[-1]), problem.n_rows, ledger)
+    rows = evaluate_rows(view, u.reshape(-1, u.shape[-1]), problem.n_rows, ledger)
     excluded = Counter(first.excluded) + Counter(second.excluded)
     evaluations = first.evaluations + second.evaluations + ledger.evaluations
     assert first.prefix_log_evidence is not None
     assert second.log_evidence is not None
-    prefixes = first.prefix_log_evidence.copy()
-    prefixes[-1] = second.log_evidence[0]
+    prefixes, blocks = np.full(problem.n_rows, np.nan), first.block_scores
+    prefixes[-len(first.prefix_log_evidence) :] = first.prefix_log_evidence
+    prefixes[-1] = value = second.log_evidence[0]
+    if len(blocks) == 1:
+        blocks = [{"first_row": 1, "last_row": problem.n_rows, "log_score": value, "sd": second.log_evidence[1]}]
     replicates = np.asarray(second.details["log_evidence_replicates"])
     return replace(
         first,
         draws=draws,
         log_evidence=second.log_evidence,
         prefix_log_evidence=prefixes,
+        block_scores=blocks,
         log_likelihood=rows.reshape(*u.shape[:2], -1),
         trace=[*first.trace, *second.trace],
         rollouts=first.rollouts + second.rollouts + ledger.rollouts,
@@ -130,12 +171,27 @@ def _joined(
             *exclusion_warnings(excluded, evaluations),
             *[sentence for sentence in second.warnings if "last moves" in sentence],
             *replicate_warnings(draws, replicates),
+            *_lost(first.log_evidence, second.log_evidence, len(replicates)),
         ],
         seconds=first.seconds + second.seconds,
         details=first.details
         | {
+            "horizons": tuple(block["last_row"] for block in blocks),
             "log_evidence_replicates": replicates.tolist(),
             "log_evidence_first_pass": first.log_evidence,
             "prior_share": bridged.mixture.prior_share,
+            "centring": view.share.tolist() if isinstance(view, CentredProblem) else None,
         },
     )
+
+
+def _lost(first: tuple[float, float] | None, second: tuple[float, float], replicates: int) -> list[str]:
+    """A sentence where the second pass finds less than the first: an evidence can be too low by what was missed."""
+    assert first is not None
+    less = first[0] - second[0]
+    if less < LOST + 4.0 * np.hypot(first[1], second[1]) / np.sqrt(replicates):
+        return []
+    return [
+        f"the log evidence of the first pass is higher by {less:.2g}: the second may have lost a part of the "
+        'posterior; compare with start = "prior"'
+    ]

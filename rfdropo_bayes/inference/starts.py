@@ -22,10 +22,10 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import bridge, horizon_smc, refinement
 from rfdropo_bayes.inference.checkpoints import run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.hamiltonian import SlopedProblem
 from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES, ROLLOUTS_PER_PARTICLE, SmcConfig
 from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
+from rfdropo_bayes.inference.numpyro_problem import NumpyroProblem
 from rfdropo_bayes.inference.prefix_scores import PrefixEvidence, block_scores, prefix_evidence
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.schedules import block_boundaries
@@ -99,9 +99,9 @@ def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
     return LaplaceConfig(starts=starts, survey=surveyors, rollouts=budget + surveyors * PER_SURVEYOR)
 
 
-def _refinable(problem: Problem, config: SmcConfig) -> TypeGuard[SlopedProblem]:
+def _refinable(problem: Problem, config: SmcConfig) -> TypeGuard[NumpyroProblem]:
     """A plain model: it has gradients, and rows that are no rollouts, so that nothing limits a second pass."""
-    return config.start == "auto" and config.rollouts is None and isinstance(problem, SlopedProblem)
+    return config.start == "auto" and config.rollouts is None and isinstance(problem, NumpyroProblem)
 
 
 def _worth_climbing(problem: Problem, config: SmcConfig) -> bool:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
 
 from rfdropo_bayes.inference import methods
+from rfdropo_bayes.inference.centring import CentredProblem, centred
 from rfdropo_bayes.inference.numpyro_problem import problem_from_numpyro
+
+from .test_numpyro_problem import SCHOOLS, schools_by_quadrature
 
 KEY = jax.random.key(8)
 SD, NOISE = 100.0, 0.5
@@ -53,14 +57,14 @@ def test_priors_a_thousand_times_wider_than_the_posterior():
     width = np.sqrt(np.diag(covariance))
     assert np.abs((draws.mean(axis=0) - mean) / width).max() < 0.15
     np.testing.assert_allclose(draws.std(axis=0), width, rtol=0.12)
-    values = {name: jax.numpy.asarray(result.draws[name][1, :5]) for name in problem.names}
+    values = {name: jnp.asarray(result.draws[name][1, :5]) for name in problem.names}
     np.testing.assert_allclose(result.log_likelihood[1, :5], problem.row_log_likelihood(values, 60)[0], rtol=1e-9)
 
 
 def two_places(y):
     """The sign of one parameter is not known, and the prior is wide: two modes of unequal mass."""
     place = numpyro.sample("place", dist.Normal(20.0, 50.0).expand([2]).to_event(1))
-    numpyro.sample("y", dist.Normal(jax.numpy.stack([jax.numpy.abs(place[0]), place[1]]), 0.2), obs=y)
+    numpyro.sample("y", dist.Normal(jnp.stack([jnp.abs(place[0]), place[1]]), 0.2), obs=y)
 
 
 @pytest.mark.slow
@@ -83,3 +87,66 @@ def test_a_start_at_the_prior_is_one_pass():
     result = methods.run(problem, "smc", {"particles": 50, "start": "prior"}, KEY)
     assert result.draws["effect[0]"].shape == (1, 50)
     assert "log_evidence_first_pass" not in result.details
+
+
+def hierarchy(y, spread):
+    """Effects written centred, and coefficients that belong to no hierarchy."""
+    mu = numpyro.sample("mu", dist.Normal(0.0, 5.0))
+    tau = numpyro.sample("tau", dist.HalfCauchy(5.0))
+    effect = numpyro.sample("effect", dist.Normal(mu, tau).expand([len(y)]).to_event(1))
+    numpyro.sample("y", dist.Normal(effect, spread), obs=y)
+
+
+def test_other_coordinates_are_the_same_density():
+    """The Jacobian by differentiation, and the way there and back."""
+    problem = problem_from_numpyro(hierarchy, (SCHOOLS["y"], SCHOOLS["sigma"]))
+    share = np.array([1.0, 1.0, *np.linspace(0.0, 0.9, 8)])
+    other = CentredProblem(problem, share, 1)
+    values = problem.sample_prior(KEY, 3)
+    u, v = problem.to_unconstrained(values), other.to_unconstrained(values)
+    assert np.abs(np.asarray(u - v)).max() > 0.1
+    np.testing.assert_allclose(other.from_unconstrained(v)["effect[7]"], values["effect[7]"], rtol=1e-9)
+    slope = np.linalg.slogdet(jax.vmap(jax.jacfwd(other._own))(v))[1]
+    np.testing.assert_allclose(other.log_prior(v), problem.log_prior(u) + slope, rtol=1e-9)
+    whole = jnp.ones(8)
+    np.testing.assert_allclose(other.path_density(v[1], whole), problem.path_density(u[1], whole) + slope[1], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_effects_are_centred_as_far_as_the_data_speak_of_them():
+    """A normal likelihood of deviation 0.01 knows an effect better than a spread near 3 does, one of 1000 does not."""
+    spread = np.array([0.01, 1000.0, 3.0])
+    problem = problem_from_numpyro(hierarchy, (np.array([4.0, 0.0, -2.0]), spread))
+    rng = np.random.default_rng(3)
+    u = np.column_stack([rng.normal(size=50), np.log(3.0) + 0.1 * rng.normal(size=50), rng.normal(size=(50, 3))])
+    share = np.asarray(centred(problem, u).share)
+    np.testing.assert_allclose(share, [1.0, 1.0, 1.0, 0.0, 0.5], atol=0.02)
+    flat = problem_from_numpyro(regression, wide_data(2, 5))
+    assert centred(flat, rng.normal(size=(50, 2))) is flat
+
+
+@pytest.mark.slow
+def test_a_series_in_time_is_no_hierarchy():
+    def walk(y):
+        x = 0.0
+        for t in range(12):
+            x = numpyro.sample(f"x{t}", dist.Normal(x, 1.0))
+        numpyro.sample("y", dist.Normal(x, 1.0), obs=y)
+
+    problem = problem_from_numpyro(walk, (np.array([1.0]),))
+    assert centred(problem, np.random.default_rng(1).normal(size=(20, 12))) is problem
+
+
+@pytest.mark.slow
+def test_centred_schools_agree_with_quadrature():
+    """Written centred they are a funnel. Replicates scatter by 0.01 nat (measured); means of 4000 draws by 0.02
+    deviations, which are 3.3 for mu and about 3 for tau; thresholds are five times that."""
+    problem = problem_from_numpyro(hierarchy, (SCHOOLS["y"], SCHOOLS["sigma"]))
+    result = methods.run(problem, "smc", {"particles": 1000, "replicates": 4}, KEY)
+    evidence, (mean, sd), tau = schools_by_quadrature()
+    assert result.log_evidence[1] < 0.05
+    assert result.log_evidence[0] == pytest.approx(evidence, abs=0.06)
+    assert result.draws["mu"].mean() == pytest.approx(mean, abs=0.33)
+    assert result.draws["mu"].std() == pytest.approx(sd, rel=0.1)
+    assert result.draws["tau"].mean() == pytest.approx(tau, abs=0.3)
+    assert result.warnings == []
