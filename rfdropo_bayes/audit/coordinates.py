@@ -105,6 +105,11 @@ class Coordinates:
         return {name: np.asarray(values, dtype=float) for name, values in draws.items()}
 
     @cached_property
+    def prior_deviations(self) -> dict[str, float]:
+        """Standard deviation of each prior in physical units."""
+        return {name: float(values.std()) for name, values in self._draws.items()}
+
+    @cached_property
     def _null(self) -> np.ndarray:
         return np.array([p.spec.nominal for p in self.space.parameters], dtype=float)
 

@@ -30,6 +30,7 @@ RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
 NEAR = 1.3  # times the error of the model that knows what is hidden
 ONCE = 'data.fit=["fit_1.nc", "screen.nc"]'  # an override that leaves the repeats out
 WHOLE = "with_whole_library"
+LEARNT = 0.5  # of a prior's deviation that a posterior's is below where the data, not the prior, say the size
 TRIES = 8  # mechanisms that are tried until one reaches the wanted size
 
 
@@ -156,8 +157,9 @@ def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path)
     answers: list[Answer] = []
     given = [] if condition.repeats else [ONCE]
     content = run_audit(hidden.experiment, place / "audit", workshop=_WORKSHOP, overrides=given, inspect=answers.append)
+    prior = answers[0].question.coordinates.prior_deviations
     judged = {
-        **judge(content, names, hidden),
+        **judge(content, names, hidden, prior),
         "error_over_oracle": error_over_oracle(answers[0], names, hidden),
     }
     if condition.removed:
@@ -165,7 +167,7 @@ def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path)
         shutil.copytree(place / "audit" / JOURNAL, place / "removed" / JOURNAL, dirs_exist_ok=True)
         less = [_without(content, names, exclude)]
         content = run_audit(hidden.experiment, place / "removed", workshop=_WORKSHOP, overrides=less, resume=True)
-        judged = {**judge(content, names, hidden), "error_over_oracle": None, WHOLE: judged}
+        judged = {**judge(content, names, hidden, prior), "error_over_oracle": None, WHOLE: judged}
     return {
         "hidden": names,
         "unreached": unreached,
@@ -217,15 +219,25 @@ def _without(content: Mapping[str, Any], names: Sequence[str], exclude: Sequence
     return f"audit.exclude={json.dumps(sorted(out & set(REGISTRY)))}"
 
 
-def judge(content: Mapping[str, Any], names: Sequence[str], hidden: Hidden) -> dict[str, Any]:
+def judge(
+    content: Mapping[str, Any], names: Sequence[str], hidden: Hidden, prior: Mapping[str, float]
+) -> dict[str, Any]:
     """What the audit said, against what is there.
 
     ``named_first``: the first finding is a hidden mechanism, or has it in its class. ``covered``: the 90 % interval of
     each parameter of a mechanism named itself holds the truth, in the identifiable form where there is one.
+    ``undetermined``: those of them whose interval is the prior's rather than the data's. A hidden size is what reaches
+    rho, not a draw from the prior, so that such an interval holds it or not as the prior happens to lie.
+
+    Args:
+        content: of audit.json.
+        names: what is hidden.
+        hidden: see `Hidden`.
+        prior: standard deviations of the priors, by parameter.
     """
     findings = content["findings"]
     classes = [set(f["equivalence_class"]) for f in findings]
-    covered = {}
+    covered, undetermined = {}, []
     for finding in findings:
         if finding["mechanism"] in names:
             forms = dict(finding["parameters"])
@@ -235,6 +247,7 @@ def judge(content: Mapping[str, Any], names: Sequence[str], hidden: Hidden) -> d
                 truth = hidden.values[name] * hidden.values[STIFFNESS] ** -row["power"]
                 covered[title] = bool(row["q05"] <= truth <= row["q95"])
             covered |= {n: bool(r["q05"] <= hidden.values[n] <= r["q95"]) for n, r in forms.items()}
+            undetermined += [n for n, row in forms.items() if row["sd"] > LEARNT * prior[n]]
     return {
         "verdict": content["verdict"],
         "named": [f["mechanism"] for f in findings],
@@ -243,6 +256,7 @@ def judge(content: Mapping[str, Any], names: Sequence[str], hidden: Hidden) -> d
         "all_named": bool(names) and all(any(n in c for c in classes) for n in names),
         "explained_fraction": content["gain"]["explained_fraction"] if content["gain"] else None,
         "covered": covered,
+        "undetermined": undetermined,
         "audit_seconds": content["seconds"],
     }
 
@@ -275,7 +289,8 @@ def summarise(condition: Condition, rows: Sequence[Mapping[str, Any]]) -> dict[s
         if row["hidden"] and not row["named_first"]:
             key = f"{' + '.join(row['hidden'])} -> {row['named'][0] if row['named'] else 'none'}"
             confusions[key] = confusions.get(key, 0) + 1
-    covered = [value for row in rows for value in row["covered"].values()]
+    covered = [value for row in rows for name, value in row["covered"].items() if name not in row["undetermined"]]
+    every = [value for row in rows for value in row["covered"].values()]
     ratios = [r["error_over_oracle"] for r in rows if r["error_over_oracle"] is not None and r["named_first"]]
     sizes = [row["class_sizes"][0] for row in rows if row["class_sizes"]]
     return {
@@ -286,7 +301,8 @@ def summarise(condition: Condition, rows: Sequence[Mapping[str, Any]]) -> dict[s
         "named_first": sum(row["named_first"] for row in rows),
         "all_named": sum(row["all_named"] for row in rows),
         "median_class_size": float(np.median(sizes)) if sizes else None,
-        "interval_coverage": float(np.mean(covered)) if covered else None,
+        "intervals": [sum(covered), len(covered)],
+        "intervals_of_undetermined_sizes": [sum(every) - sum(covered), len(every) - len(covered)],
         "within_1.3_of_the_oracle": float(np.mean(np.array(ratios) <= NEAR)) if ratios else None,
         "discretisation_rho": [round(row["rho"]["discretisation"], 4) for row in rows],
         "median_audit_seconds": float(np.median([row["audit_seconds"] for row in rows])) if rows else None,
@@ -307,10 +323,8 @@ def as_table(content: Mapping[str, Any]) -> str:
     ]
     for name, row in content["conditions"].items():
         verdicts = ", ".join(f"{verdict} {count}" for verdict, count in sorted(row["verdicts"].items()))
-        share, near = (
-            "-" if row[key] is None else f"{100 * row[key]:.0f} %"
-            for key in ("interval_coverage", "within_1.3_of_the_oracle")
-        )
+        share = "{} of {}".format(*row["intervals"]) if row["intervals"][1] else "-"
+        near = "-" if row["within_1.3_of_the_oracle"] is None else f"{100 * row['within_1.3_of_the_oracle']:.0f} %"
         rho = max(row["discretisation_rho"], default=0.0)
         right, first, every = (_rate(row, key) for key in ("right_verdict", "named_first", "all_named"))
         lines.append(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.workflow.audit_study import CONDITIONS, LEDGER, TABLE, WHOLE, _turn, judge, run_study
+from rfdropo_bayes.workflow.audit_study import CONDITIONS, LEDGER, TABLE, WHOLE, _turn, judge, run_study, summarise
 from rfdropo_bayes.workflow.hidden_effects import Hidden
 
 CONTENT = {
@@ -20,7 +20,7 @@ CONTENT = {
         {
             "mechanism": "payload",
             "equivalence_class": ["payload", "base_tilt"],
-            "parameters": {"payload_mass": {"q05": 0.2, "q95": 0.3}},
+            "parameters": {"payload_mass": {"q05": 0.2, "q95": 0.3, "sd": 0.03}},
             "relative": {
                 "payload_mass_over_young_modulus": {
                     "parameter": "payload_mass",
@@ -33,20 +33,34 @@ CONTENT = {
     ],
 }
 
+PRIOR = {"payload_mass": 0.1}
+
 
 def hidden(mass: float) -> Hidden:
     return Hidden({"payload_mass": mass, "young_modulus": 2e6}, {"discretisation": 0.01}, Path(), np.zeros((6, 1, 1)))
 
 
 def test_a_size_is_judged_in_the_form_that_can_be_known():
-    found = judge(CONTENT, ["payload"], hidden(0.02))
+    found = judge(CONTENT, ["payload"], hidden(0.02), PRIOR)
     assert found["covered"] == {"payload_mass_over_young_modulus": True}  # though 0.02 kg is not in [0.2, 0.3]
     assert found["named_first"]
-    assert not judge(CONTENT, ["payload"], hidden(0.03))["covered"]["payload_mass_over_young_modulus"]
-    other = judge(CONTENT, ["base_tilt"], hidden(0.02))
+    assert not judge(CONTENT, ["payload"], hidden(0.03), PRIOR)["covered"]["payload_mass_over_young_modulus"]
+    other = judge(CONTENT, ["base_tilt"], hidden(0.02), PRIOR)
     assert other["named_first"]
     assert other["covered"] == {}
-    assert not judge(CONTENT, ["backlash"], hidden(0.02))["named_first"]
+    assert not judge(CONTENT, ["backlash"], hidden(0.02), PRIOR)["named_first"]
+
+
+@pytest.mark.parametrize(("scale", "undetermined"), [(0.1, []), (0.05, ["payload_mass"])])
+def test_an_interval_that_is_the_priors_is_counted_apart(scale, undetermined):
+    finding = {**CONTENT["findings"][0], "relative": {}}
+    found = judge({**CONTENT, "findings": [finding]}, ["payload"], hidden(0.25), {"payload_mass": scale})
+    assert found["covered"] == {"payload_mass": True}
+    assert found["undetermined"] == undetermined
+    row = {"hidden": ["payload"], "rho": {"discretisation": 0.0}, "unreached": [], "error_over_oracle": None, **found}
+    counted = summarise(CONDITIONS[1], [row, row])
+    assert counted["intervals"] == ([2, 2] if not undetermined else [0, 0])
+    assert counted["intervals_of_undetermined_sizes"] == ([0, 0] if not undetermined else [2, 2])
 
 
 def test_every_mechanism_has_its_turn_before_one_has_its_second():
@@ -57,7 +71,7 @@ def test_every_mechanism_has_its_turn_before_one_has_its_second():
 
 def test_a_study_counts_what_its_ledger_holds_and_lists_confusions(tmp_path):
     def line(index: int, name: str, ratio: float | None, seed: int = 7) -> str:
-        judged = judge(CONTENT, [name], hidden(0.02))
+        judged = judge(CONTENT, [name], hidden(0.02), PRIOR)
         result = {"hidden": [name], "rho": {"discretisation": 0.01 * index}, **judged}
         job = {"condition": "rho_0.5", "index": index, "seed": seed}
         return json.dumps(
@@ -85,14 +99,14 @@ def test_a_study_counts_what_its_ledger_holds_and_lists_confusions(tmp_path):
     assert found["hours"] == pytest.approx(0.03)
     assert found["core_hours"] == pytest.approx(0.015)
     table = (tmp_path / TABLE).read_text()
-    assert "| rho_0.5 | 3 | equivalent 3 | 3 [29, 100] | 2 [9, 99] | 2 [9, 99] | 2.0 | 100 % | 50 % | 0.020 |" in table
+    assert "| rho_0.5 | 3 | equivalent 3 | 3 [29, 100] | 2 [9, 99] | 2 [9, 99] | 2.0 | 2 of 2 | 50 % | 0.020 |" in table
     assert "backlash -> payload (1)" in table
     with pytest.raises(InputError, match="unknown condition"):
         run_study(tmp_path, 0, 7, conditions=["rho_9"])
 
 
 def test_audits_before_a_mechanism_was_removed_count_where_nothing_was_removed(tmp_path):
-    judged = judge(CONTENT, ["payload"], hidden(0.02))
+    judged = judge(CONTENT, ["payload"], hidden(0.02), PRIOR)
     shared = {"hidden": ["payload"], "rho": {"discretisation": 0.01}, "seconds": 36.0, "core_seconds": 18.0}
     without = {**judged, "verdict": "unexplained", "named_first": False, "error_over_oracle": None, "unreached": []}
     result = {**shared, **without, WHOLE: {**judged, "error_over_oracle": 1.1}}
