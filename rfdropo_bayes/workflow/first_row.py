@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.model import RecordingSet
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.workflow.cube_start import OFFSETS
@@ -16,6 +17,7 @@ from rfdropo_bayes.workflow.cube_start import OFFSETS
 SMALLEST_ERROR = 1e-6  # [m]
 STEP = 0.05  # of a central difference, in prior deviations
 ROUNDS = 2  # of linearisation: the pose at rest is all but linear in what is found from it
+LEAST_SHARE = 0.1  # of the draws that counts after they were weighed: more says that the model is wrong, not which draw
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 
@@ -60,6 +62,56 @@ def match_first_row(
         if seen:
             values = _with_deviations(problem, values, seen[0], own, errors, jax.random.fold_in(key, number))
     return _with_offsets(problem, values, names, errors) if shifted else values
+
+
+def weighed_by_first_row(
+    recordings: RecordingSet,
+    position: Float[np.ndarray, "n recording marker 3"],
+    names: Sequence[str],
+    errors: Mapping[str, float],
+    key: PRNGKeyArray,
+) -> Int[np.ndarray, "n recording"]:
+    """Draws to predict each recording with: resampled by how well they predict its first row.
+
+    The likelihood of a row is normal, with the model's own error for each marker. Where it would leave less than a
+    tenth of the draws (in effective sample size), it is raised to a power that leaves as many.
+
+    Args:
+        recordings: those to predict.
+        position: simulated markers [m] in their first rows.
+        names: those among them whose first row no draw has seen yet.
+        errors: how far [m] the model was off for each marker; without, all draws count the same.
+        key: of the resampling.
+    """
+    count = len(position)
+    index = np.tile(np.arange(count)[:, None], (1, len(recordings.names)))
+    sd = _errors(recordings.markers, errors)[:, None] / np.sqrt(3.0)
+    for place, name in enumerate(recordings.names):
+        valid = recordings.line.valid[place, 0]
+        if not errors or name not in names or not valid.any():
+            continue
+        error = ((recordings.position[place, 0] - position[:, place]) / sd)[:, valid]
+        weight = _tempered(-0.5 * np.sum(error**2, axis=(1, 2)))
+        offset = float(jax.random.uniform(jax.random.fold_in(key, place)))
+        index[:, place] = np.searchsorted(np.cumsum(weight), (np.arange(count) + offset) / count).clip(max=count - 1)
+    return index
+
+
+def _tempered(log_weight: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Normalised weights, flattened by bisection of a power where too few draws would count."""
+
+    def weights(power: float) -> np.ndarray:
+        weight = np.exp(power * (log_weight - log_weight.max()))
+        return weight / weight.sum()
+
+    least = LEAST_SHARE * len(log_weight)
+    low, high = 0.0, 1.0
+    if 1.0 / np.sum(weights(1.0) ** 2) >= least:
+        return weights(1.0)
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if 1.0 / np.sum(weights(middle) ** 2) >= least else (low, middle)
+    return weights(low)
 
 
 def _with_offsets(

@@ -17,7 +17,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.workflow.cube_start import measured_objects, with_measured_starts
-from rfdropo_bayes.workflow.first_row import match_first_row
+from rfdropo_bayes.workflow.first_row import match_first_row, weighed_by_first_row
 
 FITTED, MARKER_ERRORS = "fitted_recordings", "marker_errors_m"  # among the attributes of a posterior
 
@@ -65,7 +65,8 @@ def predict_new(
     A parameter that was free per recording takes, for a new one, the values it had in the fitted recordings, one of
     them at random for every draw; what is of a group of recordings takes, for a new group, values from the spread
     between groups. The offset of the measuring frame and the deviations of a new group are then conditioned on the
-    first row (`match_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
+    first row (`match_first_row`), and for a new recording of a known group draws count as they predict its first row
+    (`weighed_by_first_row`). A further piece of a fitted recording keeps the parameters of that recording.
 
     A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone. A cube starts
     where it was measured in the first row.
@@ -81,11 +82,13 @@ def predict_new(
     problem = CalibrationProblem(fresh, chunk=chunk)
     own = {whole(name) for name in fitted}
     drawn = [p for p in space.parameters if p.added_to and p.name not in values]
-    extended = match_first_row(problem, extended, [n for n in names if whole(n) not in own], drawn, errors or {}, key)
+    new = [n for n in names if whole(n) not in own]
+    extended = match_first_row(problem, extended, new, drawn, errors or {}, key)
     placed, extended = with_measured_starts(fresh, trajectories, extended)
     if placed is not fresh:
         problem = CalibrationProblem(placed, chunk=chunk)
-    return _predictions(problem, extended, key, "test", None)
+    matched = {member for p in drawn for member in p.members}
+    return _predictions(problem, extended, key, "test", unseen=[n for n in new if n not in matched], errors=errors)
 
 
 def _for_new_recordings(
@@ -133,11 +136,32 @@ def _deviations(fitted: Sequence[Parameter], groups: Mapping[str, tuple[str, ...
 
 
 def _predictions(
-    problem: CalibrationProblem, values: Batch, key: PRNGKeyArray, split: str, prior: Batch | None
+    problem: CalibrationProblem,
+    values: Batch,
+    key: PRNGKeyArray,
+    split: str,
+    prior: Batch | None = None,
+    *,
+    unseen: Sequence[str] = (),
+    errors: Mapping[str, float] | None = None,
 ) -> list[RecordingPrediction]:
+    """Predictions of the recordings of a problem; draws count for those ``unseen`` as they predict the first row."""
     recordings = problem.model.recordings
-    noisy, mean, pose = _ended_well(problem, values, key)
-    before = None if prior is None else _ended_well(problem, prior, key)[0]
+    position, pose, fine = _ended_well(problem, values)
+    chosen = weighed_by_first_row(recordings, position[:, :, 0], unseen, errors or {}, key)
+    noisy = position + problem.draw_noise(key, fine)
+    before = None
+    if prior is not None:
+        clean, _, drawn = _ended_well(problem, prior)
+        before = (clean + problem.draw_noise(key, drawn)).astype(np.float32)
+    for i, name in enumerate(recordings.names):
+        if name in unseen:  # noise of their own for draws that count more than once
+            again = {parameter: column[chosen[:, i]] for parameter, column in fine.items()}
+            noise = problem.draw_noise(jax.random.fold_in(key, i), again)[:, i]
+            position[:, i] = position[chosen[:, i], i]
+            noisy[:, i] = position[:, i] + noise
+            if pose is not None:
+                pose[:, i] = pose[chosen[:, i], i]
     return [
         RecordingPrediction(
             name,
@@ -147,22 +171,19 @@ def _predictions(
             recordings.position[i, :rows],
             recordings.line.valid[i, :rows],
             noisy[:, i, :rows].astype(np.float32),
-            mean[i, :rows],
-            None if before is None else before[:, i, :rows].astype(np.float32),
+            position[:, i, :rows].mean(axis=0),
+            None if before is None else before[:, i, :rows],
             object_pose=None if pose is None else pose[:, i, :rows],
         )
         for i, (name, rows) in enumerate(zip(recordings.names, recordings.rows, strict=True))
     ]
 
 
-def _ended_well(
-    problem: CalibrationProblem, values: Batch, key: PRNGKeyArray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Noisy predictions, their noise-free mean and the poses of the object, of the rollouts that ended well."""
+def _ended_well(problem: CalibrationProblem, values: Batch) -> tuple[np.ndarray, np.ndarray | None, Batch]:
+    """Noise-free positions and poses of the object, of the rollouts that ended well, and their values."""
     position, pose, status = problem.predict_scene(values)
     fine = status == 0
     if not fine.any():
         raise InputError("no rollout under the posterior ended well", where="prediction", remedy="narrow the priors")
-    noise = problem.draw_noise(key, values)
     pose = None if pose is None else measured_objects(problem, pose, values)[fine]
-    return (position + noise)[fine], position[fine].mean(axis=0), pose
+    return position[fine], pose, {name: np.asarray(column)[fine] for name, column in values.items()}

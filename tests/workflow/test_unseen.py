@@ -19,7 +19,7 @@ from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.simulators.parameters import ParameterSpec
-from rfdropo_bayes.workflow.first_row import match_first_row
+from rfdropo_bayes.workflow.first_row import match_first_row, weighed_by_first_row
 from rfdropo_bayes.workflow.prediction import MARKER_ERRORS, _for_new_recordings
 from rfdropo_bayes.workflow.unseen import run_prediction
 
@@ -226,3 +226,20 @@ def test_deviations_given_a_first_row_are_draws_from_the_linear_model_s_posterio
         match_first_row(problem, values, ["new"], drawn, {}, jax.random.key(2))["level_deviation@new"],
         values["level_deviation@new"],
     )
+
+
+def test_draws_count_as_they_predict_the_first_row():
+    """Against the weighted mean of the closed form; a row that all but a few draws miss leaves a tenth of them."""
+    simulated = np.random.default_rng(0).normal(size=(4000, 2, 1, 3))
+    measured = np.full((2, 1, 1, 3), 1.0)
+    line = SimpleNamespace(valid=np.ones((2, 1, 1), dtype=bool))
+    recordings = SimpleNamespace(names=("seen", "new"), markers=("a",), position=measured, line=line)
+    index = weighed_by_first_row(recordings, simulated, ["new"], {"a": 2.0 * np.sqrt(3.0)}, jax.random.key(0))
+    np.testing.assert_array_equal(index[:, 0], np.arange(4000))
+    drawn = simulated[index[:, 1], 1, 0]
+    # prior N(0, 1), a measurement of 1 with deviation 2: the posterior is N(1/5, 4/5); 5 standard errors of the draws
+    np.testing.assert_allclose(drawn.mean(axis=0), 0.2, atol=5.0 * np.sqrt(0.8 / 3000))
+    np.testing.assert_allclose(drawn.std(axis=0), np.sqrt(0.8), rtol=0.08)
+    few = weighed_by_first_row(recordings, simulated, ["new"], {"a": 1e-3}, jax.random.key(0))[:, 1]
+    share = np.bincount(few, minlength=4000) / 4000
+    assert 1.0 / np.sum(share**2) == pytest.approx(400, rel=0.1)
