@@ -64,15 +64,17 @@ class ModeMixture:
         return draws
 
     def log_density(self, u: Float[Any, "n d"]) -> Float[np.ndarray, " n"]:
-        """Log density, normalised."""
+        """Log density, normalised; minus infinity where coordinates are not finite."""
+        u = np.asarray(u)
+        held = np.isfinite(u).all(axis=1)
+        u = np.where(held[:, None], u, 0.0)
         parts = [
-            np.log(share)
-            + np.atleast_1d(multivariate_t.logpdf(np.asarray(u), mean, factor @ factor.T, df=self.degrees))
+            np.log(share) + np.atleast_1d(multivariate_t.logpdf(u, mean, factor @ factor.T, df=self.degrees))
             for share, mean, factor in zip(self.share, self.means, self.factors, strict=True)
         ]
         if self.prior_share > 0.0:
-            parts.append(np.log(self.prior_share) + evaluate_prior(self.problem, np.asarray(u)))
-        return logsumexp(np.stack(parts), axis=0)
+            parts.append(np.log(self.prior_share) + evaluate_prior(self.problem, u))
+        return np.where(held, logsumexp(np.stack(parts), axis=0), -np.inf)
 
 
 def covering(problem: Problem, modes: list[Laplace], key: PRNGKeyArray) -> list[Laplace]:
