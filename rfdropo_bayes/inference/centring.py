@@ -22,6 +22,7 @@ from rfdropo_bayes.inference.numpyro_problem import NumpyroProblem
 
 DRAWS = 64  # at which the data's information is looked at
 VARIES = 1e-9  # relative: what moves less with the draws is a constant
+MOST_KNOWN = 1e50  # information that is more than this is a singularity
 DEEPEST = 8  # levels of a hierarchy
 CLOSE = 1e-6  # relative error of a round trip
 
@@ -97,9 +98,9 @@ def centred(problem: NumpyroProblem, u: Float[np.ndarray, "n d"]) -> NumpyroProb
     if not moves.any():
         return problem
     members = np.flatnonzero(moves)
-    information = np.maximum(_information(problem, u, members), 0.0)
+    known = np.clip(np.nan_to_num(_information(problem, u, members)), 0.0, MOST_KNOWN) * scale[:, members] ** 2
     share = np.ones(u.shape[1])
-    share[members] = np.nanmean(information / (information + scale[:, members] ** -2.0), axis=0)
+    share[members] = np.mean(known / (1.0 + known), axis=0)
     for depth in range(1, DEEPEST + 1):
         found = CentredProblem(problem, share, depth)
         back = found._own_batch(found._there_batch(jnp.asarray(u)))
