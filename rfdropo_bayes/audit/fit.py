@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy.optimize import least_squares
 from scipy.stats import norm
 
+from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.journal import Arrays, Journal, digest
 from rfdropo_bayes.audit.measurements import Measurements
@@ -143,6 +144,24 @@ def _around(target: Target, x: np.ndarray, free: np.ndarray, residual: np.ndarra
     inside = np.log(np.maximum(norm.cdf((high - x[free]) / spread) - norm.cdf((low - x[free]) / spread), 1e-12))
     evidence = -0.5 * float(residual @ residual) + log_prior + 0.5 * float(np.linalg.slogdet(covariance)[1])
     return Fit(x, free, residual, jacobian, covariance, evidence + float(np.sum(inside - beyond)))
+
+
+def widened(fit: Fit, coordinates: Coordinates) -> Fit:
+    """A fit as it would be under priors no narrower than the sizes found, to first order.
+
+    The prior of a candidate's size says what is usual, and decides whether the candidate is believed. Once it is, a
+    size of many prior deviations would be drawn back towards null by several posterior deviations. Sizes below one
+    prior deviation stay as they are.
+    """
+    z = np.where(coordinates.affine, fit.x / coordinates.prior_sd, 0.0)[fit.free]
+    sd = coordinates.prior_sd[fit.free]
+    less = (1.0 - 1.0 / np.maximum(np.abs(z), 1.0) ** 2) / sd**2
+    if not less.any():
+        return fit
+    covariance = np.linalg.inv(np.linalg.inv(fit.covariance) - np.diag(less))
+    x = fit.x.copy()
+    x[fit.free] += covariance @ (less * x[fit.free])
+    return replace(fit, x=np.clip(x, *coordinates.bounds), covariance=covariance)
 
 
 def fit_base(

@@ -13,7 +13,7 @@ from rfdropo_bayes.audit.affordable import unaffordable
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step
-from rfdropo_bayes.audit.fit import Fit, Target, climb, fit_base
+from rfdropo_bayes.audit.fit import Fit, Target, climb, fit_base, widened
 from rfdropo_bayes.audit.forward import Forward, Lanes
 from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
 from rfdropo_bayes.audit.journal import Journal
@@ -64,7 +64,8 @@ class Answer:
     """What an audit found; see the attributes' own classes.
 
     ``unexamined`` holds candidates that would have taken too long, with the minutes; ``looks`` are the looks at the
-    base model and after each step; ``stages`` the explained fraction after each step.
+    base model and after each step; ``stages`` the explained fraction after each step; ``sizes`` is the last model's fit
+    under priors that do not pull, and ``draws`` are from it.
     """
 
     verdict: str
@@ -80,6 +81,7 @@ class Answer:
     remainder: Remainder
     predictions: tuple[Prediction, Prediction] | None
     unseen: Unseen | None
+    sizes: Fit
     draws: Float[np.ndarray, "draw d"]
     rollouts: int
     seconds: float
@@ -120,8 +122,9 @@ def audit(
     extended = steps[-1].fit if steps else base
     gain, stages, held_out, predictions, unseen = _measured(question, target, inquiry, base, steps, rng)
     final = _final_p(question, target, extended, inquiry, steps, last)
-    sizes = [len(step.members) for step in steps]
-    verdict = decide(question.rules, looks[0].omnibus.p, final if steps else None, sizes, gain, target.noise.doubtful)
+    members = [len(step.members) for step in steps]
+    verdict = decide(question.rules, looks[0].omnibus.p, final if steps else None, members, gain, target.noise.doubtful)
+    sizes = widened(extended, question.coordinates)
     low, high = question.coordinates.bounds
     return Answer(
         verdict,
@@ -137,7 +140,8 @@ def audit(
         describe_remainder(target.measurements, extended.residual, target.noise),
         predictions,
         unseen,
-        extended.draws(np.random.default_rng([question.seed, 5]), 1000, low, high),
+        sizes,
+        sizes.draws(np.random.default_rng([question.seed, 5]), 1000, low, high),
         target.forward.rollouts + (finer.rollouts if finer else 0),
         time.monotonic() - began,
     )

@@ -155,7 +155,7 @@ def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any
 def _relative_sizes(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any]:
     """Masses, forces and stiffnesses over Young's modulus: cables that impose lengths leave their common scale free,
     so that only the ratio is known where no force was measured. First-order error propagation in logarithms."""
-    coordinates, fit = answer.question.coordinates, answer.extended
+    coordinates, fit = answer.question.coordinates, answer.sizes
     if STIFFNESS not in coordinates.names[: coordinates.base]:
         return {}
     place = {int(i): k for k, i in enumerate(fit.free)}
