@@ -219,6 +219,7 @@ def test_drag_and_wall_forces():
         np.testing.assert_allclose(load.force.sum(0), [-1e3 * LENGTH * share, 0.0, 0.0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_terminal_velocity():
     """A free bar falls sideways no faster than sqrt(m g / c A)."""
     free = bar()._replace(clamped_stations=0)

@@ -106,7 +106,7 @@ def test_agrees_with_the_reference():
     assert np.abs(plain.position - position).max() > 1e-3, "the effects do nothing"
 
 
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_null_values_change_nothing(precision):
     material, displacement = case(4)
     effects = random_effects(5)

@@ -75,6 +75,7 @@ def test_central_differences_agree_with_forward_derivatives():
     np.testing.assert_allclose(forward.linearise(u)[1], central.linearise(u)[1], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_nonlinear_model_agrees_with_smc():
     """Both estimate means to about 0.03 sd; Laplace's mode is off by O(1 / n), most for the noise (0.3 sd)."""
     problem = Decay()
