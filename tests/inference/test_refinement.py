@@ -139,12 +139,12 @@ def test_a_series_in_time_is_no_hierarchy():
 
 @pytest.mark.slow
 def test_centred_schools_agree_with_quadrature():
-    """Written centred they are a funnel. Replicates scatter by 0.01 nat (measured); means of 4000 draws by 0.02
-    deviations, which are 3.3 for mu and about 3 for tau; thresholds are five times that."""
+    """Written centred they are a funnel. Replicates scatter by 0.01 to 0.05 nat (two seeds), for which 0.15 is allowed,
+    their mean by half of that; means of 4000 draws by 0.02 deviations, which are 3.3 for mu and about 3 for tau."""
     problem = problem_from_numpyro(hierarchy, (SCHOOLS["y"], SCHOOLS["sigma"]))
     result = methods.run(problem, "smc", {"particles": 1000, "replicates": 4}, KEY)
     evidence, (mean, sd), tau = schools_by_quadrature()
-    assert result.log_evidence[1] < 0.05
+    assert result.log_evidence[1] < 0.15
     assert result.log_evidence[0] == pytest.approx(evidence, abs=0.06)
     assert result.draws["mu"].mean() == pytest.approx(mean, abs=0.33)
     assert result.draws["mu"].std() == pytest.approx(sd, rel=0.1)
