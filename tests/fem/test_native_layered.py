@@ -115,7 +115,7 @@ def test_agrees_with_reference(nodes_across, precision):
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-@pytest.mark.parametrize("nodes_across", [2, 3])
+@pytest.mark.parametrize("nodes_across", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_settles_like_the_reference(nodes_across, precision):
     """Static equilibrium under random cable displacements, and the motion from there."""
     system, _ = body_with_cables(nodes_across)

@@ -97,6 +97,7 @@ def hierarchy(y, spread):
     numpyro.sample("y", dist.Normal(effect, spread), obs=y)
 
 
+@pytest.mark.slow
 def test_other_coordinates_are_the_same_density():
     """The Jacobian by differentiation, and the way there and back."""
     problem = problem_from_numpyro(hierarchy, (SCHOOLS["y"], SCHOOLS["sigma"]))

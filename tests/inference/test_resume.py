@@ -76,9 +76,8 @@ def same(first, second):
     np.testing.assert_equal(first.trace, second.trace)
 
 
-@pytest.mark.parametrize(
-    ("method", "options"), [CASES[0], *(pytest.param(*case, marks=pytest.mark.slow) for case in CASES[1:])]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("method", "options"), CASES)
 def test_resumed_after_a_kill_at_any_stage(method, options, tmp_path):
     problem, counting = problem_for(method), Counting()
     whole = methods.run(problem, method, options, KEY, progress=counting)

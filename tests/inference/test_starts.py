@@ -82,6 +82,7 @@ def test_block_scores_are_there_without_having_passed_the_blocks(fitted):
     assert fitted[1].block_scores[-1]["last_row"] == 40
 
 
+@pytest.mark.slow
 def test_a_broad_posterior_is_still_reached_from_the_prior():
     result = methods.run(LinearGaussian(), "smc", {"rollouts": 60000, "blocks": 2}, KEY)
     assert result.details["start"] == "prior"
@@ -139,7 +140,8 @@ def test_climbs_expect_half_of_their_number_at_the_next_horizon():
     assert steps == int(1200.0 / 3.0 / 4.0 * 4.0 / 19.0)
 
 
-@pytest.mark.parametrize("budget", [pytest.param(2500, marks=pytest.mark.slow), 4000])
+@pytest.mark.slow
+@pytest.mark.parametrize("budget", [2500, 4000])
 def test_the_budget_covers_climbs_sampler_and_scores(budget):
     """The whole is within the budget, whatever the parts take; scores are left out before it is exceeded."""
     problem = LinearGaussian(n_rows=40, d=6, noise=1e-2)

@@ -84,6 +84,7 @@ def test_sofa_reaching_is_followed_to_the_last_digit(sofa, tmp_path, monkeypatch
     assert Trajectory.load(tmp_path / "trajectory.nc").synthetic
 
 
+@pytest.mark.slow
 def test_sofa_pushing_is_followed_before_contact(sofa, tmp_path, monkeypatch, capsys):
     recordings = "['sofa_trunk/push_2.csv', {observations='sofa_trunk/push_1.csv', rows=[0, 10]}]"
     settings = f"data.fit={recordings}", "simulator.push=false"
