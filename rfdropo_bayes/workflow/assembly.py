@@ -82,10 +82,16 @@ def expand_groups(table: Mapping[str, Entry], specs: Sequence[ParameterSpec]) ->
 def pooling(
     experiment: Experiment, specs: Sequence[ParameterSpec], fitted: Sequence[str], others: Sequence[str] = ()
 ) -> dict[str, Pooled]:
-    """The parameters of [model.per_group], with the recordings of each group that has one to fit."""
+    """The parameters of [model.per_group], with the recordings of each group that has one to fit.
+
+    Raises:
+        InputError: a name that is none of ``specs``, those of the simulator: noise is the same for all recordings.
+    """
     groups = gather_groups([*fitted, *others], experiment.model.groups)
     known = {group: members for group, members in groups.items() if set(members) & set(fitted)}
-    return {name: Pooled(spread, known) for name, spread in expand_groups(experiment.model.per_group, specs).items()}
+    spreads = expand_groups(experiment.model.per_group, specs)
+    check_names(spreads, specs, where="[model.per_group]")
+    return {name: Pooled(spread, known) for name, spread in spreads.items()}
 
 
 def build_model(
@@ -116,7 +122,7 @@ def build_model(
         name: matching(recordings.names, patterns, where=f"[model.per_recording] {name}")
         for name, patterns in shared.items()
     }
-    pooled = pooling(experiment, specs, recordings.names)
+    pooled = pooling(experiment, simulator.parameters, recordings.names)
     space = build_space(specs, priors, scopes, recordings.names, pooled=pooled)
     weighed = tuple(Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed)
     check_weighed(weighed, space.names)

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import jax
 import numpy as np
+from blackjax.smc import resampling
 from jaxtyping import Float, Int, PRNGKeyArray
+from scipy.special import softmax
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.model import RecordingSet
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.schedules import next_step
 from rfdropo_bayes.workflow.cube_start import OFFSETS
 
 SMALLEST_ERROR = 1e-6  # [m]
 STEP = 0.05  # of a central difference, in prior deviations
 ROUNDS = 2  # of linearisation: the pose at rest is all but linear in what is found from it
-LEAST_SHARE = 0.1  # of the draws that counts after they were weighed: more says that the model is wrong, not which draw
+LEAST_SHARE = 0.1  # of the draws: a row that leaves fewer says that the model is wrong, not which draw is right
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 
@@ -91,27 +95,10 @@ def weighed_by_first_row(
         if not errors or name not in names or not valid.any():
             continue
         error = ((recordings.position[place, 0] - position[:, place]) / sd)[:, valid]
-        weight = _tempered(-0.5 * np.sum(error**2, axis=(1, 2)))
-        offset = float(jax.random.uniform(jax.random.fold_in(key, place)))
-        index[:, place] = np.searchsorted(np.cumsum(weight), (np.arange(count) + offset) / count).clip(max=count - 1)
+        density = -0.5 * np.sum(error**2, axis=(1, 2))
+        power, _ = next_step(partial(np.multiply, density), 1.0, LEAST_SHARE)
+        index[:, place] = resampling.systematic(jax.random.fold_in(key, place), softmax(power * density), count)
     return index
-
-
-def _tempered(log_weight: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Normalised weights, flattened by bisection of a power where too few draws would count."""
-
-    def weights(power: float) -> np.ndarray:
-        weight = np.exp(power * (log_weight - log_weight.max()))
-        return weight / weight.sum()
-
-    least = LEAST_SHARE * len(log_weight)
-    low, high = 0.0, 1.0
-    if 1.0 / np.sum(weights(1.0) ** 2) >= least:
-        return weights(1.0)
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if 1.0 / np.sum(weights(middle) ** 2) >= least else (low, middle)
-    return weights(low)
 
 
 def _with_offsets(
@@ -131,7 +118,10 @@ def _with_offsets(
         for axis, offset in enumerate(OFFSETS):
             key = f"{offset}{SEPARATOR}{name}"
             if key in shifted:
-                shifted[key] = shifted[key] + np.average(error[:, :, axis], axis=1, weights=precision[valid])
+                shift = np.average(error[:, :, axis], axis=1, weights=precision[valid])
+                shifted[key] = shifted[key] + np.nan_to_num(
+                    shift
+                )  # a draw that fails is counted when all is rolled out
     return shifted
 
 
@@ -173,8 +163,9 @@ def _with_deviations(
 
 
 def _first_rows(problem: CalibrationProblem, values: Batch) -> Float[np.ndarray, "n recording marker 3"]:
-    """Simulated markers [m] in the first row of every recording."""
-    rows, _ = problem.rollouts(values, 1)
+    """Simulated markers [m] in the first row of every recording; NaN for rollouts that do not reach it well."""
+    rows, status = problem.rollouts(values, 1)
+    rows = np.where((status == 0)[:, None, None], rows, np.nan)
     return rows.reshape(len(rows), problem.n_recordings, -1, 3)
 
 

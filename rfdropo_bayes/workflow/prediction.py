@@ -77,18 +77,20 @@ def predict_new(
         groups: which recordings belong together, by name or wildcard; each is a group of its own without.
     """
     names = [t.name for t in trajectories]
-    space, extended = _for_new_recordings(model.space, values, names, fitted, key, groups or {})
+    own_key, row_key, noise_key = jax.random.split(key, 3)
+    space, extended = _for_new_recordings(model.space, values, names, fitted, own_key, groups or {})
     fresh = replace(model, space=space, recordings=gather_recordings(model.simulator, trajectories))
     problem = CalibrationProblem(fresh, chunk=chunk)
     own = {whole(name) for name in fitted}
     drawn = [p for p in space.parameters if p.added_to and p.name not in values]
     new = [n for n in names if whole(n) not in own]
-    extended = match_first_row(problem, extended, new, drawn, errors or {}, key)
+    extended = match_first_row(problem, extended, new, drawn, errors or {}, row_key)
     placed, extended = with_measured_starts(fresh, trajectories, extended)
     if placed is not fresh:
         problem = CalibrationProblem(placed, chunk=chunk)
     matched = {member for p in drawn for member in p.members}
-    return _predictions(problem, extended, key, "test", unseen=[n for n in new if n not in matched], errors=errors)
+    unseen = [n for n in new if n not in matched]
+    return _predictions(problem, extended, noise_key, "test", unseen=unseen, errors=errors)
 
 
 def _for_new_recordings(
@@ -123,8 +125,10 @@ def _for_new_recordings(
             parameters.append(replace(members[0], recording=recording))
     deviating = [p for p in space.parameters if p.added_to]
     for parameter in _deviations(deviating, gather_groups(names, groups)):
-        drawn = parameter.prior.sample(jax.random.fold_in(key, len(names) + len(parameters)), (count,))
-        extended[parameter.name] = values.get(parameter.name, np.asarray(drawn))
+        drawn = values.get(parameter.name)
+        if drawn is None:
+            drawn = np.asarray(parameter.prior.sample(jax.random.fold_in(key, len(names) + len(parameters)), (count,)))
+        extended[parameter.name] = drawn
         parameters.append(parameter)
     return ParameterSpace(tuple(parameters)), extended
 
@@ -148,7 +152,8 @@ def _predictions(
     """Predictions of the recordings of a problem; draws count for those ``unseen`` as they predict the first row."""
     recordings = problem.model.recordings
     position, pose, fine = _ended_well(problem, values)
-    chosen = weighed_by_first_row(recordings, position[:, :, 0], unseen, errors or {}, key)
+    key, choice, again_key = jax.random.split(key, 3)
+    chosen = weighed_by_first_row(recordings, position[:, :, 0], unseen, errors or {}, choice)
     noisy = position + problem.draw_noise(key, fine)
     before = None
     if prior is not None:
@@ -157,7 +162,7 @@ def _predictions(
     for i, name in enumerate(recordings.names):
         if name in unseen:  # noise of their own for draws that count more than once
             again = {parameter: column[chosen[:, i]] for parameter, column in fine.items()}
-            noise = problem.draw_noise(jax.random.fold_in(key, i), again)[:, i]
+            noise = problem.draw_noise(jax.random.fold_in(again_key, i), again)[:, i]
             position[:, i] = position[chosen[:, i], i]
             noisy[:, i] = position[:, i] + noise
             if pose is not None:

@@ -19,6 +19,8 @@ from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.workflow.assembly import pooling
+from rfdropo_bayes.workflow.experiment import Experiment
 from rfdropo_bayes.workflow.first_row import match_first_row, weighed_by_first_row
 from rfdropo_bayes.workflow.prediction import MARKER_ERRORS, _for_new_recordings
 from rfdropo_bayes.workflow.unseen import run_prediction
@@ -243,3 +245,10 @@ def test_draws_count_as_they_predict_the_first_row():
     few = weighed_by_first_row(recordings, simulated, ["new"], {"a": 1e-3}, jax.random.key(0))[:, 1]
     share = np.bincount(few, minlength=4000) / 4000
     assert 1.0 / np.sum(share**2) == pytest.approx(400, rel=0.1)
+
+
+def test_noise_is_not_pooled():
+    """It is the same for all recordings: a deviation of it would be drawn and never used."""
+    experiment = Experiment(robot="smooth_arm", model={"per_group": {"observation_noise": 1e-3}})
+    with pytest.raises(InputError, match="unknown parameter 'observation_noise'"):
+        pooling(experiment, (ParameterSpec("mass", "kg", 0.0, 1.0, 0.1, {}, ""),), ["a"])

@@ -15,13 +15,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Int
 from scipy.sparse.linalg import splu
 
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_root, store
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, mesh_kernel, mesh_pasted, square_root, store
 
 
 class BlockPattern(NamedTuple):
@@ -112,7 +111,7 @@ def block_slot(pattern: BlockPattern, row: int, column: int) -> int:
     return int(first + np.searchsorted(pattern.row[first:last], row))
 
 
-@numba.njit(inline="always")
+@mesh_pasted
 def _invert_pivot(pivot, j, token):
     """Replace the lower triangle (00, 10, 11, 20, 21, 22) of a pivot by the inverse of its Cholesky factor, and return
     it."""
@@ -135,7 +134,7 @@ def _invert_pivot(pivot, j, token):
     return i00, i10, i11, i20, i21, i22
 
 
-@numba.njit(inline="always")
+@mesh_pasted
 def _update_pivot(pivot, j, lower, pattern, column, token):
     """Subtract from a pivot the products of the blocks to its left."""
     p00, p10, p11 = load(pivot, j, token), load(pivot, j + 1, token), load(pivot, j + 2, token)
@@ -162,7 +161,7 @@ def _update_pivot(pivot, j, lower, pattern, column, token):
     store(pivot, j + 5, p22)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@mesh_kernel
 def factor(pattern, pivot, lower, token):
     """Factorise in place: ``lower`` (9 blocks, lanes) becomes L, ``pivot`` (6 n, lanes) the inverses of its diagonal
     blocks."""
@@ -205,7 +204,7 @@ def factor(pattern, pivot, lower, token):
             store(lower, t + 8, fma(a20, i20, fma(a21, i21, a22 * i22)))
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@mesh_kernel
 def forward_substitute(pattern, pivot, lower, token):
     """Turn border row 0, written anew after `factor`, into (L^-1 b)'."""
     for column in range(len(pattern.first) - 1):
@@ -225,7 +224,7 @@ def forward_substitute(pattern, pivot, lower, token):
         store(lower, t + 2, fma(x, i20, fma(y, i21, z * i22)))
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@mesh_kernel
 def condensed_entry(pattern, lower, i, j, token):
     """Product b_i' A^-1 b_j of two border rows, after `factor`."""
     total = fill(0.0, lower, token)
@@ -237,7 +236,7 @@ def condensed_entry(pattern, lower, i, j, token):
     return total
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@mesh_kernel
 def condense(pattern, lower, condensed, token):
     """Products b_i' A^-1 b_j of all border rows i >= j, after `factor`, into ``condensed`` (rows * rows, lanes),
     row-major."""
@@ -249,7 +248,7 @@ def condense(pattern, lower, condensed, token):
             store(condensed, j * rows + i, total)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@mesh_kernel
 def back_substitute(pattern, pivot, lower, weight, solution, token):
     """Solve A x = sum_i weight_i b_i over the border rows b_i, after `factor`; ``solution`` is (3 n, lanes)."""
     for column in range(len(pattern.first) - 2, -1, -1):

@@ -63,6 +63,13 @@ inlined = partial(kernel, forceinline=True)
 whole = numba.njit(nogil=True, cache=True, error_model="numpy", pipeline_class=WholeCompiler)
 """Decorator of the kernel at the top, which Python calls."""
 
+# Numba's own way, each function optimised by itself, for meshes (see `compilation`): parts of a kernel, those that it
+# takes in before and after its types are known, and kernels that are kept between processes.
+mesh_part = numba.njit(nogil=True, error_model="numpy")
+mesh_pasted = numba.njit(inline="always")
+mesh_inlined = numba.njit(forceinline=True, error_model="numpy")
+mesh_kernel = numba.njit(nogil=True, cache=True, error_model="numpy")
+
 
 class SimdType(types.Type):
     """Numba type of ``lanes`` floats of one width."""

@@ -9,11 +9,20 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, load, square_root, store
+from rfdropo_bayes.fem.native.simd import (
+    fill,
+    fma,
+    fnma,
+    load,
+    mesh_inlined,
+    mesh_part,
+    mesh_pasted,
+    square_root,
+    store,
+)
 
 POLAR_ITERATIONS = 6
 
@@ -70,12 +79,12 @@ class Work(NamedTuple):
     turned: Float[np.ndarray, "12 lanes"]
 
 
-@numba.njit(inline="always")
+@mesh_pasted
 def _cross(ax, ay, az, bx, by, bz):
     return fnma(az, by, ay * bz), fnma(ax, bz, az * bx), fnma(ay, bx, ax * by)
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@mesh_inlined
 def _edge_frame(mesh, e, x, axes, token):
     """Rows of ``axes``: along edge 0-1, across it in the face 0-1-2, normal to the face."""
     one = fill(1.0, x, token)
@@ -100,7 +109,7 @@ def _edge_frame(mesh, e, x, axes, token):
     store(axes, 8, nz)
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@mesh_inlined
 def _polar_frame(mesh, e, x, axes, token):
     """``axes`` = transposed rotation of the polar decomposition of the deformation gradient, by Newton's iteration."""
     for i in range(3):
@@ -129,7 +138,7 @@ def _polar_frame(mesh, e, x, axes, token):
         store(axes, 8, 0.5 * (c2 + w2 * scale))
 
 
-@numba.njit(inline="always")
+@mesh_pasted
 def _rotate_back(axes, x, y, z, token):
     """From the element's frame to space."""
     return (
@@ -139,7 +148,7 @@ def _rotate_back(axes, x, y, z, token):
     )
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@mesh_inlined
 def _element_force(mesh, e, work, lame, shear, lookahead, token):
     """Add an element's force at the positions x + lookahead v, in the frame of x, to ``work.force``; fill
     ``work.turned``."""
@@ -201,7 +210,7 @@ def _element_force(mesh, e, work, lame, shear, lookahead, token):
         store(work.turned, 3 * a + 2, tz)
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@mesh_inlined
 def _element_tangent(mesh, e, work, lame, shear, token):
     """Add an element's scaled tangent to the pivots and blocks of the matrix."""
     turned, pivot, lower = work.turned, work.pivot, work.lower
@@ -238,7 +247,7 @@ def _element_tangent(mesh, e, work, lame, shear, token):
             pair += 1
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def clear(array, token):
     """Fill with zeros."""
     zero = fill(0.0, array, token)
@@ -246,7 +255,7 @@ def clear(array, token):
         store(array, i, zero)
 
 
-@numba.njit(forceinline=True, error_model="numpy")
+@mesh_inlined
 def _element(mesh, e, samples, work, lookahead, token):
     """Frame and force of an element; returns its Lame constants times its volume."""
     if mesh.polar:
@@ -259,7 +268,7 @@ def _element(mesh, e, samples, work, lookahead, token):
     return lame, shear
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def elastic_forces(mesh, samples, work, time_step, token):
     """``work.force`` at the positions x + (h + b) v, in the frames of x."""
     clear(work.force, token)
@@ -268,7 +277,7 @@ def elastic_forces(mesh, samples, work, time_step, token):
         _element(mesh, e, samples, work, lookahead, token)
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def assemble(pattern, mesh, samples, work, time_step, token):
     """Matrix (1 + h a) M + h (h + b) K and, as border row 0, the right-hand side h (f + M g - (h + b) K v - a M v)."""
     clear(work.pivot, token)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -21,7 +20,7 @@ from rfdropo_bayes.fem.native.block_cholesky import (
     forward_substitute,
 )
 from rfdropo_bayes.fem.native.complementarity import solve_for_active, solve_unilateral
-from rfdropo_bayes.fem.native.simd import fill, fma, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, load, mesh_kernel, mesh_part, square_root, store, where_greater
 from rfdropo_bayes.fem.native.tetrahedral import assemble, clear, elastic_forces
 
 LARGEST = 1e12
@@ -59,7 +58,7 @@ class Output(NamedTuple):
     tension: Float[np.ndarray, "rows cables lanes"]
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def _point(cables, p, c, field, fixed, token):
     """Position or velocity of a cable's point; the anchor's is ``fixed``."""
     if p == cables.first[c]:
@@ -78,7 +77,7 @@ def _point(cables, p, c, field, fixed, token):
     return x, y, z
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def _pull(pattern, mesh, cables, p, row, work, x, y, z, token):
     """Add a force on a cable's point to the cable's border row."""
     for k in range(cables.node.shape[1]):
@@ -90,7 +89,7 @@ def _pull(pattern, mesh, cables, p, row, work, x, y, z, token):
             store(work.lower, t + 2, load(work.lower, t + 2, token) + z * w)
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def set_targets(cables, commanded, work, token):
     """Displacement that the step imposes on every cable.
 
@@ -105,7 +104,7 @@ def set_targets(cables, commanded, work, token):
         store(work.target, c, where_greater(target, limit, limit, target))
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def gather_cables(pattern, mesh, cables, work, time_step, token):
     """Border rows -dl/dx of all cables, and their slack [m] at the end of the step if nothing changed the velocity."""
     one = fill(1.0, work.position, token)
@@ -132,7 +131,7 @@ def gather_cables(pattern, mesh, cables, work, time_step, token):
         store(work.slack, c, shortening - time_step * growth - load(work.target, c, token))
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def substitute(pattern, mesh, work, pull, count, time_step, token):
     """Add A^-1 (border row 0 + h sum pull_i J_i) to the velocity."""
     clear(work.weight, token)
@@ -144,7 +143,7 @@ def substitute(pattern, mesh, work, pull, count, time_step, token):
         store(work.velocity, i, load(work.velocity, i, token) + load(work.solution, i, token))
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def find_tensions(count, work, tolerance, token):
     """Unilateral tensions; lanes without a solution are marked in ``unsolved``."""
     found = solve_unilateral(
@@ -153,7 +152,7 @@ def find_tensions(count, work, tolerance, token):
     mark_unsolved(count, work, found, token)
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def mark_unsolved(count, work, found, token):
     """Mark lanes whose tensions were not found in ``unsolved``."""
     one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
@@ -163,7 +162,7 @@ def mark_unsolved(count, work, found, token):
             store(work.unsolved, 0, where_greater(bad, zero, one, load(work.unsolved, 0, token)))
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def _keep_border(pattern, work, token):
     """Copy the border, which the factorisation overwrites, to ``load``: 9 ``border`` rows a node."""
     size = 9 * pattern.border
@@ -173,7 +172,7 @@ def _keep_border(pattern, work, token):
             store(work.load, size * node + k, load(work.lower, t + k, token))
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def unbalance(pattern, mesh, samples, work, count, time_step, token):
     """Write what the step leaves unbalanced to border row 0, and the slack that it leaves the cables."""
     elastic_forces(mesh, samples, work, time_step, token)
@@ -193,7 +192,7 @@ def unbalance(pattern, mesh, samples, work, count, time_step, token):
             store(work.lower, 9 * (pattern.first[node + 1] - pattern.border) + i, right)
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def correct(pattern, mesh, work, count, time_step, token):
     """Solve once more, for what the step's solution leaves unbalanced; which cables pull stays as it is."""
     forward_substitute(pattern, work.pivot, work.lower, token)
@@ -206,7 +205,7 @@ def correct(pattern, mesh, work, count, time_step, token):
     substitute(pattern, mesh, work, work.change, count, time_step, token)
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def accept(rest, count, work, schedule, token):
     """Take the step x += h v; in the lanes where it is lost, stay in place at rest without tension."""
     one, zero = fill(1.0, work.position, token), fill(0.0, work.position, token)
@@ -226,7 +225,7 @@ def accept(rest, count, work, schedule, token):
     store(work.lost, 0, where_greater(accepted, zero, load(work.lost, 0, token), one))
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def condense_step(pattern, mesh, cables, commanded, samples, work, schedule, token):
     """Assemble and factorise the matrix of a step, and set up the problem of its tensions."""
     count, rows, time_step = len(cables.limit), 3 * pattern.border, schedule.time_step
@@ -245,7 +244,7 @@ def condense_step(pattern, mesh, cables, commanded, samples, work, schedule, tok
             store(work.compliance, i * count + j, square * load(work.condensed, (i + 1) * rows + j + 1, token))
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def solve_step(pattern, mesh, cables, rest, commanded, samples, work, schedule, token):
     """One implicit Euler step; marks lanes that diverge in ``lost``, and those whose tensions were not found in
     ``unsolved``."""
@@ -259,7 +258,7 @@ def solve_step(pattern, mesh, cables, rest, commanded, samples, work, schedule, 
     accept(rest, count, work, schedule, token)
 
 
-@numba.njit(nogil=True, error_model="numpy")
+@mesh_part
 def record_body(work, output, row, token):
     for p in range(output.node.shape[0]):
         for i in range(3):
@@ -279,7 +278,7 @@ def compile_rollout(sources: str) -> Callable:
     the nodes' coordinates at rest.
     """
 
-    @numba.njit(nogil=True, cache=True, error_model="numpy")
+    @mesh_kernel
     def rollout(pattern, mesh, cables, rest, commands, samples, work, schedule, output, token):
         _ = sources
         for step in range(commands.shape[0]):
