@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from rfdropo_bayes.bayes.angles import angle_specs
 from rfdropo_bayes.bayes.forces import tension_specs
 from rfdropo_bayes.bayes.model import Measured, TrajectoryModel
 from rfdropo_bayes.bayes.noise import draw_noise, noise_specs
-from rfdropo_bayes.simulators.protocol import Result
+from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
 
@@ -50,7 +51,7 @@ class CalibrationProblem:
         self.n_rows = model.recordings.time.shape[1]
         self.n_recordings = len(model.recordings.names)
         self.status_names = {int(result): result.name.lower() for result in Result}
-        noise = {spec.name for spec in (*noise_specs(model.noise), *tension_specs(True))}
+        noise = {spec.name for spec in (*noise_specs(model.noise), *tension_specs(True), *angle_specs(True))}
         self.physical_names = tuple(p.name for p in model.space.parameters if p.spec.name not in noise)
 
     @cached_property
@@ -204,10 +205,9 @@ class CalibrationProblem:
         unit quaternion (x, y, z, w); None if the scene has none."""
         return self._chunked(self._positions, values, self.n_rows)
 
-    def observe(self, values: Batch) -> tuple[np.ndarray, np.ndarray, Int[np.ndarray, " n"]]:
-        """Marker positions (n, recording, time, marker, 3) [m], tensions (n, recording, time, cable) [N] and status."""
-        position, tension, status = self._chunked(self._observations, values, self.n_rows)
-        return position, tension, status
+    def observe(self, values: Batch) -> Observation:
+        """What every recording would show, without observation noise: fields (n, recording, time, ...), status (n,)."""
+        return Observation(*self._chunked(self._observations, values, self.n_rows))
 
     def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
         """A realisation of the observation noise [m] for every set of values."""
@@ -241,9 +241,9 @@ class CalibrationProblem:
 
     @cached_property
     def _observations(self) -> Callable:
-        def observations(values: Mapping[str, Array], steps: Int[Array, ""]) -> tuple[Array, Array, Array]:
+        def observations(values: Mapping[str, Array], steps: Int[Array, ""]) -> Observation:
             observation = self.model.simulate(values, steps)
-            return observation.position, observation.tension, jnp.max(observation.status)
+            return observation._replace(status=jnp.max(observation.status))
 
         return jax.jit(jax.vmap(observations, in_axes=(0, None)))
 
@@ -263,8 +263,8 @@ class CalibrationProblem:
 
 def _flat(white: Sequence[Any], horizon: int) -> list[Any]:
     """Residuals by rollout, cut to the horizon where they have a time axis, and flattened."""
-    positions, pulled, weighed = white
-    cut = [part[:, :, :horizon] for part in (positions, pulled) if part is not None]
+    *timed, weighed = white
+    cut = [part[:, :, :horizon] for part in timed if part is not None]
     return [part.reshape(len(part), -1) for part in (*cut, weighed) if part is not None]
 
 

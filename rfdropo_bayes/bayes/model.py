@@ -14,6 +14,7 @@ import numpyro
 import numpyro.distributions as dist
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from rfdropo_bayes.bayes.angles import AngleData, angle_log_density, angle_residuals
 from rfdropo_bayes.bayes.forces import (
     TensionData,
     Weighed,
@@ -38,12 +39,14 @@ class Measured(NamedTuple):
     Attributes:
         position: marker positions [m]; zero where masked.
         tension: cable tensions [N], and the size of a reading that its relative error applies to [N]; or None.
+        motor_angle: motor angles [rad]; or None.
         weighed: values of the weighed parts.
     """
 
     position: Float[Any, "recording time marker 3"]
     tension: Float[Any, "recording time cable"] | None
     reading: Float[Any, "recording time cable"] | None
+    motor_angle: Float[Any, "recording time channel"] | None
     weighed: Float[Any, " weighed"]
 
 
@@ -175,6 +178,7 @@ class TrajectoryModel:
         recordings: data.
         tension: measured cable tensions; None where they are not used.
         weighed: parameters known from measurements of their own.
+        motor_angle: measured motor angles; None where they are not used.
     """
 
     simulator: Simulator
@@ -184,6 +188,7 @@ class TrajectoryModel:
     recordings: RecordingSet
     tension: TensionData | None = None
     weighed: tuple[Weighed, ...] = ()
+    motor_angle: AngleData | None = None
 
     def noise_of(self, values: Values) -> tuple[Any, Any]:
         """Standard deviation [m] and correlation time [s] (None for white noise) among a set of values."""
@@ -225,8 +230,9 @@ class TrajectoryModel:
     def measured(self) -> Measured:
         """What was measured."""
         tension, reading = (None, None) if self.tension is None else (self.tension.measured, self.tension.scale)
+        angle = None if self.motor_angle is None else self.motor_angle.measured
         weighed = np.array([entry.value for entry in self.weighed])
-        return Measured(np.asarray(self.recordings.position), tension, reading, weighed)
+        return Measured(np.asarray(self.recordings.position), tension, reading, angle, weighed)
 
     def row_log_likelihood(
         self, values: Values, steps: Int[Array, ""] | None = None, measured: Measured | None = None
@@ -245,27 +251,33 @@ class TrajectoryModel:
         if self.tension is not None:
             pulls = self._pulls(data)
             rows += tension_log_density(observation.tension, {**self.fixed, **values}, pulls)
+        if self.motor_angle is not None:
+            angles = self.motor_angle._replace(measured=data.motor_angle)
+            rows += angle_log_density(observation.motor_angle, {**self.fixed, **values}, angles)
         return rows, jnp.max(observation.status)
 
     def residuals(
         self, values: Values, steps: Int[Array, ""], measured: Measured | None = None
-    ) -> tuple[Array, Array | None, Array | None]:
+    ) -> tuple[Array, Array | None, Array | None, Array | None]:
         """Whitened residuals, zero where masked: positions (recording, time, marker, 3), tensions (recording, time,
-        cable), weighed parts; None for what there is not."""
+        cable), motor angles (recording, time, channel), weighed parts; None for what there is not."""
         data = self.measured if measured is None else measured
         observation = self.simulate(values, steps)
         sigma, tau = self.noise_of(values)
         white = jax.vmap(lambda r, line: whiten(r, sigma, tau, line)[0])(
             data.position - observation.position, self.recordings.line
         )
-        pulled = weighed = None
+        pulled = turned = weighed = None
         if self.tension is not None:
             pulls = self._pulls(data)
             pulled, _ = tension_residuals(observation.tension, {**self.fixed, **values}, pulls)
+        if self.motor_angle is not None:
+            angles = self.motor_angle._replace(measured=data.motor_angle)
+            turned = angle_residuals(observation.motor_angle, {**self.fixed, **values}, angles)
         if self.weighed:
             entries = [entry._replace(value=value) for entry, value in zip(self.weighed, data.weighed, strict=True)]
             weighed = weighed_residuals(values, entries)
-        return white, pulled, weighed
+        return white, pulled, turned, weighed
 
     def _pulls(self, data: Measured) -> TensionData:
         assert self.tension is not None
@@ -287,5 +299,8 @@ class TrajectoryModel:
             numpyro.sample(f"position@{name}", noise, obs=measured)
         if observe and self.tension is not None:
             numpyro.factor("tension", tension_log_density(observation.tension, {**self.fixed, **values}, self.tension))
+        if observe and self.motor_angle is not None:
+            turned = angle_log_density(observation.motor_angle, {**self.fixed, **values}, self.motor_angle)
+            numpyro.factor("motor_angle", turned)
         if observe and self.weighed:
             numpyro.factor("weighed", weighed_log_density(values, self.weighed))

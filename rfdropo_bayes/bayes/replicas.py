@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from rfdropo_bayes.bayes.angles import MOTOR_ANGLE_NOISE
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.forces import TENSION_GAIN, TENSION_NOISE, reading_size
 from rfdropo_bayes.bayes.model import Measured
@@ -22,23 +23,29 @@ def simulated_data(problem: CalibrationProblem, truth: Mapping[str, float], key:
     """
     position_key, tension_key, weighed_key = jax.random.split(key, 3)
     batch = {name: jnp.array([truth[name]]) for name in problem.names}
-    position, tension, status = problem.observe(batch)
-    if status[0] != 0:
+    seen = problem.observe(batch)
+    if seen.status[0] != 0:
         return None
     model = problem.model
+    known = {**model.fixed, **truth}
     valid = model.recordings.line.valid[..., None]
-    measured = np.where(valid, position[0] + problem.draw_noise(position_key, batch)[0], 0.0)
-    read = size = None
+    measured = np.where(valid, seen.position[0] + problem.draw_noise(position_key, batch)[0], 0.0)
+    read = size = angle = None
     if model.tension is not None:
-        known = {**model.fixed, **truth}
         error = known[TENSION_NOISE.name] * np.asarray(jax.random.normal(tension_key, model.tension.measured.shape))
-        clean = known.get(TENSION_GAIN.name, TENSION_GAIN.nominal) * tension[0][..., model.tension.cables]
+        clean = (
+            known.get(TENSION_GAIN.name, TENSION_GAIN.nominal) * np.asarray(seen.tension)[0][..., model.tension.cables]
+        )
         known_readings = model.tension.valid
         sizes = [reading_size(t, v) for t, v in zip(clean, known_readings, strict=True)]
         read = np.where(known_readings, clean + error * np.stack(sizes), 0.0)
         size = np.stack([reading_size(t, v) for t, v in zip(read, known_readings, strict=True)])
+    if model.motor_angle is not None:
+        normal = np.asarray(jax.random.normal(jax.random.fold_in(key, 3), model.motor_angle.measured.shape))
+        turned = np.asarray(seen.motor_angle)[0] + known[MOTOR_ANGLE_NOISE.name] * normal
+        angle = np.where(model.motor_angle.valid, turned, 0.0)
     normal = np.asarray(jax.random.normal(weighed_key, (len(model.weighed),)))
     weighed = np.array(
         [sum(truth[n] for n in entry.parameters) + entry.sd * z for entry, z in zip(model.weighed, normal, strict=True)]
     )
-    return Measured(measured, read, size, weighed)
+    return Measured(measured, read, size, angle, weighed)

@@ -12,8 +12,8 @@ Settled poses. An observation file whose ID is the number of its command row hol
 to its settled pose and some rest. Its trajectory has one row per command: the median of the last 0.2 s, at its end;
 command row k + 1 is in force from the first row of its own block, command 0 from the start.
 
-Motor angles are in radians. In files of before June 2025 they are a 20 Hz zero-order hold; for settled poses they are
-stale and left out.
+Motor angles are in radians. In files of before June 2025 they are a 20 Hz zero-order hold, whose repeats are
+masked; for settled poses they are stale and left out.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import Faults, fill_missing, find_faults
+from rfdropo_bayes.data.held_readings import hold_time
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 
@@ -157,11 +158,8 @@ def _motion(recording: _Recording, command: np.ndarray, commands: Path | None) -
             remedy="pair the files that were recorded together; use rows = [first, last] to cut both",
         )
     angle = None
-    hold = 0.0
     if all(name in recording.table for name in _ANGLES):
         angle = np.deg2rad(recording.table.numbers(_ANGLES))
-        changes = np.flatnonzero((np.diff(angle, axis=0) != 0.0).any(axis=1))
-        hold = float(np.median(np.diff(changes))) / RATE if changes.size > 2 else 0.0
     return {
         "time": recording.time,
         "position": fill_missing(recording.time, recording.position),
@@ -170,7 +168,7 @@ def _motion(recording: _Recording, command: np.ndarray, commands: Path | None) -
         "command": command,
         "initial_command": command[0],
         "motor_angle": angle,
-        "settings": {} if angle is None else {"motor_angle_hold": hold},
+        "settings": {} if angle is None else {"motor_angle_hold": hold_time(recording.time, angle)},
     }
 
 

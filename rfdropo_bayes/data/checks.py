@@ -16,8 +16,10 @@ DIMS: dict[str, tuple[str, ...]] = {
     "initial_command": ("cable",),
     "tension": ("time", "cable"),
     "motor_angle": ("time", "cable"),
+    "motor_angle_mask": ("time", "cable"),
     "object_pose": ("time", "pose"),
 }
+MASKS = frozenset({"position_mask", "motor_angle_mask"})
 _LARGEST_EXTENT = 5.0  # [m]: no soft robot on a bench sweeps more; millimetres taken for metres always do
 _SMALLEST_EXTENT = 1e-3  # [m]: several markers on one robot are never this close; metres taken for millimetres are
 _LARGEST_COMMAND = {"m": 5.0, "rad": 20.0}  # unclipped cumulative commands stay below; other units exceed it

@@ -16,6 +16,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import fill_missing, find_faults
+from rfdropo_bayes.data.held_readings import hold_time
 from rfdropo_bayes.data.registration import rotate_pose
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
@@ -106,7 +107,9 @@ def read_plain_csv(
     time = _times(table, columns)
     faults = find_faults(time, position)
     command = _commands(table, commands, columns)
-    angle_scale = np.pi / 180.0 if columns.motor_angle_unit == "deg" else 1.0
+    angle = None
+    if columns.motor_angles is not None:
+        angle = (np.pi / 180.0 if columns.motor_angle_unit == "deg" else 1.0) * table.numbers(columns.motor_angles)
     return Trajectory.build(
         name=path.name.removesuffix(".gz").removesuffix(".csv"),
         robot=columns.robot,
@@ -121,10 +124,10 @@ def read_plain_csv(
         initial_command=command[0],
         cable_names=columns.cables or columns.commands,
         tension=None if columns.tensions is None else table.numbers(columns.tensions),
-        motor_angle=None if columns.motor_angles is None else angle_scale * table.numbers(columns.motor_angles),
+        motor_angle=angle,
         object_pose=_pose(table, columns),
         provenance=path.name,
-        settings={"faults": faults.counts},
+        settings={"faults": faults.counts} | ({} if angle is None else {"motor_angle_hold": hold_time(time, angle)}),
     )
 
 

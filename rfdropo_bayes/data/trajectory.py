@@ -15,13 +15,14 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.data import checks
+from rfdropo_bayes.data.held_readings import new_readings
 from rfdropo_bayes.errors import InputError
 
 AXES = ("x", "y", "z")
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 SCHEMA = "rfdropo_bayes.trajectory/1"
 _HASHED = ("time", "command_time", "position", "position_mask", "command", "initial_command")
-_OPTIONAL = ("tension", "motor_angle", "object_pose")
+_OPTIONAL = ("tension", "motor_angle", "motor_angle_mask", "object_pose")
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,8 @@ class Trajectory:
     - ``command(command_time, cable)``, unit in its attribute ("m" or "rad"): cumulative command, pull > 0, unclipped,
       piecewise constant. Row k is in force from ``command_time[k]`` until the next row's time, the last one for ever;
     - ``initial_command(cable)``: in force before ``command_time[0]``, hence the state the recording starts from;
-    - optionally ``tension(time, cable)`` [N], ``motor_angle(time, cable)`` [rad] and ``object_pose(time, pose)``
-      (x y z [m], unit quaternion x y z w).
+    - optionally ``tension(time, cable)`` [N], ``motor_angle(time, cable)`` [rad] and its ``motor_angle_mask``, False
+      where an older reading is repeated, and ``object_pose(time, pose)`` (x y z [m], unit quaternion x y z w).
 
     ``time`` is in seconds from the first observation row. ``command_time`` shares that clock.
 
@@ -78,8 +79,10 @@ class Trajectory:
         """Assemble and check a recording; every array is in SI units, see the class for meanings and shapes.
 
         ``initial_command`` defaults to zero; ``position_mask`` to all True. Times are shifted so that the first
-        observation is at 0. ``settings`` are facts about the recording that a model may need (JSON).
+        observation is at 0. ``settings`` are facts about the recording that a model may need (JSON); of motor angles
+        with a ``motor_angle_hold`` [s] among them only new readings are to be used (`held_readings`).
         """
+        facts = dict(settings or {})
         arrays = {
             "position": position,
             "position_mask": np.ones(np.shape(position)[:2], dtype=bool) if position_mask is None else position_mask,
@@ -87,6 +90,7 @@ class Trajectory:
             "initial_command": np.zeros(len(cable_names)) if initial_command is None else initial_command,
             "tension": tension,
             "motor_angle": motor_angle,
+            "motor_angle_mask": _angle_mask(time, motor_angle, float(facts.get("motor_angle_hold", 0.0))),
             "object_pose": None if object_pose is None else continuous_quaternions(object_pose),
         }
         dataset = _assemble(name, arrays, time, command_time, marker_names, cable_names)
@@ -100,7 +104,7 @@ class Trajectory:
             "frame": frame,
             "sample_time": float(np.median(np.diff(time))) if len(time) > 1 else 0.0,
             "synthetic": int(synthetic),
-            "settings": json.dumps(dict(settings or {}), sort_keys=True),
+            "settings": json.dumps(facts, sort_keys=True),
         }
         return cls(dataset)
 
@@ -156,8 +160,13 @@ class Trajectory:
 
     @property
     def motor_angle(self) -> Float[np.ndarray, "time cable"] | None:
-        """Measured motor angles [rad], if measured; ``settings`` says how stale they are."""
+        """Measured motor angles [rad], if measured."""
         return self._array("motor_angle") if "motor_angle" in self.dataset else None
+
+    @property
+    def motor_angle_mask(self) -> Bool[np.ndarray, "time cable"] | None:
+        """True where a motor angle is a new reading, if measured."""
+        return self._array("motor_angle_mask") if "motor_angle_mask" in self.dataset else None
 
     @property
     def object_pose(self) -> Float[np.ndarray, "time 7"] | None:
@@ -238,7 +247,7 @@ class Trajectory:
     def resample(self, sample_time: float) -> Trajectory:
         """Observations on the grid 0, sample_time, 2 sample_time, ... [s] by linear interpolation (quaternions: slerp).
 
-        Commands are events and stay as they are. A resampled position is masked if a row it draws on is masked.
+        Commands are events and stay as they are. A resampled value is masked if a row it draws on is masked.
         Nothing is filtered: resampling to a coarser grid picks rows, and their noise stays independent.
 
         Raises:
@@ -262,9 +271,10 @@ class Trajectory:
                 data[key] = (self.dataset[key].dims, (1.0 - share) * values[left] + share * values[right])
         if "object_pose" in data:
             data["object_pose"][1][:, 3:] = _slerp(self.dataset["object_pose"].values[:, 3:], left, right, weight)
-        mask = self.position_mask
-        usable = (mask[left] | (weight == 1.0)[:, None]) & (mask[right] | (weight == 0.0)[:, None])
-        data["position_mask"] = (("time", "marker"), usable)
+        for key in checks.MASKS & set(self.dataset.variables):
+            mask = self.dataset[key].values
+            usable = (mask[left] | (weight == 1.0)[:, None]) & (mask[right] | (weight == 0.0)[:, None])
+            data[key] = (self.dataset[key].dims, usable)
         dataset = self.dataset.drop_dims("time").assign(data).assign_coords(time=grid)
         return Trajectory(dataset.assign_attrs(sample_time=float(sample_time)))
 
@@ -308,7 +318,8 @@ class Trajectory:
         if missing:
             raise InputError(f"lacks the variable {missing[0]!r}", where=str(path), remedy="fetch it again")
         stored = dataset.attrs.get("sha256")
-        dataset["position_mask"] = dataset["position_mask"].astype(bool)
+        for key in checks.MASKS & set(dataset.variables):
+            dataset[key] = dataset[key].astype(bool)
         trajectory = cls(dataset)
         if stored != trajectory.sha256:
             raise InputError("its content does not match its hash", where=str(path), remedy="fetch it again")
@@ -341,6 +352,11 @@ def _assemble(
         raise InputError(
             f"recording and commands do not fit together ({error})", where=name, remedy="check their lengths"
         ) from None
+
+
+def _angle_mask(time: np.ndarray, angle: np.ndarray | None, hold: float) -> Bool[np.ndarray, "time cable"] | None:
+    fits = angle is not None and len(np.shape(angle)) == 2 and len(angle) == len(time) > 1  # else checked later
+    return new_readings(np.asarray(time), np.asarray(angle), hold) if hold > 0.0 and fits else None
 
 
 def continuous_quaternions(pose: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time 7"]:

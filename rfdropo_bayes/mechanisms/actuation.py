@@ -15,6 +15,7 @@ class CommandDelay:
 
     name = "command_delay"
     stage = "actuation"
+    inside_drive = True
     cause = "communication and drive latency"
     remedy = "stamp commands where they are executed, or shift the clock by this much"
     parameters = (
@@ -41,6 +42,7 @@ class ActuatorLag:
 
     name = "actuator_lag"
     stage = "actuation"
+    inside_drive = True
     cause = "bandwidth of the position loop of the drives"
     remedy = "stiffen the position loop, or keep the lag in the model"
     parameters = (
@@ -68,6 +70,7 @@ class CommandGain:
 
     name = "command_gain"
     stage = "actuation"
+    inside_drive = True
     cause = "wrong spool radius or transmission ratio, or cable stretch proportional to travel"
     remedy = "measure the cable travel of one motor turn"
     parameters = (

@@ -17,6 +17,7 @@ class Backlash:
 
     name = "backlash"
     stage = "actuation"
+    inside_drive = False
     cause = "play in gears, couplings or spools"
     remedy = "reverse each drive by hand and measure the play; preload the transmission"
     parameters = (

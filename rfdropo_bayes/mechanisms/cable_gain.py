@@ -23,6 +23,7 @@ class CableGain:
 
     name = "cable_gain"
     stage = "actuation"
+    inside_drive = False
     cause = "spools of different radius, or cables of different stretch"
     remedy = "measure the travel of each cable for one turn of its drive"
 

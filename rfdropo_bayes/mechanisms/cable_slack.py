@@ -14,6 +14,7 @@ class CableSlack:
 
     name = "cable_slack"
     stage = "actuation"
+    inside_drive = False
     cause = "cables that are not taut at zero command, or a dead zone of the drives"
     remedy = "tension the cables until each just moves the body, and set zero there"
     parameters = (

@@ -15,6 +15,7 @@ class DriveCreep:
 
     name = "drive_creep"
     stage = "actuation"
+    inside_drive = False
     cause = "creep of the cables or of their anchorage under load"
     remedy = "hold one command for minutes and watch the pose; stretch new cables before use"
     parameters = (

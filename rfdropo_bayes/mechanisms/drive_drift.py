@@ -14,6 +14,7 @@ class DriveDrift:
 
     name = "drive_drift"
     stage = "actuation"
+    inside_drive = False
     cause = "drives or cables that slip, or spools that wind unevenly, so that the zero wanders"
     remedy = "return to zero at the end of a recording and compare the pose with that at the start"
     parameters = (

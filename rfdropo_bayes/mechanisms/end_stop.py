@@ -14,6 +14,7 @@ class EndStop:
 
     name = "end_stop"
     stage = "actuation"
+    inside_drive = True
     cause = "a mechanical end stop, a software limit or the largest torque of a drive"
     remedy = "read the drives' limits and their measured positions where the command is largest"
     parameters = (

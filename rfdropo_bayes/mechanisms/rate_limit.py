@@ -15,6 +15,7 @@ class RateLimit:
 
     name = "rate_limit"
     stage = "actuation"
+    inside_drive = True
     cause = "the speed or current limit of the drives, or a trajectory generator between command and drive"
     remedy = "read the drives' speed limit, or record their positions during a large step"
     parameters = (

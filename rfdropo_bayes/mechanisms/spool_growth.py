@@ -13,6 +13,7 @@ class SpoolGrowth:
 
     name = "spool_growth"
     stage = "actuation"
+    inside_drive = False
     cause = "cable wound in layers, a conical spool, or a lever whose arm changes with its angle"
     remedy = "measure the travel of a cable turn by turn; use a grooved spool of one layer"
     parameters = (

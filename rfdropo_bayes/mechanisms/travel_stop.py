@@ -21,6 +21,7 @@ class TravelStop:
 
     name = "travel_stop"
     stage = "actuation"
+    inside_drive = True
     cause = "commands given relative to where the drive is, at a stop or at a limit of its controller"
     remedy = "record where the drives are, not what they were told; command absolute positions"
     parameters = (

@@ -40,7 +40,11 @@ class Mechanism(Protocol):
 
 @runtime_checkable
 class ActuationMechanism(Mechanism, Protocol):
-    """Acts on the command before it becomes a cable displacement."""
+    """Acts on the command before it becomes a cable displacement.
+
+    It may have an attribute ``inside_drive``, True if it is not said: whether an encoder on the motor shows the effect.
+    What happens behind the motor, in gears, spools and cables, has ``inside_drive = False``.
+    """
 
     def actuate(
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
@@ -72,6 +76,11 @@ class TimedSensingMechanism(Mechanism, Protocol):
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
         """Return the measured marker positions [m], given the true ones and when they are seen [s]."""
+
+
+def inside_drive(mechanism: Mechanism) -> bool:
+    """Whether an encoder on the motor shows what a mechanism of actuation does."""
+    return bool(getattr(mechanism, "inside_drive", True))
 
 
 def check_mechanisms(mechanisms: Iterable[Mechanism]) -> tuple[Mechanism, ...]:

@@ -104,7 +104,8 @@ class MeshTrunkSimulator(RobotSimulator):
             jnp.where(motion.cables_converged, int(Result.OK), int(Result.CABLE_LIMIT)),
         )
         position = self.measured(values, sample(motion.position, commands), observed_at(commands, self.time_step))
-        return Observation(position, sample(motion.tension, commands), None, status)
+        angle = self.driven(values, commands, self.time_step)
+        return Observation(position, sample(motion.tension, commands), None, status, angle)
 
     def balance(self, parameters: Values, commands: Commands) -> Balance:
         """See `RobotSimulator.balance`."""

@@ -45,12 +45,15 @@ class Observation(NamedTuple):
         tension: cable tensions [N].
         object_pose: position [m] and unit quaternion (x, y, z, w) of the object; None if the scene has none.
         status: a `Result` value.
+        motor_angle: where the drives stand: the command after delay, lag and whatever else happens inside the drives,
+            before the transmission to the cables, in the unit of the commands [rad or m]; None if it is not told.
     """
 
     position: Float[Array, "time marker 3"]
     tension: Float[Array, "time cable"]
     object_pose: Float[Array, "time 7"] | None
     status: Int[Array, ""]
+    motor_angle: Float[Array, "time channel"] | None = None
 
 
 @runtime_checkable

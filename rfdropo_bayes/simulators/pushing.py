@@ -228,4 +228,5 @@ class PushSimulator(RobotSimulator):
         position = self.trunk.measured(
             own, sample(motion.position, commands), observed_at(commands, self.engine.time_step)
         )
-        return Observation(position, sample(motion.tension, commands), pose, status)
+        angle = self.trunk.driven(own, commands, self.engine.time_step)
+        return Observation(position, sample(motion.tension, commands), pose, status, angle)

@@ -19,6 +19,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     Mechanism,
     SensingMechanism,
     TimedSensingMechanism,
+    inside_drive,
 )
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
 from rfdropo_bayes.simulators.protocol import Observation
@@ -115,13 +116,23 @@ class RobotSimulator:
         check_names(parameters, self.parameters, where="rollout")
         return {spec.name: jnp.asarray(spec.nominal) for spec in self.parameters} | dict(parameters)
 
-    def actuated(self, values: Values, commands: Commands, time_step: float) -> Float[Array, "step channel"]:
-        """Commands that reach the drives at the end of every step."""
+    def actuated(
+        self, values: Values, commands: Commands, time_step: float, *, drives_only: bool = False
+    ) -> Float[Array, "step channel"]:
+        """Commands that reach the cables at the end of every step; or the drives, before the transmission."""
         command = jnp.asarray(commands.step)
         for mechanism in self.mechanisms:
-            if isinstance(mechanism, ActuationMechanism):
+            if isinstance(mechanism, ActuationMechanism) and (inside_drive(mechanism) or not drives_only):
                 command = mechanism.actuate(values, command, commands.initial, time_step)
         return command
+
+    def driven(self, values: Values, commands: Commands, time_step: float) -> Float[Array, "time channel"]:
+        """Where the drives stand at the observation times, in the unit of the commands.
+
+        Limits of the cables' displacements are no part of it. Whoever does not look at it pays nothing under ``jit``.
+        """
+        command = self.actuated(values, commands, time_step, drives_only=True)
+        return sample(jnp.concatenate([jnp.asarray(commands.initial, command.dtype)[None], command]), commands)
 
     def pretension(self, values: Values) -> Float[Array, " cable"]:
         """Cable displacements at zero command [m]."""

@@ -184,7 +184,8 @@ class TrunkSimulator(RobotSimulator):
         status = jnp.select([case for case, _ in cases], [int(code) for _, code in cases], int(Result.OK))
         seen = observed_at(commands, self.discretisation.time_step)
         position = self.measured(values, sample(motion.position, commands), seen)
-        return Observation(position, sample(motion.tension, commands), None, status)
+        angle = self.driven(values, commands, self.discretisation.time_step)
+        return Observation(position, sample(motion.tension, commands), None, status, angle)
 
     def balance(self, parameters: Values, commands: Commands) -> Balance:
         """See `RobotSimulator.balance`."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TypeVar
 
+from rfdropo_bayes.bayes.angles import angle_specs, gather_angles
 from rfdropo_bayes.bayes.calibration import Batch, CalibrationProblem
 from rfdropo_bayes.bayes.forces import Weighed, check_weighed, gather_tension, tension_specs
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
@@ -56,10 +57,12 @@ def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path())
 
 def fixed_values(experiment: Experiment, simulator: RobotSimulator) -> dict[str, float]:
     """Values of [model.fixed], checked against names and hard bounds."""
-    specs = simulator.parameters + noise_specs(experiment.model.noise) + tension_specs(experiment.model.tension)
-    check_names(experiment.model.fixed, specs, where="[model.fixed]")
+    table = experiment.model
+    readings = tension_specs(table.tension) + angle_specs(table.motor_angle)
+    specs = simulator.parameters + noise_specs(table.noise) + readings
+    check_names(table.fixed, specs, where="[model.fixed]")
     by_name = {spec.name: spec for spec in specs}
-    return {name: check_value(by_name[name], v, where="[model.fixed]") for name, v in experiment.model.fixed.items()}
+    return {name: check_value(by_name[name], v, where="[model.fixed]") for name, v in table.fixed.items()}
 
 
 def load_data(experiment: Experiment, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
@@ -105,7 +108,7 @@ def build_model(
         InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
     """
     table = experiment.model
-    noise = noise_specs(table.noise)
+    noise = noise_specs(table.noise) + angle_specs(table.motor_angle)
     pulls = tension_specs(table.tension)
     fixed = fixed_values(experiment, simulator)
     both = sorted(set(fixed) & set(table.priors))
@@ -127,7 +130,8 @@ def build_model(
     weighed = tuple(Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed)
     check_weighed(weighed, space.names)
     tension = gather_tension(simulator, trajectories, recordings.time.shape[1]) if table.tension else None
-    return TrajectoryModel(simulator, space, fixed, table.noise, recordings, tension, weighed)
+    angles = gather_angles(trajectories, recordings.time.shape[1]) if table.motor_angle else None
+    return TrajectoryModel(simulator, space, fixed, table.noise, recordings, tension, weighed, angles)
 
 
 def build_problem(model: TrajectoryModel, earlier: Batch | None = None) -> CalibrationProblem:

@@ -239,7 +239,8 @@ def held_out_error(
     batch = {name: np.full(count, truth[name]) for name in problem.names}
     for name, column in draws.items():
         batch[name][:-1] = np.asarray(column)[index]
-    position, _, status = problem.observe(jax.tree.map(jax.numpy.asarray, batch))
+    seen = problem.observe(jax.tree.map(jax.numpy.asarray, batch))
+    position, status = np.asarray(seen.position), np.asarray(seen.status)
     good = status[:-1] == 0
     if not good.any() or status[-1] != 0:
         return None

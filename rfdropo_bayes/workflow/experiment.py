@@ -38,8 +38,9 @@ class ModelTable(Table):
     names or wildcards; a recording in none is a group of its own. ``per_group`` lets a parameter differ between groups
     about the value they share, with the given standard deviation in its unit (partial pooling). ``tension`` uses the
     recordings' cable tensions as data, with a relative noise ``tension_noise`` that is inferred and a ``tension_gain``
-    that is 1 unless it has a prior; ``weighed`` lists parameters, or sums of them, known from measurements of their
-    own.
+    that is 1 unless it has a prior; ``motor_angle`` uses the motor angles that the robot measured, with a noise
+    ``motor_angle_noise`` that is inferred; ``weighed`` lists parameters, or sums of them, known from measurements of
+    their own.
     """
 
     mechanisms: list[str] = Field(default_factory=list)
@@ -50,6 +51,7 @@ class ModelTable(Table):
     groups: dict[str, str | list[str]] = Field(default_factory=dict)
     per_group: dict[str, float] = Field(default_factory=dict)
     tension: bool = False
+    motor_angle: bool = False
     weighed: list[WeighedTable] = Field(default_factory=list)
 
 
