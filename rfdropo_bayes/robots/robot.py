@@ -140,6 +140,10 @@ class Robot(Table):
             if np.any(outside) or np.any(np.abs(place[:, :2]) > width + 1e-9):
                 raise ValueError(f"a {name} lies outside the body")
 
+    def without_command_timing(self) -> Robot:
+        """The same robot, carrying every command out at once: no ramp, no dead time."""
+        return self.model_copy(update={"command": Command(unit=self.command.unit, ramp_s=0.0, lag_steps=0)})
+
     @property
     def gravity(self) -> Float[np.ndarray, "3"]:
         """Gravity in the frame of the base [m/s2]."""

@@ -41,6 +41,8 @@ def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path())
     if table.push:
         alone = experiment.model_copy(update={"simulator": table.model_copy(update={"push": False})})
         return build_push_simulator(table, build_simulator(alone, robot, folder))
+    if table.drives == "direct":
+        robot = robot.without_command_timing()
     time_step = table.time_step or robot.time_step_s
     mechanisms = mechanisms_named(experiment.model.mechanisms, robot, folder=folder)
     if table.body == "tetrahedra" and table.tetrahedra is not None:

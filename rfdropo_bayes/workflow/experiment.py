@@ -60,11 +60,13 @@ class SimulatorTable(Table):
 
     ``body`` is made of the layers of the robot's section profile (``nodes_across``, ``refine``) or of the mesh that
     ``tetrahedra`` describes. An experiment may describe both; the body that is not chosen has no effect. ``push`` puts
-    the robot's cube and plate before the trunk.
+    the robot's cube and plate before the trunk. With ``drives = "direct"`` commands act at once, without the robot's
+    ramp and dead time: what the drives do is left to mechanisms such as `command_delay` and `actuator_lag`.
     """
 
     body: Literal["layered", "tetrahedra"] = "layered"
     push: bool = False
+    drives: Literal["robot", "direct"] = "robot"
     tetrahedra: TetrahedraTable | None = None
     engine: Literal["auto", "jax", "numba"] = "auto"
     precision: Literal["float64", "float32"] = "float64"
