@@ -8,7 +8,7 @@ from typing import Literal, TypeVar
 
 from rfdropo_bayes.bayes.angles import angle_specs, gather_angles
 from rfdropo_bayes.bayes.calibration import Batch, CalibrationProblem
-from rfdropo_bayes.bayes.forces import Weighed, check_weighed, gather_tension, tension_specs
+from rfdropo_bayes.bayes.forces import TENSION_GAIN, Weighed, check_weighed, gather_tension, tension_specs
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.pooling import Pooled, gather_groups
@@ -24,7 +24,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, chec
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 from rfdropo_bayes.workflow.engines import build_engine, build_mesh_engine, build_push_simulator
-from rfdropo_bayes.workflow.experiment import Experiment, matching
+from rfdropo_bayes.workflow.experiment import Experiment, ModelTable, matching
 
 Entry = TypeVar("Entry")
 
@@ -57,11 +57,15 @@ def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path())
     return TrunkSimulator(robot, layered, assembly, discretisation, mechanisms)
 
 
+def measurement_specs(table: ModelTable) -> tuple[ParameterSpec, ...]:
+    """Parameters of what is measured: noise of the positions, of tensions and of motor angles, where they are used."""
+    return noise_specs(table.noise) + tension_specs(table.tension) + angle_specs(table.motor_angle)
+
+
 def fixed_values(experiment: Experiment, simulator: RobotSimulator) -> dict[str, float]:
     """Values of [model.fixed], checked against names and hard bounds."""
     table = experiment.model
-    readings = tension_specs(table.tension) + angle_specs(table.motor_angle)
-    specs = simulator.parameters + noise_specs(table.noise) + readings
+    specs = simulator.parameters + measurement_specs(table)
     check_names(table.fixed, specs, where="[model.fixed]")
     by_name = {spec.name: spec for spec in specs}
     return {name: check_value(by_name[name], v, where="[model.fixed]") for name, v in table.fixed.items()}
@@ -104,23 +108,22 @@ def build_model(
 ) -> TrajectoryModel:
     """The probabilistic program of an experiment for the given recordings.
 
-    The noise parameters are always inferred, unless [model.fixed] holds them.
+    The noise parameters are always inferred, unless [model.fixed] holds them; the gain of tensions with a prior only.
 
     Raises:
         InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
     """
     table = experiment.model
-    noise = noise_specs(table.noise) + angle_specs(table.motor_angle)
-    pulls = tension_specs(table.tension)
+    measurement = measurement_specs(table)
     fixed = fixed_values(experiment, simulator)
     both = sorted(set(fixed) & set(table.priors))
     if both:
         raise InputError(f"{both[0]!r} has a prior and a fixed value", where="[model]", remedy="remove one of them")
     added = [spec.name for mechanism in simulator.mechanisms for spec in mechanism.parameters]
-    specs = simulator.parameters + noise + pulls
+    specs = simulator.parameters + measurement
     given = expand_groups(table.priors, specs)
     shared = expand_groups(table.per_recording, specs)
-    defaults = [*added, *shared, *(spec.name for spec in noise), *(spec.name for spec in pulls[:1])]
+    defaults = [*added, *shared, *(spec.name for spec in measurement if spec != TENSION_GAIN)]
     priors = {**given, **{name: {} for name in defaults if name not in fixed and name not in given}}
     recordings = gather_recordings(simulator, trajectories)
     scopes = {

@@ -20,7 +20,6 @@ from rfdropo_bayes.audit.noise import STATED, NoiseModel
 from rfdropo_bayes.audit.pipeline import Answer, Question, audit
 from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.bayes.model import gather_recordings
-from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.space import ParameterSpace, build_space
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
@@ -41,6 +40,7 @@ from rfdropo_bayes.workflow.assembly import (
     find_robot,
     fixed_values,
     load_data,
+    measurement_specs,
     pooling,
 )
 from rfdropo_bayes.workflow.experiment import Experiment, describe, load_experiment, matching
@@ -240,7 +240,7 @@ def _space(
 ) -> tuple[ParameterSpace, int]:
     """Base parameters, then those of the candidates, each with a prior; and how many are base parameters."""
     table = experiment.model
-    noise = {spec.name for spec in noise_specs(table.noise)}
+    noise = {spec.name for spec in measurement_specs(table)}
     fixed = fixed_values(experiment, simulator)
     specs = simulator.parameters
     added = {spec.name for m in candidates for spec in m.parameters}

@@ -14,7 +14,6 @@ import xarray as xr
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
-from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
 from rfdropo_bayes.data import load_unseen, start_is_known
@@ -22,7 +21,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.simulators.parameters import ParameterSpec
-from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values
+from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values, measurement_specs
 from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.files import output_folder
 from rfdropo_bayes.workflow.prediction import FITTED, MARKER_ERRORS, predict_new, thin
@@ -70,7 +69,7 @@ def run_prediction(
     unseen = load_unseen(experiment.data, folder, commands, start, rows)
     simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
     fixed = fixed_values(experiment, simulator)
-    specs = simulator.parameters + noise_specs(experiment.model.noise)
+    specs = simulator.parameters + measurement_specs(experiment.model)
     space = _fitted_space(record, specs)
     model = TrajectoryModel(simulator, space, fixed, experiment.model.noise, gather_recordings(simulator, [unseen]))
     values = thin({info.name: record.posterior[info.name] for info in record.free}, DRAWS)

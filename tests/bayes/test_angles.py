@@ -27,7 +27,7 @@ from rfdropo_bayes.simulators.mechanisms import Mechanism, inside_drive
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
-from rfdropo_bayes.workflow.assembly import build_model, build_simulator
+from rfdropo_bayes.workflow.assembly import build_model, build_simulator, measurement_specs
 from rfdropo_bayes.workflow.experiment import Experiment
 
 STEP = 0.02  # [s], of the simulation and of the recording
@@ -237,6 +237,8 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
     assert model.motor_angle.measured.shape == (1, 20, 6)
     assert set(model.space.names) == {"actuator_lag", "observation_noise", "motor_angle_noise"}
     assert CalibrationProblem(model).physical_names == ("actuator_lag",)
+    measured = {spec.name for spec in measurement_specs(experiment.model)}  # what a posterior may hold beside
+    assert measured == {"observation_noise", "motor_angle_noise"}
 
 
 def test_what_cannot_be_used_is_refused():
