@@ -23,6 +23,7 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.registry import cpu_target
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import (
     intrinsic,
@@ -48,6 +49,7 @@ def kernel(function: Callable, **options: bool) -> Callable:
         error_model="numpy",
         no_cpython_wrapper=True,
         no_cfunc_wrapper=True,
+        _nrt=False,
         pipeline_class=DeferredCompiler,
         **options,
     )(function)
@@ -308,3 +310,7 @@ def any_greater(typing_context, left, right):
         )
 
     return types.boolean(left, right), generate
+
+
+# What Numba loads before it calls its first kernel (0.4 s), with the other imports rather than in the first rollout.
+cpu_target.target_context.refresh()
