@@ -1,8 +1,11 @@
-"""Process-wide settings: double precision, operations in turn, and one BLAS thread for the small solves."""
+"""Process-wide settings: double precision, operations in turn, one BLAS thread for the small solves, and what JAX
+compiled kept for the next process."""
 
 from __future__ import annotations
 
+import hashlib
 import os
+from pathlib import Path
 
 
 def limit_blas_threads() -> None:
@@ -26,3 +29,19 @@ def configure_jax() -> None:
 
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)
+
+
+def keep_compilations() -> None:
+    """Let JAX keep what it compiles in the user's cache folder, unless the user chose otherwise.
+
+    A calibration of the demo spends a quarter of its processor time on compiling what the last one compiled. Programs
+    that call the compiled engines are not kept: JAX leaves callbacks out. The variables are read when JAX is loaded.
+    """
+    from llvmlite import binding
+
+    # Homes are shared between machines; machine code is not.
+    machine = f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}"
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rfdropo_bayes"
+    folder = cache / f"jax-{hashlib.sha256(machine.encode()).hexdigest()[:12]}"
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

@@ -13,6 +13,7 @@ from rfdropo_bayes import __version__
 from rfdropo_bayes.cli import audit, inference, pictures, prediction
 from rfdropo_bayes.cli.options import ExperimentFile, OutFolder, Overrides, Resume, folder_for
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.runtime import keep_compilations
 
 INPUT_ERROR, INTERRUPTED = 2, 3
 
@@ -103,6 +104,7 @@ app.add_typer(benchmark, name="benchmark")
 
 def main() -> None:
     """Run the command line; bad input ends with one line on stderr and status 2, an interrupted run with status 3."""
+    keep_compilations()
     try:
         sys.exit(app(standalone_mode=False))
     except InputError as error:
