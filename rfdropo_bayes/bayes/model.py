@@ -295,7 +295,7 @@ class TrajectoryModel:
             noise = TrajectoryNoise(
                 observation.position[index, :rows], sigma, tau, jnp.asarray(self.recordings.time[index, :rows]), line
             )
-            measured = self.recordings.position[index, :rows] if observe else None
+            measured = jnp.asarray(self.recordings.position[index, :rows]) if observe else None
             numpyro.sample(f"position@{name}", noise, obs=measured)
         if observe and self.tension is not None:
             numpyro.factor("tension", tension_log_density(observation.tension, {**self.fixed, **values}, self.tension))

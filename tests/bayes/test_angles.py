@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpyro.infer.util import log_density
 from scipy import stats
 
 from rfdropo_bayes.bayes.angles import angle_specs, gather_angles
@@ -112,10 +113,15 @@ def test_the_density_of_the_angles_is_that_of_normals_at_new_readings_only():
         expected = stats.norm.logpdf(read.motor_angle[row], drive, 0.01).sum() if new else 0.0
         assert with_angles[row] - without[row] == pytest.approx(expected, abs=1e-9)
     assert with_angles[0] == without[0]  # when the first row was read is not known
-    residuals = np.asarray(chosen.residuals({name: value[0] for name, value in values.items()}, 60))
+    single = {name: value[0] for name, value in values.items()}
+    residuals = np.asarray(chosen.residuals(single, 60))
     count = 2 * 19
     constant = -60 * 3 * np.log(SENT) - count * np.log(0.01) - 0.5 * (180 + count) * np.log(2 * np.pi)
     assert with_angles.sum() == pytest.approx(constant - 0.5 * np.sum(residuals**2), rel=1e-9)
+    # The numpyro program has the same joint density.
+    joint, _ = log_density(chosen.model, (), {}, single)
+    prior = sum(float(p.prior.log_prob(single[p.name])) for p in chosen.model.space.parameters)
+    assert float(joint) == pytest.approx(with_angles.sum() + prior, rel=1e-9)
     # A prefix holds the rows of the whole, and data put in the model's place count as its own do.
     np.testing.assert_allclose(chosen.row_log_likelihood(values, 20)[0][0], with_angles[:20])
     shifted = chosen.with_measured(chosen.measured._replace(motor_angle=chosen.measured.motor_angle + 1.0))
