@@ -34,12 +34,12 @@ class Command(Table):
     Attributes:
         unit: of the recorded commands: "m" of cable, or "rad" of a motor.
         ramp_s: a change of command is carried out linearly over this time.
-        lag_steps: the displacement applied is that of so many time steps before.
+        dead_time_s: a command starts to act so much later than it was given.
     """
 
     unit: Literal["m", "rad"]
     ramp_s: float = Field(ge=0.0)
-    lag_steps: int = Field(ge=0)
+    dead_time_s: float = Field(ge=0.0)
 
 
 class Marker(Table):
@@ -142,7 +142,7 @@ class Robot(Table):
 
     def without_command_timing(self) -> Robot:
         """The same robot, carrying every command out at once: no ramp, no dead time."""
-        return self.model_copy(update={"command": Command(unit=self.command.unit, ramp_s=0.0, lag_steps=0)})
+        return self.model_copy(update={"command": Command(unit=self.command.unit, ramp_s=0.0, dead_time_s=0.0)})
 
     @property
     def gravity(self) -> Float[np.ndarray, "3"]:

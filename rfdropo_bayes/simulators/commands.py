@@ -36,12 +36,12 @@ def commands_on_grid(
     *,
     time_step: float,
     ramp: float = 0.0,
-    lag_steps: int = 0,
+    dead_time: float = 0.0,
 ) -> Commands:
     """Sample a piecewise-constant command on steps of ``time_step``.
 
     ``value[k]`` is in force from ``time[k]`` on; a change is carried out linearly over ``ramp`` seconds (a moving
-    average of the piecewise-constant signal, so that overlapping changes add up), ``lag_steps`` steps late. The clock
+    average of the piecewise-constant signal, so that overlapping changes add up), ``dead_time`` seconds late. The clock
     starts at the first observation.
 
     Args:
@@ -66,7 +66,7 @@ def commands_on_grid(
     fraction = np.clip(elapsed - sample_step, 0.0, None)
     fraction[fraction < 1e-6] = 0.0
     n_steps = int(sample_step[-1]) + int(fraction[-1] > 0)
-    end = observation_time[0] + time_step * (np.arange(1, n_steps + 1) - lag_steps)
+    end = observation_time[0] + time_step * np.arange(1, n_steps + 1) - dead_time
     return Commands(np.asarray(initial, float), _ramped(time, value, initial, end, ramp), sample_step, fraction)
 
 

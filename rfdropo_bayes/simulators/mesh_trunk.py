@@ -87,7 +87,7 @@ class MeshTrunkSimulator(RobotSimulator):
             observation_time,
             time_step=self.time_step,
             ramp=self.robot.command.ramp_s,
-            lag_steps=self.robot.command.lag_steps,
+            dead_time=self.robot.command.dead_time_s,
         )
 
     def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:

@@ -158,7 +158,7 @@ class TrunkSimulator(RobotSimulator):
             observation_time,
             time_step=self.discretisation.time_step,
             ramp=self.robot.command.ramp_s,
-            lag_steps=self.robot.command.lag_steps,
+            dead_time=self.robot.command.dead_time_s,
         )
 
     def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:

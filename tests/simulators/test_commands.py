@@ -26,11 +26,14 @@ def test_a_ramp_spreads_a_change_over_its_duration():
     np.testing.assert_allclose(commands.step[:, 0], np.arange(1.0, 11.0), atol=1e-12)
 
 
-def test_a_lag_postpones_everything_by_whole_steps():
-    prompt = grid([0.0, 0.05], [5.0, 10.0], [0.0, 0.1], time_step=0.01, ramp=0.05)
-    late = grid([0.0, 0.05], [5.0, 10.0], [0.0, 0.1], time_step=0.01, ramp=0.05, lag_steps=1)
-    np.testing.assert_allclose(late.step[1:, 0], prompt.step[:-1, 0], atol=1e-12)
-    assert late.step[0, 0] == 0.0
+@pytest.mark.parametrize("time_step", [0.005, 0.01])
+def test_a_dead_time_postpones_everything_whatever_the_time_step(time_step):
+    dead = 0.02
+    prompt = grid([0.0, 0.05], [5.0, 10.0], [0.0, 0.1], time_step=time_step, ramp=0.05)
+    late = grid([0.0, 0.05], [5.0, 10.0], [0.0, 0.1], time_step=time_step, ramp=0.05, dead_time=dead)
+    steps = round(dead / time_step)
+    np.testing.assert_allclose(late.step[steps:, 0], prompt.step[:-steps, 0], atol=1e-12)
+    np.testing.assert_allclose(late.step[:steps, 0], 0.0, atol=1e-12)
 
 
 @given(
