@@ -41,7 +41,7 @@ def test_unknown_robot_lists_the_known_ones():
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("dead_time_s = 0.0", "dead_time_s = 0.0\nramp_ms = 1", r"unknown key 'command.ramp_ms'; did you mean 'ramp_s'"),
+        ("dead_time_s = 0.0", "dead_time_s = 0\nramp_ms = 1", r"unknown key 'command.ramp_ms'; did you mean 'ramp_s'"),
         ("time_step_s = 0.01", "", "'time_step_s' is missing"),
         ("time_step_s = 0.01", "time_step_s = 0.0", "time_step_s"),
         ("time_step_s = 0.01", "time_step_s = nan", "time_step_s"),
