@@ -61,10 +61,9 @@ def gather_angles(trajectories: Sequence[Trajectory], length: int) -> AngleData:
                 where=trajectory.name,
                 remedy="leave [model] motor_angle = true out, or record them",
             )
-        unit = trajectory.dataset["command"].attrs["unit"]
-        if unit != "rad":
+        if trajectory.command_unit != "rad":
             raise InputError(
-                f"its commands are in {unit}: motor angles tell of commands in rad only",
+                f"its commands are in {trajectory.command_unit}: motor angles tell of commands in rad only",
                 where=trajectory.name,
                 remedy="leave [model] motor_angle = true out, or give the commands as angles of the motors",
             )

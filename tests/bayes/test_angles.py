@@ -19,6 +19,7 @@ from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.held_readings import hold_time
+from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.mechanisms.registry import REGISTRY, mechanisms_named
@@ -141,6 +142,16 @@ def test_held_readings_stay_masked_when_rows_are_cut_or_resampled_and_in_a_file(
     whole.save(tmp_path / "held.nc")
     np.testing.assert_array_equal(Trajectory.load(tmp_path / "held.nc").motor_angle_mask, whole.motor_angle_mask)
     assert recording(60).motor_angle_mask.all()  # read at every row
+
+
+def test_a_table_of_columns_is_searched_for_held_angles_too(tmp_path):
+    whole = recording(60, hold=3)
+    table = np.column_stack([whole.time, whole.command, whole.position[:, 0], whole.motor_angle])
+    np.savetxt(tmp_path / "r.csv", table, "%.9g", delimiter=",", header="t,a,b,x,y,z,phi_a,phi_b", comments="")
+    columns = {"time": "t", "commands": ["a", "b"], "command_unit": "rad", "positions": [["x", "y", "z"]]}
+    columns |= {"position_unit": "m", "axes": ["x", "y", "z"], "motor_angles": ["phi_a", "phi_b"], "robot": "r"}
+    read = read_plain_csv(tmp_path / "r.csv", CsvColumns.model_validate(columns))
+    np.testing.assert_array_equal(read.motor_angle_mask, whole.motor_angle_mask)
 
 
 def test_a_replica_holds_new_angles_with_the_noise_of_the_model():
