@@ -163,6 +163,13 @@ def _commands(simulator: Simulator, trajectory: Trajectory) -> Commands:
             where=trajectory.name,
             remedy="use the robot that was recorded",
         )
+    unit = getattr(simulator, "command_unit", trajectory.command_unit)
+    if trajectory.command_unit != unit:
+        raise InputError(
+            f"the recording's commands are in {trajectory.command_unit}, the robot's in {unit}",
+            where=trajectory.name,
+            remedy="give the unit of the commands in the recording's columns, or use the robot that was recorded",
+        )
     return simulator.commands(trajectory.command_time, value, trajectory.initial_command, trajectory.time)
 
 

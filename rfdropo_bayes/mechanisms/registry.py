@@ -6,8 +6,10 @@ experiment file, stands wherever a registry name does; see docs/mechanisms.md.
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import importlib.util
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -80,6 +82,15 @@ REGISTRY: dict[str, type] = {
 }
 
 
+ACTS = {
+    "actuation": ("actuate",),
+    "body": ("embody",),
+    "contact": ("embody",),
+    "sensing": ("sense", "sense_over_time"),
+}
+"""By which method a mechanism of each stage acts."""
+
+
 def mechanisms_named(
     names: Iterable[str],
     robot: Robot | None = None,
@@ -112,21 +123,48 @@ def _imported(name: str, folder: Path, where: str) -> Any:
     source, _, attribute = name.rpartition(":")
     try:
         if source.endswith(".py"):
-            spec = importlib.util.spec_from_file_location(Path(source).stem, Path(folder) / source)
+            path = Path(folder).resolve() / source
+            # A file of any name, which must not stand for an installed module of that name.
+            own = f"rfdropo_mechanism_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
+            spec = importlib.util.spec_from_file_location(own, path)
             assert spec is not None
             assert spec.loader is not None
             module = importlib.util.module_from_spec(spec)
+            # As an import does it: dataclasses look their module up while they are made.
+            sys.modules[spec.name] = module
             spec.loader.exec_module(module)
         else:
             module = importlib.import_module(source)
         kind = getattr(module, attribute)
-    except (ImportError, OSError, AttributeError, ValueError) as error:
+    except Exception as error:  # whatever a user's code raises
         raise InputError(
-            f"cannot import the mechanism {name!r} ({error})",
+            f"cannot import the mechanism {name!r} ({type(error).__name__}: {error})",
             where=where,
             remedy="give module:ClassName of an installed module, or file.py:ClassName beside the experiment file",
         ) from None
-    lacking = [key for key in ("name", "stage", "cause", "remedy") if not hasattr(kind, key)]
-    if lacking:
-        raise InputError(f"{name!r} is no mechanism: it lacks {', '.join(lacking)}", where=where)
+    _check_kind(kind, name, where)
     return kind
+
+
+def _check_kind(kind: Any, name: str, where: str) -> None:
+    """Raise InputError where a user's class lacks what a mechanism must have, or has the name of another."""
+    lacking = [key for key in ("name", "stage", "cause", "remedy") if not hasattr(kind, key)]
+    # A class that is made for a robot may have its parameters only then.
+    if not hasattr(kind, "for_robot") and not hasattr(kind, "parameters"):
+        lacking.append("parameters")
+    if lacking:
+        raise InputError(
+            f"{name!r} is no mechanism: it lacks {', '.join(lacking)}", where=where, remedy="see docs/mechanisms.md"
+        )
+    if kind.stage in ACTS and not any(hasattr(kind, method) for method in ACTS[kind.stage]):
+        raise InputError(
+            f"{name!r} has stage {kind.stage!r}, but no method {' or '.join(ACTS[kind.stage])}",
+            where=where,
+            remedy="write the method, or give the stage at which it acts",
+        )
+    if REGISTRY.get(kind.name, kind) is not kind:
+        raise InputError(
+            f"{name!r} has the name of a mechanism of the library, {kind.name!r}",
+            where=where,
+            remedy="give it a name of its own",
+        )

@@ -6,7 +6,9 @@ simulator exactly. The library of mechanisms lives one room above.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Array, Float
@@ -81,6 +83,17 @@ class TimedSensingMechanism(Mechanism, Protocol):
 def inside_drive(mechanism: Mechanism) -> bool:
     """Whether an encoder on the motor shows what a mechanism of actuation does."""
     return bool(getattr(mechanism, "inside_drive", True))
+
+
+def code_of(mechanisms: Iterable[Mechanism]) -> bytes:
+    """The files that mechanisms are written in: a name alone does not tell whether its code has changed."""
+    found: set[bytes] = set()
+    for kind in {type(mechanism) for mechanism in mechanisms}:
+        try:
+            found.add(Path(inspect.getfile(kind)).read_bytes())
+        except (OSError, TypeError):  # written in a notebook or at a prompt
+            found.add(f"{kind.__module__}.{kind.__qualname__}".encode())
+    return b"".join(sorted(found))
 
 
 def check_mechanisms(mechanisms: Iterable[Mechanism]) -> tuple[Mechanism, ...]:

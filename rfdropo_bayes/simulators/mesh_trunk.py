@@ -68,6 +68,7 @@ class MeshTrunkSimulator(RobotSimulator):
             "elements": len(body.element),
             **{name: value for name, value in self.options.model_dump().items() if name != "unit"},
             "mechanisms": [mechanism.name for mechanism in self.mechanisms],
+            "content_sha256": self.content_sha256,
         }
 
     def commands(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
@@ -19,6 +20,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     Mechanism,
     SensingMechanism,
     TimedSensingMechanism,
+    code_of,
     inside_drive,
 )
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
@@ -91,6 +93,16 @@ class RobotSimulator:
             for name, p in self.robot.parameter_table().items()
         )
         return base + tuple(spec for mechanism in self.mechanisms for spec in mechanism.parameters)
+
+    @cached_property
+    def content_sha256(self) -> str:
+        """Digest of the robot's description and of the mechanisms' code: what their names do not tell."""
+        return hashlib.sha256(self.robot.model_dump_json().encode() + code_of(self.mechanisms)).hexdigest()
+
+    @property
+    def command_unit(self) -> str:
+        """Unit of the robot's commands: "m" of cable, or "rad" of a motor."""
+        return self.robot.command.unit
 
     @property
     def marker_names(self) -> tuple[str, ...]:

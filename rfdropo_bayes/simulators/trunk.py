@@ -141,6 +141,7 @@ class TrunkSimulator(RobotSimulator):
             "nodes_across": self.discretisation.nodes_across,
             "layers": len(self.assembly.system.body.station) - 1,
             "mechanisms": [mechanism.name for mechanism in self.mechanisms],
+            "content_sha256": self.content_sha256,
         }
 
     def commands(

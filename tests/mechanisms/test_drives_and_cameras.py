@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import jax
@@ -13,6 +14,8 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.commands import commands_on_grid
+from rfdropo_bayes.workflow.assembly import build_simulator
+from rfdropo_bayes.workflow.experiment import Experiment
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.01
@@ -162,6 +165,54 @@ def test_a_mechanism_of_the_users_own_is_found_beside_the_experiment(tmp_path):
     for wrong in ("mine.py:None_", "other.py:Half", "no.such:Thing", "mine.py:Nothing"):
         with pytest.raises(InputError):
             mechanisms_named([wrong], folder=tmp_path)
+
+
+BASE = "from rfdropo_bayes.mechanisms.actuation import CommandGain\n"
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("class Own(CommandGain)\n    pass", "SyntaxError"),
+        (BASE + "class Own(CommandGain):\n    name = nowhere", "NameError"),
+        ("class Own:\n    name, stage, cause, remedy = 'own', 'actuation', '', ''", "lacks parameters"),
+        (
+            "class Own:\n    name, stage, cause, remedy, parameters = 'own', 'actuation', '', '', ()",
+            "no method actuate",
+        ),
+        (BASE + "class Own(CommandGain):\n    name, stage = 'own', 'sensing'", "no method sense or sense_over_time"),
+        (BASE + "class Own(CommandGain):\n    pass", "has the name of a mechanism of the library, 'command_gain'"),
+    ],
+)
+def test_what_is_wrong_with_a_mechanism_of_the_users_own_is_said(tmp_path, code, message):
+    (tmp_path / "own.py").write_text(code)
+    with pytest.raises(InputError, match=message):
+        mechanisms_named(["own.py:Own"], folder=tmp_path)
+
+
+def test_a_users_file_may_hold_dataclasses_and_have_any_name(tmp_path):
+    (tmp_path / "numpy.py").write_text(
+        "from __future__ import annotations\nfrom dataclasses import dataclass\n"
+        + BASE
+        + "@dataclass\nclass Own(CommandGain):\n    share: float = 0.5\n    name = 'own'\n"
+    )
+    (mechanism,) = mechanisms_named(["numpy.py:Own"], folder=tmp_path)
+    assert mechanism.share == 0.5
+    assert sys.modules["numpy"] is np
+
+
+def test_the_code_of_a_mechanism_is_part_of_what_a_simulator_is(tmp_path):
+    """A checkpoint made with other code, or with another robot of the same name, must not be taken up."""
+    robot = load_robot("smooth_arm")
+    stiffer = robot.model_copy(update={"description": "the same name, other content"})
+
+    def content(robot, share):
+        (tmp_path / "own.py").write_text(BASE + f"class Own(CommandGain):\n    name, share = 'own', {share}")
+        experiment = Experiment(robot="smooth_arm", model={"mechanisms": ["own.py:Own"]})
+        return build_simulator(experiment, robot, tmp_path).description["content_sha256"]
+
+    assert content(robot, 1) == content(robot, 1)
+    assert len({content(robot, 1), content(robot, 2), content(stiffer, 1)}) == 3
 
 
 def test_the_documented_example_is_a_mechanism(tmp_path):
