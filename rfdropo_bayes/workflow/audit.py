@@ -303,6 +303,10 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path) -> dic
             for spec in candidate.mechanism.parameters if candidate.mechanism else ():
                 if spec.name not in fixed:
                     model.setdefault("priors", {}).setdefault(spec.name, dict(spec.prior))
+    audit = extended.get("audit", {})
+    if "candidates" in audit:
+        taken = {c.source for c in answer.question.candidates if c.name in {step.name for step in answer.steps}}
+        audit["candidates"] = [_found_again(source, folder) for source in audit["candidates"] if source not in taken]
     data = extended.get("data", {})
     robot = folder / str(extended.get("robot", ""))
     if robot.suffix == ".toml" and robot.is_file():
