@@ -16,6 +16,7 @@ from rfdropo_bayes.simulators.mechanisms import Mechanism
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)  # quantiles of the prior at which a shape is tried
 LEVELS_OF_TWO = (0.2, 0.5, 0.8)  # if there are two of them
 WAY = np.geomspace(0.05, 1.5, 12)  # from null to where a shape was tried: where on it the data are met best
+SIZES = np.geomspace(0.03, 3.0, 12)  # of an amplitude, in deviations of its prior: far from null its slope says little
 UNSEEN = 1e-6  # of the whitened data per prior deviation: the parameter does nothing at null
 
 
@@ -162,19 +163,39 @@ def _probe(
 def lead(target: Target, fit: Fit, probe: Probe, lm: float) -> tuple[float, Float[np.ndarray, " d"]]:
     """What a candidate may take from the sum of squares, and the point from which a refit should start.
 
-    The score statistic is the drop that an amplitude brings. A shape alone has none: its effect has the size it has,
-    and may be too large where it was tried. The way there from its null value is searched, with places and times held
-    where there is also a size.
+    The score statistic is the drop that an amplitude brings, if its effect is in proportion to it. One large enough to
+    shift a motion by its own period is not, so that several sizes of a single amplitude are tried besides. A shape
+    alone has no amplitude: its effect has the size it has, and may be too large where it was tried. The way there from
+    its null value is searched, with places and times held where there is also a size.
     """
+    coordinates = target.forward.coordinates
+    if len(probe.amplitudes) == 1:
+        found = _best_of(target, fit, _sizes(target, fit, probe))
+        return found if found[0] > lm else (lm, probe.start(fit))
     if probe.amplitudes:
         return lm, probe.start(fit)
-    base, coordinates = span(fit.jacobian), target.forward.coordinates
     points = np.repeat(fit.x[None], len(WAY), axis=0)
     sizes = [i for i in probe.point if coordinates.affine[i] and not coordinates.space.parameters[i].spec.grid]
     for index, value in probe.point.items():
         null = coordinates.null[index]
         points[:, index] = null + WAY * (value - null) if index in sizes or not sizes else value
-    points = np.clip(points, *coordinates.bounds)
+    return _best_of(target, fit, np.clip(points, *coordinates.bounds))
+
+
+def _sizes(target: Target, fit: Fit, probe: Probe) -> Float[np.ndarray, "way d"]:
+    """A fit with several sizes of a probe's one amplitude, of both signs where it has two."""
+    coordinates, (index,) = target.forward.coordinates, probe.amplitudes
+    null, sd, sign = coordinates.null[index], coordinates.prior_sd[index], coordinates.one_sided[index]
+    sizes = SIZES * sign if sign else np.concatenate([-SIZES, SIZES])
+    points = np.repeat(fit.x[None], len(sizes), axis=0)
+    points[:, list(probe.point)] = list(probe.point.values())
+    points[:, index] = null + sd * sizes
+    return np.clip(points, *coordinates.bounds)
+
+
+def _best_of(target: Target, fit: Fit, points: Float[np.ndarray, "way d"]) -> tuple[float, Float[np.ndarray, " d"]]:
+    """The point that takes most from the sum of squares, base parameters moved with it, and how much it takes."""
+    base = span(fit.jacobian)
     found = target.recall("way", [points], lambda: {"residual": target.residual(points)})["residual"]
     left = np.sum(project_out(base, found.T) ** 2, axis=0)
     best = int(np.argmin(left))

@@ -15,6 +15,8 @@ from rfdropo_bayes.audit.screen import Look, Row, look
 
 DISCRETISATION = "discretisation"
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])
+TOLD_APART = 10.0  # nats: one of a class that explains the data so much worse, once refitted, is none of it
+POOR = 2.0  # squared residual per value from which on a climb may have ended far from where it should
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,12 @@ class Inquiry:
             step = self._extend(found, named)
             if step is None:
                 return steps, found
+            if steps and (better := self._climbed_again(step, named)) is not None:
+                self.report(f"without {step.name}, a better optimum than before: {steps[-1].name} once more")
+                gained = better.log_evidence - fit.log_evidence
+                steps[-1] = replace(steps[-1], fit=better, log_bayes_factor=steps[-1].log_bayes_factor + gained)
+                fit = better
+                continue
             steps.append(step)
             fit = step.fit
             if len(steps) > 1:
@@ -141,14 +149,31 @@ class Inquiry:
             fits[row.name] = self._refit(found.fit, row, leads[row.name][1])
             refits[row.name] = fits[row.name].log_evidence - found.fit.log_evidence
             self.report(f"refit with {row.name}: log Bayes factor {refits[row.name]:.1f}")
+        for name, fit in fits.items():
+            fits[name] = self._from_afar(name, fit)
+            refits[name] = fits[name].log_evidence - found.fit.log_evidence
         further = np.log(len(self.candidates)) if named else 0.0
         if not refits or max(refits.values()) < self.rules.evidence + further:
             return None
         best = max(refits, key=lambda name: refits[name])
         enough = self.rules.class_cosine**2 * leads[best][0]
         able = [row for row in significant if leads[row.name][0] > enough]
+        # What looks the same near null may be another thing at the size that it has.
+        able = [row for row in able if refits.get(row.name, np.inf) > refits[best] - TOLD_APART]
         members = self._class_of(found.row(best), able)
         return Step(best, members, found, fits[best], refits[best], refits)
+
+    def _climbed_again(self, step: Step, named: Sequence[str]) -> Fit | None:
+        """The model before a step, climbed from where the step led: a candidate must not be named for having moved a
+        climb on that had stopped early. None where that is no better."""
+        before = step.before.fit
+        if any(other == DISCRETISATION for other in named):  # its fits are of another simulator
+            return None
+        start = step.fit.x.copy()
+        added = np.setdiff1d(step.fit.free, before.free)
+        start[added] = before.x[added]
+        again = climb(self.target, start, before.free)
+        return again if again.log_evidence > before.log_evidence + 1.0 else None
 
     def _lead(self, fit: Fit, row: Row) -> tuple[float, np.ndarray]:
         """See `lead`; a finer mesh has no parameter, and its effect only one size."""
@@ -202,6 +227,27 @@ class Inquiry:
         if found.residual @ found.residual > fit.residual @ fit.residual:
             found = max(found, climb(self.target, fit.x, free), key=lambda end: end.log_evidence)
         return found
+
+    def _from_afar(self, name: str, fit: Fit) -> Fit:
+        """A fit with one amplitude that leaves most of a large misfit, or a better one from elsewhere: the base model's
+        optimum, where it has made up for the effect, may be in another valley than that of both together."""
+        candidate = next((c for c in self.candidates if c.name == name), None)
+        poor = fit.residual @ fit.residual > POOR * np.count_nonzero(fit.residual)
+        if candidate is None or len(candidate.indices) != 1 or not poor:
+            return fit
+        coordinates, (index,) = self.target.forward.coordinates, candidate.indices
+        signs = (coordinates.one_sided[index],) if coordinates.one_sided[index] else (-1, 1)
+        ends = [fit]
+        for sign in signs:
+            far = coordinates.prior_mean.copy()
+            far[coordinates.base :] = fit.x[coordinates.base :]
+            for start in (fit.x.copy(), far):
+                start[index] = coordinates.null[index] + sign * coordinates.prior_sd[index]
+                ends.append(climb(self.target, start, fit.free))
+        best = max(ends, key=lambda end: end.log_evidence)
+        if best is not fit:
+            self.report(f"{name} from elsewhere: sum of squares {best.residual @ best.residual:.0f}")
+        return best
 
     def _on_the_way(self, fit: Fit, row: Row, start: np.ndarray) -> np.ndarray:
         """The best point between a fit and the linear extrapolation from it, which a large misfit carries too far."""

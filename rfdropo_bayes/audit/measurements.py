@@ -27,7 +27,8 @@ class Measurements:
         position: mean over the repeats [m]; zero where nothing is valid.
         count: valid repeats behind each value.
         single: every recording on its own; single_valid: what may be used of it.
-        repeated: True for recordings that have repeats.
+        apart: recordings that repeat the commands of another one and are not joined with it, as their rows or clocks
+            differ.
     """
 
     names: tuple[str, ...]
@@ -37,6 +38,7 @@ class Measurements:
     count: Float[np.ndarray, "group time channel"]
     single: Float[np.ndarray, "recording time channel"]
     single_valid: np.ndarray
+    apart: tuple[str, ...] = ()
 
     @property
     def valid(self) -> np.ndarray:
@@ -113,9 +115,18 @@ def gather_measurements(recordings: RecordingSet, trajectories: Sequence[Traject
         np.stack([valid[list(group)].sum(axis=0).astype(float) for group in groups]),
         position,
         valid,
+        _apart(recordings, trajectories, groups) if join else (),
     )
     object.__setattr__(measurements, "position", measurements.mean_of(position))
     return measurements
+
+
+def _apart(
+    recordings: RecordingSet, trajectories: Sequence[Trajectory], groups: Sequence[tuple[int, ...]]
+) -> tuple[str, ...]:
+    firsts = {group[0] for group in groups}
+    repeats = [index for found in group_repeats(trajectories) for index in found[1:]]
+    return tuple(recordings.names[index] for index in repeats if index in firsts)
 
 
 def _groups(recordings: RecordingSet, trajectories: Sequence[Trajectory]) -> list[tuple[int, ...]]:

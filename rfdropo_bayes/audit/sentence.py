@@ -54,6 +54,8 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
             f"{named} {verb} named, but the discrepancy is too small to say how much of it that explains "
             f"([{low:.0f}, {high:.0f}] %); unseen recordings are {likelier}likelier with it"
         )
+    elif answer.verdict == UNEXPLAINED and gain.explained < 0.0:
+        head = f"Unexplained: with the best of the library, {named}, unseen recordings are predicted worse"
     elif answer.verdict == UNEXPLAINED:
         head = f"Unexplained: the best of the library, {named}, explains only {share}"
     elif answer.verdict in (EXPLAINED, "equivalent"):
@@ -98,10 +100,13 @@ def _excluded(answer: Answer) -> str:
 
 def _remains(answer: Answer) -> str:
     assert answer.gain is not None
+    noise = noise_distance(answer.target.noise)
     remain = f"{1e3 * answer.gain.rmse_extended:.2g} mm remain"
-    if answer.target.noise.source == REPEATS:
-        return f"{remain}, {1e3 * noise_distance(answer.target.noise):.2g} mm of it noise"
-    return remain
+    if answer.target.noise.source != REPEATS:
+        return remain
+    return (
+        f"{remain}, {1e3 * noise:.2g} mm of it noise" if noise < answer.gain.rmse_extended else f"{remain}, all noise"
+    )
 
 
 def _resolution(answer: Answer) -> str:
@@ -116,4 +121,11 @@ def _assumption(answer: Answer) -> str:
         return ""
     if source == STATED:
         return "; the noise is what the experiment file states"
-    return "; without repeats the noise is an assumption, an autoregression fitted to the residuals themselves"
+    words = "; without repeats the noise is an assumption, an autoregression fitted to the residuals themselves"
+    if apart := answer.target.measurements.apart:
+        which = ", ".join(apart[:MOST_EXCLUDED]) + (" ..." if len(apart) > MOST_EXCLUDED else "")
+        words += (
+            f" (the same commands were repeated in {which}, but rows or clocks differ: [data] resample brings "
+            "recordings onto one clock)"
+        )
+    return words

@@ -10,15 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rfdropo_bayes.audit.candidates import lead
 from rfdropo_bayes.audit.experiment_design import Hypothesis, at_hand, outlooks
-from rfdropo_bayes.audit.extension import Inquiry
+from rfdropo_bayes.audit.extension import Inquiry, Step
+from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
 from rfdropo_bayes.audit.journal import Journal
+from rfdropo_bayes.audit.measurements import gather_measurements
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.record import next_experiment, record
+from rfdropo_bayes.bayes.model import gather_recordings
+from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.simulators.commands import Commands
 
-from .toys import CANDIDATES, NOISE, Toy, question
+from .toys import CANDIDATES, NOISE, ROWS, STEP, Toy, question, recordings
 
 TRUTH = {"gain": 1.3, "bend": -0.4}
 
@@ -215,3 +220,52 @@ def test_a_refit_finds_back_from_an_extrapolation_at_which_rollouts_fail(monkeyp
     fit = inquiry.refit(base, look.row("play"))
     assert fit.log_evidence > base.log_evidence + 10.0
     assert asked.coordinates.named(fit.x)["play"] == pytest.approx(1.0, abs=0.2)
+
+
+class Turning(Toy):
+    """A ``lag`` whose effect near null is another than that of a size that matters."""
+
+    def rollout(self, parameters, commands, steps=None):
+        values = {spec.name: jnp.asarray(spec.nominal) for spec in Toy.parameters} | dict(parameters)
+        size = values["lag"]
+        return super().rollout(values | {"lag": size**2, "play": values["play"] + 0.05 * size}, commands, steps)
+
+
+def test_a_large_effect_is_found_though_its_slope_at_null_points_elsewhere():
+    asked = replace(question({**TRUTH, "delay": 1.0}, 2), lanes=Lanes(Turning(), np.arange(4)))
+    target, base = base_model(asked, np.random.default_rng(0))
+    look, _ = Inquiry(target, asked.candidates, asked.rules, 0).look_at(base)
+    row = look.row("lag")
+    drop, start = lead(target, base, row.probe, row.lm)
+    assert drop > 10.0 * row.lm
+    assert drop > 0.8 * look.row("delay").lm  # of which it can do the same at its size 1 or -1
+    assert abs(start[asked.coordinates.space.names.index("lag")]) == pytest.approx(1.0, abs=0.35)
+
+
+def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it():
+    asked = question({**TRUTH, "play": 1.0}, 1)
+    target, base = base_model(asked, np.random.default_rng(0))
+    inquiry = Inquiry(target, asked.candidates, asked.rules, 0)
+    look, _ = inquiry.look_at(base)
+    play, creep = (next(c for c in asked.candidates if c.name == name) for name in ("play", "creep"))
+    with_play = np.array([*base.free, *play.indices], dtype=int)
+    early = climb(target, base.x, with_play, evaluations=1)
+    whole = climb(target, base.x, with_play)
+    assert early.log_evidence < whole.log_evidence - 100.0  # what it is about
+    both = climb(target, whole.x, np.array([*with_play, *creep.indices], dtype=int))
+    step = Step("creep", ("creep",), replace(look, fit=early), both, both.log_evidence - early.log_evidence, {})
+    again = inquiry._climbed_again(step, ["play"])
+    assert again is not None
+    assert again.log_evidence == pytest.approx(whole.log_evidence, abs=0.1)
+    assert inquiry._climbed_again(replace(step, before=replace(look, fit=whole)), ["play"]) is None
+
+
+def test_repeats_whose_clocks_differ_are_not_joined_and_named():
+    trajectories = recordings(TRUTH, 1)[:4]
+    late = trajectories[1].dataset
+    time = late["time"].values + 0.2 * STEP * (np.arange(ROWS) % 2)
+    trajectories[1] = Trajectory(late.assign_coords(time=time))
+    measurements = gather_measurements(gather_recordings(Toy(), trajectories), trajectories, join=True)
+    assert measurements.apart == ("r1",)
+    assert measurements.members[0] == (0, 2)
+    assert gather_measurements(gather_recordings(Toy(), trajectories), trajectories, join=False).apart == ()
