@@ -131,6 +131,67 @@ def read_plain_csv(
     )
 
 
+def read_csv_start(path: Path, columns: CsvColumns, start: Path | None, row: int = 0) -> Trajectory:
+    """Commands with the start pose at most: positions of one observation row, all others masked.
+
+    Observations are due at the times of the commands, and once more as long after the last as two are apart.
+
+    Args:
+        path: file of the commands, with their times.
+        columns: what each column is; those of positions are looked for in ``start`` only.
+        start: file that holds the start pose; None where it is not known.
+        row: that of the start pose; a file of a single row has it there.
+
+    Raises:
+        InputError: on a damaged file, a column that is not there, or a start without that row.
+    """
+    table = CsvTable(path, columns.commands, machine_written=False)
+    time = _times(table, columns)
+    time = np.append(time, time[-1] + (float(np.median(np.diff(time))) if len(time) > 1 else 1.0))
+    markers = len(columns.positions)
+    position, mask = np.zeros((len(time), markers, 3)), np.zeros((len(time), markers), dtype=bool)
+    if start is not None:
+        coordinates = [name for point in columns.positions for name in point]
+        points = CsvTable(start, coordinates, machine_written=False).points(coordinates, allow_missing=True)
+        if len(points) != 1 and row >= len(points):
+            raise InputError(f"has no row {row} to start from", where=str(start), remedy="choose other --rows")
+        first = _METRES[columns.position_unit] * points[min(row, len(points) - 1)] @ axes_matrix(columns.axes).T
+        seen = np.isfinite(first).all(axis=1)
+        position[:], mask[row] = np.where(seen[:, None], first, 0.0), seen
+    command = _commands(table, None, columns)
+    return Trajectory.build(
+        name=path.name.removesuffix(".gz").removesuffix(".csv"),
+        robot=columns.robot,
+        format=FORMAT,
+        time=time,
+        position=position,
+        position_mask=mask,
+        marker_names=columns.markers or [f"m{marker}" for marker in range(1, markers + 1)],
+        command_time=time[:-1],
+        command=command,
+        command_unit=_COMMANDS[columns.command_unit][0],
+        initial_command=command[0],
+        cable_names=columns.cables or columns.commands,
+        provenance=path.name,
+        settings={"unseen": True},
+    )
+
+
+def command_columns(
+    columns: CsvColumns, time: Float[np.ndarray, " rows"], command: Float[np.ndarray, "rows cable"]
+) -> dict[str, Float[np.ndarray, " rows"]]:
+    """Times [s] and commands [m or rad] as the columns of a file that this table describes."""
+    stamped = {} if columns.time is None else {columns.time: time * (1e3 if columns.time_unit == "ms" else 1.0)}
+    return stamped | dict(zip(columns.commands, command.T / _COMMANDS[columns.command_unit][1], strict=True))
+
+
+def holds_commands_alone(path: Path, columns: CsvColumns) -> bool:
+    """Whether a file holds commands with their times, and no positions."""
+    table = CsvTable(path, columns.commands, machine_written=False)
+    timed = columns.time is None or columns.time in table
+    return timed and not any(name in table for point in columns.positions for name in point)
+
+
 def _times(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " rows"]:
     if columns.time is None:
         return float(columns.sample_time or 0.0) * np.arange(len(table))

@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from rfdropo_bayes.data.asl_csv import read_asl_start
+from rfdropo_bayes.data.plain_csv import holds_commands_alone, read_csv_start
 from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, load_recordings
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
@@ -21,8 +22,8 @@ def load_unseen(
 ) -> Trajectory:
     """The commands of a file in the format of an experiment, and its start pose.
 
-    Formats that keep commands and observations in one file take the start pose from its first row. "asl-csv" and "csv"
-    with a command file take it from the first row of ``start``; without one, "asl-csv" starts from an unknown pose.
+    Formats that keep commands and observations in one file take the start pose from its first row. "asl-csv", and
+    "csv" with a file of commands alone, take it from the first row of ``start``, or start from an unknown pose.
 
     Args:
         spec: the [data] table of the experiment; its recordings are not read.
@@ -32,13 +33,18 @@ def load_unseen(
         rows: keep observation rows first to last, both included; the start pose is then that of row ``first``.
 
     Raises:
-        InputError: a file that is missing or bad, a start where the format has it in the same file, or none where a
-            table of columns needs one.
+        InputError: a file that is missing or bad, or a start where the format has it in the same file.
     """
     if spec.format == "asl-csv":
         observations = None if start is None else find_data_file(start, base)
         whole = read_asl_start(find_data_file(commands, base), observations, rows[0] if rows else 0)
         return whole if rows is None else whole.slice_rows(*rows)
+    if spec.format == "csv" and spec.columns is not None:
+        path = find_data_file(commands, base)
+        if holds_commands_alone(path, spec.columns):
+            observations = None if start is None else find_data_file(start, base)
+            whole = read_csv_start(path, spec.columns, observations, rows[0] if rows else 0)
+            return whole if rows is None else whole.slice_rows(*rows)
     if spec.format == "csv" and start is not None:
         entry = RecordingEntry(observations=start, commands=commands, rows=rows)
     elif start is not None:

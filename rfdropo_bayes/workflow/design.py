@@ -16,6 +16,7 @@ from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry
 from rfdropo_bayes.audit.pipeline import base_model
 from rfdropo_bayes.audit.screen import Look
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.plain_csv import command_columns
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.workflow.assembly import load_data
 from rfdropo_bayes.workflow.audit import build_question
@@ -64,7 +65,10 @@ def run_design(
     outlook = outlooks(target, base, hypotheses, shaped)
     chosen = best(outlook, len(hypotheses) > 1)
     kind, time, value = proposals[chosen]
-    columns = {"time_s": time} | {f"{c}_{first.command_unit}": value[:, k] for k, c in enumerate(first.cable_names)}
+    if experiment.data is not None and experiment.data.columns is not None:
+        columns = command_columns(experiment.data.columns, time, value)
+    else:
+        columns = {"time_s": time} | {f"{c}_{first.command_unit}": value[:, k] for k, c in enumerate(first.cable_names)}
     pd.DataFrame(columns).to_csv(out / COMMANDS, index=False, float_format="%.6f")
     now = at_hand(target, hypotheses)
     content = {

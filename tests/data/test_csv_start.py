@@ -1,0 +1,59 @@
+"""Commands of one's own columns, with at most the first row of what was measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from rfdropo_bayes.data import DataSpec, load_unseen, start_is_known
+from rfdropo_bayes.data.plain_csv import CsvColumns, command_columns
+from rfdropo_bayes.errors import InputError
+
+COLUMNS = {
+    "time": "t",
+    "time_unit": "ms",
+    "commands": ["u1", "u2"],
+    "command_unit": "mm",
+    "positions": [["x1", "y1", "z1"], ["x2", "y2", "z2"]],
+    "position_unit": "mm",
+    "axes": ["x", "z", "-y"],
+}
+TIME = 0.05 * np.arange(4)
+COMMAND = np.array([[0.0, 0.0], [0.002, 0.0], [0.002, 0.003], [0.004, 0.003]])
+
+
+@pytest.fixture
+def spec() -> DataSpec:
+    return DataSpec.model_validate({"format": "csv", "fit": ["fitted.csv"], "columns": COLUMNS})
+
+
+def written(folder: Path) -> None:
+    """The file that a proposed experiment is written to, and a start pose."""
+    table = command_columns(CsvColumns.model_validate(COLUMNS), TIME, COMMAND)
+    assert list(table) == ["t", "u1", "u2"]
+    pd.DataFrame(table).to_csv(folder / "next.csv", index=False)
+    row = {f"{axis}{m}": 100.0 * m + k for m in (1, 2) for k, axis in enumerate("xyz")}
+    pd.DataFrame([row, row]).to_csv(folder / "start.csv", index=False)
+
+
+def test_commands_alone_are_read_back_as_they_were_written(tmp_path: Path, spec: DataSpec) -> None:
+    written(tmp_path)
+    found = load_unseen(spec, tmp_path, "next.csv")
+    np.testing.assert_allclose(found.command, COMMAND, atol=1e-12)
+    np.testing.assert_allclose(found.command_time, TIME, atol=1e-12)
+    np.testing.assert_allclose(found.time, 0.05 * np.arange(5), atol=1e-12)  # the last command has an outcome, too
+    assert found.command_unit == "m"
+    assert not start_is_known(found)
+
+
+def test_the_start_pose_is_one_row_of_another_file_in_the_base_frame(tmp_path: Path, spec: DataSpec) -> None:
+    written(tmp_path)
+    found = load_unseen(spec, tmp_path, "next.csv", "start.csv")
+    assert start_is_known(found)
+    assert np.asarray(found.position_mask).sum() == 2  # both markers, in the first row only
+    np.testing.assert_allclose(found.position[0, 1], [0.200, 0.202, -0.201], atol=1e-12)
+    with pytest.raises(InputError, match="no row 2 to start from"):
+        load_unseen(spec, tmp_path, "next.csv", "start.csv", (2, 4))
