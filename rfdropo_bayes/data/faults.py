@@ -169,7 +169,8 @@ def _smooth_steps(
 
 def _end_velocities(time: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Median velocity of the few steps that arrive at each row, and of those that leave it: one bad step is ignored."""
-    velocity = np.diff(position, axis=0) / np.diff(time)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):  # times that do not increase are refused later, by their row
+        velocity = np.diff(position, axis=0) / np.diff(time)[:, None]
     edge = np.full((_VELOCITY_ROWS, 3), np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([edge, velocity, edge]), _VELOCITY_ROWS, axis=0)
     with warnings.catch_warnings():
