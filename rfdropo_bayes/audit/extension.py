@@ -149,8 +149,8 @@ class Inquiry:
             fits[row.name] = self._refit(found.fit, row, leads[row.name][1])
             refits[row.name] = fits[row.name].log_evidence - found.fit.log_evidence
             self.report(f"refit with {row.name}: log Bayes factor {refits[row.name]:.1f}")
-        for name, fit in fits.items():
-            fits[name] = self._from_afar(name, fit)
+        for name in sorted(refits, key=lambda name: -refits[name])[: self.rules.classes]:
+            fits[name] = self._from_afar(name, fits[name])
             refits[name] = fits[name].log_evidence - found.fit.log_evidence
         further = np.log(len(self.candidates)) if named else 0.0
         if not refits or max(refits.values()) < self.rules.evidence + further:
