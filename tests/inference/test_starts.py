@@ -89,6 +89,7 @@ def test_a_broad_posterior_is_still_reached_from_the_prior():
     assert result.rollouts <= 60000
 
 
+@pytest.mark.slow
 def test_both_modes_survive_a_start_at_the_optima():
     """A share of 0.61 from 4 replicates of about 100: scatter 0.05."""
     problem = TwoModes()
@@ -185,6 +186,7 @@ def test_the_mixture_is_a_density_that_its_draws_have():
     )
 
 
+@pytest.mark.slow
 def test_climbs_keep_their_budget():
     problem = Decay(n_rows=40, traceable=False)
     result = methods.run(problem, "laplace", {"rollouts": 120, "screen": 16}, KEY)
