@@ -116,6 +116,7 @@ class Inquiry:
         """Forward-stepwise extension: the steps taken, and the look at the final model."""
         steps: list[Step] = []
         fit = base
+        renewed = 0  # number of steps at which the model was climbed again: once at each
         while True:
             named = [step.name for step in steps]
             found, _ = self.look_at(fit, named)
@@ -127,7 +128,8 @@ class Inquiry:
             step = self._extend(found, named)
             if step is None:
                 return steps, found
-            if steps and (better := self._climbed_again(step, named)) is not None:
+            if len(steps) > renewed and (better := self._climbed_again(step, named)) is not None:
+                renewed = len(steps)
                 self.report(f"without {step.name}, a better optimum than before: {steps[-1].name} once more")
                 gained = better.log_evidence - fit.log_evidence
                 steps[-1] = replace(steps[-1], fit=better, log_bayes_factor=steps[-1].log_bayes_factor + gained)
