@@ -15,7 +15,7 @@ from rfdropo_bayes.audit.screen import Look, Row, look
 
 DISCRETISATION = "discretisation"
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])
-TOLD_APART = 10.0  # nats: one of a class that explains the data so much worse, once refitted, is none of it
+TOLD_APART = 10.0  # nats: a candidate that is so much worse, once refitted, is excluded, and of no class with the best
 POOR = 2.0  # squared residual per value from which on a climb may have ended far from where it should
 
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rfdropo_bayes.audit.extension import DISCRETISATION
+from rfdropo_bayes.audit.extension import DISCRETISATION, TOLD_APART
 from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.noise import REPEATS, STATED
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.verdict import EXPLAINED, NO_DISCREPANCY, UNEXPLAINED, unclear
 
 MOST_EXCLUDED = 3
-CLEARLY_WORSE = 10.0  # nats
 
 
 def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
@@ -92,7 +91,7 @@ def _excluded(answer: Answer) -> str:
         name.replace("_", " ")
         for name, value in step.refits.items()
         if name not in step.members
-        and value < step.log_bayes_factor - CLEARLY_WORSE
+        and value < step.log_bayes_factor - TOLD_APART
         and all(name != other.name for other in answer.steps)
     ]
     return f"; {', '.join(worse[:MOST_EXCLUDED])} excluded" if worse else ""

@@ -36,6 +36,7 @@ def version(show: Annotated[bool, typer.Option("--version", help="print the vers
     if show:
         typer.echo(__version__)
         raise typer.Exit
+    keep_compilations()
 
 
 @app.command()
@@ -104,7 +105,6 @@ app.add_typer(benchmark, name="benchmark")
 
 def main() -> None:
     """Run the command line; bad input ends with one line on stderr and status 2, an interrupted run with status 3."""
-    keep_compilations()
     try:
         sys.exit(app(standalone_mode=False))
     except InputError as error:

@@ -119,9 +119,8 @@ def _with_offsets(
             key = f"{offset}{SEPARATOR}{name}"
             if key in shifted:
                 shift = np.average(error[:, :, axis], axis=1, weights=precision[valid])
-                shifted[key] = shifted[key] + np.nan_to_num(
-                    shift
-                )  # a draw that fails is counted when all is rolled out
+                # A draw that fails here is counted when all is rolled out.
+                shifted[key] = shifted[key] + np.nan_to_num(shift)
     return shifted
 
 
