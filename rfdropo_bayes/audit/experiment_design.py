@@ -67,7 +67,7 @@ def outlooks(
 
         def whiten(series: np.ndarray, k: int = k) -> np.ndarray:
             own = series[..., k, :, :]
-            white = target.noise.whiten(own, np.broadcast_to(first, own.shape))
+            white = target.noise.whiten(own, first)
             return white.reshape(*own.shape[:-2], -1)
 
         news = [whiten(position) for position in predicted]

@@ -65,7 +65,8 @@ class Target:
     def identity(self) -> str:
         """Digest of everything that a residual depends on beside the parameters."""
         data, noise = self.measurements, self.noise
-        return digest(self.forward.identity, data.position, data.count, noise.scale, noise.autocorrelation)
+        across = np.zeros(0) if noise.correlation is None else noise.correlation
+        return digest(self.forward.identity, data.position, data.count, noise.scale, noise.autocorrelation, across)
 
     def recall(self, what: str, inputs: Sequence[np.ndarray], compute: Callable[[], Arrays]) -> Arrays:
         """A computation with this target, looked up where the journal has it; its rollouts count either way."""

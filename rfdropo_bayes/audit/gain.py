@@ -108,7 +108,7 @@ def noise_distance(noise: NoiseModel) -> float:
 def _elpd(unseen: Unseen, prediction: Prediction, noise: NoiseModel) -> Float[np.ndarray, " trajectory"]:
     """Log predictive density of each trajectory, up to the noise's normaliser."""
     residual = np.where(unseen.valid, unseen.position - prediction.draws, 0.0)
-    white = noise.whiten(residual, np.broadcast_to(unseen.valid, residual.shape))
+    white = noise.whiten(residual, unseen.valid)
     return logsumexp(-0.5 * np.sum(white**2, axis=(-2, -1)), axis=0) - np.log(len(residual))
 
 

@@ -52,8 +52,7 @@ class Measurements:
 
     def whiten(self, residual: np.ndarray, noise: NoiseModel) -> Float[np.ndarray, "*batch n"]:
         """Residuals (..., group, time, channel) of the means as independent unit normals, flattened."""
-        valid = np.broadcast_to(self.valid, residual.shape)
-        white = noise.whiten(residual, valid) * np.sqrt(self.count)
+        white = noise.separate(noise.innovations(residual, self.valid) * np.sqrt(self.count), self.valid)
         return white.reshape(*residual.shape[:-3], int(np.prod(residual.shape[-3:])))
 
     def mean_of(self, single: Float[np.ndarray, "recording time channel"]) -> Float[np.ndarray, "group time channel"]:
@@ -80,17 +79,19 @@ class Measurements:
     def noise(
         self, residual: Float[np.ndarray, "recording time channel"], parameters: int, like: NoiseModel | None = None
     ) -> NoiseModel:
-        """Noise from repeats where there are any, else from what a model leaves.
+        """Noise from repeats where there are any, else from what a model leaves, of whose correlation between channels
+        nothing says how much is noise: a discrepancy moves them together, too.
 
         Args:
             residual: recordings less what a model predicts for each.
             parameters: fitted by that model.
-            like: an earlier estimate, whose order and pooling are kept.
+            like: an earlier estimate, whose order, pooling and sharing are kept.
         """
         order = None if like is None else like.order
+        shared = None if like is None else like.correlation is not None
         pooled = None if like is None else bool(np.ptp(like.scale) == 0.0)
         if self.has_repeats:
-            return estimate_noise(*self.deviations(residual), source=REPEATS, order=order, pooled=pooled)
+            return estimate_noise(*self.deviations(residual), source=REPEATS, order=order, pooled=pooled, shared=shared)
         share = max(1.0 - parameters / max(self.single_valid.sum(), 1), 0.1)
         return estimate_noise(residual, self.single_valid, share, source=RESIDUALS, order=order, pooled=pooled)
 

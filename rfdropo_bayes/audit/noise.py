@@ -1,17 +1,20 @@
 """The noise of a measurement as an autoregressive process, estimated where an experiment was repeated.
 
 Whitening is exact for a stationary Gaussian AR(p) on every unbroken stretch of rows: the k-th row of a stretch is
-predicted from the min(k, p) rows before it (Levinson-Durbin).
+predicted from the min(k, p) rows before it (Levinson-Durbin). Noise that channels share has the same memory as the rest
+(a separable covariance); across a gap in some of the channels alone its whitening is approximate.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.signal import lfilter
+
+from rfdropo_bayes.audit.shared_noise import mixed, shrunk_correlation
 
 MAX_ORDER = 3
 LEAST_SHARE = 0.05  # of the mean deviation that a channel has at least: a marker that never moves is no certainty
@@ -29,12 +32,14 @@ class NoiseModel:
         source: "repeats" (pure error), "stated" (in the experiment file) or "residuals" (an assumption: what the base
             model leaves is taken for noise as far as such a process can make it).
         freedom: degrees of freedom of the variance; infinite where stated.
+        correlation: of the channels at one time; None where they are independent.
     """
 
     scale: Float[np.ndarray, " channel"]
     autocorrelation: Float[np.ndarray, " lag"]
     source: str
     freedom: float
+    correlation: Float[np.ndarray, "channel channel"] | None = None
 
     @property
     def order(self) -> int:
@@ -52,9 +57,15 @@ class NoiseModel:
         return levinson(self.autocorrelation)
 
     def whiten(
-        self, series: Float[np.ndarray, "*batch time channel"], valid: Bool[np.ndarray, "*batch time channel"]
+        self, series: Float[np.ndarray, "*batch time channel"], valid: Bool[np.ndarray, "*rest time channel"]
     ) -> Float[np.ndarray, "*batch time channel"]:
         """Independent unit-variance rows, zero where not valid; linear in the series."""
+        return self.separate(self.innovations(series, valid), valid)
+
+    def innovations(
+        self, series: Float[np.ndarray, "*batch time channel"], valid: Bool[np.ndarray, "*rest time channel"]
+    ) -> Float[np.ndarray, "*batch time channel"]:
+        """What the rows before do not predict, in unit variance; channels that share noise still do."""
         coefficients, deviation = self.predictors
         memory = np.minimum(rows_before(valid), self.order)
         innovation = np.array(series, dtype=float)
@@ -64,13 +75,25 @@ class NoiseModel:
             innovation -= coefficients[memory, lag - 1] * before
         return np.where(valid, innovation / (deviation[memory] * self.scale), 0.0)
 
+    def separate(
+        self, innovations: Float[np.ndarray, "*batch time channel"], valid: Bool[np.ndarray, "*rest time channel"]
+    ) -> Float[np.ndarray, "*batch time channel"]:
+        """Innovations of which each channel has its own; `gather` undoes it."""
+        return innovations if self.correlation is None else mixed(innovations, valid, self.correlation, -0.5)
+
+    def gather(
+        self, white: Float[np.ndarray, "*batch time channel"], valid: Bool[np.ndarray, "*rest time channel"]
+    ) -> Float[np.ndarray, "*batch time channel"]:
+        """Innovations of the channels themselves, what they share included."""
+        return white if self.correlation is None else mixed(white, valid, self.correlation, 0.5)
+
     def colour(
-        self, white: Float[np.ndarray, "*batch time channel"], valid: Bool[np.ndarray, "*batch time channel"]
+        self, white: Float[np.ndarray, "*batch time channel"], valid: Bool[np.ndarray, "*rest time channel"]
     ) -> Float[np.ndarray, "*batch time channel"]:
         """The series that `whiten` makes ``white`` of; zero where not valid."""
         coefficients, deviation = self.predictors
         memory = np.minimum(rows_before(valid), self.order)
-        series = np.where(valid, white * deviation[memory] * self.scale, 0.0)
+        series = np.where(valid, self.gather(white, valid) * deviation[memory] * self.scale, 0.0)
         for row in range(1, series.shape[-2]):
             for lag in range(1, min(self.order, row) + 1):
                 share = coefficients[memory[..., row, :], lag - 1]
@@ -82,6 +105,7 @@ class NoiseModel:
         coefficients, deviation = self.predictors
         warm = 0 if self.order == 0 else 60
         white = rng.standard_normal((*shape[:-2], shape[-2] + warm, shape[-1]))
+        white = self.gather(white, np.ones(white.shape[-2:], dtype=bool))
         filtered = lfilter([deviation[-1]], np.concatenate([[1.0], -coefficients[-1]]), white, axis=-2)
         return self.scale * filtered[..., warm:, :]
 
@@ -118,6 +142,7 @@ def estimate_noise(
     source: str,
     order: int | None = None,
     pooled: bool | None = None,
+    shared: bool | None = False,
 ) -> NoiseModel:
     """Fit the noise to deviations that hold nothing else.
 
@@ -128,6 +153,7 @@ def estimate_noise(
         source: what the deviations are.
         order: of the process; by default the one of smallest BIC up to `MAX_ORDER`.
         pooled: one standard deviation for all channels; by default as BIC has it.
+        shared: whether channels share noise; None to test it.
     """
     square = np.where(valid, series, 0.0) ** 2
     count = np.maximum(valid.sum(axis=(0, 1)), 1) * freedom_share
@@ -143,7 +169,13 @@ def estimate_noise(
         _, deviation = levinson(correlation)
         total = count.sum()
         order = int(np.argmin([2.0 * total * np.log(deviation[k]) + k * np.log(total) for k in range(len(deviation))]))
-    return NoiseModel(scale, correlation[: order + 1], source, float(count.sum()))
+    alone = NoiseModel(scale, correlation[: order + 1], source, float(count.sum()))
+    whole = valid.all(axis=-1)
+    across = shrunk_correlation(alone.innovations(series, valid)[whole], freedom_share, shared=shared)
+    if across is None:
+        return alone
+    # The mean of correlated squares is known as well as that of fewer independent ones.
+    return replace(alone, correlation=across, freedom=alone.freedom * len(across) / float(np.sum(across**2)))
 
 
 def _autocorrelation(series: np.ndarray, valid: np.ndarray, lags: int) -> np.ndarray:

@@ -108,7 +108,8 @@ def audit(
     began = time.monotonic()
     rng = np.random.default_rng(question.seed)
     target, base = base_model(question, rng, journal, report)
-    report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.order})")
+    shared = "" if target.noise.correlation is None else ", shared between channels"
+    report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.order}){shared}")
     finer = None
     if question.finer is not None:
         finer = _forward(question, True, target.measurements)

@@ -54,6 +54,9 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
             "order": noise.order,
             "autocorrelation": noise.autocorrelation.tolist(),
             "standard_deviation_mm": (MILLIMETRES * noise.scale).tolist(),
+            "correlation_between_channels": None
+            if noise.correlation is None
+            else np.round(noise.correlation, 3).tolist(),
         },
         "residual_in_noise_deviations": base_rms,
         "remainder": {

@@ -38,11 +38,12 @@ def describe_remainder(measurements: Measurements, white: Float[np.ndarray, " n"
     """Fit the process to the whitened residuals of a model.
 
     The whitening is a linear map, so that the process is fitted to the residual itself under correlated noise: its
-    covariance is whitened, too.
+    covariance is whitened, too. Each channel is taken for itself.
     """
     shape = measurements.position.shape
     rows = np.arange(shape[1])[: min(shape[1], MOST_ROWS)]
-    data = white.reshape(shape)[:, rows] * noise.scale / np.mean(noise.scale)
+    channels = noise.gather(white.reshape(shape), measurements.valid)
+    data = channels[:, rows] * noise.scale / np.mean(noise.scale)
     weight = np.sqrt(np.maximum(measurements.count[:, rows].max(axis=(1, 2)), 1.0))
     every = np.ones((len(rows), 1), dtype=bool)
     unit = NoiseModel(np.ones(1), noise.autocorrelation, noise.source, noise.freedom)
