@@ -158,12 +158,12 @@ def estimate_noise(
     square = np.where(valid, series, 0.0) ** 2
     count = np.maximum(valid.sum(axis=(0, 1)), 1) * freedom_share
     own = np.sqrt(np.maximum(square.sum(axis=(0, 1)) / count, 1e-20))
-    shared = float(np.sqrt(max(square.sum() / count.sum(), 1e-20)))
-    own = np.maximum(own, LEAST_SHARE * shared)
+    mean = float(np.sqrt(max(square.sum() / count.sum(), 1e-20)))
+    own = np.maximum(own, LEAST_SHARE * mean)
     if pooled is None:
-        gain = count.sum() * np.log(shared) - np.sum(count * np.log(own))
+        gain = count.sum() * np.log(mean) - np.sum(count * np.log(own))
         pooled = bool(gain < 0.5 * len(own) * np.log(count.sum()) * 3.0)  # memory leaves a third of the rows' worth
-    scale = np.full(len(own), shared) if pooled else own
+    scale = np.full(len(own), mean) if pooled else own
     correlation = _autocorrelation(np.where(valid, series, 0.0) / scale, valid, MAX_ORDER if order is None else order)
     if order is None:
         _, deviation = levinson(correlation)

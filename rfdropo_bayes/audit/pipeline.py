@@ -119,12 +119,18 @@ def audit(
     examined = [c for c in question.candidates if c.name not in unexamined]
     inquiry = Inquiry(target, examined, question.rules, question.seed, finer, report)
     steps, last = inquiry.name_causes(base)
-    looks = [*(step.before for step in steps), last]
+    if steps and target.noise.source == RESIDUALS:
+        inquiry, base = _asked_again(inquiry, base, steps[-1].fit)
+        target, (steps, last) = inquiry.target, inquiry.name_causes(base)
     extended = steps[-1].fit if steps else base
+    if steps and target.noise.source == RESIDUALS:
+        last = _final_look(inquiry, extended, steps)
+    looks = [*(step.before for step in steps), last]
     gain, stages, held_out, predictions, unseen = _measured(question, target, inquiry, base, steps, rng)
-    final = _final_p(question, target, extended, inquiry, steps, last)
     members = [len(step.members) for step in steps]
-    verdict = decide(question.rules, looks[0].omnibus.p, final if steps else None, members, gain, target.noise.doubtful)
+    verdict = decide(
+        question.rules, looks[0].omnibus.p, last.omnibus.p if steps else None, members, gain, target.noise.doubtful
+    )
     sizes = widened(extended, question.coordinates)
     low, high = question.coordinates.bounds
     return Answer(
@@ -202,6 +208,14 @@ def _residual_noise(target: Target, fit: Fit) -> NoiseModel:
     return target.measurements.noise(np.where(target.measurements.single_valid, single, 0.0), len(fit.free))
 
 
+def _asked_again(inquiry: Inquiry, base: Fit, extended: Fit) -> tuple[Inquiry, Fit]:
+    """The inquiry with the noise of what a first extension leaves: that of the base model holds the discrepancy itself,
+    and whitens away what would tell its causes apart."""
+    target = replace(inquiry.target, noise=_residual_noise(inquiry.target, extended))
+    inquiry.report(f"once more with the noise that the extended model leaves, AR({target.noise.order})")
+    return replace(inquiry, target=target), climb(target, base.x, base.free)
+
+
 def _subset(recordings: RecordingSet, chosen: Sequence[int]) -> RecordingSet:
     """Some recordings only, no more rows than the longest of them has."""
     index = list(chosen)
@@ -217,17 +231,13 @@ def _subset(recordings: RecordingSet, chosen: Sequence[int]) -> RecordingSet:
     )
 
 
-def _final_p(
-    question: Question, target: Target, extended: Fit, inquiry: Inquiry, steps: Sequence[Step], last: Look
-) -> float:
-    """p-value of the extended model; noise that was taken from the base model's residuals is estimated anew."""
-    if not steps or target.noise.source != RESIDUALS:
-        return last.omnibus.p
-    renewed = replace(target, noise=_residual_noise(target, extended))
-    again = replace(inquiry, target=renewed)
+def _final_look(inquiry: Inquiry, extended: Fit, steps: Sequence[Step]) -> Look:
+    """The look at the extended model under the noise that it leaves itself."""
+    renewed = replace(inquiry.target, noise=_residual_noise(inquiry.target, extended))
     fit = climb(renewed, extended.x, extended.free)
-    found, _ = again.look_at(fit, [step.name for step in steps])
-    return found.omnibus.p
+    found, _ = replace(inquiry, target=renewed).look_at(fit, [step.name for step in steps])
+    inquiry.report(f"joint test under the noise that it leaves: p = {found.omnibus.p:.3g}")
+    return found
 
 
 def _predict(forward: Forward, fit: Fit, seed: Sequence[int]) -> Prediction:

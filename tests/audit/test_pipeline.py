@@ -269,3 +269,18 @@ def test_repeats_whose_clocks_differ_are_not_joined_and_named():
     assert measurements.apart == ("r1",)
     assert measurements.members[0] == (0, 2)
     assert gather_measurements(gather_recordings(Toy(), trajectories), trajectories, join=False).apart == ()
+
+
+def test_without_repeats_the_noise_is_what_the_extended_model_leaves():
+    """The noise is within 10 % (160 rows, 12 channels, half of them for memory: five standard errors), where the base
+    model leaves several times as much."""
+    trajectories = recordings({**TRUTH, "play": 3.0}, 5)
+    single = [trajectories[index] for index in (0, 3, 4, 5, 6, 7, 8, 9)]
+    asked = question(TRUTH, 5)
+    asked = replace(asked, recordings=gather_recordings(Toy(), single), trajectories=single[:2])
+    before, _ = base_model(asked, np.random.default_rng(0))
+    assert np.mean(before.noise.scale) > 2.0 * NOISE
+    answer = audit(asked)
+    assert [step.name for step in answer.steps] == ["play"]
+    assert answer.verdict == "explained"
+    np.testing.assert_allclose(answer.target.noise.scale, NOISE, rtol=0.1)
