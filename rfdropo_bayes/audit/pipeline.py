@@ -18,7 +18,7 @@ from rfdropo_bayes.audit.forward import Forward, Lanes
 from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
-from rfdropo_bayes.audit.noise import RESIDUALS, NoiseModel
+from rfdropo_bayes.audit.noise import RESIDUALS, STATED, NoiseModel
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Look
 from rfdropo_bayes.audit.verdict import decide
@@ -65,7 +65,8 @@ class Answer:
 
     ``unexamined`` holds candidates that would have taken too long, with the minutes; ``looks`` are the looks at the
     base model and after each step; ``stages`` the explained fraction after each step; ``sizes`` is the last model's fit
-    under priors that do not pull, and ``draws`` are from it.
+    under priors that do not pull, and ``draws`` are from it; ``suspected`` is a noise under which the base model would
+    pass, where a stated one leaves a discrepancy that is not explained.
     """
 
     verdict: str
@@ -83,6 +84,7 @@ class Answer:
     unseen: Unseen | None
     sizes: Fit
     draws: Float[np.ndarray, "draw d"]
+    suspected: NoiseModel | None
     rollouts: int
     seconds: float
 
@@ -149,6 +151,7 @@ def audit(
         unseen,
         sizes,
         sizes.draws(np.random.default_rng([question.seed, 5]), 1000, low, high),
+        _suspected(question, inquiry, base, last),
         target.forward.rollouts + (finer.rollouts if finer else 0),
         time.monotonic() - began,
     )
@@ -192,10 +195,14 @@ def base_model(
         return target, fit_base(target, free, rng, start, report)
     white = NoiseModel(np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf)
     target = Target(forward, measurements, white, journal)
-    fit = fit_base(target, free, rng, start, report)
+    return _under_residual_noise(target, fit_base(target, free, rng, start, report))
+
+
+def _under_residual_noise(target: Target, fit: Fit) -> tuple[Target, Fit]:
+    """Noise and fit in turn."""
     for _ in range(2):
         target = replace(target, noise=_residual_noise(target, fit))
-        fit = climb(target, fit.x, free)
+        fit = climb(target, fit.x, fit.free)
     return target, fit
 
 
@@ -238,6 +245,16 @@ def _final_look(inquiry: Inquiry, extended: Fit, steps: Sequence[Step]) -> Look:
     found, _ = replace(inquiry, target=renewed).look_at(fit, [step.name for step in steps])
     inquiry.report(f"joint test under the noise that it leaves: p = {found.omnibus.p:.3g}")
     return found
+
+
+def _suspected(question: Question, inquiry: Inquiry, base: Fit, last: Look) -> NoiseModel | None:
+    """Noise fitted to what the base model leaves, where it passes under that, though not under the noise stated."""
+    if inquiry.target.noise.source != STATED or last.omnibus.p > question.rules.extended_passes:
+        return None
+    target, fit = _under_residual_noise(inquiry.target, base)
+    found, _ = replace(inquiry, target=target).look_at(fit)
+    passes = found.omnibus.p > question.rules.base_passes and not target.noise.doubtful
+    return target.noise if passes else None
 
 
 def _predict(forward: Forward, fit: Fit, seed: Sequence[int]) -> Prediction:

@@ -57,6 +57,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
             "correlation_between_channels": None
             if noise.correlation is None
             else np.round(noise.correlation, 3).tolist(),
+            "suspected_mm": None if answer.suspected is None else (MILLIMETRES * answer.suspected.scale).tolist(),
         },
         "residual_in_noise_deviations": base_rms,
         "remainder": {
@@ -80,6 +81,9 @@ def next_experiment(answer: Answer) -> dict[str, Any] | None:
     """What to do next: how to split a class, or how to learn more where nothing was named; None if all is well."""
     if answer.verdict == NO_DISCREPANCY:
         return None
+    if answer.suspected is not None:
+        words = "Repeat one command sequence three times: then it shows whether the noise is what [noise] states."
+        return {"sentence": words, "separates": []}
     if answer.target.noise.doubtful:
         words = "Repeat one command sequence three times, or state the noise in [noise]: then a slow discrepancy shows."
         return {"sentence": words, "separates": []}

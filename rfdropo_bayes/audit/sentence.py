@@ -16,13 +16,25 @@ MOST_EXCLUDED = 3
 
 def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     """What was found, how much of the discrepancy it explains, what is excluded, what remains."""
-    words = _words(answer, findings) + _unexamined(answer)
+    words = _words(answer, findings) + _suspicion(answer) + _unexamined(answer)
     return words[0].upper() + words[1:]
 
 
 def _unexamined(answer: Answer) -> str:
     names = " and ".join(name.replace("_", " ") for name in answer.unexamined)
     return f" Not examined, as it would have taken too long: {names}." if names else ""
+
+
+def _suspicion(answer: Answer) -> str:
+    noise = answer.suspected
+    if noise is None:
+        return ""
+    stated, other = (1e3 * noise_distance(n) for n in (answer.target.noise, noise))
+    memory = f", {noise.autocorrelation[1]:.2f} of it kept from row to row," if noise.order else ""
+    return (
+        f" But noise of {other:.2g} mm{memory} instead of the {stated:.2g} mm stated would leave no discrepancy: "
+        "check [noise], or repeat one command sequence three times."
+    )
 
 
 def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:

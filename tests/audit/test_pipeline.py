@@ -17,6 +17,7 @@ from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import gather_measurements
+from rfdropo_bayes.audit.noise import STATED, NoiseModel
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.bayes.model import gather_recordings
@@ -271,16 +272,33 @@ def test_repeats_whose_clocks_differ_are_not_joined_and_named():
     assert gather_measurements(gather_recordings(Toy(), trajectories), trajectories, join=False).apart == ()
 
 
+def unrepeated(truth: dict, seed: int):
+    """Two recordings of different commands to fit, six to test."""
+    trajectories = recordings({**TRUTH, **truth}, seed)
+    single = [trajectories[index] for index in (0, 3, 4, 5, 6, 7, 8, 9)]
+    asked = question(TRUTH, seed)
+    return replace(asked, recordings=gather_recordings(Toy(), single), trajectories=single[:2])
+
+
 def test_without_repeats_the_noise_is_what_the_extended_model_leaves():
     """The noise is within 10 % (160 rows, 12 channels, half of them for memory: five standard errors), where the base
     model leaves several times as much."""
-    trajectories = recordings({**TRUTH, "play": 3.0}, 5)
-    single = [trajectories[index] for index in (0, 3, 4, 5, 6, 7, 8, 9)]
-    asked = question(TRUTH, 5)
-    asked = replace(asked, recordings=gather_recordings(Toy(), single), trajectories=single[:2])
+    asked = unrepeated({"play": 3.0}, 5)
     before, _ = base_model(asked, np.random.default_rng(0))
     assert np.mean(before.noise.scale) > 2.0 * NOISE
     answer = audit(asked)
     assert [step.name for step in answer.steps] == ["play"]
     assert answer.verdict == "explained"
     np.testing.assert_allclose(answer.target.noise.scale, NOISE, rtol=0.1)
+
+
+@pytest.mark.parametrize(("size", "play", "suspected"), [(1 / 3, 0.0, True), (1.0, 0.0, False), (1.0, 3.0, False)])
+def test_a_stated_noise_that_is_too_small_is_suspected_and_a_right_one_is_not(size, play, suspected):
+    stated = NoiseModel(np.full(12, size * NOISE), np.array([1.0, 0.6]), STATED, np.inf)
+    answer = audit(replace(unrepeated({"play": play}, 6), stated_noise=stated))
+    content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
+    assert ("check [noise]" in content["sentence"]) == suspected
+    if suspected:
+        assert answer.verdict == "unexplained"
+        np.testing.assert_allclose(content["noise"]["suspected_mm"], 1e3 * NOISE, rtol=0.1)
+        assert "Repeat" in content["next_experiment"]["sentence"]
