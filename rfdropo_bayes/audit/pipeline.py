@@ -93,6 +93,11 @@ class Answer:
         """The last model."""
         return self.steps[-1].fit if self.steps else self.base
 
+    @property
+    def adopted(self) -> list[Step]:
+        """Steps that join the model for good: none where unseen recordings are surely predicted worse with them."""
+        return [] if self.gain is not None and self.gain.interval[1] < 0.0 else self.steps
+
 
 def audit(
     question: Question, report: Callable[[str], None] = lambda line: None, journal: Journal | None = None

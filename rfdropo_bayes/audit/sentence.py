@@ -65,8 +65,11 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
             f"{named} {verb} named, but the discrepancy is too small to say how much of it that explains "
             f"([{low:.0f}, {high:.0f}] %); unseen recordings are {likelier}likelier with it"
         )
-    elif answer.verdict == UNEXPLAINED and gain.explained < 0.0:
-        head = f"Unexplained: with the best of the library, {named}, unseen recordings are predicted worse"
+    elif not answer.adopted:
+        head = (
+            f"Unexplained: with the best of the library, {named}, unseen recordings are predicted worse, and "
+            "extended.toml keeps the base model"
+        )
     elif answer.verdict == UNEXPLAINED:
         head = f"Unexplained: the best of the library, {named}, explains only {share}"
     elif answer.verdict in (EXPLAINED, "equivalent"):

@@ -88,7 +88,7 @@ def run_audit(
     folder = Path(path).resolve().parent
     fitted, tested = (load_data(experiment, folder, role) for role in ("fit", "test"))
     chosen = experiment.seed if seed is None else seed
-    question = build_question(experiment, folder, fitted, tested, chosen, start=_start(base), workshop=workshop)
+    question = build_question(experiment, folder, fitted, tested, chosen, start=start_values(base), workshop=workshop)
     out = output_folder(out)
     answer = audit(question, report, Journal(out / JOURNAL, resume=resume))
     inspect(answer)
@@ -114,13 +114,15 @@ def build_question(
     *,
     start: dict[str, float] | None = None,
     workshop: Workshop | None = None,
+    names: Sequence[str] | None = None,
 ) -> Question:
     """The experiment's base model with every candidate of the library in it, at its null value.
 
-    ``workshop`` keeps compiled simulators for further data sets of the same experiment.
+    ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names`` are the candidates,
+    where it is not all.
     """
     robot = find_robot(experiment, folder)
-    names = candidate_names(experiment)
+    names = candidate_names(experiment) if names is None else names
     simulator = build_simulator(_with(experiment, names), robot, folder)
     trajectories = [*fitted, *tested]
     recordings = gather_recordings(simulator, trajectories)
@@ -271,7 +273,7 @@ def _stated(experiment: Experiment, markers: int, first: Trajectory) -> NoiseMod
     return NoiseModel(np.full(3 * markers, noise.standard_deviation), np.array([1.0, *memory]), STATED, np.inf)
 
 
-def _start(base: Path | None) -> dict[str, float] | None:
+def start_values(base: Path | None) -> dict[str, float] | None:
     """Posterior means of an earlier calibration."""
     if base is None:
         return None
@@ -287,11 +289,11 @@ def _start(base: Path | None) -> dict[str, float] | None:
 
 
 def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path) -> dict[str, Any]:
-    """The experiment file with the named mechanisms in its model, for ``rfdropo calibrate``."""
+    """The experiment file with the mechanisms that the model adopts, for ``rfdropo calibrate``."""
     extended = copy.deepcopy(tables)
     model = extended.setdefault("model", {})
     simulator = extended.setdefault("simulator", {})
-    for step in answer.steps:
+    for step in answer.adopted:
         if step.name == DISCRETISATION:
             assert answer.question.finer is not None
             simulator["refine"] = FINER * int(simulator.get("refine", 1))
@@ -305,7 +307,7 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path) -> dic
                     model.setdefault("priors", {}).setdefault(spec.name, dict(spec.prior))
     audit = extended.get("audit", {})
     if "candidates" in audit:
-        taken = {c.source for c in answer.question.candidates if c.name in {step.name for step in answer.steps}}
+        taken = {c.source for c in answer.question.candidates if c.name in {step.name for step in answer.adopted}}
         audit["candidates"] = [_found_again(source, folder) for source in audit["candidates"] if source not in taken]
     data = extended.get("data", {})
     robot = folder / str(extended.get("robot", ""))

@@ -302,3 +302,14 @@ def test_a_stated_noise_that_is_too_small_is_suspected_and_a_right_one_is_not(si
         assert answer.verdict == "unexplained"
         np.testing.assert_allclose(content["noise"]["suspected_mm"], 1e3 * NOISE, rtol=0.1)
         assert "Repeat" in content["next_experiment"]["sentence"]
+
+
+def test_what_predicts_unseen_recordings_worse_is_named_and_not_adopted():
+    """The test recordings have the effect with the other sign."""
+    fitted = unrepeated({"delay": 1.0}, 7)
+    single = [*fitted.trajectories, *recordings({**TRUTH, "delay": -1.0}, 7)[4:]]
+    answer = audit(replace(fitted, recordings=gather_recordings(Toy(), single), trajectories=single[:2]))
+    content = record(answer, versions={}, data_sha256="", next_experiment=None)
+    assert answer.steps
+    assert answer.adopted == []
+    assert "predicted worse" in content["sentence"]

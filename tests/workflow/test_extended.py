@@ -13,7 +13,7 @@ from rfdropo_bayes.workflow.audit import extended_tables
 def test_a_mechanism_of_the_users_own_is_found_again_and_tried_no_more(tmp_path: Path) -> None:
     lag = REGISTRY["actuator_lag"]()
     own = Candidate("own", (), lag, "own.py:Own")
-    answer = SimpleNamespace(steps=[SimpleNamespace(name="own")], question=SimpleNamespace(candidates=[own]))
+    answer = SimpleNamespace(adopted=[SimpleNamespace(name="own")], question=SimpleNamespace(candidates=[own]))
     tables = {"robot": "smooth_arm", "audit": {"candidates": ["own.py:Own", "own.py:Other"]}}
     extended = extended_tables(tables, answer, tmp_path)  # type: ignore[arg-type]
     assert extended["model"]["mechanisms"] == [f"{tmp_path / 'own.py'}:Own"]

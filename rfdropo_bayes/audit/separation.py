@@ -1,0 +1,227 @@
+"""Which of several mechanisms a data set tells apart.
+
+All of them join the base model. Then the model is fitted without any, with each alone, and with all but each, under one
+noise: what the model with all of them leaves, since what is left without them holds what they explain. A mechanism that
+can go at no cost is not needed beside the others; of two whose effects on the data point the same way, either may.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rfdropo_bayes.audit.candidates import Candidate, lead, probe_all
+from rfdropo_bayes.audit.extension import SHARES, TOLD_APART
+from rfdropo_bayes.audit.fit import Fit, Target, climb
+from rfdropo_bayes.audit.noise import RESIDUALS, NoiseModel
+from rfdropo_bayes.audit.score import Signature, likeness, project_out, signature, span, statistic
+
+SMALL = 0.1  # prior deviations at which a mechanism starts that shows nothing at null
+GROWING, REFITTING, FINAL = 8, 6, 15  # evaluations of a climb while the model grows, of a variant, and of the whole
+ROUNDS = 2  # of noise and fit in turn
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The model with some of the mechanisms.
+
+    Attributes:
+        present: their names.
+        fit: of the model with them.
+        rmse: root mean square distance of the markers that it leaves [m].
+    """
+
+    present: tuple[str, ...]
+    fit: Fit
+    rmse: float
+
+
+@dataclass(frozen=True)
+class Separation:
+    """What was found of mechanisms and of groups of them; a mechanism is a group of one.
+
+    Attributes:
+        target: data and noise of all fits.
+        groups: members of each, by name: every mechanism, then the groups that were given.
+        none, whole: the model without any, and with all.
+        alone, without: with a group alone, and with all but it.
+        marks: what each group does to the data at the whole model's optimum, less what the base model can imitate.
+        own: share of that which the other groups' mechanisms cannot imitate either.
+        rollouts: that it took.
+    """
+
+    target: Target
+    groups: Mapping[str, tuple[str, ...]]
+    none: Variant
+    whole: Variant
+    alone: Mapping[str, Variant]
+    without: Mapping[str, Variant]
+    marks: Mapping[str, Signature]
+    own: Mapping[str, float]
+    rollouts: int
+
+    def gain(self, group: str) -> float:
+        """Log evidence that a group alone brings [nats]."""
+        return self.alone[group].fit.log_evidence - self.none.fit.log_evidence
+
+    def loss(self, group: str) -> float:
+        """Log evidence that is lost without a group, though the others may make up for it [nats]."""
+        return self.whole.fit.log_evidence - self.without[group].fit.log_evidence
+
+    def cosine(self, first: str, second: str) -> float:
+        """Smallest cosine of the principal angles between the effects of two groups."""
+        return abs(likeness(self.marks[first], self.marks[second]))
+
+    def needed(self, group: str) -> bool:
+        """Whether the data have no use for the model without a group."""
+        return self.loss(group) > TOLD_APART
+
+
+def separate(
+    target: Target,
+    candidates: Sequence[Candidate],
+    groups: Mapping[str, Sequence[str]],
+    start: Float[np.ndarray, " d"],
+    report: Callable[[str], None] = lambda line: None,
+) -> Separation:
+    """Fit all the variants.
+
+    Args:
+        target: data, simulator and a noise; one that was not measured (source "residuals") is estimated here.
+        candidates: the mechanisms, each at its null value in the simulator.
+        groups: names of further groups, and of the mechanisms in them.
+        start: coordinates that the model without mechanisms starts from.
+        report: called with a line of words now and then.
+    """
+    coordinates = target.forward.coordinates
+    members = {c.name: (c.name,) for c in candidates} | {name: tuple(group) for name, group in groups.items()}
+    base = climb(target, start, np.arange(coordinates.base))
+    report(f"without any: {_words(target, base)}")
+    grown = base
+    for candidate in candidates:
+        grown = _joined(target, grown, candidate)
+        report(f"with {candidate.name}: {_words(target, grown)}")
+    measured_noise = target.noise.source != RESIDUALS
+    for _ in range(1 if measured_noise else ROUNDS):
+        if not measured_noise:
+            target = replace(target, noise=residual_noise(target, grown))
+            report(f"noise of what is left: AR({target.noise.order})")
+        grown = climb(target, grown.x, grown.free, evaluations=FINAL)
+        report(f"with all: {_words(target, grown)}")
+    indices = {c.name: c.indices for c in candidates}
+    names = tuple(indices)
+
+    def variant(present: tuple[str, ...]) -> Variant:
+        free = np.array([*range(coordinates.base), *(i for name in present for i in indices[name])], dtype=int)
+        starts = [_reduced(target, grown, free)]
+        if len(present) <= len(names) / 2:  # far from the whole model: the base model may be nearer
+            starts.append(np.where(np.isin(np.arange(len(base.x)), free[coordinates.base :]), grown.x, base.x))
+        fits = [climb(target, x, free, evaluations=REFITTING) for x in starts]
+        fit = max(fits, key=lambda fit: fit.log_evidence)
+        report(f"{' + '.join(present) or 'none'}: log evidence {fit.log_evidence - grown.log_evidence:+.1f}")
+        return Variant(present, fit, distance(target, fit))
+
+    none = variant(())
+    alone = {name: variant(group) for name, group in members.items()}
+    without = {name: variant(tuple(n for n in names if n not in group)) for name, group in members.items()}
+    whole = Variant(names, grown, distance(target, grown))
+    marks, own = effects(grown, coordinates.base, {name: _places(grown, indices, members[name]) for name in members})
+    return Separation(target, members, none, whole, alone, without, marks, own, target.forward.rollouts)
+
+
+def residual_noise(target: Target, fit: Fit) -> NoiseModel:
+    """An autoregression fitted to what a model leaves of data that were not repeated."""
+    left = target.measurements.position - target.forward.position(fit.x)
+    return target.measurements.noise(np.where(target.measurements.valid, left, 0.0), len(fit.free))
+
+
+def distance(target: Target, fit: Fit) -> float:
+    """Root mean square distance of the markers from where the model has them [m]."""
+    measured = target.measurements
+    square = (measured.position - target.forward.position(fit.x)) ** 2
+    return float(np.sqrt(3.0 * np.mean(square[measured.valid])))
+
+
+def effects(
+    fit: Fit, base: int, columns: Mapping[str, Int[np.ndarray, " k"]]
+) -> tuple[dict[str, Signature], dict[str, float]]:
+    """Signatures of groups of a fit's columns, and the share of each that nothing else in the model can imitate.
+
+    Args:
+        fit: of the model with all of them.
+        base: number of coordinates of the base model, which come first.
+        columns: of the Jacobian, by group.
+    """
+    fitted = fit.jacobian
+    ground = span(fitted[:, :base])
+    marks, own = {}, {}
+    for name, chosen in columns.items():
+        marks[name] = signature(ground, fitted[:, chosen])
+        rest = span(np.delete(fitted, chosen, axis=1))
+        left, seen = project_out(rest, marks[name].basis), marks[name].rank
+        own[name] = float(np.sqrt(np.sum(left**2) / seen)) if seen else 0.0
+    return marks, own
+
+
+def _places(fit: Fit, indices: Mapping[str, tuple[int, ...]], members: Sequence[str]) -> Int[np.ndarray, " k"]:
+    """Columns of a fit's Jacobian that belong to mechanisms."""
+    return np.flatnonzero(np.isin(fit.free, [i for name in members for i in indices[name]]))
+
+
+def _joined(target: Target, fit: Fit, candidate: Candidate) -> Fit:
+    """The model of a fit with a mechanism in it."""
+    seen = [probe for probe in probe_all(target, fit, [candidate]) if probe.mark.rank > 0]
+    start = fit.x.copy()
+    if seen:
+        best = max(seen, key=lambda probe: float(statistic(probe.mark, fit.residual)[1]))
+        start = lead(target, fit, best, float(statistic(best.mark, fit.residual)[0]))[1]
+        held = list(best.point)
+    else:
+        held = []
+    start = _nearest(target, fit.x, start, held)
+    for index in candidate.indices:  # a size of nothing has no slope for its shape
+        null = target.forward.coordinates.null[index]
+        if target.forward.coordinates.affine[index] and abs(start[index] - null) < SMALL:
+            start[index] = null + SMALL
+    free = np.array([*fit.free, *candidate.indices], dtype=int)
+    found = climb(target, np.clip(start, *target.forward.coordinates.bounds), free, evaluations=GROWING)
+    if found.residual @ found.residual > fit.residual @ fit.residual:  # it went astray
+        return climb(target, fit.x, free, evaluations=GROWING)
+    return found
+
+
+def _reduced(target: Target, fit: Fit, free: Int[np.ndarray, " free"]) -> Float[np.ndarray, " d"]:
+    """Where a fit with fewer free coordinates starts: the others at null, and these where the linear model has them."""
+    coordinates = target.forward.coordinates
+    gone = np.setdiff1d(fit.free, free)
+    emptied = fit.x.copy()
+    emptied[gone] = coordinates.null[gone]
+    place = {int(i): k for k, i in enumerate(fit.free)}
+    kept, lost = [place[int(i)] for i in free], [place[int(i)] for i in gone]
+    left = fit.residual - fit.jacobian[:, lost] @ (emptied - fit.x)[gone]
+    prior = np.diag(1.0 / coordinates.prior_sd[free])
+    pull = (coordinates.prior_mean[free] - emptied[free]) / coordinates.prior_sd[free]
+    design = np.concatenate([fit.jacobian[:, kept], prior])
+    moved = emptied.copy()
+    moved[free] += np.linalg.lstsq(design, np.concatenate([left, pull]), rcond=None)[0]
+    return _nearest(target, emptied, moved, [])
+
+
+def _nearest(
+    target: Target, here: Float[np.ndarray, " d"], there: Float[np.ndarray, " d"], held: Sequence[int]
+) -> Float[np.ndarray, " d"]:
+    """The best point on the way to a linear extrapolation, which may go too far."""
+    coordinates = target.forward.coordinates
+    points = here + np.array([*SHARES, 0.0])[:, None] * (there - here)
+    points[:, list(held)] = there[list(held)]  # places and times mean the same however large the effect is
+    points = np.clip(points, *coordinates.bounds)
+    residual = target.recall("shares", [points], lambda: {"residual": target.residual(points)})["residual"]
+    z = (points - coordinates.prior_mean) / coordinates.prior_sd
+    return points[int(np.argmin(np.sum(residual**2, axis=1) + np.sum(z**2, axis=1)))]
+
+
+def _words(target: Target, fit: Fit) -> str:
+    return f"{1e3 * distance(target, fit):.2f} mm"
