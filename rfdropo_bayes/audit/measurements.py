@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.noise import REPEATS, RESIDUALS, NoiseModel, estimate_noise
+from rfdropo_bayes.audit.repeat_shifts import repeat_shift
 from rfdropo_bayes.bayes.model import RecordingSet
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.repeats import group_repeats
@@ -75,6 +76,11 @@ class Measurements:
                 freedom += own.sum() * (1.0 - 1.0 / len(group))
                 values += int(own.sum())
         return np.concatenate(parts), np.concatenate(valid), freedom / max(values, 1)
+
+    @property
+    def shift(self) -> float | None:
+        """See `repeat_shift`; None without repeats."""
+        return repeat_shift(*self.deviations(self.single)) if self.has_repeats else None
 
     def noise(
         self, residual: Float[np.ndarray, "recording time channel"], parameters: int, like: NoiseModel | None = None

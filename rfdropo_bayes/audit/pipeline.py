@@ -66,7 +66,8 @@ class Answer:
     ``unexamined`` holds candidates that would have taken too long, with the minutes; ``looks`` are the looks at the
     base model and after each step; ``stages`` the explained fraction after each step; ``sizes`` is the last model's fit
     under priors that do not pull, and ``draws`` are from it; ``suspected`` is a noise under which the base model would
-    pass, where a stated one leaves a discrepancy that is not explained.
+    pass, where a stated one leaves a discrepancy that is not explained; ``shift`` is the distance by which constants
+    tell repeats apart [m].
     """
 
     verdict: str
@@ -85,6 +86,7 @@ class Answer:
     sizes: Fit
     draws: Float[np.ndarray, "draw d"]
     suspected: NoiseModel | None
+    shift: float | None
     rollouts: int
     seconds: float
 
@@ -157,6 +159,7 @@ def audit(
         sizes,
         sizes.draws(np.random.default_rng([question.seed, 5]), 1000, low, high),
         _suspected(question, inquiry, base, last),
+        target.measurements.shift,
         target.forward.rollouts + (finer.rollouts if finer else 0),
         time.monotonic() - began,
     )

@@ -57,6 +57,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
             "correlation_between_channels": None
             if noise.correlation is None
             else np.round(noise.correlation, 3).tolist(),
+            "shift_between_repeats_mm": None if answer.shift is None else MILLIMETRES * answer.shift,
             "suspected_mm": None if answer.suspected is None else (MILLIMETRES * answer.suspected.scale).tolist(),
         },
         "residual_in_noise_deviations": base_rms,

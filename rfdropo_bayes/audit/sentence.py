@@ -16,7 +16,7 @@ MOST_EXCLUDED = 3
 
 def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     """What was found, how much of the discrepancy it explains, what is excluded, what remains."""
-    words = _words(answer, findings) + _suspicion(answer) + _unexamined(answer)
+    words = _words(answer, findings) + _suspicion(answer) + _shifted(answer) + _unexamined(answer)
     return words[0].upper() + words[1:]
 
 
@@ -34,6 +34,15 @@ def _suspicion(answer: Answer) -> str:
     return (
         f" But noise of {other:.2g} mm{memory} instead of the {stated:.2g} mm stated would leave no discrepancy: "
         "check [noise], or repeat one command sequence three times."
+    )
+
+
+def _shifted(answer: Answer) -> str:
+    if answer.shift is None:
+        return ""
+    return (
+        f" Repeats differ by constants of {1e3 * answer.shift:.2g} mm, which pass for noise here: a frame or a start "
+        "that was not the same each time? Let camera_offset differ in [model.per_recording]."
     )
 
 

@@ -43,7 +43,7 @@ def test_what_looks_the_same_can_go_one_at_a_time_and_not_together(asked):
     assert found.own["play"] > 0.8
     assert {name for name in found.groups if found.needed(name)} == {"play", "lateness"}
     assert found.gain("delay") > 10.0
-    assert found.gain("creep") < 3.0
+    assert found.loss("creep") < 3.0
     assert found.whole.rmse < found.without["play"].rmse
     assert found.whole.rmse < 0.3 * found.none.rmse
     content = record_separation(found, whole)

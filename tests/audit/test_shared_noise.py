@@ -7,6 +7,7 @@ from rfdropo_bayes.audit.bootstrap import null_residuals, tail
 from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.noise import REPEATS, STATED, NoiseModel
 from rfdropo_bayes.audit.omnibus import statistics
+from rfdropo_bayes.audit.repeat_shifts import repeat_shift
 from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.audit.shared_noise import mixed, shrunk_correlation
 
@@ -96,3 +97,23 @@ def test_data_without_discrepancy_pass_whatever_their_markers_share(share):
         p.append([tail(float(v[0]), reference[k]) for k, v in statistics(residual).items()])
     bound = 3.3 * np.sqrt(1 / 12 / 60)
     assert np.all(np.abs(np.mean(p, axis=0) - 0.5) < bound), np.mean(p, axis=0)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.8])
+def test_constants_between_repeats_are_found_and_noise_is_not_taken_for_them(share):
+    """40 data sets without shifts: none is called shifted (each by chance once in several thousands, a short memory's
+    bias included). Shifts of 3 deviations, the same for all markers: the size within 40 % (6 degrees of freedom each,
+    mean of 10: four standard errors)."""
+    rng = np.random.default_rng(8)
+    truth = NoiseModel(np.full(12, 5e-4), MEMORY, REPEATS, np.inf, common(share) if share else None)
+    plain = [repeats(truth.draw(rng, (4, 80, 12))) for _ in range(40)]
+    assert [measured.shift for measured in plain] == [None] * 40
+    sizes = []
+    for _ in range(10):
+        shift = 1.5e-3 * rng.standard_normal((4, 1, 3))
+        found = repeats(truth.draw(rng, (4, 80, 12)) + np.tile(shift, 4)).shift
+        assert found is not None
+        sizes.append(found)
+    assert np.sqrt(np.mean(np.square(sizes))) == pytest.approx(1.5e-3 * np.sqrt(3), rel=0.4)
+    short = np.zeros((3, 5, 6))
+    assert repeat_shift(short, np.ones(short.shape, dtype=bool), 2 / 3) is None
