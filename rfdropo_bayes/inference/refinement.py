@@ -99,14 +99,13 @@ def run(
     first_key, second_key = jax.random.split(key)
     config = replace(config, replicates=REPLICATES if config.replicates == 1 else config.replicates)
     whole = chosen_kernel(config.kernel, problem, None) == "hamiltonian"
-    first = horizon_smc.run(WholeProblem(problem) if whole else problem, config, first_key, logbook)
+    first = horizon_smc.run(WholeProblem(problem) if whole else problem, config, first_key, logbook.part(0.0, 0.5))
     values = {name: jnp.asarray(first.draws[name].ravel()) for name in problem.names}
     view = centred(problem, _finite(problem.to_unconstrained(values)))
     bridged = _cover(view, _finite(view.to_unconstrained(values)))
-    folder = None if logbook.folder is None else logbook.folder / "refined"
     correlation, moves = min(config.correlation, FORGOTTEN), max(config.max_moves, MOST_MOVES)
     settings = replace(config, blocks=1, correlation=correlation, max_moves=moves)
-    second = horizon_smc.run(bridged, settings, second_key, Logbook(folder, logbook.resume))
+    second = horizon_smc.run(bridged, settings, second_key, logbook.part(0.5, 1.0, "refined"))
     if view is problem and not whole and len(second.trace) > SHORTER * len(first.trace):
         return first  # a shape that the fit does not cover: from the prior the way is as short, and misses no mode
     return _joined(problem, view, bridged, first, second)
