@@ -34,12 +34,16 @@ class Lanes:
         simulator: with the base model's mechanisms and every candidate at its null value.
         marker_index: which of its markers are measured.
         width: lanes of one call; the last call of a batch is padded.
+        slope_rollouts: what a derivative costs, that of the value included.
     """
 
-    def __init__(self, simulator: Simulator, marker_index: np.ndarray, width: int = WIDTH) -> None:
+    def __init__(
+        self, simulator: Simulator, marker_index: np.ndarray, width: int = WIDTH, slope_rollouts: int = 3
+    ) -> None:
         self.simulator = simulator
         self.marker_index = marker_index
         self.width = width
+        self.slope_rollouts = slope_rollouts
         self.physical = tuple(spec.name for spec in simulator.parameters)
 
     def _observe(self, theta: jax.Array, commands: Commands) -> tuple[jax.Array, jax.Array]:
@@ -95,7 +99,7 @@ class RoutedLanes(Lanes):
     """
 
     def __init__(self, fast: Lanes, slow: Lanes, null: Mapping[str, float]) -> None:
-        super().__init__(slow.simulator, slow.marker_index)
+        super().__init__(slow.simulator, slow.marker_index, slow.width, slow.slope_rollouts)
         self.fast, self.slow = fast, slow
         self._kept = np.array([self.physical.index(name) for name in fast.physical])
         self._further = np.setdiff1d(np.arange(len(self.physical)), self._kept)
@@ -211,7 +215,7 @@ class Forward:
         theta, lane = self._lanes_of(points)
         tangent = self.coordinates.physical_tangents(points, directions, self.slots).reshape(theta.shape)
         found = self.lanes.differentiate(theta, tangent, self.commands, lane)
-        self.rollouts += 3 * len(lane)
+        self.rollouts += self.lanes.slope_rollouts * len(lane)
         return np.nan_to_num(found).reshape(len(points), self.count, *found.shape[1:])
 
     def _lanes_of(self, points: Points) -> tuple[np.ndarray, np.ndarray]:

@@ -91,6 +91,7 @@ class CompiledEngine:
         from_equilibrium: start in the static equilibrium of the initial displacements, else undeformed.
         precision: of all arithmetic.
         threads: None for all processors.
+        one_sided: derivatives from one rollout per direction, see `with_differences`.
     """
 
     assembly: Assembly
@@ -98,6 +99,7 @@ class CompiledEngine:
     from_equilibrium: bool
     precision: Literal["float64", "float32"] = "float64"
     threads: int | None = None
+    one_sided: bool = False
     lanes: ClassVar[int] = 512
 
     @cached_property
@@ -127,7 +129,7 @@ class CompiledEngine:
     ) -> Motion:
         """See `Engine.motion`.
 
-        Derivatives are central differences along each tangent, two rollouts per direction. With effects of the body
+        Derivatives are differences along each tangent, two rollouts per direction or one. With effects of the body
         that this engine does not know, the reference engine computes rollouts and derivatives.
         """
         lacking = effects_lacking(material.effects)
@@ -141,7 +143,7 @@ class CompiledEngine:
 
     @cached_property
     def _differentiable(self) -> Callable[[Inputs, Array], Motion]:
-        return with_differences(self._call, input_sizes, self.precision)
+        return with_differences(self._call, input_sizes, self.precision, self.one_sided)
 
     def _call(self, inputs: Inputs, limit: Array) -> Motion:
         material, start, displacement = inputs

@@ -207,11 +207,19 @@ def _lanes(
     added = whole.mechanisms[len(experiment.model.mechanisms) :]
     kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
     if len(kept) == len(names):
-        return Lanes(whole, recordings.marker_index), recordings.commands
-    fast = Lanes(build_simulator(_with(experiment, kept), robot, folder), recordings.marker_index)
+        return _brisk(whole, recordings.marker_index), recordings.commands
+    fast = _brisk(build_simulator(_with(experiment, kept), robot, folder), recordings.marker_index)
     null = dict(coordinates.nominal) | dict(coordinates.fixed) | coordinates.named(coordinates.null)
-    routed = RoutedLanes(fast, Lanes(whole, recordings.marker_index), null)
+    routed = RoutedLanes(fast, _brisk(whole, recordings.marker_index), null)
     return routed, recordings.commands
+
+
+def _brisk(simulator: RobotSimulator, marker_index: np.ndarray) -> Lanes:
+    """Lanes with one-sided differences where there are any: they are exact enough for climbs and scores."""
+    if isinstance(simulator, TrunkSimulator) and isinstance(simulator.engine, CompiledEngine):
+        quick = replace(simulator, engine=replace(simulator.engine, one_sided=True))
+        return Lanes(quick, marker_index, slope_rollouts=2)
+    return Lanes(simulator, marker_index)
 
 
 def _costly(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
