@@ -20,8 +20,7 @@ from rfdropo_bayes.audit.noise import RESIDUALS, NoiseModel
 from rfdropo_bayes.audit.score import Signature, likeness, project_out, signature, span, statistic
 
 SMALL = 0.1  # prior deviations at which a mechanism starts that shows nothing at null
-GROWING, REFITTING, FINAL = 8, 6, 15  # evaluations of a climb while the model grows, of a variant, and of the whole
-ROUNDS = 2  # of noise and fit in turn
+GROWING, REFITTING, FINAL = 8, 3, 8  # evaluations of a climb while the model grows, of a variant, and of the whole
 
 
 @dataclass(frozen=True)
@@ -104,13 +103,11 @@ def separate(
     for candidate in candidates:
         grown = _joined(target, grown, candidate)
         report(f"with {candidate.name}: {_words(target, grown)}")
-    measured_noise = target.noise.source != RESIDUALS
-    for _ in range(1 if measured_noise else ROUNDS):
-        if not measured_noise:
-            target = replace(target, noise=residual_noise(target, grown))
-            report(f"noise of what is left: AR({target.noise.order})")
-        grown = climb(target, grown.x, grown.free, evaluations=FINAL)
-        report(f"with all: {_words(target, grown)}")
+    if target.noise.source == RESIDUALS:
+        target = replace(target, noise=residual_noise(target, grown))
+        report(f"noise of what is left: AR({target.noise.order})")
+    grown = climb(target, grown.x, grown.free, evaluations=FINAL)
+    report(f"with all: {_words(target, grown)}")
     indices = {c.name: c.indices for c in candidates}
     names = tuple(indices)
 

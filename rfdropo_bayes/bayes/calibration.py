@@ -17,6 +17,7 @@ from rfdropo_bayes.bayes.angles import angle_specs
 from rfdropo_bayes.bayes.forces import tension_specs
 from rfdropo_bayes.bayes.model import Measured, TrajectoryModel
 from rfdropo_bayes.bayes.noise import draw_noise, noise_specs
+from rfdropo_bayes.bayes.objects import object_specs
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
@@ -51,7 +52,8 @@ class CalibrationProblem:
         self.n_rows = model.recordings.time.shape[1]
         self.n_recordings = len(model.recordings.names)
         self.status_names = {int(result): result.name.lower() for result in Result}
-        noise = {spec.name for spec in (*noise_specs(model.noise), *tension_specs(True), *angle_specs(True))}
+        specs = (*noise_specs(model.noise), *tension_specs(True), *angle_specs(True), *object_specs(True))
+        noise = {spec.name for spec in specs}
         self.physical_names = tuple(p.name for p in model.space.parameters if p.spec.name not in noise)
 
     @cached_property

@@ -24,6 +24,7 @@ from rfdropo_bayes.bayes.forces import (
     weighed_residuals,
 )
 from rfdropo_bayes.bayes.noise import Timeline, draw_noise, row_log_density, timeline, whiten
+from rfdropo_bayes.bayes.objects import ObjectData, Placing, object_log_density, object_residuals, offset_of
 from rfdropo_bayes.bayes.space import ParameterSpace
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
@@ -41,6 +42,7 @@ class Measured(NamedTuple):
         tension: cable tensions [N], and the size of a reading that its relative error applies to [N]; or None.
         motor_angle: motor angles [rad]; or None.
         weighed: values of the weighed parts.
+        object_pose: poses of the pushed body [m, quaternion]; or None.
     """
 
     position: Float[Any, "recording time marker 3"]
@@ -48,6 +50,7 @@ class Measured(NamedTuple):
     reading: Float[Any, "recording time cable"] | None
     motor_angle: Float[Any, "recording time channel"] | None
     weighed: Float[Any, " weighed"]
+    object_pose: Float[Any, "recording time 7"] | None = None
 
 
 class TrajectoryNoise(dist.Distribution):
@@ -186,6 +189,8 @@ class TrajectoryModel:
         tension: measured cable tensions; None where they are not used.
         weighed: parameters known from measurements of their own.
         motor_angle: measured motor angles; None where they are not used.
+        object_pose: measured poses of the pushed body, which then starts at the first of them; None where they are not
+            used.
     """
 
     simulator: Simulator
@@ -196,6 +201,7 @@ class TrajectoryModel:
     tension: TensionData | None = None
     weighed: tuple[Weighed, ...] = ()
     motor_angle: AngleData | None = None
+    object_pose: ObjectData | None = None
 
     def noise_of(self, values: Values) -> tuple[Any, Any]:
         """Standard deviation [m] and correlation time [s] (None for white noise) among a set of values."""
@@ -215,7 +221,12 @@ class TrajectoryModel:
     def rollout_values(self, values: Values, recording: str) -> dict[str, Array]:
         """What the simulator is given for one recording: fixed and inferred physical parameters."""
         chosen = {**self._absent, **self.fixed, **self.space.for_recording(values, recording)}
-        return {name: jnp.asarray(value) for name, value in chosen.items() if name in self._physical}
+        physical = {name: jnp.asarray(value) for name, value in chosen.items() if name in self._physical}
+        if self.object_pose is None:
+            return physical
+        assert isinstance(self.simulator, Placing)
+        start = self.object_pose.measured[self.recordings.names.index(recording), 0]
+        return self.simulator.with_object_at(physical, start)
 
     def simulate(self, values: Values, steps: Int[Array, ""] | None = None) -> Observation:
         """Roll out every recording under one set of values.
@@ -239,7 +250,8 @@ class TrajectoryModel:
         tension, reading = (None, None) if self.tension is None else (self.tension.measured, self.tension.scale)
         angle = None if self.motor_angle is None else self.motor_angle.measured
         weighed = np.array([entry.value for entry in self.weighed])
-        return Measured(np.asarray(self.recordings.position), tension, reading, angle, weighed)
+        pose = None if self.object_pose is None else self.object_pose.measured
+        return Measured(np.asarray(self.recordings.position), tension, reading, angle, weighed, pose)
 
     def row_log_likelihood(
         self, values: Values, steps: Int[Array, ""] | None = None, measured: Measured | None = None
@@ -261,34 +273,48 @@ class TrajectoryModel:
         if self.motor_angle is not None:
             angles = self.motor_angle._replace(measured=data.motor_angle)
             rows += angle_log_density(observation.motor_angle, {**self.fixed, **values}, angles)
+        if self.object_pose is not None:
+            rows += object_log_density(*self._objects(values, observation, data))
         return rows, jnp.max(observation.status)
 
     def residuals(
         self, values: Values, steps: Int[Array, ""], measured: Measured | None = None
-    ) -> tuple[Array, Array | None, Array | None, Array | None]:
+    ) -> tuple[Array, Array | None, Array | None, Array | None, Array | None]:
         """Whitened residuals, zero where masked: positions (recording, time, marker, 3), tensions (recording, time,
-        cable), motor angles (recording, time, channel), weighed parts; None for what there is not."""
+        cable), motor angles (recording, time, channel), poses of the body (recording, time, 1, 6), weighed parts; None
+        for what there is not."""
         data = self.measured if measured is None else measured
         observation = self.simulate(values, steps)
         sigma, tau = self.noise_of(values)
         white = jax.vmap(lambda r, line: whiten(r, sigma, tau, line)[0])(
             data.position - observation.position, self.recordings.line
         )
-        pulled = turned = weighed = None
+        pulled = turned = moved = weighed = None
         if self.tension is not None:
             pulls = self._pulls(data)
             pulled, _ = tension_residuals(observation.tension, {**self.fixed, **values}, pulls)
         if self.motor_angle is not None:
             angles = self.motor_angle._replace(measured=data.motor_angle)
             turned = angle_residuals(observation.motor_angle, {**self.fixed, **values}, angles)
+        if self.object_pose is not None:
+            moved, _ = object_residuals(*self._objects(values, observation, data))
         if self.weighed:
             entries = [entry._replace(value=value) for entry, value in zip(self.weighed, data.weighed, strict=True)]
             weighed = weighed_residuals(values, entries)
-        return white, pulled, turned, weighed
+        return white, pulled, turned, moved, weighed
 
     def _pulls(self, data: Measured) -> TensionData:
         assert self.tension is not None
         return TensionData(data.tension, data.reading, self.tension.valid, self.tension.cables)
+
+    def _objects(
+        self, values: Values, observation: Observation, data: Measured
+    ) -> tuple[Array, Array, dict[str, Any], ObjectData]:
+        """Simulated poses of the body, offset of the measuring frame, values of the noise, and what was measured."""
+        assert self.object_pose is not None
+        known = {**self.fixed, **values}
+        offset = jnp.stack([offset_of(self.rollout_values(values, name)) for name in self.recordings.names])
+        return observation.object_pose, offset, known, self.object_pose._replace(measured=data.object_pose)
 
     def __call__(self, observe: bool = True) -> None:
         """The numpyro model; ``observe=False`` leaves the positions free, for predictive draws."""
@@ -309,5 +335,8 @@ class TrajectoryModel:
         if observe and self.motor_angle is not None:
             turned = angle_log_density(observation.motor_angle, {**self.fixed, **values}, self.motor_angle)
             numpyro.factor("motor_angle", turned)
+        if observe and self.object_pose is not None:
+            pushed = object_log_density(*self._objects(values, observation, self.measured))
+            numpyro.factor("object_pose", pushed)
         if observe and self.weighed:
             numpyro.factor("weighed", weighed_log_density(values, self.weighed))

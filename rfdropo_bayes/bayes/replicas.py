@@ -13,6 +13,7 @@ from rfdropo_bayes.bayes.angles import MOTOR_ANGLE_NOISE
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.forces import TENSION_GAIN, TENSION_NOISE, reading_size
 from rfdropo_bayes.bayes.model import Measured
+from rfdropo_bayes.bayes.objects import draw_object_error, offset_of
 
 
 def simulated_data(problem: CalibrationProblem, truth: Mapping[str, float], key: PRNGKeyArray) -> Measured | None:
@@ -30,7 +31,7 @@ def simulated_data(problem: CalibrationProblem, truth: Mapping[str, float], key:
     known = {**model.fixed, **truth}
     valid = model.recordings.line.valid[..., None]
     measured = np.where(valid, seen.position[0] + problem.draw_noise(position_key, batch)[0], 0.0)
-    read = size = angle = None
+    read = size = angle = pose = None
     if model.tension is not None:
         error = known[TENSION_NOISE.name] * np.asarray(jax.random.normal(tension_key, model.tension.measured.shape))
         clean = (
@@ -44,8 +45,16 @@ def simulated_data(problem: CalibrationProblem, truth: Mapping[str, float], key:
         normal = np.asarray(jax.random.normal(jax.random.fold_in(key, 3), model.motor_angle.measured.shape))
         turned = np.asarray(seen.motor_angle)[0] + known[MOTOR_ANGLE_NOISE.name] * normal
         angle = np.where(model.motor_angle.valid, turned, 0.0)
+    if model.object_pose is not None:
+        single = {name: column[0] for name, column in batch.items()}
+        offset = np.stack([offset_of(model.rollout_values(single, name)) for name in model.recordings.names])
+        clean = np.array(seen.object_pose)[0]
+        clean[..., :3] += offset[:, None]
+        keys = jax.random.split(jax.random.fold_in(key, 4), len(clean))
+        noisy = jax.vmap(lambda k, p, t: draw_object_error(k, p, t, known))(keys, clean, model.recordings.time)
+        pose = np.where(model.object_pose.line.valid, np.asarray(noisy), 0.0)
     normal = np.asarray(jax.random.normal(weighed_key, (len(model.weighed),)))
     weighed = np.array(
         [sum(truth[n] for n in entry.parameters) + entry.sd * z for entry, z in zip(model.weighed, normal, strict=True)]
     )
-    return Measured(measured, read, size, angle, weighed)
+    return Measured(measured, read, size, angle, weighed, pose)

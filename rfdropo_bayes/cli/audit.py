@@ -31,6 +31,23 @@ def audit(
     typer.echo(f"report: {folder / 'report.html'}; extended model: {folder / 'extended.toml'}")
 
 
+def separate(
+    experiment: ExperimentFile,
+    out: OutFolder = None,
+    base: Annotated[
+        Path | None, typer.Option("--base", help="folder of an earlier calibration, to start the base model from")
+    ] = None,
+    resume: Resume = False,
+    overrides: Overrides = None,
+) -> None:
+    """Say which mechanisms the recordings tell apart: writes separation.json, separation.md and separation.png."""
+    from rfdropo_bayes.workflow.separation import TABLE, run_separation
+
+    folder = folder_for(experiment, out)
+    run_separation(experiment, folder, overrides=overrides or [], base=base, resume=resume, report=say_progress())
+    typer.echo((folder / TABLE).read_text(encoding="utf-8"))
+
+
 def design(experiment: ExperimentFile, out: OutFolder = None, seed: Seed = None, overrides: Overrides = None) -> None:
     """Propose the commands that best separate the leading explanations: writes next_commands.csv and design.json."""
     from rfdropo_bayes.workflow.design import run_design

@@ -92,6 +92,7 @@ def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a ca
 
 
 app.command()(audit.audit)
+app.command()(audit.separate)
 app.command()(audit.design)
 app.command()(inference.export)
 app.command()(pictures.view)

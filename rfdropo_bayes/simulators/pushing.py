@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
@@ -191,6 +191,26 @@ class PushSimulator(RobotSimulator):
             jnp.asarray(values["friction"], float),
             cube_at(centre, values["cube_yaw"], plate_normal(self.robot)),
         )
+
+    def with_object_at(self, values: Mapping[str, Any], pose: Float[Any, "7"]) -> dict[str, Any]:
+        """Values with the cube where it was measured, less the offset of the measuring frame, standing on the plate.
+
+        Args:
+            values: of one rollout, or of many (arrays of one shape); what is left out is nominal.
+            pose: measured centre [m] and unit quaternion (x, y, z, w).
+        """
+        nominal = {spec.name: spec.nominal for spec in self.parameters}
+        known = {**nominal, **values}
+        normal = plate_normal(self.robot)
+        offset = [known[f"offset_{axis}"] for axis in "xyz"]
+        centre = jnp.stack(
+            jnp.broadcast_arrays(*(jnp.asarray(p - o) for p, o in zip(pose[:3], offset, strict=True))), -1
+        )
+        height = push_table(self.robot).plate_height_m + 0.5 * jnp.asarray(known["cube_side"])
+        centre = centre + (height - centre @ normal)[..., None] * normal
+        yaw = 2.0 * jnp.arctan2(jnp.asarray(pose[3:6]) @ normal, pose[6])
+        yaw = jnp.broadcast_to((yaw + jnp.pi) % (2.0 * jnp.pi) - jnp.pi, centre.shape[:-1])
+        return {**values, "cube_yaw": yaw} | {f"cube_{axis}": centre[..., i] for i, axis in enumerate("xyz")}
 
     def balance(self, parameters: Values, commands: Commands) -> Balance:
         """See `RobotSimulator.balance`; the energies are those of the trunk."""

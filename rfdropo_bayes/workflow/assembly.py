@@ -11,6 +11,7 @@ from rfdropo_bayes.bayes.calibration import Batch, CalibrationProblem
 from rfdropo_bayes.bayes.forces import TENSION_GAIN, Weighed, check_weighed, gather_tension, tension_specs
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
 from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.objects import gather_objects, object_specs
 from rfdropo_bayes.bayes.pooling import Pooled, gather_groups
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory, find_data_file, load_recordings
@@ -58,8 +59,10 @@ def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path())
 
 
 def measurement_specs(table: ModelTable) -> tuple[ParameterSpec, ...]:
-    """Parameters of what is measured: noise of the positions, of tensions and of motor angles, where they are used."""
-    return noise_specs(table.noise) + tension_specs(table.tension) + angle_specs(table.motor_angle)
+    """Parameters of what is measured: noise of the positions, and of tensions, motor angles and poses of the pushed
+    body where they are used."""
+    forces, drives = tension_specs(table.tension), angle_specs(table.motor_angle)
+    return noise_specs(table.noise) + forces + drives + object_specs(table.object_pose)
 
 
 def fixed_values(experiment: Experiment, simulator: RobotSimulator) -> dict[str, float]:
@@ -136,7 +139,8 @@ def build_model(
     check_weighed(weighed, space.names)
     tension = gather_tension(simulator, trajectories, recordings.time.shape[1]) if table.tension else None
     angles = gather_angles(trajectories, recordings.time.shape[1]) if table.motor_angle else None
-    return TrajectoryModel(simulator, space, fixed, table.noise, recordings, tension, weighed, angles)
+    poses = gather_objects(simulator, trajectories, recordings.time.shape[1]) if table.object_pose else None
+    return TrajectoryModel(simulator, space, fixed, table.noise, recordings, tension, weighed, angles, poses)
 
 
 def build_problem(model: TrajectoryModel, earlier: Batch | None = None) -> CalibrationProblem:

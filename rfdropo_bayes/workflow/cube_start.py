@@ -5,20 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.model import TrajectoryModel
+from rfdropo_bayes.bayes.objects import OFFSETS, draw_object_error, object_specs
 from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.simulators.pushing import PushSimulator, plate_normal, push_table
+from rfdropo_bayes.simulators.pushing import PushSimulator
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 
 PLACE = ("cube_x", "cube_y", "cube_z", "cube_yaw")
-OFFSETS = ("offset_x", "offset_y", "offset_z")
 
 
 def with_measured_starts(
@@ -54,15 +55,8 @@ def _place(simulator: PushSimulator, model: TrajectoryModel, trajectory: Traject
         return {}
     count = len(next(iter(values.values())))
     known = {**model.fixed, **model.space.for_recording(values, trajectory.name)}
-    centre = np.broadcast_to(pose[0, :3], (count, 3)) - offsets(known, count)
-    normal = plate_normal(simulator.robot)
-    table = push_table(simulator.robot)
-    side = np.broadcast_to(known.get("cube_side", table.parameters["cube_side"].nominal), (count,))
-    height = table.plate_height_m + 0.5 * side
-    centre = centre + (height - centre @ normal)[:, None] * normal
-    yaw = 2.0 * np.arctan2(pose[0, 3:6] @ normal, pose[0, 6])
-    yaw = (yaw + np.pi) % (2.0 * np.pi) - np.pi
-    return {**dict(zip(PLACE, centre.T, strict=False)), "cube_yaw": np.full(count, yaw)}
+    placed = simulator.with_object_at(known, pose[0])
+    return {name: np.broadcast_to(np.asarray(placed[name]), (count,)) for name in PLACE}
 
 
 def offsets(known: Mapping[str, object], count: int) -> Float[np.ndarray, "n 3"]:
@@ -73,12 +67,19 @@ def offsets(known: Mapping[str, object], count: int) -> Float[np.ndarray, "n 3"]
 
 
 def measured_objects(
-    problem: CalibrationProblem, pose: Float[np.ndarray, "n recording time 7"], values: Batch
+    problem: CalibrationProblem, pose: Float[np.ndarray, "n recording time 7"], values: Batch, key: PRNGKeyArray
 ) -> Float[np.ndarray, "n recording time 7"]:
-    """Simulated poses of the cube as they would be measured: with the offset of the measuring frame."""
+    """Simulated poses of the cube as they would be measured: with the offset of the measuring frame and, where measured
+    poses were among the data, with the error that the model was found to have."""
     model = problem.model
     shifted = np.array(pose)
+    count = len(shifted)
     for index, name in enumerate(model.recordings.names):
         known = {**model.fixed, **model.space.for_recording(values, name)}
-        shifted[:, index, :, :3] += offsets(known, len(pose))[:, None]
+        shifted[:, index, :, :3] += offsets(known, count)[:, None]
+        sizes = {s.name: np.broadcast_to(known[s.name], (count,)) for s in object_specs(True) if s.name in known}
+        if sizes:
+            keys = jax.random.split(jax.random.fold_in(key, index), count)
+            draw = jax.vmap(draw_object_error, in_axes=(0, 0, None, 0))
+            shifted[:, index] = draw(keys, shifted[:, index], model.recordings.time[index], sizes)
     return shifted

@@ -39,8 +39,9 @@ class ModelTable(Table):
     about the value they share, with the given standard deviation in its unit (partial pooling). ``tension`` uses the
     recordings' cable tensions as data, with a relative noise ``tension_noise`` that is inferred and a ``tension_gain``
     that is 1 unless it has a prior; ``motor_angle`` uses the motor angles that the robot measured, with a noise
-    ``motor_angle_noise`` that is inferred; ``weighed`` lists parameters, or sums of them, known from measurements of
-    their own.
+    ``motor_angle_noise`` that is inferred; ``object_pose`` uses the measured poses of the pushed body, which then
+    starts at the first of them, with ``object_noise``, ``object_turn_noise`` and ``object_correlation_time``;
+    ``weighed`` lists parameters, or sums of them, known from measurements of their own.
     """
 
     mechanisms: list[str] = Field(default_factory=list)
@@ -52,6 +53,7 @@ class ModelTable(Table):
     per_group: dict[str, float] = Field(default_factory=dict)
     tension: bool = False
     motor_angle: bool = False
+    object_pose: bool = False
     weighed: list[WeighedTable] = Field(default_factory=list)
 
 
@@ -135,6 +137,32 @@ class AuditTable(Table):
     minutes: float = Field(default=10.0, ge=0.0)
 
 
+class SeparationTable(Table):
+    """[separation]: ``mechanisms`` that join the base model, to see which of them the recordings tell apart; ``groups``
+    names sets of them that are asked for together, such as all ways to be late."""
+
+    mechanisms: list[str] = Field(min_length=2)
+    groups: dict[str, list[str]] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _has_members(self) -> SeparationTable:
+        for name, members in self.groups.items():
+            for member in members:
+                if member not in self.mechanisms:
+                    raise InputError(
+                        f"{member!r} is none of the mechanisms",
+                        where=f"[separation.groups] {name}",
+                        remedy=f"use {', '.join(self.mechanisms)}",
+                    )
+            if name in self.mechanisms or not members:
+                raise InputError(
+                    f"{name!r} is a mechanism itself" if members else "is empty",
+                    where=f"[separation.groups] {name}",
+                    remedy="give a group a name of its own, and members",
+                )
+        return self
+
+
 class Experiment(Table):
     """An experiment as read from its file; see `load_experiment`."""
 
@@ -148,6 +176,7 @@ class Experiment(Table):
     simulator: SimulatorTable = Field(default_factory=SimulatorTable)
     inference: InferenceTable = Field(default_factory=InferenceTable)
     audit: AuditTable = Field(default_factory=AuditTable)
+    separation: SeparationTable | None = None
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experiment, dict[str, Any]]:

@@ -13,10 +13,10 @@ from scipy.special import softmax
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.model import RecordingSet
+from rfdropo_bayes.bayes.objects import OFFSETS
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.schedules import next_step
-from rfdropo_bayes.workflow.cube_start import OFFSETS
 
 SMALLEST_ERROR = 1e-6  # [m]
 STEP = 0.05  # of a central difference, in prior deviations

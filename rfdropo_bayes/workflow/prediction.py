@@ -79,7 +79,7 @@ def predict_new(
     names = [t.name for t in trajectories]
     own_key, row_key, noise_key = jax.random.split(key, 3)
     space, extended = _for_new_recordings(model.space, values, names, fitted, own_key, groups or {})
-    fresh = replace(model, space=space, recordings=gather_recordings(model.simulator, trajectories))
+    fresh = replace(model, space=space, recordings=gather_recordings(model.simulator, trajectories), object_pose=None)
     problem = CalibrationProblem(fresh, chunk=chunk)
     own = {whole(name) for name in fitted}
     drawn = [p for p in space.parameters if p.added_to and p.name not in values]
@@ -153,6 +153,8 @@ def _predictions(
     recordings = problem.model.recordings
     position, pose, fine = _ended_well(problem, values)
     key, choice, again_key = jax.random.split(key, 3)
+    if pose is not None:
+        pose = measured_objects(problem, pose, fine, jax.random.fold_in(key, 1))
     chosen = weighed_by_first_row(recordings, position[:, :, 0], unseen, errors or {}, choice)
     noisy = position + problem.draw_noise(key, fine)
     before = None
@@ -190,5 +192,8 @@ def _ended_well(problem: CalibrationProblem, values: Batch) -> tuple[np.ndarray,
     fine = status == 0
     if not fine.any():
         raise InputError("no rollout under the posterior ended well", where="prediction", remedy="narrow the priors")
-    pose = None if pose is None else measured_objects(problem, pose, values)[fine]
-    return position[fine], pose, {name: np.asarray(column)[fine] for name, column in values.items()}
+    return (
+        position[fine],
+        None if pose is None else pose[fine],
+        {name: np.asarray(column)[fine] for name, column in values.items()},
+    )

@@ -13,6 +13,7 @@ from rfdropo_bayes.audit.pipeline import base_model
 from rfdropo_bayes.audit.separation import effects, separate
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.separation_table import separation_figure, separation_markdown
+from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.workflow.experiment import SeparationTable
 from rfdropo_bayes.workflow.separation import record_separation
 
@@ -63,7 +64,9 @@ def test_noise_that_was_not_measured_is_what_the_model_with_all_of_them_leaves(a
     target, base, candidates, _ = asked
     guessed = replace(target, noise=replace(target.noise, scale=np.full(12, 1e-2), source=RESIDUALS))
     # As if nothing had been repeated: each recording for itself.
-    alone = replace(guessed.measurements, members=tuple((group[0],) for group in guessed.measurements.members))
+    joined = guessed.measurements
+    members = tuple((index,) for index in range(len(joined.members)))
+    alone = replace(joined, members=members, single=joined.position, single_valid=joined.valid)
     found = separate(replace(guessed, measurements=alone), candidates[:2], {}, base.x)
     kept = found.target.noise
     assert kept.source == RESIDUALS
@@ -86,4 +89,4 @@ def test_the_share_of_an_effect_that_nothing_else_imitates_is_its_sine(asked):
 def test_groups_hold_what_is_asked_for():
     for groups, words in (({"late": ["lag"]}, "none of the mechanisms"), ({"play": ["play"]}, "a mechanism itself")):
         with pytest.raises(InputError, match=words):
-            SeparationTable(mechanisms=["play", "delay"], groups=groups)
+            parse_table(SeparationTable, {"mechanisms": ["play", "delay"], "groups": groups}, where="file")

@@ -1,0 +1,150 @@
+"""``rfdropo separate``: which of several mechanisms the recordings tell apart; separation.json, .md and .png."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.audit.fit import Fit, Target
+from rfdropo_bayes.audit.journal import Journal
+from rfdropo_bayes.audit.measurements import gather_measurements
+from rfdropo_bayes.audit.noise import RESIDUALS, NoiseModel
+from rfdropo_bayes.audit.pipeline import FIRST_GUESS, Question, simulated
+from rfdropo_bayes.audit.separation import Separation, separate
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.report import software_versions
+from rfdropo_bayes.report.separation_table import separation_figure, separation_markdown
+from rfdropo_bayes.report.summary import combined_hash
+from rfdropo_bayes.workflow.assembly import load_data
+from rfdropo_bayes.workflow.audit import build_question, start_values
+from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.workflow.files import output_folder
+
+RESULT, TABLE, FIGURE, JOURNAL = "separation.json", "separation.md", "separation.png", "checkpoints/separation"
+DRAWS = 1000
+MILLIMETRES = 1e3
+
+
+def run_separation(
+    path: Path,
+    out: Path,
+    *,
+    overrides: Sequence[str] = (),
+    base: Path | None = None,
+    resume: bool = False,
+    report: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """Fit the experiment's base model with and without the mechanisms of its table [separation].
+
+    Args:
+        path: the experiment file; its ``fit`` recordings are used.
+        out: folder to write to.
+        overrides: assignments that replace entries of the file.
+        base: folder of an earlier calibration, from whose posterior means the model without mechanisms starts.
+        resume: go on from what an interrupted run has left in ``out``.
+        report: called with a line of words now and then.
+
+    Returns:
+        the content of separation.json.
+
+    Raises:
+        InputError: bad input, before anything long has started.
+    """
+    experiment, _ = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    table = experiment.separation
+    if table is None:
+        raise InputError("has no [separation]", where=str(path), remedy="name the mechanisms to tell apart")
+    both = [name for name in table.mechanisms if name in experiment.model.mechanisms]
+    if both:
+        raise InputError(
+            f"{both[0]!r} is in the base model", where="[separation] mechanisms", remedy="leave it out of one of them"
+        )
+    fitted = load_data(experiment, folder, "fit")
+    start = start_values(base)
+    question = build_question(experiment, folder, fitted, [], experiment.seed, start=start, names=table.mechanisms)
+    out = output_folder(out)
+    coordinates = question.coordinates
+    found = separate(
+        _target(question, Journal(out / JOURNAL, resume=resume)),
+        question.candidates,
+        table.groups,
+        coordinates.null if start is None else coordinates.encode(start),
+        report,
+    )
+    content = {
+        **record_separation(found, question),
+        "seed": experiment.seed,
+        "versions": software_versions(),
+        "data_sha256": combined_hash([trajectory.sha256 for trajectory in fitted]),
+    }
+    (out / RESULT).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    (out / TABLE).write_text(separation_markdown(content), encoding="utf-8")
+    separation_figure(content).savefig(out / FIGURE)
+    return content
+
+
+def _target(question: Question, journal: Journal) -> Target:
+    """The fitted recordings under the noise of repeats or of the experiment file, or a first guess."""
+    per_recording = any(p.recording for p in question.coordinates.space.parameters)
+    measurements = gather_measurements(question.recordings, question.trajectories, join=not per_recording)
+    chosen = {name: group[0] for name, group in zip(measurements.names, measurements.members, strict=True)}
+    noise = question.stated_noise
+    if measurements.has_repeats:
+        noise = measurements.noise(measurements.single, 0)
+    if noise is None:
+        noise = NoiseModel(np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf)
+    return Target(simulated(question, False, chosen), measurements, noise, journal)
+
+
+def record_separation(found: Separation, question: Question) -> dict[str, Any]:
+    """What was found as plain values; evidences in nats, lengths in mm where a name says so."""
+    noise, names = found.target.noise, list(found.groups)
+    return {
+        "noise": {
+            "source": noise.source,
+            "standard_deviation_mm": (MILLIMETRES * noise.scale).tolist(),
+            "autocorrelation": noise.autocorrelation.tolist(),
+        },
+        "rmse_none_mm": MILLIMETRES * found.none.rmse,
+        "rmse_all_mm": MILLIMETRES * found.whole.rmse,
+        "log_evidence_all_over_none": found.whole.fit.log_evidence - found.none.fit.log_evidence,
+        "groups": {
+            name: {
+                "members": list(found.groups[name]),
+                "gain_alone": found.gain(name),
+                "rmse_alone_mm": MILLIMETRES * found.alone[name].rmse,
+                "loss_without": found.loss(name),
+                "rmse_without_mm": MILLIMETRES * found.without[name].rmse,
+                "needed": found.needed(name),
+                "own_share": found.own[name],
+                "sizes_with_all": _sizes(found.whole.fit, found.groups[name], question),
+                "sizes_alone": _sizes(found.alone[name].fit, found.groups[name], question),
+            }
+            for name in names
+        },
+        "cosines": [[found.cosine(a, b) if a != b else 1.0 for b in names] for a in names],
+        "rollouts": found.rollouts,
+    }
+
+
+def _sizes(fit: Fit, members: Sequence[str], question: Question) -> dict[str, Any]:
+    """Medians and 90 % intervals of mechanisms' parameters, from the normal approximation."""
+    coordinates = question.coordinates
+    draws = fit.draws(np.random.default_rng([question.seed, 5]), DRAWS, *coordinates.bounds)
+    values = coordinates.values(draws)
+    indices = [i for c in question.candidates if c.name in members for i in c.indices]
+    quantiles = {i: np.quantile(values[:, i], [0.05, 0.5, 0.95]) for i in indices}
+    return {
+        coordinates.names[i]: {
+            "q05": float(low),
+            "median": float(middle),
+            "q95": float(high),
+            "unit": coordinates.space.parameters[i].spec.unit,
+        }
+        for i, (low, middle, high) in quantiles.items()
+    }
