@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rfdropo_bayes.audit.candidates import Candidate, Probe, discretisation_probe, fixed_drop, lead, probe_all
-from rfdropo_bayes.audit.fit import Fit, Target, climb
+from rfdropo_bayes.audit.fit import FIRST, Fit, Target, climb
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.score import likeness, span
 from rfdropo_bayes.audit.screen import Look, Row, look
@@ -239,16 +239,17 @@ class Inquiry:
             return fit
         coordinates, (index,) = self.target.forward.coordinates, candidate.indices
         signs = (coordinates.one_sided[index],) if coordinates.one_sided[index] else (-1, 1)
-        ends = [fit]
+        tried = []
         for sign in signs:
             far = coordinates.prior_mean.copy()
             far[coordinates.base :] = fit.x[coordinates.base :]
             for start in (fit.x.copy(), far):
                 start[index] = coordinates.null[index] + sign * coordinates.prior_sd[index]
-                ends.append(climb(self.target, start, fit.free))
-        best = max(ends, key=lambda end: end.log_evidence)
-        if best is not fit:
-            self.report(f"{name} from elsewhere: sum of squares {best.residual @ best.residual:.0f}")
+                tried.append(climb(self.target, start, fit.free, evaluations=FIRST))
+        best = climb(self.target, max(tried, key=lambda end: end.log_evidence).x, fit.free)
+        if best.log_evidence <= fit.log_evidence:
+            return fit
+        self.report(f"{name} from elsewhere: sum of squares {best.residual @ best.residual:.0f}")
         return best
 
     def _on_the_way(self, fit: Fit, row: Row, start: np.ndarray) -> np.ndarray:
