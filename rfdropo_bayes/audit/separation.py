@@ -108,22 +108,29 @@ def separate(
         report(f"noise of what is left: AR({target.noise.order})")
     grown = climb(target, grown.x, grown.free, evaluations=FINAL)
     report(f"with all: {_words(target, grown)}")
+    by_name = {c.name: c for c in candidates}
     indices = {c.name: c.indices for c in candidates}
     names = tuple(indices)
 
-    def variant(present: tuple[str, ...]) -> Variant:
-        free = np.array([*range(coordinates.base), *(i for name in present for i in indices[name])], dtype=int)
-        starts = [_reduced(target, grown, free)]
-        if len(present) <= len(names) / 2:  # far from the whole model: the base model may be nearer
-            starts.append(np.where(np.isin(np.arange(len(base.x)), free[coordinates.base :]), grown.x, base.x))
-        fits = [climb(target, x, free, evaluations=REFITTING) for x in starts]
-        fit = max(fits, key=lambda fit: fit.log_evidence)
+    def variant(present: tuple[str, ...], fit: Fit) -> Variant:
         report(f"{' + '.join(present) or 'none'}: log evidence {fit.log_evidence - grown.log_evidence:+.1f}")
         return Variant(present, fit, distance(target, fit))
 
-    none = variant(())
-    alone = {name: variant(group) for name, group in members.items()}
-    without = {name: variant(tuple(n for n in names if n not in group)) for name, group in members.items()}
+    def reduced(present: tuple[str, ...]) -> Fit:
+        free = np.array([*range(coordinates.base), *(i for name in present for i in indices[name])], dtype=int)
+        return climb(target, _reduced(target, grown, free), free, evaluations=REFITTING)
+
+    def joined(present: tuple[str, ...]) -> Fit:
+        fit = none.fit
+        for name in present:
+            fit = _joined(target, fit, by_name[name])
+        return fit
+
+    starts = reduced(()), climb(target, base.x, base.free, evaluations=REFITTING)
+    none = variant((), max(starts, key=lambda fit: fit.log_evidence))
+    rest = {name: tuple(n for n in names if n not in group) for name, group in members.items()}
+    without = {name: variant(present, reduced(present)) for name, present in rest.items()}
+    alone = {name: variant(group, joined(group)) for name, group in members.items()}
     whole = Variant(names, grown, distance(target, grown))
     marks, own = effects(grown, coordinates.base, {name: _places(grown, indices, members[name]) for name in members})
     return Separation(target, members, none, whole, alone, without, marks, own, target.forward.rollouts)

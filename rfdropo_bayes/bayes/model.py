@@ -312,7 +312,8 @@ class TrajectoryModel:
     ) -> tuple[Array, Array, dict[str, Any], ObjectData]:
         """Simulated poses of the body, offset of the measuring frame, values of the noise, and what was measured."""
         assert self.object_pose is not None
-        known = {**self.fixed, **values}
+        assert observation.object_pose is not None
+        known: dict[str, Any] = {**self.fixed, **values}
         offset = jnp.stack([offset_of(self.rollout_values(values, name)) for name in self.recordings.names])
         return observation.object_pose, offset, known, self.object_pose._replace(measured=data.object_pose)
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
@@ -81,5 +82,6 @@ def measured_objects(
         if sizes:
             keys = jax.random.split(jax.random.fold_in(key, index), count)
             draw = jax.vmap(draw_object_error, in_axes=(0, 0, None, 0))
-            shifted[:, index] = draw(keys, shifted[:, index], model.recordings.time[index], sizes)
+            time = jnp.asarray(model.recordings.time[index])
+            shifted[:, index] = draw(keys, jnp.asarray(shifted[:, index]), time, sizes)
     return shifted
