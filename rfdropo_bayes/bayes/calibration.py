@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.angles import angle_specs
+from rfdropo_bayes.bayes.batches import is_batch, padded
 from rfdropo_bayes.bayes.forces import tension_specs
 from rfdropo_bayes.bayes.model import Measured, TrajectoryModel
 from rfdropo_bayes.bayes.noise import draw_noise, noise_specs
@@ -86,15 +87,30 @@ class CalibrationProblem:
 
     def to_unconstrained(self, values: Batch) -> Float[Array, "n d"]:
         """Values as points of the unconstrained space, columns in the order of ``names``."""
-        return self.model.space.to_unconstrained(values)
+        columns = {name: values[name] for name in self.names}
+        space = self.model.space
+        return padded(self._unconstrained, columns) if is_batch(columns, 1) else space.to_unconstrained(columns)
 
     def from_unconstrained(self, u: Float[Array, "n d"]) -> dict[str, Float[Array, " n"]]:
         """Inverse of `to_unconstrained`."""
-        return self.model.space.from_unconstrained(u)
+        return padded(self._constrained, u) if is_batch(u, 2) else self.model.space.from_unconstrained(u)
 
     def log_prior(self, u: Float[Array, "n d"]) -> Float[Array, " n"]:
         """Log prior density in the unconstrained space."""
-        return self.model.space.log_prior_unconstrained(u)
+        space = self.model.space
+        return padded(self._log_prior, u) if is_batch(u, 2) else space.log_prior_unconstrained(u)
+
+    @cached_property
+    def _unconstrained(self) -> Callable:
+        return jax.jit(self.model.space.to_unconstrained)
+
+    @cached_property
+    def _constrained(self) -> Callable:
+        return jax.jit(self.model.space.from_unconstrained)
+
+    @cached_property
+    def _log_prior(self) -> Callable:
+        return jax.jit(self.model.space.log_prior_unconstrained)
 
     @cached_property
     def prior_derivatives(self) -> tuple[Callable, Callable]:
@@ -189,7 +205,8 @@ class CalibrationProblem:
 
         Its Jacobians are taken by differences of compiled rollouts: a derivative of its own would be compiled for it.
         """
-        for shared in ("_rows", "_white", "_positions", "_observations", "prior_derivatives", "actions"):
+        coordinates = ("_unconstrained", "_constrained", "_log_prior", "prior_derivatives")
+        for shared in ("_rows", "_white", "_positions", "_observations", "actions", *coordinates):
             getattr(self, shared)  # made before the copy, so that all copies have the same compiled functions
         other = copy.copy(self)
         for derived in ("fingerprint", "observed"):

@@ -38,6 +38,9 @@ TENSION_GAIN = ParameterSpec(
 )
 # A slack cable reads nothing: below this share of the recording's root mean square the error no longer shrinks.
 SMALLEST_READING = 0.05
+ABOVE_ZERO = (
+    50.0  # keeps what stands under a square root in `size_residuals` positive: logarithms of ratios are smaller
+)
 
 
 class TensionData(NamedTuple):
@@ -45,13 +48,11 @@ class TensionData(NamedTuple):
 
     Attributes:
         measured: [N], zero where there is none.
-        scale: size of a reading that its relative error applies to [N].
         valid: True where it may be used.
         cables: which of the simulator's cables were measured.
     """
 
     measured: Float[Any, "recording time cable"]
-    scale: Float[Any, "recording time cable"]
     valid: Bool[np.ndarray, "recording time cable"]
     cables: Int[np.ndarray, " cable"]
 
@@ -105,35 +106,52 @@ def gather_tension(simulator: Simulator, trajectories: Sequence[Trajectory], len
         valid.append(np.pad(known, missing))
     if any(column != columns[0] for column in columns):
         raise InputError("the recordings measure different cables", where="[model] tension", remedy="use one set")
-    scales = [reading_size(tension, known) for tension, known in zip(measured, valid, strict=True)]
-    return TensionData(np.stack(measured), np.stack(scales), np.stack(valid), np.array(columns[0]))
+    return TensionData(np.stack(measured), np.stack(valid), np.array(columns[0]))
 
 
 def reading_size(
-    tension: Float[np.ndarray, "time cable"], known: Bool[np.ndarray, "time cable"]
-) -> Float[np.ndarray, "time cable"]:
-    """Size of each reading that its relative error applies to [N]."""
-    size = float(np.sqrt(np.mean(tension[known] ** 2))) if known.any() else 0.0
-    return np.maximum(np.abs(tension), SMALLEST_READING * size if size > 0.0 else 1.0)
+    tension: Float[Any, "recording time cable"],
+    known: Bool[np.ndarray, "recording time cable"],
+    among: Float[Any, "recording time cable"],
+) -> Float[Array, "recording time cable"]:
+    """Size of each tension that its reading's relative error applies to [N]; ``among`` sets what the least one is."""
+    square = jnp.sum(jnp.where(known, among, 0.0) ** 2, axis=(1, 2), keepdims=True)
+    least = SMALLEST_READING * jnp.sqrt(square / np.maximum(known.sum(axis=(1, 2), keepdims=True), 1))
+    return jnp.maximum(jnp.abs(tension), jnp.where(least > 0.0, least, 1.0))
 
 
 def tension_residuals(
     simulated: Float[Array, "recording time all"], values: Mapping[str, Any], data: TensionData
 ) -> tuple[Float[Array, "recording time cable"], Float[Array, "recording time cable"]]:
-    """Unit-variance residuals of the readings, zero where there is none, and the deviation of each [N]."""
-    gain = values.get(TENSION_GAIN.name, TENSION_GAIN.nominal)
-    deviation = values[TENSION_NOISE.name] * jnp.asarray(data.scale)
-    white = (data.measured - gain * simulated[..., data.cables]) / deviation
-    return jnp.where(data.valid, white, 0.0), deviation
+    """Unit-variance residuals of the readings, zero where there is none, and the size each error is relative to [N].
+
+    That is the size of the tension, not of what was read for it: readings that happen to be low would count more than
+    high ones, and pull all forces down by twice the square of their relative error.
+    """
+    expected = values.get(TENSION_GAIN.name, TENSION_GAIN.nominal) * simulated[..., data.cables]
+    size = reading_size(expected, data.valid, data.measured)
+    white = (data.measured - expected) / (values[TENSION_NOISE.name] * size)
+    return jnp.where(data.valid, white, 0.0), size
+
+
+def size_residuals(
+    size: Float[Array, "recording time cable"], data: TensionData
+) -> Float[Array, "recording time cable"]:
+    """Residuals whose squares add to twice the logarithms of the sizes, up to a constant; zero where there is none.
+
+    With them the log likelihood is a sum of squares but for terms in the noise alone, as Gauss-Newton wants it.
+    """
+    ratio = size / reading_size(data.measured, data.valid, data.measured)
+    return jnp.where(data.valid, jnp.sqrt(2.0 * (ABOVE_ZERO + jnp.log(ratio))), 0.0)
 
 
 def tension_log_density(
     simulated: Float[Array, "recording time all"], values: Mapping[str, Any], data: TensionData
 ) -> Float[Array, " time"]:
     """Log density of the readings of each row, summed over recordings and cables."""
-    white, deviation = tension_residuals(simulated, values, data)
-    normaliser = jnp.where(data.valid, 0.5 * jnp.log(2.0 * jnp.pi) + jnp.log(deviation), 0.0)
-    return jnp.sum(-0.5 * white**2 - normaliser, axis=(0, 2))
+    white, size = tension_residuals(simulated, values, data)
+    normaliser = 0.5 * jnp.log(2.0 * jnp.pi) + jnp.log(values[TENSION_NOISE.name] * size)
+    return jnp.sum(-0.5 * white**2 - jnp.where(data.valid, normaliser, 0.0), axis=(0, 2))
 
 
 def weighed_residuals(values: Mapping[str, Any], weighed: Sequence[Weighed]) -> Float[Array, " weighed"]:

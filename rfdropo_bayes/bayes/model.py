@@ -18,6 +18,7 @@ from rfdropo_bayes.bayes.angles import AngleData, angle_log_density, angle_resid
 from rfdropo_bayes.bayes.forces import (
     TensionData,
     Weighed,
+    size_residuals,
     tension_log_density,
     tension_residuals,
     weighed_log_density,
@@ -39,7 +40,7 @@ class Measured(NamedTuple):
 
     Attributes:
         position: marker positions [m]; zero where masked.
-        tension: cable tensions [N], and the size of a reading that its relative error applies to [N]; or None.
+        tension: cable tensions [N]; or None.
         motor_angle: motor angles [rad]; or None.
         weighed: values of the weighed parts.
         object_pose: poses of the pushed body [m, quaternion]; or None.
@@ -47,7 +48,6 @@ class Measured(NamedTuple):
 
     position: Float[Any, "recording time marker 3"]
     tension: Float[Any, "recording time cable"] | None
-    reading: Float[Any, "recording time cable"] | None
     motor_angle: Float[Any, "recording time channel"] | None
     weighed: Float[Any, " weighed"]
     object_pose: Float[Any, "recording time 7"] | None = None
@@ -247,11 +247,11 @@ class TrajectoryModel:
     @cached_property
     def measured(self) -> Measured:
         """What was measured."""
-        tension, reading = (None, None) if self.tension is None else (self.tension.measured, self.tension.scale)
+        tension = None if self.tension is None else self.tension.measured
         angle = None if self.motor_angle is None else self.motor_angle.measured
         weighed = np.array([entry.value for entry in self.weighed])
         pose = None if self.object_pose is None else self.object_pose.measured
-        return Measured(np.asarray(self.recordings.position), tension, reading, angle, weighed, pose)
+        return Measured(np.asarray(self.recordings.position), tension, angle, weighed, pose)
 
     def row_log_likelihood(
         self, values: Values, steps: Int[Array, ""] | None = None, measured: Measured | None = None
@@ -268,7 +268,7 @@ class TrajectoryModel:
         weighed = [entry._replace(value=value) for entry, value in zip(self.weighed, data.weighed, strict=True)]
         rows = jnp.sum(density, axis=0).at[0].add(weighed_log_density(values, weighed))
         if self.tension is not None:
-            pulls = self._pulls(data)
+            pulls = self.tension._replace(measured=data.tension)
             rows += tension_log_density(observation.tension, {**self.fixed, **values}, pulls)
         if self.motor_angle is not None:
             angles = self.motor_angle._replace(measured=data.motor_angle)
@@ -280,9 +280,9 @@ class TrajectoryModel:
     def residuals(
         self, values: Values, steps: Int[Array, ""], measured: Measured | None = None
     ) -> tuple[Array, Array | None, Array | None, Array | None, Array | None]:
-        """Whitened residuals, zero where masked: positions (recording, time, marker, 3), tensions (recording, time,
-        cable), motor angles (recording, time, channel), poses of the body (recording, time, 1, 6), weighed parts; None
-        for what there is not."""
+        """Whitened residuals, zero where masked: positions (recording, time, marker, 3), tensions and their sizes
+        (recording, time, 2 cables), motor angles (recording, time, channel), poses of the body (recording, time, 1, 6),
+        weighed parts; None for what there is not."""
         data = self.measured if measured is None else measured
         observation = self.simulate(values, steps)
         sigma, tau = self.noise_of(values)
@@ -291,8 +291,9 @@ class TrajectoryModel:
         )
         pulled = turned = moved = weighed = None
         if self.tension is not None:
-            pulls = self._pulls(data)
-            pulled, _ = tension_residuals(observation.tension, {**self.fixed, **values}, pulls)
+            pulls = self.tension._replace(measured=data.tension)
+            read, size = tension_residuals(observation.tension, {**self.fixed, **values}, pulls)
+            pulled = jnp.concatenate([read, size_residuals(size, pulls)], axis=-1)
         if self.motor_angle is not None:
             angles = self.motor_angle._replace(measured=data.motor_angle)
             turned = angle_residuals(observation.motor_angle, {**self.fixed, **values}, angles)
@@ -302,10 +303,6 @@ class TrajectoryModel:
             entries = [entry._replace(value=value) for entry, value in zip(self.weighed, data.weighed, strict=True)]
             weighed = weighed_residuals(values, entries)
         return white, pulled, turned, moved, weighed
-
-    def _pulls(self, data: Measured) -> TensionData:
-        assert self.tension is not None
-        return TensionData(data.tension, data.reading, self.tension.valid, self.tension.cables)
 
     def _objects(
         self, values: Values, observation: Observation, data: Measured

@@ -31,16 +31,14 @@ def simulated_data(problem: CalibrationProblem, truth: Mapping[str, float], key:
     known = {**model.fixed, **truth}
     valid = model.recordings.line.valid[..., None]
     measured = np.where(valid, seen.position[0] + problem.draw_noise(position_key, batch)[0], 0.0)
-    read = size = angle = pose = None
+    read = angle = pose = None
     if model.tension is not None:
         error = known[TENSION_NOISE.name] * np.asarray(jax.random.normal(tension_key, model.tension.measured.shape))
         clean = (
             known.get(TENSION_GAIN.name, TENSION_GAIN.nominal) * np.asarray(seen.tension)[0][..., model.tension.cables]
         )
-        known_readings = model.tension.valid
-        sizes = [reading_size(t, v) for t, v in zip(clean, known_readings, strict=True)]
-        read = np.where(known_readings, clean + error * np.stack(sizes), 0.0)
-        size = np.stack([reading_size(t, v) for t, v in zip(read, known_readings, strict=True)])
+        size = np.asarray(reading_size(clean, model.tension.valid, clean))
+        read = np.where(model.tension.valid, clean + error * size, 0.0)
     if model.motor_angle is not None:
         normal = np.asarray(jax.random.normal(jax.random.fold_in(key, 3), model.motor_angle.measured.shape))
         turned = np.asarray(seen.motor_angle)[0] + known[MOTOR_ANGLE_NOISE.name] * normal
@@ -57,4 +55,4 @@ def simulated_data(problem: CalibrationProblem, truth: Mapping[str, float], key:
     weighed = np.array(
         [sum(truth[n] for n in entry.parameters) + entry.sd * z for entry, z in zip(model.weighed, normal, strict=True)]
     )
-    return Measured(measured, read, size, angle, weighed, pose)
+    return Measured(measured, read, angle, weighed, pose)

@@ -39,6 +39,7 @@ def check(path: Path, out: Path, name: str, datasets: int, overrides: list[str],
 def table1(
     out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/table1"),
     truths: Annotated[int, typer.Option(help="truths of each kind for our rows")] = 100,
+    repeats: Annotated[int, typer.Option(help="data sets at the paper's truth for our rows")] = 20,
     rival_truths: Annotated[int, typer.Option(help="truths of each kind for the other rows")] = 5,
     budget: Annotated[int, typer.Option(help="rollouts per posterior")] = 10000,
     actions: Annotated[int, typer.Option(help="length of a recording, in actions of 50 ms")] = 100,
@@ -50,7 +51,7 @@ def table1(
     """The paper's Table I, with baselines, rivals and off-centre truths: table1.json, table1.md, table1.png."""
     from rfdropo_bayes.workflow.table1 import ROWS, Size, run_table1
 
-    size = Size(truths, rival_truths, budget, actions, seed)
+    size = Size(truths, rival_truths, budget, actions, seed, repeats)
     words = " ".join(["rfdropo", *sys.argv[1:]])
     content = run_table1(out, size, rows=rows or tuple(ROWS), resume=resume, cluster=cluster, command=words)
     for claim in content["claims"]:

@@ -42,6 +42,7 @@ class BridgeConfig:
         particles: per replicate; None takes as many as the budget serves.
         replicates: independent repetitions.
         target_ess: share of effective particles kept from one target to the next.
+        draws: as of `SmcConfig`.
     """
 
     climb: LaplaceConfig = field(default_factory=LaplaceConfig)
@@ -52,6 +53,7 @@ class BridgeConfig:
     particles: int | None = 500
     replicates: int = 4
     target_ess: float = 0.5
+    draws: int = 400
 
     def __post_init__(self) -> None:
         if self.inflation < 1.0 or self.degrees <= 0.0:
@@ -68,6 +70,7 @@ class BridgeConfig:
             replicates=self.replicates,
             blocks=1,
             target_ess=self.target_ess,
+            draws=self.draws,
         )
 
 

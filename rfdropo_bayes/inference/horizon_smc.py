@@ -32,7 +32,7 @@ from rfdropo_bayes.inference.result import (
     replicate_warnings,
 )
 from rfdropo_bayes.inference.schedules import SPACINGS, block_boundaries
-from rfdropo_bayes.inference.tempering import Population, StageInfo, Tuning, refresh, stage
+from rfdropo_bayes.inference.tempering import Population, StageInfo, Tuning, prolong, refresh, stage
 
 PARTICLES_WITHOUT_BUDGET = 1000
 ROLLOUTS_PER_PARTICLE = 20.0
@@ -59,6 +59,7 @@ class SmcConfig:
         correlation: moves of a stage end once no direction is more correlated than this with its start.
         max_moves: most moves in a stage.
         start: "prior", "optimum", or "auto": see `starts`; this module always starts at the prior.
+        draws: fewer particles, of all replicates together, move on with the rest of a budget: see `tempering.prolong`.
     """
 
     rollouts: float | None = None
@@ -73,6 +74,7 @@ class SmcConfig:
     correlation: float = 0.3
     max_moves: int = 20
     start: str = "auto"
+    draws: int = 400
 
     def __post_init__(self) -> None:
         where = "[inference]"
@@ -85,7 +87,7 @@ class SmcConfig:
         for name in ("target_ess", "acceptance", "correlation"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InputError(f"{name} = {getattr(self, name)} is not between 0 and 1", where=where)
-        for name in ("replicates", "blocks", "max_moves"):
+        for name in ("replicates", "blocks", "max_moves", "draws"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} = {getattr(self, name)} is less than 1", where=where)
         if self.particles is not None and self.particles < 10:
@@ -224,6 +226,9 @@ def step(
         moves = max(1, _affordable_moves(state, plan, horizon, problem.n_rows, last=True))
         last_key = jax.random.fold_in(key, 1)
         population, done = refresh(last_key, population, info, evaluate, tuning, moves)
+        left = _affordable_moves(state, plan, horizon, problem.n_rows, last=True) if np.isfinite(plan.budget) else 0
+        rounds = min(left // done.moves, -(-config.draws // (plan.particles * config.replicates)) - 1)
+        population = prolong(last_key, population, evaluate, tuning, done.moves, rounds)
         state.trace.append(facts | _facts(done) | {"rollouts": state.ledger.rollouts, "final": True})
     state = state._replace(
         population=population,
@@ -337,7 +342,8 @@ def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SmcState:
 
 
 def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcState]) -> InferenceResult:
-    draws = chains(problem, [state.population.position for state in states])
+    count = min(len(state.population.position) for state in states)  # some had rollouts left for another round
+    draws = chains(problem, [state.population.position[:count] for state in states])
     values = np.array([state.log_evidence for state in states])
     prefixes = np.stack([state.prefix_log_evidence for state in states])
     excluded: Counter[str] = sum((state.ledger.excluded for state in states), Counter())
@@ -350,7 +356,7 @@ def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcSta
         log_evidence=(float(np.mean(values)), sd),
         prefix_log_evidence=prefixes.mean(axis=0),
         block_scores=_block_scores(plan.horizons, prefixes),
-        log_likelihood=np.stack([state.population.rows for state in states]),
+        log_likelihood=np.stack([state.population.rows[:count] for state in states]),
         trace=trace,
         rollouts=sum(state.ledger.rollouts for state in states),
         evaluations=evaluations,
@@ -385,8 +391,7 @@ def _stage_warnings(trace: list[dict[str, Any]], config: SmcConfig) -> list[str]
             f"the budget of {config.rollouts:g} rollouts ran out at row {leaps[0]['progress']:g}: the last rows were "
             f"brought in by reweighting only (effective share {worst:.2%}); allow more rollouts or use fewer particles"
         )
-    last = [row for row in trace if row.get("final")]
-    stuck = max(row["correlation"] for row in last)
+    stuck = max(row["correlation"] for row in trace if row.get("final"))
     if stuck > max(0.7, config.correlation):
         sentences.append(
             f"the last moves left the particles {stuck:.2f} correlated with where they were: several modes, or a shape "

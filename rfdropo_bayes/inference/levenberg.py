@@ -116,15 +116,14 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
     densities = target.density(state.position + moves)
     best = int(np.argmax(densities))
     gain = float(densities[best] - state.log_density)
-    if gain <= 0.0:
-        # The differences left are those of rounding, or the model is useless here: smaller steps next time.
-        stuck = state.damping > 1e8 or promised < 100.0 * tolerance
-        return state._replace(damping=state.damping * 1e5, converged=stuck), StepInfo(0.0, promised, len(dampings))
-    # An engine in single precision has gradients that promise a little for ever; what it delivers tells.
-    idle = gain < tolerance and promised < 100.0 * tolerance
-    moved = LevenbergState(
-        state.position + moves[best], float(densities[best]), float(np.clip(dampings[best], 1e-9, 1e9)), idle
-    )
+    position, density = (state.position + moves[best], float(densities[best])) if gain > 0.0 else state[:2]
+    # An engine in single precision promises for ever what it does not deliver. Where six decades of damping gain
+    # nothing, the differences left are those of rounding, or the model is useless here: smaller steps, if any.
+    if gain < tolerance:
+        stuck = dampings[-1] > 1e8 or promised < 100.0 * tolerance
+        moved = LevenbergState(position, density, state.damping * 1e5, stuck)
+    else:
+        moved = LevenbergState(position, density, float(np.clip(dampings[best], 1e-9, 1e9)), False)
     return moved, StepInfo(gain, promised, len(dampings))
 
 

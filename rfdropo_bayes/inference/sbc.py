@@ -24,6 +24,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.checkpoints import run_digest
 from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.result import central_interval
 
 DRAWS = 99  # of each posterior, thinned: ranks run from 0 to 99
 BINS = 10
@@ -170,7 +171,7 @@ def _one(
     ranks[LOG_LIKELIHOOD] = int(np.sum(density[:-1] < density[-1]))
     inside = {}
     for name, column in flat.items():
-        low, high = np.quantile(column, [0.05, 0.95])
+        low, high = central_interval(column)
         inside[name] = bool(low <= truth[name] <= high)
     spread = np.asarray(problem.to_unconstrained(flat), dtype=float).std(axis=0) / prior_sd
     contraction = dict(zip(problem.names, spread.tolist(), strict=True))

@@ -36,6 +36,7 @@ SURVEY_OF_ALL = 0.4  # and the survey before them
 PER_SURVEYOR = 32.0  # rollouts that a particle of the survey takes, typically
 # With fewer, more than half of the surveys of a rugged ridge missed the summit.
 MOST_SURVEYORS, FEWEST_SURVEYORS = 128, 64
+CLOSE = 1e-2  # nats below its optimum that a climb may end: the sampler starts from a wider distribution
 STEPS = 12.0  # that a climb takes at each horizon, typically
 SCORING = 0.1  # and the evidence of the blocks
 MARGIN = 3.0  # what real posteriors cost over the estimate, which takes them to be normal and data to be even
@@ -96,7 +97,8 @@ def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
     # Three horizons that double cost 1.75 times the last, two 1.5; a step is a Jacobian by differences and 6 dampings.
     whole = (1.5 if surveyors else 1.75) * STEPS * (4.0 * len(problem.names) + 7.0)
     starts = int(np.clip(budget / whole, 1, LaplaceConfig().starts))
-    return LaplaceConfig(starts=starts, survey=surveyors, rollouts=budget + surveyors * PER_SURVEYOR)
+    limit = budget + surveyors * PER_SURVEYOR
+    return LaplaceConfig(starts=starts, survey=surveyors, tolerance=CLOSE, rollouts=limit)
 
 
 def _refinable(problem: Problem, config: SmcConfig) -> TypeGuard[NumpyroProblem]:
@@ -140,13 +142,15 @@ def _from_optima(
 ) -> InferenceResult:
     sample_key, score_key = jax.random.split(key)
     left = None if config.rollouts is None else config.rollouts - found.climbs.ledger.rollouts
-    scoring = None if left is None else SCORING * config.rollouts  # type: ignore[operator]
+    prefixed = len(block_boundaries(problem.n_rows, config.blocks, config.spacing)) > 1
+    scoring = None if left is None else SCORING * prefixed * config.rollouts  # type: ignore[operator]
     sampling = None if left is None else left - scoring  # type: ignore[operator]
     settings = bridge.BridgeConfig(
         rollouts=sampling,
         particles=config.particles,
         replicates=_replicates(config, sampling),
         target_ess=config.target_ess,
+        draws=config.draws,
     )
     result = bridge.sample_from_modes(problem, settings, found, sample_key, logbook)
     prefixes, ledger = _prefixes(problem, config, found, scoring, score_key)

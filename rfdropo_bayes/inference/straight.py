@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from rfdropo_bayes.bayes.batches import padded
 from rfdropo_bayes.bayes.problem import ResidualProblem, Values
 from rfdropo_bayes.inference.levenberg import Laplace
 
@@ -37,7 +38,6 @@ class StraightProblem:
         drawn = problem.sample_prior(key, MOMENTS)
         self.logarithmic = np.array([np.min(np.asarray(drawn[name])) > 0.0 for name in self.names])
         self._stand_in = {name: float(np.median(np.asarray(drawn[name]))) for name in self.names}
-        self._own_and_slope = jax.jit(self._trace_own_and_slope)
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
         """Independent prior draws."""
@@ -57,8 +57,9 @@ class StraightProblem:
 
     def log_prior(self, v: Float[Any, "n d"]) -> Float[Any, " n"]:
         """Log density in these coordinates; not a number beyond a bound."""
-        own, slope = self._own_and_slope(jnp.asarray(v))
-        return jnp.asarray(self.problem.log_prior(own)) + jnp.sum(jnp.log(slope), axis=1)
+        own, slope = self._own_and_slope(v)
+        with np.errstate(divide="ignore"):
+            return np.asarray(self.problem.log_prior(jnp.asarray(own))) + np.log(slope).sum(axis=1)
 
     def row_log_likelihood(self, values: Values, horizon: int) -> tuple[Float[Any, "n horizon"], Int[Any, " n"]]:
         """The problem's; minus infinity for values beyond a bound, which are not simulated."""
@@ -72,7 +73,7 @@ class StraightProblem:
         v = np.asarray(
             self.to_unconstrained(self.problem.from_unconstrained(jnp.asarray(mode.mean[None]))), dtype=float
         )
-        slope = np.asarray(self._own_and_slope(jnp.asarray(v))[1], dtype=float)[0]
+        slope = np.asarray(self._own_and_slope(v)[1], dtype=float)[0]
         information = None if mode.information is None else mode.information * np.outer(slope, slope)
         return Laplace(
             v[0],
@@ -82,11 +83,14 @@ class StraightProblem:
             None if mode.slope is None else mode.slope * slope,
         )
 
-    def _trace_own_and_slope(self, v: Float[Array, "n d"]) -> tuple[Float[Array, "n d"], Float[Array, "n d"]]:
+    def _own_and_slope(self, v: Float[Any, "n d"]) -> tuple[Float[Any, "n d"], Float[Any, "n d"]]:
         """The problem's own coordinates, and the derivative of each by the one here."""
 
         def own(v: Array) -> Array:
             return jnp.asarray(self.problem.to_unconstrained(self.from_unconstrained(v)))
 
-        value, slope = jax.jvp(own, (v,), (jnp.ones_like(v),))
-        return value, jnp.abs(slope)
+        def both(v: np.ndarray) -> tuple[Array, Array]:
+            value, slope = jax.jvp(own, (jnp.asarray(v),), (jnp.ones_like(v),))
+            return value, jnp.abs(slope)
+
+        return padded(both, v)

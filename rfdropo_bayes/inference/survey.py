@@ -83,7 +83,7 @@ def survey(
     # The sampler takes blocks for rows of equal cost, which is more than short ones cost.
     whole = None if rollouts is None else rollouts * problem.n_rows / horizons[-1]
     config = horizon_smc.SmcConfig(
-        rollouts=whole, particles=particles, blocks=len(horizons), spacing="linear", max_moves=MOST_MOVES
+        rollouts=whole, particles=particles, blocks=len(horizons), spacing="linear", max_moves=MOST_MOVES, draws=1
     )
     folder = None if logbook.folder is None else logbook.folder / "survey"
     found = horizon_smc.run(blocks, config, run_key, Logbook(folder, logbook.resume))

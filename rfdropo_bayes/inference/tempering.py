@@ -293,3 +293,22 @@ def refresh(
         return population, info
     population, done = move(move_key, population, references, halves, evaluate, tuning, moves)
     return population, info._replace(**done)
+
+
+def prolong(
+    key: PRNGKeyArray, population: Population, evaluate: Evaluate, tuning: Tuning, moves: int, rounds: int
+) -> Population:
+    """Equal-weight particles, and where each of some rounds of moves under the same target takes them.
+
+    All are draws of the target; a hundred particles alone make coarse quantiles, the more so as resampling left copies.
+    """
+    found = [population]
+    for index in range(rounds):
+        second = np.arange(len(population.base)) >= len(population.base) // 2
+        round_key = jax.random.fold_in(key, 1 + index)
+        found.append(move(round_key, found[-1], cross_references(found[-1]), second, evaluate, tuning, moves)[0])
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(p, name) for p in found]) for name in ("position", "base", "rows")
+    }
+    count = len(joined["base"])
+    return population._replace(log_weights=np.full(count, -np.log(count)), **joined)

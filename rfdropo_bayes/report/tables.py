@@ -58,7 +58,7 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
     rows = []
     for info in record.parameters:
         draws, prior = record.flat(info.name), record.prior.get(info.name)
-        q05, median, q95 = np.quantile(draws, [0.05, 0.5, 0.95])
+        q05, median, q95 = np.quantile(draws, [0.05, 0.5, 0.95], method="weibull")
         bound = bound_reached(draws, info) if info.name in free else None
         before = (None, None) if prior is None else np.quantile(prior, [0.05, 0.95]).tolist()
         rows.append(

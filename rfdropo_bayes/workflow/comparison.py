@@ -17,6 +17,7 @@ from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
+from rfdropo_bayes.inference.result import central_interval
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator
 from rfdropo_bayes.workflow.commands import random_walk
@@ -59,8 +60,8 @@ ROWS: dict[str, tuple[str, dict[str, Any]]] = {
     "NPDR": ("npdr", {"rounds": 10}),
     "RF-DROPO as published": ("rfdropo", {"mended": False}),
     "RF-DROPO mended": ("rfdropo", {"horizon": "full"}),
-    "ours": ("smc", {"blocks": 3}),
-    "ours + tension": ("smc", {"blocks": 3}),
+    "ours": ("smc", {"blocks": 1, "particles": 200}),
+    "ours + tension": ("smc", {"blocks": 1, "particles": 200}),
 }
 RIVALS = ("UDR", "BayesSim", "NPDR", "RF-DROPO as published", "RF-DROPO mended")
 
@@ -147,7 +148,7 @@ def fit(job: Mapping[str, Any]) -> dict[str, Any]:
     if job["row"] == "ours + tension":
         replica = with_tension.with_measured(measured)
     else:
-        replica = problem.with_measured(measured._replace(tension=None, reading=None))
+        replica = problem.with_measured(measured._replace(tension=None))
     began = time.monotonic()
     try:
         draws, rollouts = infer(job, replica, fit_key)
@@ -199,12 +200,12 @@ def infer(
 
 
 def scores(task: Task, draws: Mapping[str, Float[np.ndarray, " n"]], truth: Mapping[str, float]) -> dict[str, Any]:
-    """Errors of a posterior that need no simulation; see docs/table1.md."""
+    """Errors of a posterior that need no simulation; see reports/table1."""
     scale = {name: WIDTH / (high - low) for name, (low, high) in task.ranges.items()}
     offsets = np.stack([(np.asarray(draws[name]) - truth[name]) * scale[name] for name in task.ranges])
     inside = []
     for name in task.ranges:
-        low, high = np.quantile(draws[name], [0.05, 0.95])
+        low, high = central_interval(np.asarray(draws[name]))
         inside.append(bool(low <= truth[name] <= high))
     ratio = np.log(np.asarray(draws["young_modulus"]) / np.asarray(draws["trunk_mass"]))
     true_ratio = np.log(truth["young_modulus"] / truth["trunk_mass"])

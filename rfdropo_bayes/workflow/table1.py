@@ -39,11 +39,12 @@ class Size:
     """How large the benchmark is.
 
     Attributes:
-        truths: off-centre truths for our rows, and data sets at the paper's truth.
-        rival_truths: the same for every other row.
+        truths: off-centre truths for our rows.
+        rival_truths: off-centre truths, and data sets at the paper's truth, for every other row.
         budget: rollouts per posterior.
         actions: length of the recording, in moves of 50 ms; the paper's has 100.
         seed: of everything.
+        repeats: data sets at the paper's truth for our rows, if there are as many truths.
     """
 
     truths: int = 100
@@ -51,6 +52,7 @@ class Size:
     budget: int = 10000
     actions: int = 100
     seed: int = 0
+    repeats: int = 20
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
@@ -103,7 +105,8 @@ def list_jobs(size: Size, rows: Sequence[str]) -> list[dict[str, Any]]:
     for index in range(max(size.truths, size.rival_truths)):
         for truths in TRUTHS:
             for task in TASKS:
-                chosen = [row for row in rows if index < (size.truths if row in OWN else size.rival_truths)]
+                own = size.truths if truths == "off-centre" else min(size.truths, size.repeats)
+                chosen = [row for row in rows if index < (own if row in OWN else size.rival_truths)]
                 jobs += [{"task": task, "row": row, "truths": truths, "index": index, **shared} for row in chosen]
     return jobs
 
@@ -201,8 +204,9 @@ def as_markdown(content: Mapping[str, Any]) -> str:
         "",
         f"`{content['command']}`",
         "",
-        f"Recordings of {size['actions']} actions; at most {size['budget']} rollouts per posterior; of each kind of "
-        f"truth {size['truths']} for our rows and {size['rival_truths']} for the others. Mean ± standard deviation. "
+        f"Recordings of {size['actions']} actions; at most {size['budget']} rollouts per posterior. Our rows: "
+        f"{size['truths']} truths off the centre, {min(size['truths'], size['repeats'])} data sets at the truth of the "
+        f"paper; the others {size['rival_truths']} of each. Mean ± standard deviation. "
         "MSE: the paper's, in ranges scaled to [0, 4]. Held out: tip error of the mean prediction under commands that "
         "no fit saw.",
         "",

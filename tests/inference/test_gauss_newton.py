@@ -10,9 +10,10 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import bridge, horizon_smc, laplace
 from rfdropo_bayes.inference.bridge import BridgeConfig
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
+from rfdropo_bayes.inference.gauss_newton import Target, make_target, prior_derivatives
 from rfdropo_bayes.inference.horizon_smc import SmcConfig
 from rfdropo_bayes.inference.laplace import LaplaceConfig
+from rfdropo_bayes.inference.levenberg import maximise
 
 from .toys import Decay, LinearGaussian, Spring, TwoModes
 
@@ -133,3 +134,21 @@ def test_failed_rollouts_never_become_the_optimum():
     result = laplace.run(problem, LaplaceConfig(blocks=1), KEY)
     assert result.optimum["rate"] <= 0.75
     assert result.excluded["diverged"] > 0
+
+
+def test_a_climb_ends_where_nothing_is_delivered_of_what_is_promised():
+    """A flat top whose gradient promises half a nat for ever, and whose rounding delivers a trace of it. Three
+    steps try dampings of fifteen decades."""
+    calls = []
+
+    def density(points):
+        calls.append(len(points))
+        return 1e-8 * len(calls) - points[:, 0] ** 2
+
+    def steep(u):
+        return np.zeros(1), np.array([[1.0]])
+
+    target = Target(density, density, lambda u: np.ones(1), lambda u: np.zeros((1, 1)), steep, np.zeros(1, dtype=bool))
+    state, steps = maximise(target, np.zeros(1), max_steps=60, tolerance=1e-4)
+    assert state.converged
+    assert len(steps) == 3

@@ -60,6 +60,29 @@ def test_the_carried_likelihood_belongs_to_the_draws(linear):
     np.testing.assert_allclose(result.log_likelihood[3], problem.row_log_likelihood(values, 12)[0], rtol=1e-9)
 
 
+def test_what_a_budget_has_left_becomes_further_draws():
+    """Means of 5 x 400 draws, at worst of 5 x 100 independent ones, are off by 0.045 sd: four times that fails once
+    in 5000, three parameters together."""
+    problem = LinearGaussian()
+    few, many = (
+        [
+            horizon_smc.run(problem, SmcConfig(rollouts=4000.0, particles=100, draws=d), jax.random.key(i))
+            for i in range(5)
+        ]
+        for d in (100, 400)
+    )
+    for plain, result in zip(few, many, strict=True):
+        assert result.draws["x0"].shape == (1, 400)
+        assert result.rollouts <= 4000
+        np.testing.assert_array_equal(result.draws["x0"][:, :100], plain.draws["x0"])
+        assert result.log_evidence[0] == plain.log_evidence[0]
+        values = {name: result.draws[name][0] for name in problem.names}
+        np.testing.assert_allclose(result.log_likelihood[0], problem.row_log_likelihood(values, 12)[0], rtol=1e-9)
+    mean, covariance = problem.posterior()
+    drawn = np.mean([[result.draws[name].mean() for name in problem.names] for result in many], axis=0)
+    assert np.abs((drawn - mean) / np.sqrt(np.diag(covariance))).max() < 0.18
+
+
 def test_random_walk_agrees_and_costs_more(linear):
     problem, reference = linear
     config = SmcConfig(particles=1000, replicates=4, kernel="random_walk")

@@ -14,7 +14,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods, sbc
-from rfdropo_bayes.inference.result import InferenceResult
+from rfdropo_bayes.inference.result import InferenceResult, central_interval
 
 from .toys import LinearGaussian
 
@@ -107,3 +107,10 @@ def test_few_data_sets_are_refused():
 def test_horizon_smc_is_calibrated_on_the_linear_model():
     found = sbc.calibrate(LinearGaussian(), simulate, "smc", {"particles": 150, "start": "prior"}, KEY, 60)
     assert found.passed, found.sentence
+
+
+def test_intervals_of_a_few_draws_hold_what_they_say():
+    """Of 19 draws, 4000 times: the share scatters by 0.5 %; the usual quantiles would hold 82 %."""
+    rng = np.random.default_rng(5)
+    low, high = np.transpose([central_interval(rng.uniform(size=19)) for _ in range(4000)])
+    assert np.mean(high - low) == pytest.approx(0.9, abs=0.01)

@@ -106,6 +106,16 @@ def rows():
     return found
 
 
+def test_the_paper_s_truth_is_repeated_less_often_than_truths_are_drawn():
+    jobs = list_jobs(Size(truths=8, rival_truths=2, repeats=3), ["ours", "UDR"])
+    count = {
+        (row, kind): sum((j["row"], j["truths"]) == (row, kind) for j in jobs)
+        for row in ("ours", "UDR")
+        for kind in table1.TRUTHS
+    }
+    assert count == {("ours", "paper"): 3, ("ours", "off-centre"): 8, ("UDR", "paper"): 2, ("UDR", "off-centre"): 2}
+
+
 def test_cells_claims_and_the_table_follow_from_the_fits(tmp_path):
     found = rows()
     cells, checked = summarise(found), claims(found)
@@ -120,7 +130,7 @@ def test_cells_claims_and_the_table_follow_from_the_fits(tmp_path):
     assert sum("paired" in words and c["holds"] for words, c in by_words.items()) == len(table1.RIVALS)
     content = {
         "command": "c",
-        "size": {"actions": 1, "budget": 2, "truths": 8, "rival_truths": 4},
+        "size": {"actions": 1, "budget": 2, "truths": 8, "rival_truths": 4, "repeats": 20},
         "cells": cells,
         "claims": checked,
         "left_out": {},
