@@ -27,6 +27,7 @@ from rfdropo_bayes.mechanisms.drive_creep import DriveCreep
 from rfdropo_bayes.mechanisms.drive_drift import DriveDrift
 from rfdropo_bayes.mechanisms.end_stop import EndStop
 from rfdropo_bayes.mechanisms.friction import CableCompliance, CapstanFriction, CoulombFriction
+from rfdropo_bayes.mechanisms.marker_offset import MarkerOffset
 from rfdropo_bayes.mechanisms.material_laws import (
     BendingStiffening,
     BendTwistCoupling,
@@ -76,6 +77,7 @@ REGISTRY: dict[str, type] = {
         CameraScale,
         CameraOffset,
         CameraDrift,
+        MarkerOffset,
         SensorLag,
         ClockOffset,
     )

@@ -35,7 +35,7 @@ DRIVES = (
     "rate_limit",
     "spool_growth",
 )
-CAMERAS = ("camera_drift", "camera_offset", "clock_offset", "sensor_lag")
+CAMERAS = ("camera_drift", "camera_offset", "clock_offset", "marker_offset", "sensor_lag")
 
 
 def applied(name: str, values: dict):
@@ -223,3 +223,30 @@ def test_the_documented_example_is_a_mechanism(tmp_path):
     ramp = STEP * jnp.arange(1, 81)[:, None] * jnp.ones(2)
     moved = mechanism.actuate({"overshoot_time": 0.03}, ramp, START, STEP)
     np.testing.assert_allclose(moved, ramp + 0.03, atol=1e-12)
+
+
+def test_markers_beside_their_places_turn_with_the_body():
+    """A body that bends in a plane as an arc: an arm across it, and one along it, against the rotated frame."""
+    place = np.linspace(0.1, 0.4, 40)
+    angles = np.array([0.0, 0.4, 1.1])  # of the direction at the end of a length of 0.4 m
+
+    def arc(angle):
+        curvature = max(angle, 1e-9) / 0.4
+        turned = curvature * place
+        return np.stack([(1 - np.cos(turned)) / curvature, 0 * place, np.sin(turned) / curvature], axis=1), turned
+
+    position = np.stack([arc(angle)[0] for angle in angles])
+    mechanism = REGISTRY["marker_offset"]([str(k) for k in range(len(place))])
+    arms = np.random.default_rng(2).normal(size=(len(place), 3)) * 2e-3
+    values = dict(zip((s.name for s in mechanism.parameters), arms.ravel(), strict=True))
+    seen = np.asarray(mechanism.sense(values, jnp.asarray(position)))
+    for row, angle in enumerate(angles):
+        for k in range(1, len(place) - 1):  # chords of the neighbours have the direction of the arc between them
+            c, s = np.cos(arc(angle)[1][k]), np.sin(arc(angle)[1][k])
+            frame = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+            np.testing.assert_allclose(seen[row, k] - position[row, k], frame @ arms[k], atol=1e-9)
+    one = REGISTRY["marker_offset"](["tip"])
+    moved = one.sense(
+        {f"marker_offset_tip_{a}": v for a, v in zip("xyz", (1.0, 2.0, 3.0), strict=True)}, POSITION[:, :1]
+    )
+    np.testing.assert_allclose(moved - POSITION[:, :1], np.broadcast_to([1.0, 2.0, 3.0], (80, 1, 3)))
