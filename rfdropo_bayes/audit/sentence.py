@@ -12,6 +12,7 @@ from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.verdict import EXPLAINED, NO_DISCREPANCY, UNEXPLAINED, unclear
 
 MOST_EXCLUDED = 3
+MOST_SIZES = 4
 
 
 def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
@@ -97,7 +98,8 @@ def _named(finding: dict[str, Any]) -> str:
     # Where cables leave the common scale of forces and stiffness free, only the ratio means something.
     ratios = {row["parameter"]: (title, row) for title, row in finding["relative"].items()}
     given = [ratios.get(name, (name, row)) for name, row in finding["parameters"].items()]
-    sizes = ", ".join(_size(title, row) for title, row in given[:4])
+    surest = sorted(given, key=lambda entry: -abs(entry[1]["mean"]) / max(entry[1]["sd"], 1e-300))[:MOST_SIZES]
+    sizes = ", ".join(_size(title, row) for title, row in given if (title, row) in surest)
     others = [other.replace("_", " ") for other in finding["equivalence_class"][1:]]
     alike = f" (not to be told from {', '.join(others)} by these data)" if others else ""
     return f"{name} ({sizes}){alike}"

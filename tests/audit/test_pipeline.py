@@ -4,6 +4,7 @@ seed in twenty or fewer, those on several as stated."""
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from rfdropo_bayes.audit.measurements import gather_measurements
 from rfdropo_bayes.audit.noise import STATED, NoiseModel
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.record import next_experiment, record
+from rfdropo_bayes.audit.sentence import _named
 from rfdropo_bayes.bayes.model import gather_recordings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.simulators.commands import Commands
@@ -313,3 +315,9 @@ def test_what_predicts_unseen_recordings_worse_is_named_and_not_adopted():
     assert answer.steps
     assert answer.adopted == []
     assert "predicted worse" in content["sentence"]
+
+
+def test_of_many_sizes_the_surest_are_said_in_their_order():
+    sizes = {f"size_{k}": {"mean": float(m), "sd": 1.0, "unit": "m"} for k, m in enumerate((0, 5, -9, 1, 7, 6))}
+    finding = {"mechanism": "glue", "parameters": sizes, "relative": {}, "equivalence_class": ["glue"]}
+    assert re.findall(r"size (\d)", _named(finding)) == ["1", "2", "4", "5"]
