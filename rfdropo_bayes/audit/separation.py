@@ -116,9 +116,10 @@ def separate(
         report(f"{' + '.join(present) or 'none'}: log evidence {fit.log_evidence - grown.log_evidence:+.1f}")
         return Variant(present, fit, distance(target, fit))
 
-    def reduced(present: tuple[str, ...]) -> Fit:
+    def reduced(present: tuple[str, ...], others: Sequence[Float[np.ndarray, " d"]]) -> Fit:
         free = np.array([*range(coordinates.base), *(i for name in present for i in indices[name])], dtype=int)
-        return climb(target, _reduced(target, grown, free), free, evaluations=REFITTING)
+        starts = [_reduced(target, grown, free), *others]
+        return max((climb(target, x, free, evaluations=REFITTING) for x in starts), key=lambda fit: fit.log_evidence)
 
     def joined(present: tuple[str, ...]) -> Fit:
         fit = none.fit
@@ -126,12 +127,18 @@ def separate(
             fit = _joined(target, fit, by_name[name])
         return fit
 
-    starts = reduced(()), climb(target, base.x, base.free, evaluations=REFITTING)
-    none = variant((), max(starts, key=lambda fit: fit.log_evidence))
+    none = variant((), reduced((), [base.x]))
     rest = {name: tuple(n for n in names if n not in group) for name, group in members.items()}
-    without = {name: variant(present, reduced(present)) for name, present in rest.items()}
+    without: dict[str, Variant] = {}
+    for name in sorted(rest, key=lambda name: len(rest[name])):  # what a smaller model has found, a larger one has, too
+        inside = [found.fit.x for found in without.values() if set(found.present) < set(rest[name])]
+        without[name] = variant(rest[name], reduced(rest[name], inside))
     alone = {name: variant(group, joined(group)) for name, group in members.items()}
-    whole = Variant(names, grown, distance(target, grown))
+    best = max(without.values(), key=lambda found: found.fit.log_evidence).fit
+    if best.log_evidence > grown.log_evidence:  # the whole model's climb had stopped early, or has nothing to gain
+        again = climb(target, best.x, grown.free, evaluations=FINAL)
+        grown = max(grown, again, key=lambda fit: fit.log_evidence)
+    whole = variant(names, grown)
     marks, own = effects(grown, coordinates.base, {name: _places(grown, indices, members[name]) for name in members})
     return Separation(target, members, none, whole, alone, without, marks, own, target.forward.rollouts)
 
