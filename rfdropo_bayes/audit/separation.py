@@ -19,6 +19,7 @@ from rfdropo_bayes.audit.fit import Fit, Target, climb
 from rfdropo_bayes.audit.noise import RESIDUALS, NoiseModel
 from rfdropo_bayes.audit.score import Signature, likeness, project_out, signature, span, statistic
 
+PASSES = 2  # over the models without each, which begin where the one with all of them ends, and it where the best does
 SMALL = 0.1  # prior deviations at which a mechanism starts that shows nothing at null
 GROWING, REFITTING, FINAL = 8, 3, 8  # evaluations of a climb while the model grows, of a variant, and of the whole
 
@@ -130,14 +131,17 @@ def separate(
     none = variant((), reduced((), [base.x]))
     rest = {name: tuple(n for n in names if n not in group) for name, group in members.items()}
     without: dict[str, Variant] = {}
-    for name in sorted(rest, key=lambda name: len(rest[name])):  # what a smaller model has found, a larger one has, too
-        inside = [found.fit.x for found in without.values() if set(found.present) < set(rest[name])]
-        without[name] = variant(rest[name], reduced(rest[name], inside))
+    for _ in range(PASSES):
+        for name in sorted(rest, key=lambda name: len(rest[name])):  # what a smaller model has found, a larger one has
+            inside = [found.fit.x for found in without.values() if set(found.present) < set(rest[name])]
+            found = [*([without[name].fit] if name in without else []), reduced(rest[name], inside or [none.fit.x])]
+            without[name] = variant(rest[name], max(found, key=lambda fit: fit.log_evidence))
+        best = max(without.values(), key=lambda found: found.fit.log_evidence).fit
+        further = climb(target, best.x, grown.free, evaluations=FINAL)
+        if further.log_evidence <= grown.log_evidence:
+            break
+        grown = further  # the climb with all of them had stopped early, and those without each began where it ended
     alone = {name: variant(group, joined(group)) for name, group in members.items()}
-    best = max(without.values(), key=lambda found: found.fit.log_evidence).fit
-    if best.log_evidence > grown.log_evidence:  # the whole model's climb had stopped early, or has nothing to gain
-        again = climb(target, best.x, grown.free, evaluations=FINAL)
-        grown = max(grown, again, key=lambda fit: fit.log_evidence)
     whole = variant(names, grown)
     marks, own = effects(grown, coordinates.base, {name: _places(grown, indices, members[name]) for name in members})
     return Separation(target, members, none, whole, alone, without, marks, own, target.forward.rollouts)
