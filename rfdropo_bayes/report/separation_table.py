@@ -54,7 +54,7 @@ def separation_figure(content: Mapping[str, Any]) -> Figure:
     bars.set_yticks(place, titles)
     bars.invert_yaxis()
     bars.set_xlabel("log evidence [nats]")
-    bars.legend()
+    bars.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
     values = np.array(content["cosines"])
     cosines.imshow(values, vmin=0.0, vmax=1.0, cmap="Blues")
     cosines.grid(visible=False)
