@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 REST = 1e-9  # m or rad per step: less is the rounding of a command that is held
 
 
-class Backlash:
+class Backlash(InCommandUnit):
     """At each reversal a drive moves by twice ``backlash`` before the cable follows (play operator); none at null."""
 
     name = "backlash"
@@ -20,10 +21,10 @@ class Backlash:
     inside_drive = False
     cause = "play in gears, couplings or spools"
     remedy = "reverse each drive by hand and measure the play; preload the transmission"
-    parameters = (
+    in_metres = (
         ParameterSpec(
             "backlash",
-            "m or rad",
+            "m",
             0.0,
             0.1,
             0.0,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
-class CableSlack:
+class CableSlack(InCommandUnit):
     """The first part of every pull only takes up slack (a dead zone around zero); none at null."""
 
     name = "cable_slack"
@@ -17,10 +18,10 @@ class CableSlack:
     inside_drive = False
     cause = "cables that are not taut at zero command, or a dead zone of the drives"
     remedy = "tension the cables until each just moves the body, and set zero there"
-    parameters = (
+    in_metres = (
         ParameterSpec(
             "cable_slack",
-            "m or rad",
+            "m",
             0.0,
             0.1,
             0.0,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
-class DriveDrift:
+class DriveDrift(InCommandUnit):
     """The zero of all drives moves at a steady rate from the start of the recording; no rate at null."""
 
     name = "drive_drift"
@@ -17,10 +18,10 @@ class DriveDrift:
     inside_drive = False
     cause = "drives or cables that slip, or spools that wind unevenly, so that the zero wanders"
     remedy = "return to zero at the end of a recording and compare the pose with that at the start"
-    parameters = (
+    in_metres = (
         ParameterSpec(
             "drive_drift",
-            "m/s or rad/s",
+            "m/s",
             -0.1,
             0.1,
             0.0,

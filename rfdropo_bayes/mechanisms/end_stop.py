@@ -5,11 +5,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
-class EndStop:
+class EndStop(InCommandUnit):
     """Commands beyond a limit are cut off on either side; the limit is infinite, its inverse zero, at null."""
 
     name = "end_stop"
@@ -17,10 +18,10 @@ class EndStop:
     inside_drive = True
     cause = "a mechanical end stop, a software limit or the largest torque of a drive"
     remedy = "read the drives' limits and their measured positions where the command is largest"
-    parameters = (
+    in_metres = (
         ParameterSpec(
             "inverse_travel_limit",
-            "1/m or 1/rad",
+            "1/m",
             0.0,
             1e5,
             0.0,

@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
-class RateLimit:
+class RateLimit(InCommandUnit):
     """Drives follow at a limited speed; the speed is infinite, its inverse zero, at null."""
 
     name = "rate_limit"
@@ -18,10 +19,10 @@ class RateLimit:
     inside_drive = True
     cause = "the speed or current limit of the drives, or a trajectory generator between command and drive"
     remedy = "read the drives' speed limit, or record their positions during a large step"
-    parameters = (
+    in_metres = (
         ParameterSpec(
             "inverse_speed_limit",
-            "s/m or s/rad",
+            "s/m",
             0.0,
             1e4,
             0.0,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from jaxtyping import Array, Float
 
+from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
-class SpoolGrowth:
+class SpoolGrowth(InCommandUnit):
     """Displacement grows with the square of the command, ``u (1 + k u)``; k is zero at null."""
 
     name = "spool_growth"
@@ -16,10 +17,10 @@ class SpoolGrowth:
     inside_drive = False
     cause = "cable wound in layers, a conical spool, or a lever whose arm changes with its angle"
     remedy = "measure the travel of a cable turn by turn; use a grooved spool of one layer"
-    parameters = (
+    in_metres = (
         ParameterSpec(
             "spool_growth",
-            "1/m or 1/rad",
+            "1/m",
             -1e3,
             1e3,
             0.0,

@@ -6,13 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 GRID = (5.0, 15.0, 30.0, 60.0, 85.0, 110.0, 150.0, 250.0, 500.0, 1000.0)
 
 
-class TravelStop:
+class TravelStop(InCommandUnit):
     """Commands beyond a stop are lost, not remembered: a drive at its stop moves with the next command away from it.
 
     In contrast to `EndStop`, which cuts off the accumulated command and has to be commanded all the way back. Travel is
@@ -24,10 +25,10 @@ class TravelStop:
     inside_drive = True
     cause = "commands given relative to where the drive is, at a stop or at a limit of its controller"
     remedy = "record where the drives are, not what they were told; command absolute positions"
-    parameters = (
+    in_metres = (
         ParameterSpec(
             "inverse_release_travel",
-            "1/m or 1/rad",
+            "1/m",
             0.0,
             1e5,
             0.0,
@@ -37,7 +38,7 @@ class TravelStop:
         ),
         ParameterSpec(
             "inverse_pull_travel",
-            "1/m or 1/rad",
+            "1/m",
             0.0,
             1e5,
             0.0,

@@ -250,3 +250,18 @@ def test_markers_beside_their_places_turn_with_the_body():
         {f"marker_offset_tip_{a}": v for a, v in zip("xyz", (1.0, 2.0, 3.0), strict=True)}, POSITION[:, :1]
     )
     np.testing.assert_allclose(moved - POSITION[:, :1], np.broadcast_to([1.0, 2.0, 3.0], (80, 1, 3)))
+
+
+def test_sizes_of_commands_are_in_the_unit_that_the_robot_is_commanded_in():
+    """Half a millimetre of play is 25 mrad of a motor with a spool of 20 mm; a limit of 1/m becomes one of 0.02/rad."""
+    names = ["backlash", "cable_slack", "end_stop", "travel_stop", "spool_growth", "drive_drift", "rate_limit"]
+    cables, motors = (mechanisms_named(names, load_robot(robot)) for robot in ("smooth_arm", "asl_trunk"))
+    units = [spec.unit for mechanism in motors for spec in mechanism.parameters]
+    assert units == ["rad", "rad", "1/rad", "1/rad", "1/rad", "1/rad", "rad/s", "s/rad"]
+    play, turned = cables[0].parameters[0], motors[0].parameters[0]
+    assert (play.unit, play.prior["scale"], play.high) == ("m", 0.0005, 0.1)
+    assert (turned.prior["scale"], turned.high) == pytest.approx((0.025, 5.0))
+    stop, turned = cables[2].parameters[0], motors[2].parameters[0]
+    np.testing.assert_allclose(turned.grid, 0.02 * np.array(stop.grid))
+    assert turned.prior["distribution"] == "HalfNormal"
+    assert stop.prior["scale"] == pytest.approx(50.0 * turned.prior["scale"])
