@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 SMALLEST, GROWTH = 8, 4  # sizes that batches are padded to: 8, 32, 128, ...
@@ -24,7 +25,7 @@ def padded(function: Callable[[Any], Any], given: Any) -> Any:
         size *= GROWTH
     index = np.minimum(np.arange(size), count - 1)
     found = function(jax.tree.map(lambda array: np.asarray(array, dtype=float)[index], given))
-    return jax.tree.map(lambda array: np.asarray(array)[:count], found)
+    return jax.tree.map(lambda array: jnp.asarray(np.asarray(array)[:count]), found)  # sliced by JAX, it would compile
 
 
 def is_batch(given: Any, axes: int) -> bool:
