@@ -85,17 +85,17 @@ class CalibrationProblem:
         """Where climbs may start: the prior, with what an earlier posterior knows in its place."""
         return self.model.space.sample_around(self.earlier, key, n)
 
-    def to_unconstrained(self, values: Batch) -> Float[Array, "n d"]:
+    def to_unconstrained(self, values: Batch) -> Float[Any, "n d"]:
         """Values as points of the unconstrained space, columns in the order of ``names``."""
         columns = {name: values[name] for name in self.names}
         space = self.model.space
         return padded(self._unconstrained, columns) if is_batch(columns, 1) else space.to_unconstrained(columns)
 
-    def from_unconstrained(self, u: Float[Array, "n d"]) -> dict[str, Float[Array, " n"]]:
+    def from_unconstrained(self, u: Float[Any, "n d"]) -> dict[str, Float[Any, " n"]]:
         """Inverse of `to_unconstrained`."""
         return padded(self._constrained, u) if is_batch(u, 2) else self.model.space.from_unconstrained(u)
 
-    def log_prior(self, u: Float[Array, "n d"]) -> Float[Array, " n"]:
+    def log_prior(self, u: Float[Any, "n d"]) -> Float[Any, " n"]:
         """Log prior density in the unconstrained space."""
         space = self.model.space
         return padded(self._log_prior, u) if is_batch(u, 2) else space.log_prior_unconstrained(u)
