@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rfdropo_bayes.audit.candidates import Candidate, Probe, discretisation_probe, fixed_drop, lead, probe_all
-from rfdropo_bayes.audit.fit import FIRST, Fit, Target, climb
+from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.score import likeness, span
 from rfdropo_bayes.audit.screen import Look, Row, look
@@ -222,9 +222,10 @@ class Inquiry:
         if row.name == DISCRETISATION:
             assert self.finer is not None
             return climb(replace(self.target, forward=self.finer), start, fit.free)
+        assert row.probe is not None
         candidate = next(c for c in self.candidates if c.name == row.name)
         free = np.array([*fit.free, *candidate.indices], dtype=int)
-        found = climb(self.target, self._on_the_way(fit, row, start), free)
+        found = climb(self.target, best_between(self.target, fit.x, start, list(row.probe.point), SHARES), free)
         # The model without the candidate is among those with it: a climb that ends at a worse one went astray.
         if found.residual @ found.residual > fit.residual @ fit.residual:
             found = max(found, climb(self.target, fit.x, free), key=lambda end: end.log_evidence)
@@ -251,19 +252,6 @@ class Inquiry:
             return fit
         self.report(f"{name} from elsewhere: sum of squares {best.residual @ best.residual:.0f}")
         return best
-
-    def _on_the_way(self, fit: Fit, row: Row, start: np.ndarray) -> np.ndarray:
-        """The best point between a fit and the linear extrapolation from it, which a large misfit carries too far."""
-        assert row.probe is not None
-        coordinates = self.target.forward.coordinates
-        points = fit.x + SHARES[:, None] * (start - fit.x)
-        held = list(row.probe.point)  # places and times mean the same however large the effect is
-        points[:, held] = start[held]
-        points = np.clip(points, *coordinates.bounds)
-        residual = self.target.recall("shares", [points], lambda: {"residual": self.target.residual(points)})
-        z = (points - coordinates.prior_mean) / coordinates.prior_sd
-        cost = np.sum(residual["residual"] ** 2, axis=1) + np.sum(z**2, axis=1)
-        return points[int(np.argmin(cost))]
 
     def _reconsider(self, base: Fit, steps: list[Step]) -> list[Step]:
         """With the last mechanism in the model, was the first one named rightly? Take it out and ask again."""

@@ -147,6 +147,24 @@ def _around(target: Target, x: np.ndarray, free: np.ndarray, residual: np.ndarra
     return Fit(x, free, residual, jacobian, covariance, evidence + float(np.sum(inside - beyond)))
 
 
+def best_between(
+    target: Target,
+    here: Float[np.ndarray, " d"],
+    there: Float[np.ndarray, " d"],
+    held: Sequence[int],
+    shares: Float[np.ndarray, " share"],
+) -> Float[np.ndarray, " d"]:
+    """The best point, at some shares of the way, between one and a linear extrapolation from it, which a large misfit
+    carries too far. Coordinates that are held, places and times, mean the same however large an effect is."""
+    coordinates = target.forward.coordinates
+    points = here + shares[:, None] * (there - here)
+    points[:, list(held)] = there[list(held)]
+    points = np.clip(points, *coordinates.bounds)
+    residual = target.recall("shares", [points], lambda: {"residual": target.residual(points)})["residual"]
+    z = (points - coordinates.prior_mean) / coordinates.prior_sd
+    return points[int(np.argmin(np.sum(residual**2, axis=1) + np.sum(z**2, axis=1)))]
+
+
 def widened(fit: Fit, coordinates: Coordinates) -> Fit:
     """A fit as it would be under priors no narrower than the sizes found, to first order.
 

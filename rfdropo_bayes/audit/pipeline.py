@@ -209,12 +209,12 @@ def base_model(
 def _under_residual_noise(target: Target, fit: Fit) -> tuple[Target, Fit]:
     """Noise and fit in turn."""
     for _ in range(2):
-        target = replace(target, noise=_residual_noise(target, fit))
+        target = replace(target, noise=residual_noise(target, fit))
         fit = climb(target, fit.x, fit.free)
     return target, fit
 
 
-def _residual_noise(target: Target, fit: Fit) -> NoiseModel:
+def residual_noise(target: Target, fit: Fit) -> NoiseModel:
     """An autoregression fitted to what a model leaves of every recording."""
     predicted = target.forward.position(fit.x)
     single = np.array(target.measurements.single)
@@ -226,7 +226,7 @@ def _residual_noise(target: Target, fit: Fit) -> NoiseModel:
 def _asked_again(inquiry: Inquiry, base: Fit, extended: Fit) -> tuple[Inquiry, Fit]:
     """The inquiry with the noise of what a first extension leaves: that of the base model holds the discrepancy itself,
     and whitens away what would tell its causes apart."""
-    target = replace(inquiry.target, noise=_residual_noise(inquiry.target, extended))
+    target = replace(inquiry.target, noise=residual_noise(inquiry.target, extended))
     inquiry.report(f"once more with the noise that the extended model leaves, AR({target.noise.order})")
     return replace(inquiry, target=target), climb(target, base.x, base.free)
 
@@ -248,7 +248,7 @@ def _subset(recordings: RecordingSet, chosen: Sequence[int]) -> RecordingSet:
 
 def _final_look(inquiry: Inquiry, extended: Fit, steps: Sequence[Step]) -> Look:
     """The look at the extended model under the noise that it leaves itself."""
-    renewed = replace(inquiry.target, noise=_residual_noise(inquiry.target, extended))
+    renewed = replace(inquiry.target, noise=residual_noise(inquiry.target, extended))
     fit = climb(renewed, extended.x, extended.free)
     found, _ = replace(inquiry, target=renewed).look_at(fit, [step.name for step in steps])
     inquiry.report(f"joint test under the noise that it leaves: p = {found.omnibus.p:.3g}")

@@ -15,11 +15,13 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.audit.candidates import Candidate, lead, probe_all
 from rfdropo_bayes.audit.extension import SHARES, TOLD_APART
-from rfdropo_bayes.audit.fit import Fit, Target, climb
-from rfdropo_bayes.audit.noise import RESIDUALS, NoiseModel
+from rfdropo_bayes.audit.fit import Fit, Target, best_between, climb
+from rfdropo_bayes.audit.noise import RESIDUALS
+from rfdropo_bayes.audit.pipeline import residual_noise
 from rfdropo_bayes.audit.score import Signature, likeness, project_out, signature, span, statistic
 
 PASSES = 2  # over the models without each, which begin where the one with all of them ends, and it where the best does
+WITH_NONE = np.append(SHARES, 0.0)
 SMALL = 0.1  # prior deviations at which a mechanism starts that shows nothing at null
 GROWING, REFITTING, FINAL = 8, 3, 8  # evaluations of a climb while the model grows, of a variant, and of the whole
 
@@ -147,12 +149,6 @@ def separate(
     return Separation(target, members, none, whole, alone, without, marks, own, target.forward.rollouts)
 
 
-def residual_noise(target: Target, fit: Fit) -> NoiseModel:
-    """An autoregression fitted to what a model leaves of data that were not repeated."""
-    left = target.measurements.position - target.forward.position(fit.x)
-    return target.measurements.noise(np.where(target.measurements.valid, left, 0.0), len(fit.free))
-
-
 def distance(target: Target, fit: Fit) -> float:
     """Root mean square distance of the markers from where the model has them [m]."""
     measured = target.measurements
@@ -196,7 +192,7 @@ def _joined(target: Target, fit: Fit, candidate: Candidate) -> Fit:
         held = list(best.point)
     else:
         held = []
-    start = _nearest(target, fit.x, start, held)
+    start = best_between(target, fit.x, start, held, WITH_NONE)
     for index in candidate.indices:  # a size of nothing has no slope for its shape
         null = target.forward.coordinates.null[index]
         if target.forward.coordinates.affine[index] and abs(start[index] - null) < SMALL:
@@ -222,20 +218,7 @@ def _reduced(target: Target, fit: Fit, free: Int[np.ndarray, " free"]) -> Float[
     design = np.concatenate([fit.jacobian[:, kept], prior])
     moved = emptied.copy()
     moved[free] += np.linalg.lstsq(design, np.concatenate([left, pull]), rcond=None)[0]
-    return _nearest(target, emptied, moved, [])
-
-
-def _nearest(
-    target: Target, here: Float[np.ndarray, " d"], there: Float[np.ndarray, " d"], held: Sequence[int]
-) -> Float[np.ndarray, " d"]:
-    """The best point on the way to a linear extrapolation, which may go too far."""
-    coordinates = target.forward.coordinates
-    points = here + np.array([*SHARES, 0.0])[:, None] * (there - here)
-    points[:, list(held)] = there[list(held)]  # places and times mean the same however large the effect is
-    points = np.clip(points, *coordinates.bounds)
-    residual = target.recall("shares", [points], lambda: {"residual": target.residual(points)})["residual"]
-    z = (points - coordinates.prior_mean) / coordinates.prior_sd
-    return points[int(np.argmin(np.sum(residual**2, axis=1) + np.sum(z**2, axis=1)))]
+    return best_between(target, emptied, moved, [], WITH_NONE)
 
 
 def _words(target: Target, fit: Fit) -> str:
