@@ -38,9 +38,7 @@ TENSION_GAIN = ParameterSpec(
 )
 # A slack cable reads nothing: below this share of the recording's root mean square the error no longer shrinks.
 SMALLEST_READING = 0.05
-ABOVE_ZERO = (
-    50.0  # keeps what stands under a square root in `size_residuals` positive: logarithms of ratios are smaller
-)
+ABOVE_ZERO = 50.0  # larger than any logarithm of a ratio of sizes: keeps a root in `size_residuals` real
 
 
 class TensionData(NamedTuple):
