@@ -78,7 +78,8 @@ def test_sharing_is_found_where_it_is_and_not_where_it_is_not():
     assert shrunk_correlation(rng.normal(size=(20, 12)), 1.0, shared=True) is None
 
 
-@pytest.mark.parametrize("share", [pytest.param(0.3, marks=pytest.mark.slow), 0.8])
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.3, 0.8])
 def test_data_without_discrepancy_pass_whatever_their_markers_share(share):
     """Fits to 60 data sets against those that the bootstrap draws: the p-values of every statistic have their mean
     within 3.3 standard errors of a half (12 assertions: 1 seed in 80)."""

@@ -102,6 +102,7 @@ def batch(**values: float) -> dict[str, jax.Array]:
     return {name: jnp.array([value]) for name, value in {**TRUTH, **values}.items()}
 
 
+@pytest.mark.slow
 def test_the_density_of_the_angles_is_that_of_normals_at_new_readings_only():
     read = recording(60, hold=3)
     chosen, plain = problem(read), problem(read, angles=False)

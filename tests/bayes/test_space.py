@@ -47,6 +47,7 @@ def test_the_unconstrained_map_is_a_bijection_and_its_density_carries_the_jacobi
     np.testing.assert_allclose(chosen.log_prior_unconstrained(u), expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_draws_around_an_earlier_posterior_keep_its_rows_together_and_stay_inside():
     """What it lacks, and what lies outside the support, comes from the prior; one value for all serves every one."""
     modulus = np.array([2e6, 3e6, 1e6, 9e9])  # the third on the bound, the fourth beyond it

@@ -102,6 +102,7 @@ def test_the_bridge_has_the_evidence_at_a_fraction_of_the_rollouts():
     assert np.abs((draws.mean(axis=0) - mean) / np.sqrt(np.diag(covariance))).max() < 0.12
 
 
+@pytest.mark.slow
 def test_the_bridge_keeps_two_modes_that_the_climbs_found():
     class Absolute(TwoModes):
         def residuals(self, values, horizon):

@@ -60,6 +60,7 @@ def test_the_carried_likelihood_belongs_to_the_draws(linear):
     np.testing.assert_allclose(result.log_likelihood[3], problem.row_log_likelihood(values, 12)[0], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_a_budget_has_left_becomes_further_draws():
     """Means of 5 x 400 draws, at worst of 5 x 100 independent ones, are off by 0.045 sd: four times that fails once
     in 5000, three parameters together."""
@@ -159,7 +160,7 @@ def test_a_prior_far_from_the_data_collapses_the_evidence():
     assert result.log_evidence[0] == pytest.approx(exact, rel=0.01)
 
 
-@pytest.mark.parametrize("budget", [1500.0, 8000.0])
+@pytest.mark.parametrize("budget", [pytest.param(1500.0, marks=pytest.mark.slow), 8000.0])
 def test_the_budget_is_kept(budget):
     problem = LinearGaussian(n_rows=40, d=8)
     result = horizon_smc.run(problem, SmcConfig(rollouts=budget, replicates=2), KEY)

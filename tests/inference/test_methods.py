@@ -42,7 +42,14 @@ def test_options_come_as_toml_has_them():
     assert methods.make_config("smc", {"rollouts": None}).rollouts is None
 
 
-@pytest.mark.parametrize("method", [name for name in methods.METHODS if name not in OTHERS])
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name == "bridge" else name
+        for name in methods.METHODS
+        if name not in OTHERS
+    ],
+)
 def test_every_method_answers_in_the_same_form(method):
     problem = Spring() if method == "rfdropo" else Decay(n_rows=20)
     options = {"smc": {"particles": 100}, "rfdropo": {"evaluations": 40, "rollouts_per_candidate": 10}}.get(method, {})

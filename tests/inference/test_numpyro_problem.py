@@ -148,6 +148,7 @@ def schools_by_quadrature():
     return np.log(evidence), (mu, np.sqrt(second - mu**2)), average(tau)
 
 
+@pytest.mark.slow
 def test_eight_schools_agrees_with_quadrature():
     """4000 draws give the means to 0.05; thresholds allow for the heavy tail of tau."""
     options = {"particles": 1000, "replicates": 4}
@@ -184,6 +185,7 @@ def test_a_range_that_moves_with_another_parameter_is_no_bound():
     np.testing.assert_allclose(back["beta1"], prior["beta1"], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_data_outside_their_interval_have_no_likelihood():
     """y ~ uniform(0, theta): the evidence is the integral of theta^-n from the largest y on. Four replicates of 500
     scatter by 0.1 each, their mean by 0.05; the threshold is five times that."""
@@ -198,6 +200,7 @@ def test_data_outside_their_interval_have_no_likelihood():
     assert result.log_evidence[0] == pytest.approx(np.log((2.9**-4 - 10.0**-4) / 40.0), abs=0.25)
 
 
+@pytest.mark.slow
 def test_draws_come_back_in_the_shapes_of_the_sites_with_what_follows_from_them():
     def model(y):
         mu = numpyro.sample("mu", dist.Normal(0.0, 1.0))
@@ -238,6 +241,7 @@ def test_prior_draws_beyond_double_precision_keep_their_share():
     assert result.draws["precision"].mean() == pytest.approx(shape / rate, rel=0.1)
 
 
+@pytest.mark.slow
 def test_laplace_and_the_bridge_take_a_plain_model():
     """No residuals, but a likelihood that JAX differentiates. A conjugate model is normal: Laplace has its evidence to
     the digit; four replicates of the bridge scatter by 0.06."""

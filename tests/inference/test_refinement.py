@@ -40,6 +40,7 @@ def closed_form(design, y):
     return -0.5 * (logs + rest @ rest / NOISE**2 - score @ away), 0.3 + away, np.linalg.inv(precision)
 
 
+@pytest.mark.slow
 def test_priors_a_thousand_times_wider_than_the_posterior():
     """Eight coefficients. The first pass scatters by half a nat, the second by 0.05 or less (measured); means of 1200
     draws by 0.03 deviations, the largest of eight by 0.08, deviations by 2 %. One replicate is none: there are four."""

@@ -175,7 +175,7 @@ methods.run(problem, sys.argv[3], json.loads(sys.argv[4]), jax.random.key(12), c
 @pytest.mark.parametrize(
     ("method", "options", "begun"),
     [
-        ("smc", OPTIONS["smc"], "smc_1"),
+        pytest.param("smc", OPTIONS["smc"], "smc_1", marks=pytest.mark.slow),
         pytest.param("bridge", OPTIONS["bridge"], "smc_0", marks=pytest.mark.slow),
         pytest.param("rfdropo", OPTIONS["rfdropo"], "rfdropo", marks=pytest.mark.slow),
         pytest.param(*CASES[-1], "rfdropo", marks=pytest.mark.slow),
@@ -247,7 +247,7 @@ def test_the_log_has_a_line_per_stage_in_plain_json(tmp_path):
     assert {"time", "elapsed", "run", "horizon", "ess", "rollouts", "stage"} <= lines[0].keys()
 
 
-@pytest.mark.parametrize("method", ["laplace", "smc"])
+@pytest.mark.parametrize("method", [pytest.param("laplace", marks=pytest.mark.slow), "smc"])
 def test_exclusions_survive_a_checkpoint(method, tmp_path):
     """A part of the prior diverges: its count is saved and read back."""
 

@@ -139,6 +139,7 @@ def test_what_is_not_finite_is_null_with_a_reason(folder: Path) -> None:
     assert "replicate" in summary["not_available"]["log_evidence.sd"]
 
 
+@pytest.mark.slow
 def test_the_report_is_drawn_again_from_the_folder(folder: Path) -> None:
     before = (folder / "report.html").read_text()
     (folder / "report.html").unlink()

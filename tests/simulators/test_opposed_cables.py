@@ -36,6 +36,7 @@ def test_a_notched_trunk_between_opposed_cables_stays_whole():
     assert np.asarray(seen.tension).max() > 50.0
 
 
+@pytest.mark.slow
 def test_a_notched_trunk_settles_between_opposed_cables():
     """Taut cables hold its necks against twist; an iteration that does not know this swings in twist for ever."""
     simulator = build_simulator(Experiment(robot="trunk_physical"), load_robot("trunk_physical"))

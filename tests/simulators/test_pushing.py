@@ -86,6 +86,7 @@ def test_the_cube_comes_to_rest_and_a_trunk_that_does_not_touch_it_moves_as_with
     assert int(aside.status) == Result.OK
 
 
+@pytest.mark.slow
 def test_the_trunk_pushes_the_cube_and_the_cube_holds_the_trunk(rollout, trunk, commands):
     """A cube beside the trunk's path that is heavy and rough resists more than a light and smooth one."""
     beside = {"cube_x": -0.02, "cube_y": REST_HEIGHT}
