@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.compiled import CompiledEngine
