@@ -21,7 +21,7 @@ from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
 from rfdropo_bayes.audit.noise import RESIDUALS, STATED, NoiseModel
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Look
-from rfdropo_bayes.audit.verdict import decide
+from rfdropo_bayes.audit.verdict import PARTLY, UNEXPLAINED, decide
 from rfdropo_bayes.bayes.model import RecordingSet
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.simulators.commands import Commands
@@ -140,6 +140,7 @@ def audit(
     verdict = decide(
         question.rules, looks[0].omnibus.p, last.omnibus.p if steps else None, members, gain, target.noise.doubtful
     )
+    unexplained = verdict in (PARTLY, UNEXPLAINED) and last.omnibus.p <= question.rules.extended_passes
     sizes = widened(extended, question.coordinates)
     low, high = question.coordinates.bounds
     return Answer(
@@ -158,7 +159,7 @@ def audit(
         unseen,
         sizes,
         sizes.draws(np.random.default_rng([question.seed, 5]), 1000, low, high),
-        _suspected(question, inquiry, base, last),
+        _suspected(inquiry, base) if unexplained else None,
         target.measurements.shift,
         target.forward.rollouts + (finer.rollouts if finer else 0),
         time.monotonic() - began,
@@ -255,13 +256,13 @@ def _final_look(inquiry: Inquiry, extended: Fit, steps: Sequence[Step]) -> Look:
     return found
 
 
-def _suspected(question: Question, inquiry: Inquiry, base: Fit, last: Look) -> NoiseModel | None:
+def _suspected(inquiry: Inquiry, base: Fit) -> NoiseModel | None:
     """Noise fitted to what the base model leaves, where it passes under that, though not under the noise stated."""
-    if inquiry.target.noise.source != STATED or last.omnibus.p > question.rules.extended_passes:
+    if inquiry.target.noise.source != STATED:
         return None
     target, fit = _under_residual_noise(inquiry.target, base)
     found, _ = replace(inquiry, target=target).look_at(fit)
-    passes = found.omnibus.p > question.rules.base_passes and not target.noise.doubtful
+    passes = found.omnibus.p > inquiry.rules.base_passes and not target.noise.doubtful
     return target.noise if passes else None
 
 

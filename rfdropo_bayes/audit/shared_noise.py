@@ -28,6 +28,7 @@ def shrunk_correlation(
         return None
     scale = np.sqrt(np.maximum(np.mean(rows**2, axis=0), 1e-300))
     sample = (rows / scale).T @ (rows / scale) / len(rows)
+    np.fill_diagonal(sample, 1.0)  # of a channel that never differs, too
     pairs = channels * (channels - 1) / 2
     if shared is None:
         likelihood = -(count - 1.0 - (2.0 * channels + 5.0) / 6.0) * np.linalg.slogdet(sample)[1]

@@ -3,6 +3,7 @@
 from rfdropo_bayes.posteriors.bounds import piled_at
 from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
 from rfdropo_bayes.posteriors.inference_data import load_posterior, save_posterior, summarise, to_inference_data
+from rfdropo_bayes.posteriors.intervals import central_interval
 from rfdropo_bayes.posteriors.record import ParameterInfo, PosteriorRecord, RecordingPrediction
 
 __all__ = [
@@ -10,6 +11,7 @@ __all__ = [
     "PosteriorRecord",
     "ProductOfPowers",
     "RecordingPrediction",
+    "central_interval",
     "evaluate_products",
     "load_posterior",
     "piled_at",

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, piled_at, summarise
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, central_interval, piled_at, summarise
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
     rows = []
     for info in record.parameters:
         draws, prior = record.flat(info.name), record.prior.get(info.name)
-        q05, median, q95 = np.quantile(draws, [0.05, 0.5, 0.95], method="weibull")
+        q05, q95 = central_interval(draws)
         bound = bound_reached(draws, info) if info.name in free else None
         before = (None, None) if prior is None else np.quantile(prior, [0.05, 0.95]).tolist()
         rows.append(
@@ -69,7 +69,7 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
                 float(draws.mean()),
                 float(draws.std(ddof=1)) if len(draws) > 1 else 0.0,
                 float(q05),
-                float(median),
+                float(np.median(draws)),
                 float(q95),
                 bound is not None,
                 bound,

@@ -17,7 +17,7 @@ from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.result import central_interval
+from rfdropo_bayes.posteriors import central_interval
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator
 from rfdropo_bayes.workflow.commands import random_walk

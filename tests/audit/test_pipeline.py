@@ -306,6 +306,15 @@ def test_a_stated_noise_that_is_too_small_is_suspected_and_a_right_one_is_not(si
         assert "Repeat" in content["next_experiment"]["sentence"]
 
 
+def test_where_nothing_is_wrong_a_stated_noise_is_not_suspected_however_low_the_passing_p():
+    stated = NoiseModel(np.full(12, NOISE), np.array([1.0, 0.6]), STATED, np.inf)
+    asked = replace(unrepeated({}, 6), stated_noise=stated)
+    strict = replace(asked, rules=replace(asked.rules, extended_passes=1.0))
+    answer = audit(strict)
+    assert answer.verdict == "no_discrepancy"
+    assert answer.suspected is None
+
+
 def test_what_predicts_unseen_recordings_worse_is_named_and_not_adopted():
     """The test recordings have the effect with the other sign."""
     fitted = unrepeated({"delay": 1.0}, 7)

@@ -78,6 +78,15 @@ def test_sharing_is_found_where_it_is_and_not_where_it_is_not():
     assert shrunk_correlation(rng.normal(size=(20, 12)), 1.0, shared=True) is None
 
 
+def test_a_channel_that_never_differs_stays_as_it_is_beside_others_that_share():
+    rows = np.random.default_rng(6).normal(size=(200, 12)) @ np.linalg.cholesky(common(0.8)).T
+    rows[:, 4] = 0.0
+    found = shrunk_correlation(rows, 1.0)
+    np.testing.assert_allclose(np.diag(found), 1.0)
+    np.testing.assert_allclose(np.delete(found[4], 4), 0.0)
+    assert np.linalg.eigvalsh(found).min() > 0.05
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.3, 0.8])
 def test_data_without_discrepancy_pass_whatever_their_markers_share(share):

@@ -14,7 +14,8 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods, sbc
-from rfdropo_bayes.inference.result import InferenceResult, central_interval
+from rfdropo_bayes.inference.result import InferenceResult
+from rfdropo_bayes.posteriors import central_interval
 
 from .toys import LinearGaussian
 
