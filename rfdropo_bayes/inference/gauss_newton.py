@@ -7,6 +7,10 @@ along which coordinates ``c`` changes. Along these the gradient is taken from th
 differences; and since ``J'J`` holds only one half of the information about a scale (``m`` instead of ``2 m``), their
 block of the Hessian at the optimum is taken by second differences of the log likelihood. Physical parameters keep the
 Gauss-Newton block.
+
+Differences of rollouts in single precision carry rounding, whose square adds to ``J'J`` in all directions alike. Along
+a ridge, where the data say least, it can be most of what is there, and the ridge then looks shorter than it is. Where
+the posterior is roughly known, differences are therefore taken along its own axes, over a good part of its deviations.
 """
 
 from __future__ import annotations
@@ -36,6 +40,8 @@ class Target(NamedTuple):
         prior_gradient, prior_hessian: of the log prior.
         linearise: residuals (m,) and their Jacobian (m, d).
         noise: coordinates along which the log determinant changes.
+        differences: residuals (m,), and half of what they change by (m, d) from one step against each column of a
+            matrix (d, d) to one step along it; None where derivatives are exact.
     """
 
     density: Callable[[np.ndarray], np.ndarray]
@@ -44,12 +50,27 @@ class Target(NamedTuple):
     prior_hessian: Callable[[np.ndarray], np.ndarray]
     linearise: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     noise: Bool[np.ndarray, " d"]
+    differences: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+
+    def along(self, axes: Float[np.ndarray, "d d"]) -> Target | None:
+        """See `Climbable.along`."""
+        differences = self.differences
+        if differences is None:
+            return None
+
+        def linearise(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            residual, changes = differences(u, axes)
+            lost = ~np.isfinite(changes).all(axis=0)
+            if lost.any():  # steps along coordinates are shorter
+                changes[:, lost] = (_known(self.linearise(u)[1]) @ axes)[:, lost]
+            return residual, np.linalg.solve(axes.T, changes.T).T
+
+        return self._replace(linearise=linearise)
 
     def quadratic(self, u: Float[np.ndarray, " d"]) -> tuple[np.ndarray, np.ndarray]:
         """See `Climbable.quadratic`."""
         residual, jacobian = self.linearise(u)
-        # Where a neighbour's rollout is lost there is no derivative: that coordinate stays where it is for this step.
-        jacobian = np.where(np.isfinite(jacobian).all(axis=0), jacobian, 0.0)
+        jacobian = _known(jacobian)
         gradient = -jacobian.T @ residual
         curvature = jacobian.T @ jacobian
         if self.noise.any():
@@ -97,7 +118,7 @@ def make_target(
     def density(points: np.ndarray) -> np.ndarray:
         return evaluate_prior(problem, points) + likelihood(points)
 
-    residuals_at, linearise = _make_linearise(problem, horizon, ledger, u, jacobian)
+    residuals_at, linearise, differences = _make_linearise(problem, horizon, ledger, u, jacobian)
     physical = getattr(problem, "physical_names", problem.names)
     if noise is None and len(physical) < len(problem.names):
         noise = np.array([name not in physical for name in problem.names])
@@ -106,7 +127,7 @@ def make_target(
         noise = _noise_coordinates(
             lambda points: likelihood(points) + 0.5 * np.sum(residuals_at(points) ** 2, axis=1), u
         )
-    return Target(density, likelihood, *prior, linearise, noise)
+    return Target(density, likelihood, *prior, linearise, noise, differences)
 
 
 def prior_derivatives(problem: Problem) -> tuple[Callable, Callable]:
@@ -122,8 +143,9 @@ def prior_derivatives(problem: Problem) -> tuple[Callable, Callable]:
 
 def _make_linearise(
     problem: ResidualProblem, horizon: int, ledger: Ledger, u: np.ndarray, jacobian: str
-) -> tuple[Callable, Callable]:
-    """Residuals of a batch of points, not charged; residuals and Jacobian at one point, charged."""
+) -> tuple[Callable, Callable, Callable | None]:
+    """Residuals of a batch of points, not charged; residuals and Jacobian at one point, charged; and
+    `Target.differences`."""
 
     def residuals(u: Array) -> Any:
         values = problem.from_unconstrained(u[None])
@@ -144,12 +166,15 @@ def _make_linearise(
             return np.asarray(batched(jnp.asarray(points)))
         return np.stack([np.asarray(residuals(jnp.asarray(point))) for point in points])
 
-    def differences(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def differences(u: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ledger.charge(problem, 2 * len(u) + 1, horizon)
-        steps = width * np.eye(len(u))
-        values = at(np.concatenate([u[None], u + steps, u - steps]))
+        values = at(np.concatenate([u[None], u + axes.T, u - axes.T]))
         upper, lower = values[1 : len(u) + 1], values[len(u) + 1 :]
-        return values[0], (upper - lower).T / (2.0 * width)
+        return values[0], 0.5 * (upper - lower).T
+
+    def central(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        residual, changes = differences(u, width * np.eye(len(u)))
+        return residual, changes / width
 
     @jax.jit
     def both(u: Array) -> tuple[Array, Array]:
@@ -162,7 +187,7 @@ def _make_linearise(
 
     if jacobian == "auto":
         jacobian = "forward" if _works(_directional, residuals, u) else "central"
-    return at, forward if jacobian == "forward" else differences
+    return (at, forward, None) if jacobian == "forward" else (at, central, differences)
 
 
 def _directional(residuals: Callable, u: Array, direction: Array | None = None) -> tuple[Array, Array]:
@@ -189,6 +214,11 @@ def _noise_coordinates(determinant: Callable, u: np.ndarray, width: float = 0.05
     changes = np.abs(values[1:] - values[0]).reshape(2, len(u))
     # A rollout that fails says nothing; its other side does.
     return np.max(np.where(np.isfinite(changes), changes, 0.0), axis=0) > 1e-2 + 1e-6 * abs(values[0])
+
+
+def _known(jacobian: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
+    """Where a neighbour's rollout is lost there is no derivative: that coordinate stays where it is for a step."""
+    return np.where(np.isfinite(jacobian).all(axis=0), jacobian, 0.0)
 
 
 def _slope(likelihood: Callable, u: np.ndarray, chosen: np.ndarray) -> np.ndarray:

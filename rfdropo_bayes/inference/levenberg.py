@@ -9,6 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 NOISE_GRID = 13  # values of a noise coordinate tried at the start of a climb
+AXIS, LONGEST = 0.5, 0.25  # step along an axis of a posterior, in its deviations, and at most in any coordinate
+ROUNDS = 4  # of differences along axes that get better
+SAME = 0.05  # nats between two normal distributions that are taken for one
 
 
 @runtime_checkable
@@ -31,6 +34,13 @@ class Climbable(Protocol):
 
     def information(self, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
         """Minus the Hessian of the log likelihood at a mode, as well as it is known."""
+        ...
+
+    def along(self, axes: Float[np.ndarray, "d d"]) -> Climbable | None:
+        """The same log posterior with differences over one step along and one against each column.
+
+        None where derivatives are exact.
+        """
         ...
 
     @property
@@ -156,13 +166,41 @@ def maximise(
 
 
 def laplace(target: Climbable, state: LevenbergState) -> Laplace:
-    """Normal approximation at a mode."""
+    """Normal approximation at a mode; where derivatives are differences, the last of them are along its own axes."""
+    found = _normal(target, state)
+    for _ in range(ROUNDS):
+        nearer = target.along(_axes(found.covariance))
+        if nearer is None:
+            break
+        moved, _ = step(nearer, state._replace(position=found.mean, log_density=found.log_density), SAME**2)
+        before, found = found, _normal(nearer, moved)
+        if divergence(before, found) < SAME:
+            break
+    return found
+
+
+def _normal(target: Climbable, state: LevenbergState) -> Laplace:
     u = state.position
     information = target.information(u)
     values, vectors = np.linalg.eigh(information + positive_part(-target.prior_hessian(u)))
     values = np.maximum(values, 1e-12 * values[-1])
     covariance = (vectors / values) @ vectors.T
     return Laplace(u, covariance, state.log_density, information, -target.prior_gradient(u))
+
+
+def _axes(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
+    """Steps to take differences over, one per column."""
+    values, vectors = np.linalg.eigh(covariance)
+    steps = AXIS * vectors * np.sqrt(values)
+    return steps * np.minimum(1.0, LONGEST / np.abs(steps).max(axis=0))
+
+
+def divergence(first: Laplace, second: Laplace) -> float:
+    """Kullback-Leibler divergence of two normal distributions [nat], from the second to the first."""
+    factor = np.linalg.cholesky(second.covariance)
+    moved = np.linalg.solve(factor, second.mean - first.mean)
+    ratio = np.linalg.solve(factor, np.linalg.cholesky(first.covariance))
+    return float(0.5 * (np.sum(ratio**2) + moved @ moved - len(moved)) - np.log(np.abs(np.diag(ratio))).sum())
 
 
 def positive_part(matrix: np.ndarray) -> np.ndarray:

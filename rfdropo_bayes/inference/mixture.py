@@ -16,12 +16,11 @@ from scipy.stats import multivariate_t
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.inference.evaluations import evaluate_prior
-from rfdropo_bayes.inference.levenberg import Laplace, positive_part
+from rfdropo_bayes.inference.levenberg import SAME, Laplace, divergence, positive_part
 from rfdropo_bayes.inference.proposals import host_generator
 
 LEAST_SHARE = 0.05  # of a mode, before normalising: Laplace evidences of ill-shaped modes are off by nats
 MOMENTS = 1000  # prior draws behind its mean and covariance
-SAME = 0.05  # nats between two normal distributions that are taken for one
 
 
 class ModeMixture:
@@ -86,7 +85,7 @@ def covering(problem: Problem, modes: list[Laplace], key: PRNGKeyArray) -> list[
     found = []
     for mode in modes:
         wide = _with_prior_moments(mode, mean, precision)
-        found += [mode] if wide is None or _divergence(mode, wide) < SAME else [mode, wide]
+        found += [mode] if wide is None or divergence(mode, wide) < SAME else [mode, wide]
     return found
 
 
@@ -101,11 +100,3 @@ def _with_prior_moments(
     # Of the two neither is known to be the better: they get equal shares.
     wide = Laplace(centre, covariance, 0.0)
     return wide._replace(log_density=mode.log_evidence - wide.log_evidence)
-
-
-def _divergence(first: Laplace, second: Laplace) -> float:
-    """Kullback-Leibler divergence of two normal distributions [nat], from the second to the first."""
-    factor = np.linalg.cholesky(second.covariance)
-    moved = np.linalg.solve(factor, second.mean - first.mean)
-    ratio = np.linalg.solve(factor, np.linalg.cholesky(first.covariance))
-    return float(0.5 * (np.sum(ratio**2) + moved @ moved - len(moved)) - np.log(np.abs(np.diag(ratio))).sum())

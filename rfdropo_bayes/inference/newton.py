@@ -52,6 +52,9 @@ class SmoothTarget(NamedTuple):
         """See `Climbable.information`."""
         return -self._at(u)[1]
 
+    def along(self, axes: Float[np.ndarray, "d d"]) -> None:
+        """See `Climbable.along`: derivatives are exact."""
+
     def _at(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives; a coordinate without one is taken to have no say."""
         self.ledger.charge(self.problem, len(u) + 1, self.problem.n_rows)

@@ -84,7 +84,7 @@ def task_problem(task: str, actions: int, tension: bool, held_out: bool, seed: i
     experiment = Experiment.model_validate(
         {
             "robot": chosen.robot,
-            "simulator": {"precision": "float32", "threads": None},
+            "simulator": {"precision": "float64", "threads": None},
             "model": {
                 "noise": "ar1",
                 "tension": tension,

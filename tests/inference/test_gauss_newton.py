@@ -76,6 +76,34 @@ def test_central_differences_agree_with_forward_derivatives():
     np.testing.assert_allclose(forward.linearise(u)[1], central.linearise(u)[1], rtol=1e-6, atol=1e-6)
 
 
+class RoundedRidge(LinearGaussian):
+    """Two parameters whose sum is known 2000 times as well as their difference, and residuals rounded to 1e-4."""
+
+    def __init__(self):
+        super().__init__(n_rows=400, d=2)
+        along = np.sin(np.arange(400.0))
+        self.design = np.stack([100.0 + 0.05 * along, 100.0 - 0.05 * along], axis=1)
+        self.noise = np.ones(400)
+        self.data = self.design @ (self.mean + np.array([0.4, -0.3])) + np.cos(3.0 * np.arange(400.0))
+
+    def residuals(self, values, horizon):
+        def rounded(u):
+            return np.round((self.data[:horizon] - self.design[:horizon] @ u) / self.noise[:horizon], 4)
+
+        u = jax.numpy.stack([values[name] for name in self.names])
+        return jax.pure_callback(rounded, jax.ShapeDtypeStruct((horizon,), float), u, vmap_method="sequential")
+
+
+def test_rounding_does_not_shorten_a_ridge():
+    """Differences over 1e-4 have rounding of 0.3 in each of 400 rows, which is 50 times what the data say there."""
+    problem = RoundedRidge()
+    result = laplace.run(problem, LaplaceConfig(blocks=1, starts=2), KEY)
+    mean, covariance = problem.posterior()
+    np.testing.assert_allclose(result.details["covariance_unconstrained"], covariance, rtol=0.02)
+    found = np.array(list(result.optimum.values()))
+    assert (found - mean) @ np.linalg.solve(covariance, found - mean) < 0.05
+
+
 @pytest.mark.slow
 def test_a_nonlinear_model_agrees_with_smc():
     """Both estimate means to about 0.03 sd; Laplace's mode is off by O(1 / n), most for the noise (0.3 sd)."""
