@@ -11,14 +11,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
 from rfdropo_bayes.bayes.angles import angle_specs
 from rfdropo_bayes.bayes.batches import is_batch, padded
 from rfdropo_bayes.bayes.forces import tension_specs
 from rfdropo_bayes.bayes.model import Measured, TrajectoryModel
 from rfdropo_bayes.bayes.noise import draw_noise, noise_specs
-from rfdropo_bayes.bayes.objects import object_specs
+from rfdropo_bayes.bayes.objects import draw_feature_error, object_features, object_specs, offset_of
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
@@ -155,18 +155,21 @@ class CalibrationProblem:
     def rollouts(
         self, values: Batch, horizon: int
     ) -> tuple[Float[np.ndarray, "n horizon feature"], Int[np.ndarray, " n"]]:
-        """Simulated marker coordinates [m] of all recordings side by side, without observation noise."""
-        position, _, status = self._chunked(self._positions, values, horizon)
-        position = np.moveaxis(position, 1, 2)[:, :horizon]
-        return position.reshape(len(position), horizon, -1), status
+        """Simulated features [m] of all recordings side by side, without observation noise: coordinates of the markers,
+        and `object_features` where poses are data."""
+        features, status = self._chunked(self._features, values, horizon)
+        return self._side_by_side(features)[:, :horizon], status
 
     def noisy_rollouts(
         self, key: PRNGKeyArray, values: Batch
     ) -> tuple[Float[np.ndarray, "n n_rows feature"], Int[np.ndarray, " n"]]:
         """`rollouts` of all rows with a realisation of the observation noise [m]."""
         clean, status = self.rollouts(values, self.n_rows)
-        noise = np.moveaxis(self.draw_noise(key, values), 1, 2)
-        return clean + noise.reshape(clean.shape), status
+        noise = self.draw_noise(key, values)
+        noise = noise.reshape(*noise.shape[:3], -1)
+        if self.model.object_pose is not None:
+            noise = np.concatenate([noise, self._object_noise(jax.random.fold_in(key, 1), values)], axis=-1)
+        return clean + self._side_by_side(noise), status
 
     @cached_property
     def actions(self) -> Float[np.ndarray, "n_rows channel"]:
@@ -179,14 +182,36 @@ class CalibrationProblem:
 
     @cached_property
     def observed(self) -> Float[np.ndarray, "n_rows feature"]:
-        """Measured marker coordinates [m], laid out like `rollouts`."""
-        return np.moveaxis(np.asarray(self.measured.position), 0, 1).reshape(self.n_rows, -1)
+        """Measured features [m], laid out like `rollouts`."""
+        position = np.asarray(self.measured.position)
+        features = position.reshape(*position.shape[:2], -1)
+        if self.measured.object_pose is not None:
+            poses = np.asarray(object_features(self.measured.object_pose))
+            features = np.concatenate([features, poses], axis=-1)
+        return self._side_by_side(features[None])[0]
 
     @cached_property
     def observed_mask(self) -> np.ndarray:
         """True where ``observed`` may be used."""
-        valid = np.moveaxis(self.model.recordings.line.valid, 0, 1)
-        return np.repeat(valid[..., None], 3, axis=-1).reshape(self.n_rows, -1)
+        valid = np.repeat(self.model.recordings.line.valid, 3, axis=-1)
+        if self.model.object_pose is not None:
+            valid = np.concatenate([valid, np.repeat(self.model.object_pose.line.valid, 6, axis=-1)], axis=-1)
+        return self._side_by_side(valid[None])[0]
+
+    def _side_by_side(self, features: Shaped[Any, "n recording time f"]) -> Shaped[np.ndarray, "n time recording*f"]:
+        return np.moveaxis(np.asarray(features), 1, 2).reshape(len(features), features.shape[2], -1)
+
+    def _object_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time 6"]:
+        """A realisation of the noise of `object_features` [m] for every set of values."""
+
+        def noise(key: PRNGKeyArray, values: Mapping[str, Array]) -> Array:
+            keys = jax.random.split(key, self.n_recordings)
+            known = {**self.model.fixed, **values}
+            return jax.vmap(lambda k, t: draw_feature_error(k, t, known))(keys, self.model.recordings.time)
+
+        inferred = {name: jnp.asarray(values[name]) for name in self.names}
+        count = len(next(iter(inferred.values())))
+        return np.asarray(jax.vmap(noise)(jax.random.split(key, count), inferred))
 
     def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " residual"]:
         """Whitened residuals of the first ``horizon`` rows (zero where masked); traceable, for one set of values."""
@@ -206,7 +231,7 @@ class CalibrationProblem:
         Its Jacobians are taken by differences of compiled rollouts: a derivative of its own would be compiled for it.
         """
         coordinates = ("_unconstrained", "_constrained", "_log_prior", "prior_derivatives")
-        for shared in ("_rows", "_white", "_positions", "_observations", "actions", *coordinates):
+        for shared in ("_rows", "_white", "_positions", "_features", "_observations", "actions", *coordinates):
             getattr(self, shared)  # made before the copy, so that all copies have the same compiled functions
         other = copy.copy(self)
         for derived in ("fingerprint", "observed"):
@@ -257,6 +282,21 @@ class CalibrationProblem:
             return observation.position, observation.object_pose, jnp.max(observation.status)
 
         return jax.jit(jax.vmap(positions, in_axes=(0, None)))
+
+    @cached_property
+    def _features(self) -> Callable:
+        def features(values: Mapping[str, Array], steps: Int[Array, ""]) -> tuple[Array, Array]:
+            observation = self.model.simulate(values, steps)
+            position = observation.position
+            found = position.reshape(*position.shape[:2], -1)
+            if self.model.object_pose is not None:
+                names = self.model.recordings.names
+                offset = jnp.stack([offset_of(self.model.rollout_values(values, name)) for name in names])
+                poses = object_features(observation.object_pose)
+                found = jnp.concatenate([found, poses.at[..., :3].add(offset[:, None])], axis=-1)
+            return found, jnp.max(observation.status)
+
+        return jax.jit(jax.vmap(features, in_axes=(0, None)))
 
     @cached_property
     def _observations(self) -> Callable:

@@ -23,6 +23,9 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 OFFSETS = ("offset_x", "offset_y", "offset_z")
 """Parameters that shift what is measured against what is simulated [m]."""
 
+LEVER = 0.02
+"""[m] A turn counts among features as the way of points so far from the centre."""
+
 OBJECT_NOISE = ParameterSpec(
     "object_noise",
     "m",
@@ -152,17 +155,38 @@ def object_log_density(
 def draw_object_error(
     key: PRNGKeyArray, pose: Float[Array, "time 7"], time: Float[Array, " time"], values: Mapping[str, Any]
 ) -> Float[Array, "time 7"]:
-    """A body's poses with a realisation of the noise of centre and turn, of which there is none in the first row.
+    """A body's poses with a realisation of the noise of centre and turn, of which there is none in the first row."""
+    error = _error(key, time, values)
+    half = 0.5 * jnp.linalg.norm(error[:, 1], axis=1, keepdims=True)
+    turn = jnp.concatenate([0.5 * jnp.sinc(half / jnp.pi) * error[:, 1], jnp.cos(half)], axis=1)
+    return jnp.concatenate([pose[:, :3] + error[:, 0], _product(turn, pose[:, 3:])], axis=1)
+
+
+def object_features(pose: Float[Any, "recording time 7"]) -> Float[Array, "recording time 6"]:
+    """Centre [m], and the turn since the start as the way of points at `LEVER` [m]."""
+    pose = jnp.asarray(pose)
+    turn = _turn_since_start(pose[..., 3:])
+    none = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]), turn.shape)
+    return jnp.concatenate([pose[..., :3], LEVER * _turn_between(none, turn)], axis=-1)
+
+
+def draw_feature_error(
+    key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
+) -> Float[Array, "time 6"]:
+    """Noise of `object_features` [m], for turns much smaller than one."""
+    error = _error(key, time, values)
+    return jnp.concatenate([error[:, 0], LEVER * error[:, 1]], axis=1)
+
+
+def _error(key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]) -> Float[Array, "time 2 3"]:
+    """Noise of centre [m] and turn [rad].
 
     An Ornstein-Uhlenbeck process less its decaying start is the same process conditioned on starting at zero.
     """
     tau = values[OBJECT_CORRELATION_TIME.name]
     sizes = jnp.stack([values[OBJECT_NOISE.name], values[OBJECT_TURN_NOISE.name]])
     error = sizes[:, None] * draw_noise(key, time, 2, jnp.ones(()), tau)
-    error -= jnp.exp(-(time - time[0]) / tau)[:, None, None] * error[0]
-    half = 0.5 * jnp.linalg.norm(error[:, 1], axis=1, keepdims=True)
-    turn = jnp.concatenate([0.5 * jnp.sinc(half / jnp.pi) * error[:, 1], jnp.cos(half)], axis=1)
-    return jnp.concatenate([pose[:, :3] + error[:, 0], _product(turn, pose[:, 3:])], axis=1)
+    return error - jnp.exp(-(time - time[0]) / tau)[:, None, None] * error[0]
 
 
 def _turn_since_start(q: Float[Array, "recording time 4"]) -> Float[Array, "recording time 4"]:

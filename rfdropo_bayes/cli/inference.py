@@ -45,15 +45,17 @@ def table1(
     actions: Annotated[int, typer.Option(help="length of a recording, in actions of 50 ms")] = 100,
     seed: Annotated[int, typer.Option(help="of everything")] = 0,
     rows: Annotated[list[str] | None, typer.Option("--row", help="only this row; may be repeated")] = None,
+    tasks: Annotated[list[str] | None, typer.Option("--task", help="only this task; may be repeated")] = None,
     resume: Annotated[bool, typer.Option(help="keep the fits that an interrupted run has done")] = False,
     cluster: Annotated[str | None, typer.Option(help="local, or HOST:PORT of a Dask scheduler")] = None,
 ) -> None:
     """The paper's Table I, with baselines, rivals and off-centre truths: table1.json, table1.md, table1.png."""
-    from rfdropo_bayes.workflow.table1 import ROWS, Size, run_table1
+    from rfdropo_bayes.workflow.table1 import ROWS, TASKS, Size, run_table1
 
     size = Size(truths, rival_truths, budget, actions, seed, repeats)
     words = " ".join(["rfdropo", *sys.argv[1:]])
-    content = run_table1(out, size, rows=rows or tuple(ROWS), resume=resume, cluster=cluster, command=words)
+    chosen = {"rows": rows or tuple(ROWS), "tasks": tasks or tuple(TASKS)}
+    content = run_table1(out, size, **chosen, resume=resume, cluster=cluster, command=words)
     for claim in content["claims"]:
         typer.echo(f"{'holds' if claim['holds'] else 'FAILS'}: {claim['task']}, {claim['claim']}: {claim['value']:.3g}")
     typer.echo(f"table: {out / 'table1.md'}")

@@ -206,7 +206,8 @@ class PushSimulator(RobotSimulator):
         centre = jnp.stack(
             jnp.broadcast_arrays(*(jnp.asarray(p - o) for p, o in zip(pose[:3], offset, strict=True))), -1
         )
-        height = push_table(self.robot).plate_height_m + 0.5 * jnp.asarray(known["cube_side"])
+        table = push_table(self.robot)
+        height = table.plate_height_m + table.contact_distance_m + 0.5 * jnp.asarray(known["cube_side"])
         centre = centre + (height - centre @ normal)[..., None] * normal
         yaw = 2.0 * jnp.arctan2(jnp.asarray(pose[3:6]) @ normal, pose[6])
         yaw = jnp.broadcast_to((yaw + jnp.pi) % (2.0 * jnp.pi) - jnp.pi, centre.shape[:-1])

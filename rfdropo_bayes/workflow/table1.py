@@ -15,10 +15,11 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.rivals import import_sbi
 from rfdropo_bayes.report.facts import software_versions
-from rfdropo_bayes.workflow.comparison import RIVALS, ROWS, TASKS, fit
+from rfdropo_bayes.workflow.comparison import RIVALS, ROWS, fit
 from rfdropo_bayes.workflow.files import output_folder
 from rfdropo_bayes.workflow.fits import run_fits
 from rfdropo_bayes.workflow.table1_figure import draw_figure
+from rfdropo_bayes.workflow.tasks import TASKS
 
 PAPER = {  # mean squared error and its deviation, Table I
     "TrunkReach": {"BayesSim": (16.60, 0.30), "NPDR": (8.38, 3.22), "RF-DROPO": (1.70, 1.93)},
@@ -28,10 +29,19 @@ NEEDS_SBI = ("BayesSim", "NPDR")
 OWN = ("ours", "ours + tension")
 TRUTHS = ("paper", "off-centre")
 HEADINGS = (
-    *("row", "fits", "MSE", "E / mass [%]", "Poisson [%]", "90 % coverage"),
+    *("row", "fits", "MSE", "MSE, told", "E / mass [%]", "Poisson [%]", "90 % coverage"),
     *("log score", "held out [mm]", "rollouts", "s"),
 )
-FIGURES = ("mse", "ratio_error_percent", "poisson_error_percent", "log_score", "held_out_mm", "rollouts", "seconds")
+FIGURES = (
+    "mse",
+    "mse_excited",
+    "ratio_error_percent",
+    "poisson_error_percent",
+    "log_score",
+    "held_out_mm",
+    "rollouts",
+    "seconds",
+)
 
 
 @dataclass(frozen=True)
@@ -65,6 +75,7 @@ def run_table1(
     size: Size,
     *,
     rows: Sequence[str] = tuple(ROWS),
+    tasks: Sequence[str] = tuple(TASKS),
     resume: bool = False,
     cluster: str | None = None,
     command: str = "",
@@ -72,14 +83,15 @@ def run_table1(
     """Do all fits and write ``table1.json``, ``table1.md`` and ``table1.png``; fits.jsonl keeps each fit as it ends.
 
     Raises:
-        InputError: an unknown row, or a folder that cannot be written.
+        InputError: an unknown row or task, or a folder that cannot be written.
     """
-    for row in rows:
-        if row not in ROWS:
-            raise InputError(f"unknown row {row!r}", where="--rows", remedy=f"some of {', '.join(ROWS)}")
+    for kind, given, known in (("row", rows, ROWS), ("task", tasks, TASKS)):
+        for name in given:
+            if name not in known:
+                raise InputError(f"unknown {kind} {name!r}", where=f"--{kind}", remedy=f"some of {', '.join(known)}")
     out = output_folder(out)
     left_out = _without_sbi(rows)
-    jobs = list_jobs(size, [row for row in rows if row not in left_out])
+    jobs = list_jobs(size, [row for row in rows if row not in left_out], tasks)
     with Progress("table1", show=None, log=out / "log.jsonl") as progress:
         found = run_fits(jobs, fit, out / "fits.jsonl", resume=resume, cluster=cluster, progress=progress)
     content = {
@@ -98,13 +110,13 @@ def run_table1(
     return content
 
 
-def list_jobs(size: Size, rows: Sequence[str]) -> list[dict[str, Any]]:
+def list_jobs(size: Size, rows: Sequence[str], tasks: Sequence[str] = tuple(TASKS)) -> list[dict[str, Any]]:
     """Every fit; rows share their truths and data, so that they can be compared in pairs. Cheap rounds come first."""
     shared = {"budget": size.budget, "actions": size.actions, "seed": size.seed}
     jobs = []
     for index in range(max(size.truths, size.rival_truths)):
         for truths in TRUTHS:
-            for task in TASKS:
+            for task in tasks:
                 own = size.truths if truths == "off-centre" else min(size.truths, size.repeats)
                 chosen = [row for row in rows if index < (own if row in OWN else size.rival_truths)]
                 jobs += [{"task": task, "row": row, "truths": truths, "index": index, **shared} for row in chosen]
@@ -134,7 +146,7 @@ def summarise(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                     continue
                 cell: dict[str, Any] = {"task": task, "truths": truths, "row": row, "fits": len(done)}
                 cell["failed"] = [r["failed"] for r in members if "failed" in r]
-                cell |= {figure: _moments([r[figure] for r in done]) for figure in FIGURES}
+                cell |= {figure: _moments([r.get(figure) for r in done]) for figure in FIGURES}
                 # A point has no interval to cover anything with.
                 inside = [hit for r in done for hit in r["inside_90"]] if row != "mid-range" else []
                 cell["coverage_90"] = float(np.mean(inside)) if inside else None
@@ -165,8 +177,9 @@ def claims(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             share = float(np.mean([hit for r in plain for hit in r["inside_90"]]))
             checked.append(_claim(task, "90 % intervals hold 85 to 95 % of the truths", share, 0.85 <= share <= 0.95))
         if tension:
-            value = float(np.mean([r["mse"] for r in tension]))
-            checked.append(_claim(task, "the paper's error at most 0.05 with tension", value, value <= 0.05))
+            value = float(np.mean([r.get("mse_excited", r["mse"]) for r in tension]))
+            words = "the paper's error of what the motion tells at most 0.05 with tension"
+            checked.append(_claim(task, words, value, value <= 0.05))
         for rival in RIVALS:
             excess = _paired(plain, at(rival))
             if excess is not None:
@@ -207,8 +220,9 @@ def as_markdown(content: Mapping[str, Any]) -> str:
         f"Recordings of {size['actions']} actions; at most {size['budget']} rollouts per posterior. Our rows: "
         f"{size['truths']} truths off the centre, {min(size['truths'], size['repeats'])} data sets at the truth of the "
         f"paper; the others {size['rival_truths']} of each. Mean ± standard deviation. "
-        "MSE: the paper's, in ranges scaled to [0, 4]. Held out: tip error of the mean prediction under commands that "
-        "no fit saw.",
+        "MSE: the paper's, in ranges scaled to [0, 4]; told: of the parameters that the motion tells of, which are "
+        "those of a cube only where it is pushed by 5 mm. Held out: tip error of the mean prediction under commands "
+        "that no fit saw.",
         "",
     ]
     for task in dict.fromkeys(cell["task"] for cell in content["cells"]):
@@ -245,5 +259,5 @@ def _row(cell: Mapping[str, Any]) -> str:
         return f"{entry['mean']:.3g}{spread}"
 
     coverage = "-" if cell["coverage_90"] is None else f"{100 * cell['coverage_90']:.0f} %"
-    figures = [moments(figure) for figure in FIGURES[:3]] + [coverage] + [moments(figure) for figure in FIGURES[3:]]
+    figures = [moments(figure) for figure in FIGURES[:4]] + [coverage] + [moments(figure) for figure in FIGURES[4:]]
     return f"| {cell['row']} | {cell['fits']} | " + " | ".join(figures) + " |"

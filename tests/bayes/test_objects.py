@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
 from rfdropo_bayes.bayes.noise import Timeline, noise_specs, timeline
-from rfdropo_bayes.bayes.objects import draw_object_error, gather_objects, object_specs
+from rfdropo_bayes.bayes.objects import LEVER, draw_object_error, gather_objects, object_specs
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory
@@ -176,3 +176,26 @@ def test_what_is_lacking_is_said():
         gather_objects(Finger(), [recording(pose=False)], 30)
     with pytest.raises(InputError, match="no body whose pose"):
         gather_objects(object(), [recording()], 30)
+
+
+def test_methods_that_compare_rollouts_see_the_way_and_the_turn_of_the_body():
+    """Columns are those of the tip, of the centre and of the turn; noise has the sizes and the start of the model's."""
+    chosen = problem(recording(), lost=(7,))
+    values = {name: jnp.full(4000, value) for name, value in TRUTH.items()}
+    clean, status = chosen.rollouts({name: column[:1] for name, column in values.items()}, 30)
+    assert clean.shape == (1, 30, 9)
+    assert not status.any()
+    way = TRUTH["reach"] * np.clip(np.maximum(STEP * np.arange(30) - STEP, 0.0), 0.0, 1.5)
+    pushed = TRUTH["slip"] * way
+    np.testing.assert_allclose(clean[0, :, 3], START[0] + pushed, atol=1e-9)
+    np.testing.assert_allclose(clean[0, :, 7], LEVER * 2.0 * np.sin(2.5 * pushed), atol=1e-9)
+    np.testing.assert_allclose(chosen.observed[:, 3:], clean[0, :, 3:], atol=1e-9)  # the body was read without noise
+    assert not chosen.observed_mask[7, 3:].any()
+    assert chosen.observed_mask[8].all()
+    noise = chosen.noisy_rollouts(jax.random.key(0), values)[0] - clean
+    assert not noise[:, 0, 3:].any()
+    # 4000 draws know a deviation to 1.1 %: 5 times that.
+    decayed = np.sqrt(1.0 - np.exp(-2.0 * 2.9 / 0.5))
+    np.testing.assert_allclose(noise[:, 29, 3:6].std(axis=0), 2e-3 * decayed, rtol=0.056)
+    np.testing.assert_allclose(noise[:, 29, 6:].std(axis=0), LEVER * 0.05 * decayed, rtol=0.056)
+    np.testing.assert_allclose(noise[:, 29, :3].std(axis=0), 1e-3, rtol=0.056)

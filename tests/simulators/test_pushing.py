@@ -270,3 +270,11 @@ def test_the_engine_is_the_one_that_was_asked_for(trunk):
 def test_a_robot_without_a_cube_is_refused():
     with pytest.raises(InputError, match="no cube to push"):
         push_table(load_robot("smooth_arm"))
+
+
+def test_a_cube_that_was_measured_stands_on_the_plate(pushing):
+    """At the distance that surfaces keep, wherever the measured height is: else the first step throws it up."""
+    placed = pushing.with_object_at({}, np.array([0.01, -0.03, 0.12, 0.0, 0.0, 0.0, 1.0]))
+    assert float(placed["cube_x"]) == pytest.approx(0.01)
+    assert float(placed["cube_y"]) == pytest.approx(REST_HEIGHT)
+    assert float(placed["cube_z"]) == pytest.approx(0.12)
