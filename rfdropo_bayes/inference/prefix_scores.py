@@ -77,7 +77,7 @@ def _affordable(
     share = 0.5 * budget * problem.n_rows / sum(horizons)  # rollouts of a prefix, climb and draws each
     d, k = len(noise), int(noise.sum())
     step = 4.0 * d + 7.0  # a Jacobian by differences, noise coordinates, six dampings
-    around = step + 4.0 * k**2  # the normal approximation at the end
+    around = 3.0 * step + 8.0 * k**2  # the normal approximation at the end, twice: the second along its own axes
     return min(MOST_STEPS, int((share - around) / step)), min(MOST_DRAWS, int(share))
 
 
