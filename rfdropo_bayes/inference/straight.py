@@ -8,6 +8,8 @@ price is a wall at each bound: there is no density beyond it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -85,12 +87,15 @@ class StraightProblem:
 
     def _own_and_slope(self, v: Float[Any, "n d"]) -> tuple[Float[Any, "n d"], Float[Any, "n d"]]:
         """The problem's own coordinates, and the derivative of each by the one here."""
+        return padded(self._compiled, v)
 
+    @cached_property
+    def _compiled(self) -> Callable:
         def own(v: Array) -> Array:
             return jnp.asarray(self.problem.to_unconstrained(self.from_unconstrained(v)))
 
-        def both(v: np.ndarray) -> tuple[Array, Array]:
-            value, slope = jax.jvp(own, (jnp.asarray(v),), (jnp.ones_like(v),))
+        def both(v: Array) -> tuple[Array, Array]:
+            value, slope = jax.jvp(own, (v,), (jnp.ones_like(v),))
             return value, jnp.abs(slope)
 
-        return padded(both, v)
+        return jax.jit(both)
