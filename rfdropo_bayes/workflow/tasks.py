@@ -157,7 +157,7 @@ def _commands(task: str, actions: int, held_out: bool, seed: int) -> Commands:
     middle = {name: jnp.array([0.5 * sum(ends)]) for name, ends in chosen.ranges.items()}
     noise = {"observation_noise": POSITION_NOISE, "noise_correlation_time": CORRELATION_TIME}
     seen = problem.observe(middle | {name: jnp.array([size]) for name, size in noise.items()})
-    return walks[int(np.argmax(_ways(np.asarray(seen.object_pose))[0]))]
+    return walks[int(np.argmax(np.nan_to_num(_ways(np.asarray(seen.object_pose))[0])))]
 
 
 def _ways(pose: Float[np.ndarray, "n recording time 7"]) -> Float[np.ndarray, "n recording"]:
