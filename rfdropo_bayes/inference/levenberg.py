@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 NOISE_GRID = 13  # values of a noise coordinate tried at the start of a climb
-AXIS, LONGEST = 0.5, 0.25  # step along an axis of a posterior, in its deviations, and at most in any coordinate
-ROUNDS = 4  # of differences along axes that get better
+AXIS, LONGEST = 0.5, 0.05  # step along an axis of a posterior, in its deviations, and at most in any coordinate
+NOISE_STEP = 1e-2  # of a noise coordinate, along which residuals only change their scale
+ROUNDS = 3  # of differences along axes that get better
 SAME = 0.05  # nats between two normal distributions that are taken for one
 
 
@@ -169,7 +170,7 @@ def laplace(target: Climbable, state: LevenbergState) -> Laplace:
     """Normal approximation at a mode; where derivatives are differences, the last of them are along its own axes."""
     found = _normal(target, state)
     for _ in range(ROUNDS):
-        nearer = target.along(_axes(found.covariance))
+        nearer = target.along(_axes(found.covariance, target.noise))
         if nearer is None:
             break
         moved, _ = step(nearer, state._replace(position=found.mean, log_density=found.log_density), SAME**2)
@@ -181,18 +182,20 @@ def laplace(target: Climbable, state: LevenbergState) -> Laplace:
 
 def _normal(target: Climbable, state: LevenbergState) -> Laplace:
     u = state.position
-    information = target.information(u)
+    information = positive_part(target.information(u))
     values, vectors = np.linalg.eigh(information + positive_part(-target.prior_hessian(u)))
     values = np.maximum(values, 1e-12 * values[-1])
     covariance = (vectors / values) @ vectors.T
     return Laplace(u, covariance, state.log_density, information, -target.prior_gradient(u))
 
 
-def _axes(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
-    """Steps to take differences over, one per column."""
-    values, vectors = np.linalg.eigh(covariance)
+def _axes(covariance: Float[np.ndarray, "d d"], noise: Bool[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
+    """Steps to take differences over, one per column; those of noise coordinates are along themselves."""
+    axes, physical = NOISE_STEP * np.eye(len(covariance)), np.flatnonzero(~noise)
+    values, vectors = np.linalg.eigh(covariance[np.ix_(physical, physical)])
     steps = AXIS * vectors * np.sqrt(values)
-    return steps * np.minimum(1.0, LONGEST / np.abs(steps).max(axis=0))
+    axes[np.ix_(physical, physical)] = steps * np.minimum(1.0, LONGEST / np.abs(steps).max(axis=0))
+    return axes
 
 
 def divergence(first: Laplace, second: Laplace) -> float:
