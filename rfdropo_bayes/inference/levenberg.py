@@ -192,9 +192,10 @@ def _normal(target: Climbable, state: LevenbergState) -> Laplace:
 def _axes(covariance: Float[np.ndarray, "d d"], noise: Bool[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
     """Steps to take differences over, one per column; those of noise coordinates are along themselves."""
     axes, physical = NOISE_STEP * np.eye(len(covariance)), np.flatnonzero(~noise)
-    values, vectors = np.linalg.eigh(covariance[np.ix_(physical, physical)])
-    steps = AXIS * vectors * np.sqrt(values)
-    axes[np.ix_(physical, physical)] = steps * np.minimum(1.0, LONGEST / np.abs(steps).max(axis=0))
+    if len(physical):
+        values, vectors = np.linalg.eigh(covariance[np.ix_(physical, physical)])
+        steps = AXIS * vectors * np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+        axes[np.ix_(physical, physical)] = steps * np.minimum(1.0, LONGEST / np.abs(steps).max(axis=0))
     return axes
 
 
