@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -53,7 +54,7 @@ def table1(
     from rfdropo_bayes.workflow.table1 import ROWS, TASKS, Size, run_table1
 
     size = Size(truths, rival_truths, budget, actions, seed, repeats)
-    words = " ".join(["rfdropo", *sys.argv[1:]])
+    words = shlex.join(["rfdropo", *sys.argv[1:]])
     chosen = {"rows": rows or tuple(ROWS), "tasks": tasks or tuple(TASKS)}
     content = run_table1(out, size, **chosen, resume=resume, cluster=cluster, command=words)
     for claim in content["claims"]:

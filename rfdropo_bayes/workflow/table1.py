@@ -93,7 +93,9 @@ def run_table1(
     left_out = _without_sbi(rows)
     jobs = list_jobs(size, [row for row in rows if row not in left_out], tasks)
     with Progress("table1", show=None, log=out / "log.jsonl") as progress:
-        found = run_fits(jobs, fit, out / "fits.jsonl", resume=resume, cluster=cluster, progress=progress)
+        done = run_fits(jobs, fit, out / "fits.jsonl", resume=resume, cluster=cluster, progress=progress)
+    # Ledgers older than this figure have no cube: their motion tells of all parameters.
+    found = [{"mse_excited": result.get("mse"), **result} for result in done]
     content = {
         "schema_version": 1,
         "command": command,
@@ -177,7 +179,7 @@ def claims(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             share = float(np.mean([hit for r in plain for hit in r["inside_90"]]))
             checked.append(_claim(task, "90 % intervals hold 85 to 95 % of the truths", share, 0.85 <= share <= 0.95))
         if tension:
-            value = float(np.mean([r.get("mse_excited", r["mse"]) for r in tension]))
+            value = float(np.mean([r["mse_excited"] for r in tension]))
             words = "the paper's error of what the motion tells at most 0.05 with tension"
             checked.append(_claim(task, words, value, value <= 0.05))
         for rival in RIVALS:
