@@ -8,7 +8,10 @@ from typing import Any
 
 import matplotlib
 
-PANELS = (("mse", "MSE of the parameters (ranges scaled to [0, 4])"), ("held_out_mm", "held-out tip error [mm]"))
+PANELS = (
+    ("mse_excited", "MSE of what the motion tells (ranges scaled to [0, 4])"),
+    ("held_out_mm", "held-out tip error [mm]"),
+)
 COLOURS = {"paper": "#4c72b0", "off-centre": "#dd8452"}
 
 
