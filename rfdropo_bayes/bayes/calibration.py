@@ -168,7 +168,8 @@ class CalibrationProblem:
         noise = self.draw_noise(key, values)
         noise = noise.reshape(*noise.shape[:3], -1)
         if self.model.object_pose is not None:
-            noise = np.concatenate([noise, self._object_noise(jax.random.fold_in(key, 1), values)], axis=-1)
+            poses = self._realised(self._pose_noise, jax.random.fold_in(key, 1), values)
+            noise = np.concatenate([noise, poses], axis=-1)
         return clean + self._side_by_side(noise), status
 
     @cached_property
@@ -200,18 +201,6 @@ class CalibrationProblem:
 
     def _side_by_side(self, features: Shaped[Any, "n recording time f"]) -> Shaped[np.ndarray, "n time recording*f"]:
         return np.moveaxis(np.asarray(features), 1, 2).reshape(len(features), features.shape[2], -1)
-
-    def _object_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time 6"]:
-        """A realisation of the noise of `object_features` [m] for every set of values."""
-
-        def noise(key: PRNGKeyArray, values: Mapping[str, Array]) -> Array:
-            keys = jax.random.split(key, self.n_recordings)
-            known = {**self.model.fixed, **values}
-            return jax.vmap(lambda k, t: draw_feature_error(k, t, known))(keys, self.model.recordings.time)
-
-        inferred = {name: jnp.asarray(values[name]) for name in self.names}
-        count = len(next(iter(inferred.values())))
-        return np.asarray(jax.vmap(noise)(jax.random.split(key, count), inferred))
 
     def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " residual"]:
         """Whitened residuals of the first ``horizon`` rows (zero where masked); traceable, for one set of values."""
@@ -255,17 +244,29 @@ class CalibrationProblem:
 
     def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
         """A realisation of the observation noise [m] for every set of values."""
-        time = self.model.recordings.time
-        markers = self.model.recordings.position.shape[2]
+        return self._realised(self._marker_noise, key, values)
 
-        def noise(key: PRNGKeyArray, values: Mapping[str, Array]) -> Array:
-            sigma, tau = self.model.noise_of(values)
+    def _marker_noise(
+        self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
+    ) -> Float[Array, "time marker 3"]:
+        sigma, tau = self.model.noise_of(values)
+        return draw_noise(key, time, self.model.recordings.position.shape[2], sigma, tau)
+
+    def _pose_noise(
+        self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
+    ) -> Float[Array, "time 6"]:
+        return draw_feature_error(key, time, {**self.model.fixed, **values})
+
+    def _realised(self, draw: Callable, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time ..."]:
+        """What ``draw`` makes of a key, the times of a recording and a set of values, for all of both."""
+
+        def of_all(key: PRNGKeyArray, values: Mapping[str, Array]) -> Array:
             keys = jax.random.split(key, self.n_recordings)
-            return jax.vmap(lambda k, t: draw_noise(k, t, markers, sigma, tau))(keys, time)
+            return jax.vmap(lambda k, t: draw(k, t, values))(keys, self.model.recordings.time)
 
         inferred = {name: jnp.asarray(values[name]) for name in self.names}
         count = len(next(iter(inferred.values())))
-        return np.asarray(jax.vmap(noise)(jax.random.split(key, count), inferred))
+        return np.asarray(jax.vmap(of_all)(jax.random.split(key, count), inferred))
 
     @cached_property
     def _rows(self) -> Callable:

@@ -48,6 +48,7 @@ def table1(
     rows: Annotated[list[str] | None, typer.Option("--row", help="only this row; may be repeated")] = None,
     tasks: Annotated[list[str] | None, typer.Option("--task", help="only this task; may be repeated")] = None,
     resume: Annotated[bool, typer.Option(help="keep the fits that an interrupted run has done")] = False,
+    only_done: Annotated[bool, typer.Option(help="tables of the fits that an interrupted run has done")] = False,
     cluster: Annotated[str | None, typer.Option(help="local, or HOST:PORT of a Dask scheduler")] = None,
 ) -> None:
     """The paper's Table I, with baselines, rivals and off-centre truths: table1.json, table1.md, table1.png."""
@@ -55,8 +56,16 @@ def table1(
 
     size = Size(truths, rival_truths, budget, actions, seed, repeats)
     words = shlex.join(["rfdropo", *sys.argv[1:]])
-    chosen = {"rows": rows or tuple(ROWS), "tasks": tasks or tuple(TASKS)}
-    content = run_table1(out, size, **chosen, resume=resume, cluster=cluster, command=words)
+    content = run_table1(
+        out,
+        size,
+        rows=rows or tuple(ROWS),
+        tasks=tasks or tuple(TASKS),
+        resume=resume,
+        cluster=cluster,
+        only_done=only_done,
+        command=words,
+    )
     for claim in content["claims"]:
         typer.echo(f"{'holds' if claim['holds'] else 'FAILS'}: {claim['task']}, {claim['claim']}: {claim['value']:.3g}")
     typer.echo(f"table: {out / 'table1.md'}")

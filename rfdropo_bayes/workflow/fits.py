@@ -52,6 +52,12 @@ def run_fits(
     return [{**job, **known[_name(job)][1]} for job in jobs]
 
 
+def finished(jobs: Sequence[Job], log: Path) -> list[dict[str, Any]]:
+    """Results of the jobs that the log holds, as `run_fits` returns them; nothing is done."""
+    known = _read(log)
+    return [{**job, **known[_name(job)][1]} for job in jobs if _name(job) in known]
+
+
 def _results(
     jobs: Sequence[Job], fit: Callable[[Job], dict[str, Any]], cluster: str | None
 ) -> Iterator[tuple[Job, dict[str, Any]]]:

@@ -27,6 +27,13 @@ CENTRAL = 0.5  # share of each range that off-centre truths stay out of
 WALKS = 32  # random walks of which a task with a cube takes the one that pushes it farthest
 PUSHED = 0.005  # m that a cube must move to tell of its mass and friction
 
+NOISE = {
+    "observation_noise": POSITION_NOISE,
+    "noise_correlation_time": CORRELATION_TIME,
+    "tension_noise": TENSION_NOISE,
+}
+"""Values of the noise parameters that data are simulated with."""
+
 Commands = tuple[Float[np.ndarray, " command"], Float[np.ndarray, "command channel"]]
 
 
@@ -90,12 +97,7 @@ def draw_truth(task: Task, kind: str, names: tuple[str, ...], rng: np.random.Gen
         for name, (low, high) in task.ranges.items():
             side, place = rng.integers(2), rng.uniform(0.0, 0.5 * (1.0 - CENTRAL))
             chosen[name] = low + (high - low) * (1.0 - place if side else place)
-    noise = {
-        "observation_noise": POSITION_NOISE,
-        "noise_correlation_time": CORRELATION_TIME,
-        "tension_noise": TENSION_NOISE,
-    }
-    return {name: float({**chosen, **noise}[name]) for name in names}
+    return {name: float({**chosen, **NOISE}[name]) for name in names}
 
 
 def excited(task: Task, problem: CalibrationProblem, truth: Mapping[str, float]) -> tuple[str, ...]:
@@ -154,9 +156,8 @@ def _commands(task: str, actions: int, held_out: bool, seed: int) -> Commands:
     simulator = build_simulator(experiment, load_robot(chosen.robot))
     recordings = [_blank(simulator, walk, actions, False, f"walk_{i}") for i, walk in enumerate(walks)]
     problem = build_problem(build_model(experiment, simulator, recordings))
-    middle = {name: jnp.array([0.5 * sum(ends)]) for name, ends in chosen.ranges.items()}
-    noise = {"observation_noise": POSITION_NOISE, "noise_correlation_time": CORRELATION_TIME}
-    seen = problem.observe(middle | {name: jnp.array([size]) for name, size in noise.items()})
+    middle = {name: 0.5 * sum(ends) for name, ends in chosen.ranges.items()} | NOISE
+    seen = problem.observe({name: jnp.array([middle[name]]) for name in problem.names})
     return walks[int(np.argmax(np.nan_to_num(_ways(np.asarray(seen.object_pose))[0])))]
 
 

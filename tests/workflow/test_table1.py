@@ -155,6 +155,7 @@ def test_cells_claims_and_the_table_follow_from_the_fits(tmp_path):
         "cells": cells,
         "claims": checked,
         "left_out": {},
+        "not_done": 0,
         "paper": table1.PAPER,
     }
     text = as_markdown(content)
@@ -169,6 +170,12 @@ def test_a_run_writes_its_files(tmp_path, monkeypatch):
     assert {cell["row"] for cell in content["cells"]} == {"prior", "ours"}
     assert (tmp_path / "table1.png").stat().st_size > 5000
     assert "rfdropo benchmark table1" in (tmp_path / "table1.md").read_text()
+    assert content["not_done"] == 0
+    monkeypatch.setattr(table1, "fit", None)  # nothing is done where only what is done is wanted
+    partly = run_table1(tmp_path, Size(2, 1), rows=["prior", "ours"], only_done=True)
+    assert partly["not_done"] == 4  # ours, of the second truth and data set of two tasks
+    assert partly["cells"] == content["cells"]
+    assert "4 fits that were not done" in (tmp_path / "table1.md").read_text()
     with pytest.raises(InputError, match="unknown row"):
         run_table1(tmp_path, Size(1, 1), rows=["theirs"])
     with pytest.raises(InputError, match="unknown task"):
