@@ -11,6 +11,7 @@ PIP     = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-
 PYTEST  = $(BIN)/python -m pytest
 CORE    = $(VENV)/core.stamp
 DEV     = $(VENV)/dev.stamp
+ALL     = $(VENV)/all.stamp
 
 # Two BLAS threads that fight over small blocks make a solve fifty times slower.
 export OPENBLAS_NUM_THREADS = 1
@@ -28,7 +29,7 @@ demo: $(CORE) ## calibrate the bundled example and write its report (minutes)
 test: $(DEV) ## the tests that are not slow
 	$(PYTEST) -n $(WORKERS) -m "not slow and not notebook"
 
-test-all: $(DEV) ## every test, the slow ones and the notebooks too
+test-all: $(ALL) ## every test, the slow ones, the notebooks and those of optional packages too
 	$(PYTEST) -n $(WORKERS)
 
 lint: $(DEV) ## ruff, its formatter, and mypy
@@ -68,3 +69,8 @@ $(CORE): pyproject.toml constraints.txt | $(BIN)/python
 $(DEV): pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) --editable '.[dev]'
 	@touch $(CORE) $@
+
+# Apart from what `make test` needs: PyTorch is large.
+$(ALL): pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) --editable '.[dev,sbi,cluster]'
+	@touch $(CORE) $(DEV) $@

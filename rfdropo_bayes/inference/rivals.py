@@ -115,6 +115,10 @@ class StandardPrior:
         u = np.asarray(problem.to_unconstrained(problem.sample_prior(key, 2000)), dtype=float)
         self.mean, self.sd = u.mean(axis=0), u.std(axis=0)
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> StandardPrior:
+        """Itself: ``sbi`` copies what a round proposes from, and a problem's compiled functions cannot be copied."""
+        return self
+
     def sample(self, sample_shape: Any = ()) -> Any:
         """Draws, as a tensor of single precision."""
         import torch

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import importlib.util
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,10 @@ class LinearRollouts(LinearGaussian):
     """The linear model seen as trajectories of one feature."""
 
     observed_mask = np.ones((12, 1), dtype=bool)
+
+    def __init__(self):
+        super().__init__()
+        self.compiled = threading.local()  # cannot be copied, as the functions of a compiled simulator cannot
 
     @property
     def observed(self):
