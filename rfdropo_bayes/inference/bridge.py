@@ -25,7 +25,7 @@ from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes, mo
 from rfdropo_bayes.inference.levenberg import Laplace
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.mixture import ModeMixture, covering
-from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, exclusion_warnings, replicate_warnings
+from rfdropo_bayes.inference.result import InferenceResult, exclusion_warnings, prior_warnings, replicate_warnings
 from rfdropo_bayes.inference.straight import StraightProblem
 
 
@@ -169,7 +169,7 @@ def sample_from_modes(
         rollouts=ledger.rollouts + sampled.rollouts,
         evaluations=evaluations,
         excluded=dict(excluded),
-        warnings=[*kept, *bound_warnings(problem, draws), *exclusion_warnings(excluded, evaluations)],
+        warnings=[*kept, *prior_warnings(problem, draws), *exclusion_warnings(excluded, evaluations)],
         seconds=found.climbs.seconds + sampled.seconds,
         optimum=mode_values(problem, found.modes[0]),
         details=sampled.details

@@ -26,9 +26,9 @@ from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.proposals import KERNELS, initial_scale
 from rfdropo_bayes.inference.result import (
     InferenceResult,
-    bound_warnings,
     chains,
     exclusion_warnings,
+    prior_warnings,
     replicate_warnings,
 )
 from rfdropo_bayes.inference.schedules import SPACINGS, block_boundaries
@@ -362,7 +362,7 @@ def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcSta
         evaluations=evaluations,
         excluded=dict(excluded),
         warnings=[
-            *bound_warnings(problem, draws),
+            *prior_warnings(problem, draws),
             *exclusion_warnings(excluded, evaluations),
             *_stage_warnings(trace, config),
             *replicate_warnings(draws, values),

@@ -21,7 +21,7 @@ from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES
 from rfdropo_bayes.inference.levenberg import NOISE_GRID, Climbable, Laplace, LevenbergState, laplace, maximise
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.newton import SmoothTarget, log_likelihood_derivatives
-from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains, exclusion_warnings
+from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_warnings, prior_warnings
 from rfdropo_bayes.inference.schedules import block_boundaries
 from rfdropo_bayes.inference.survey import survey
 
@@ -337,7 +337,7 @@ def run(
         excluded=dict(ledger.excluded),
         warnings=[
             *found.warnings,
-            *bound_warnings(problem, draws),
+            *prior_warnings(problem, draws),
             *exclusion_warnings(ledger.excluded, ledger.evaluations),
         ],
         seconds=found.climbs.seconds,

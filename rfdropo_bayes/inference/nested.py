@@ -21,7 +21,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.nuts import log_densities
-from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains
+from rfdropo_bayes.inference.result import InferenceResult, chains, prior_warnings
 
 SHRINKAGES = 100  # simulated prior volumes behind the evidence's deviation
 EVALUATIONS = 8  # of a slice, roughly: stepping out and shrinking
@@ -93,7 +93,7 @@ def run(
         trace=[{"rollouts": ledger.rollouts, "log_evidence": evidence[0], "steps": len(dead)}],
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
-        warnings=[*short, *bound_warnings(problem, draws)],
+        warnings=[*short, *prior_warnings(problem, draws)],
         seconds=time.monotonic() - began,
         details={"live": config.live, "steps": len(dead), "rollouts_are_estimated": True},
     )

@@ -20,7 +20,7 @@ from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains
+from rfdropo_bayes.inference.result import InferenceResult, chains, prior_warnings
 
 LOWEST = -1e10  # density of a rollout that failed: finite, so that a gradient there is zero and not NaN
 
@@ -125,7 +125,7 @@ def run(
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
-        warnings=[*warnings, *bound_warnings(problem, draws)],
+        warnings=[*warnings, *prior_warnings(problem, draws)],
         seconds=time.monotonic() - began,
         details={"diverging": diverging, "gradients": steps},
     )

@@ -34,8 +34,8 @@ from rfdropo_bayes.inference.numpyro_problem import NumpyroProblem
 from rfdropo_bayes.inference.proposals import fit_reference
 from rfdropo_bayes.inference.result import (
     InferenceResult,
-    bound_warnings,
     exclusion_warnings,
+    prior_warnings,
     replicate_warnings,
 )
 
@@ -166,7 +166,7 @@ def _joined(
         evaluations=evaluations,
         excluded=dict(excluded),
         warnings=[
-            *bound_warnings(problem, draws),
+            *prior_warnings(problem, draws),
             *exclusion_warnings(excluded, evaluations),
             *[sentence for sentence in second.warnings if "last moves" in sentence],
             *replicate_warnings(draws, replicates),

@@ -13,11 +13,11 @@ from jaxtyping import Float
 from scipy.stats import skew
 
 from rfdropo_bayes.bayes.problem import Problem
-from rfdropo_bayes.posteriors import piled_at
+from rfdropo_bayes.posteriors import contradiction, contradicts, piled_at
 
 SCATTERED = 0.5  # nats
 APART = 1.1  # R-hat: the means of replicates scatter by nearly half of the posterior's width
-PRIOR_DRAWS = 1000  # that tell whether a prior is one of logarithms
+PRIOR_DRAWS = 2000  # that tell where a prior is, and whether it is one of logarithms
 
 Draws = dict[str, Float[np.ndarray, "chain draw"]]
 
@@ -67,26 +67,29 @@ def chains(problem: Problem, positions: list[np.ndarray]) -> Draws:
     return {name: np.stack([np.asarray(v[name], dtype=float) for v in values]) for name in problem.names}
 
 
-def bound_warnings(problem: Problem, draws: Draws) -> list[str]:
-    """A sentence for every parameter whose posterior is cut off by a bound at its mode: there the bound decides.
+def prior_warnings(problem: Problem, draws: Draws) -> list[str]:
+    """A sentence for every parameter whose posterior is cut off by a bound at its mode, where the bound decides, and
+    one for those that the data put where the prior hardly is.
 
-    A prior that is more even in logarithms has its posterior compared in logarithms: a scale that ranges over decades
-    has much of a linear range's mass at the lower end.
+    A prior that is more even in logarithms has its posterior compared with a bound in logarithms: a scale that ranges
+    over decades has much of a linear range's mass at the lower end.
     """
-    sentences = []
+    drawn = problem.sample_prior(jax.random.key(0), PRIOR_DRAWS)
+    sentences, apart = [], []
     for name, values in draws.items():
-        values, (low, high) = np.ravel(values), problem.bounds[name]
+        values, (low, high), prior = np.ravel(values), problem.bounds[name], np.asarray(drawn[name], dtype=float)
         side = piled_at(values, low, high)
-        if side and _even_in_logarithms(problem, name):
+        if side and _even_in_logarithms(prior):
             side = piled_at(values, low, high, logarithmic=True)
         if side:
             word, bound = ("lower", low) if side == "low" else ("upper", high)
             sentences.append(f"{name} sits on its {word} bound {bound:g}, which decides there, and not the data")
-    return sentences
+        elif contradicts(values, prior):
+            apart.append(name)
+    return sentences + [contradiction(apart)] * bool(apart)
 
 
-def _even_in_logarithms(problem: Problem, name: str) -> bool:
-    prior = np.asarray(problem.sample_prior(jax.random.key(0), PRIOR_DRAWS)[name], dtype=float)
+def _even_in_logarithms(prior: Float[np.ndarray, " n"]) -> bool:
     return bool(np.all(prior > 0.0) and abs(skew(np.log(prior))) < abs(skew(prior)))
 
 

@@ -29,7 +29,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.proposals import host_generator
-from rfdropo_bayes.inference.result import InferenceResult, bound_warnings, chains, exclusion_warnings
+from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_warnings, prior_warnings
 from rfdropo_bayes.inference.summaries import cross_correlation_summary, informative, thinned_summary
 
 FEWEST_ROLLOUTS = 50
@@ -266,7 +266,7 @@ def _run(
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
         warnings=[
-            *bound_warnings(problem, draws),
+            *prior_warnings(problem, draws),
             *exclusion_warnings(ledger.excluded, ledger.evaluations),
         ],
         seconds=time.monotonic() - began,

@@ -1,6 +1,6 @@
 """Draws and predictions on disk: the one room that knows ArviZ and its version."""
 
-from rfdropo_bayes.posteriors.bounds import piled_at
+from rfdropo_bayes.posteriors.bounds import contradiction, contradicts, piled_at
 from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
 from rfdropo_bayes.posteriors.inference_data import load_posterior, save_posterior, summarise, to_inference_data
 from rfdropo_bayes.posteriors.intervals import central_interval
@@ -12,6 +12,8 @@ __all__ = [
     "ProductOfPowers",
     "RecordingPrediction",
     "central_interval",
+    "contradiction",
+    "contradicts",
     "evaluate_products",
     "load_posterior",
     "piled_at",

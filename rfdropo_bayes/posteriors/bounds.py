@@ -1,10 +1,13 @@
-"""Whether draws are piled up at a bound, however wide the bounds are."""
+"""Whether draws are piled up at a bound, however wide the bounds are, or lie where the prior hardly is."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
+OUTERMOST = 0.005  # of the prior, on either side
 PILED = 0.13  # of a standard deviation, between a half-normal (0.10) and a uniform distribution (0.17)
 
 
@@ -27,3 +30,23 @@ def piled_at(draws: Float[np.ndarray, " n"], low: float, high: float, *, logarit
     if q05 - low <= reach:
         return "low"
     return "high" if high - q95 <= reach else None
+
+
+def contradicts(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"]) -> bool:
+    """Whether the median of a posterior lies in the outermost 1 % of its prior; False if too few draws tell.
+
+    Args:
+        draws: of one parameter's posterior.
+        prior: draws of its prior, some 400 at least.
+    """
+    if len(prior) < 2.0 / OUTERMOST:
+        return False
+    below = float(np.mean(prior < np.median(draws)))
+    return not OUTERMOST <= below <= 1.0 - OUTERMOST
+
+
+def contradiction(names: Sequence[str]) -> str:
+    """The clause about parameters whose posterior `contradicts` the prior."""
+    return (
+        f"the data put {', '.join(names)} into the outermost {200 * OUTERMOST:.0f} % of the prior, which excludes them"
+    )

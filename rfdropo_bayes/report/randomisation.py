@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.posteriors import PosteriorRecord, contradiction, contradicts
 from rfdropo_bayes.report.headline import best_baseline
 
 BAND = "0.9"
@@ -16,7 +16,6 @@ OVERCONFIDENT, VAGUE = 0.8, 0.97  # share of measurements in the 90 % band
 FEW_DRAWS = 100.0  # effective ones
 UNMIXED = 1.1  # R-hat
 LOST = 0.05  # share of rollouts without weight
-OUTERMOST = 0.005  # of the prior, on either side
 SMALLEST_SPREAD = "sits on its smallest value"  # in the warnings of RF-DROPO
 
 WORDS = {
@@ -88,19 +87,9 @@ def _sampling(summary: Mapping[str, Any]) -> list[str]:
 
 def _conflicts(record: PosteriorRecord) -> list[str]:
     """Parameters whose posterior lies where the prior hardly is: the data contradict the prior, or the model."""
-    names = []
-    for info in record.free:
-        prior = record.prior.get(info.name)
-        if prior is None or len(prior) < 2.0 / OUTERMOST:
-            continue
-        below = float(np.mean(prior < np.median(record.flat(info.name))))
-        if not OUTERMOST <= below <= 1.0 - OUTERMOST:
-            names.append(info.name)
-    if not names:
-        return []
-    return [
-        f"the data put {', '.join(names)} into the outermost {200 * OUTERMOST:.0f} % of the prior, which excludes them"
-    ]
+    known = [info.name for info in record.free if info.name in record.prior]
+    names = [name for name in known if contradicts(record.flat(name), record.prior[name])]
+    return [contradiction(names)] if names else []
 
 
 def _reservations(summary: Mapping[str, Any]) -> list[str]:

@@ -158,6 +158,7 @@ def test_a_prior_far_from_the_data_collapses_the_evidence():
     result = horizon_smc.run(far, SmcConfig(particles=300), KEY)
     assert exact < near.prefix_log_evidence()[-1] - 100.0
     assert result.log_evidence[0] == pytest.approx(exact, rel=0.01)
+    assert any(sentence.startswith("the data put x0, x1, x2 into the outermost") for sentence in result.warnings)
 
 
 @pytest.mark.parametrize("budget", [pytest.param(1500.0, marks=pytest.mark.slow), 8000.0])

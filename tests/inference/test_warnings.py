@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.result import bound_warnings, replicate_warnings
+from rfdropo_bayes.inference.result import prior_warnings, replicate_warnings
 
 from .toys import LinearGaussian, Ratio
 
@@ -44,8 +44,15 @@ def log_normal(key, n):
     ],
 )
 def test_only_a_posterior_cut_off_at_its_mode_is_warned_of(prior, bounds, draws, side):
-    sentences = bound_warnings(OneParameter(prior, bounds), {"x0": draws[None]})
-    assert [sentence.split()[4] for sentence in sentences] == ([side] if side else [])
+    sentences = prior_warnings(OneParameter(prior, bounds), {"x0": draws[None]})
+    assert [sentence.split()[4] for sentence in sentences if "bound" in sentence] == ([side] if side else [])
+
+
+@pytest.mark.parametrize(("centre", "excluded"), [(0.5, False), (0.02, False), (1e-4, True), (0.9999, True)])
+def test_a_prior_that_the_data_contradict_is_named(centre, excluded):
+    sentences = prior_warnings(OneParameter(uniform, (-np.inf, np.inf)), {"x0": centre + 1e-5 * GRID[None]})
+    said = "the data put x0 into the outermost 1 % of the prior, which excludes them"
+    assert sentences == [said] * excluded
 
 
 @pytest.mark.slow
