@@ -146,6 +146,18 @@ class StandardPrior:
         return self.mean + self.sd * theta
 
 
+class Untracked:
+    """A tracker for ``sbi`` that keeps nothing; its own would write into a folder ``sbi-logs`` where it is run."""
+
+    log_dir = None
+
+    def log_metric(self, name: str, value: Any, step: int | None = None) -> None:
+        """Keep nothing."""
+
+    def flush(self) -> None:
+        """Write nothing."""
+
+
 def import_sbi() -> tuple[Any, Any]:
     """The packages ``torch`` and ``sbi``.
 
@@ -235,7 +247,8 @@ def _run(
     share = int(config.rollouts // rounds)
     with _apart(torch, seed):
         wrapped, _, _ = sbi.utils.process_prior(prior)
-        trainer = sbi.inference.NPE_C(wrapped, density_estimator=_estimator(sbi, config, len(problem.names)))
+        estimator = _estimator(sbi, config, len(problem.names))
+        trainer = sbi.inference.NPE_C(wrapped, density_estimator=estimator, tracker=Untracked())
         proposal, posterior, scaling = wrapped, None, None
         for index in range(rounds):
             theta = np.asarray(proposal.sample((share,)).detach().numpy(), dtype=float)

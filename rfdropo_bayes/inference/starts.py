@@ -128,7 +128,7 @@ def _with_climbs(result: InferenceResult, found: Modes, way: Way) -> InferenceRe
         evaluations=result.evaluations + ledger.evaluations,
         excluded=dict(Counter(result.excluded) + ledger.excluded),
         seconds=result.seconds + found.climbs.seconds,
-        details=result.details | {"start": "prior", "expected_stages": way.stages, "information": way.information},
+        details=result.details | {"start": "prior", "expected_stages": way.stages, "information_nats": way.information},
     )
 
 
@@ -170,7 +170,7 @@ def _from_optima(
         | {
             "start": "optimum",
             "expected_stages": way.stages,
-            "information": way.information,
+            "information_nats": way.information,
             "prefix_ess": [prefix.ess for prefix in prefixes],
         },
     )

@@ -118,14 +118,16 @@ def posterior_of_every_second_row(problem):
 @pytest.mark.parametrize(
     ("method", "options"), [("bayessim", {"rollouts": 2000}), ("npdr", {"rollouts": 2000, "rounds": 2, "hidden": 40})]
 )
-def test_the_rivals_approach_a_posterior_in_closed_form(method, options):
+def test_the_rivals_approach_a_posterior_in_closed_form(method, options, tmp_path, monkeypatch):
     """NPDR sees every second row; networks of so few simulations are some 1.4 times too wide (measured).
     BayesSim sees only moments of the changes, so that it may be as wide as the prior, but no wider."""
     import torch
 
+    monkeypatch.chdir(tmp_path)
     problem, before = LinearRollouts(), torch.get_rng_state()
     result = methods.run(problem, method, options, KEY)
     assert torch.equal(torch.get_rng_state(), before)  # the caller's random numbers are the caller's
+    assert not list(tmp_path.iterdir())  # and so is the folder
     draws = np.stack([result.draws[name].ravel() for name in problem.names], axis=1)
     assert result.rollouts == 2000
     assert np.isfinite(draws).all()
