@@ -18,7 +18,7 @@ from rfdropo_bayes.bayes.batches import is_batch, padded
 from rfdropo_bayes.bayes.forces import tension_specs
 from rfdropo_bayes.bayes.model import Measured, TrajectoryModel
 from rfdropo_bayes.bayes.noise import draw_noise, noise_specs
-from rfdropo_bayes.bayes.objects import draw_feature_error, object_features, object_specs, offset_of
+from rfdropo_bayes.bayes.objects import draw_feature_error, feature_deviation, object_features, object_specs, offset_of
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
@@ -171,6 +171,16 @@ class CalibrationProblem:
             poses = self._realised(self._pose_noise, jax.random.fold_in(key, 1), values)
             noise = np.concatenate([noise, poses], axis=-1)
         return clean + self._side_by_side(noise), status
+
+    def noise_deviation(self, values: Mapping[str, float]) -> Float[np.ndarray, " feature"]:
+        """Standard deviation of the observation noise [m] of each feature, laid out like `rollouts`, at one set of
+        values."""
+        recordings, _, markers, _ = self.model.recordings.position.shape
+        known = {**self.model.fixed, **values}
+        deviation = np.full(3 * markers, known["observation_noise"])
+        if self.model.object_pose is not None:
+            deviation = np.concatenate([deviation, feature_deviation(known)])
+        return np.tile(deviation, recordings)
 
     @cached_property
     def actions(self) -> Float[np.ndarray, "n_rows channel"]:

@@ -178,6 +178,11 @@ def draw_feature_error(
     return jnp.concatenate([error[:, 0], LEVER * error[:, 1]], axis=1)
 
 
+def feature_deviation(values: Mapping[str, Any]) -> Float[np.ndarray, "6"]:
+    """Standard deviation of the noise of `object_features` [m], long after the start."""
+    return np.repeat([values[OBJECT_NOISE.name], LEVER * values[OBJECT_TURN_NOISE.name]], 3)
+
+
 def _error(key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]) -> Float[Array, "time 2 3"]:
     """Noise of centre [m] and turn [rad].
 

@@ -91,7 +91,8 @@ class RolloutProblem(Problem, Protocol):
     It may also have ``physical_names: tuple[str, ...]``, the parameters that a rollout depends on (all of ``names``
     where it is missing); the others, such as the noise scale, are passed at their prior median. Methods that learn from
     simulations use ``noisy_rollouts(key, values)``, rollouts of all rows with observation noise, and ``actions``
-    (n_rows, a), the commands at the rows, where it has them.
+    (n_rows, a), the commands at the rows, where it has them. To the variances of rollouts RF-DROPO adds those of
+    ``noise_deviation(values)``, the standard deviation (feature,) of each feature's noise at one set of values.
     """
 
     @property

@@ -26,6 +26,7 @@ class Plan(NamedTuple):
         finalists: how many are scored again.
         fixed: values of the parameters that are not searched.
         scale: unit of the features [unit of the problem's features].
+        floor: added to the variance of each feature, in squares of that unit.
     """
 
     space: Family
@@ -34,6 +35,7 @@ class Plan(NamedTuple):
     finalists: int
     fixed: dict[str, float]
     scale: float
+    floor: Float[np.ndarray, " f"]
 
 
 def uniforms(key: PRNGKeyArray, m: int, d: int, *, stratified: bool) -> Float[np.ndarray, "m d"]:
@@ -78,9 +80,7 @@ def target_features(problem: RolloutProblem, plan: Plan, horizon: int) -> tuple[
     return np.where(mask, np.asarray(problem.observed, dtype=float)[:horizon], 0.0) / plan.scale, mask
 
 
-def row_scores(
-    problem: RolloutProblem, plan: Plan, variance_floor: float, found: Simulated, horizon: int
-) -> Float[np.ndarray, "c horizon"]:
+def row_scores(problem: RolloutProblem, plan: Plan, found: Simulated, horizon: int) -> Float[np.ndarray, "c horizon"]:
     """Log likelihood (eq. 3) of each row under every candidate; minus infinity where half of its rollouts failed."""
     observed, mask = target_features(problem, plan, horizon)
     c, m = found.alive.shape
@@ -88,5 +88,5 @@ def row_scores(
     for index in range(c):
         if found.alive[index].sum() >= max(2, m / 2):
             features = found.features[index, :, :horizon]
-            rows[index] = step_log_likelihood(features, found.alive[index], observed, mask, variance_floor)
+            rows[index] = step_log_likelihood(features, found.alive[index], observed, mask, plan.floor)
     return rows

@@ -34,7 +34,7 @@ class Pool:
         log_source: log density of each set under the mixture of all sources.
         observed, mask: the trajectory, likewise.
         recordings: how many lie side by side in the features.
-        variance_floor: as in the search.
+        floor: as in the search.
     """
 
     family: Family
@@ -44,7 +44,7 @@ class Pool:
     observed: Float[np.ndarray, "time f"]
     mask: Bool[np.ndarray, "time f"]
     recordings: int
-    variance_floor: float
+    floor: Float[np.ndarray, " f"]
 
     def weights(self, vector: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " n"], float]:
         """Normalised weights of the pool under a distribution, and their effective sample size."""
@@ -70,7 +70,7 @@ class Pool:
                     np.ones(int(kept.sum()), dtype=bool),
                     self.observed[:, columns],
                     self.mask[:, columns],
-                    self.variance_floor,
+                    self.floor[columns],
                     weights[kept] / weights[kept].sum(),
                 )
                 total -= count * float(rows.sum())
@@ -86,14 +86,14 @@ def make_pool(
     observed: Float[np.ndarray, "time f"],
     mask: Bool[np.ndarray, "time f"],
     recordings: int,
-    variance_floor: float,
+    floor: Float[np.ndarray, " f"],
 ) -> Pool:
     """Pool of the live rollouts of some candidates; each counts as a source by the rollouts of it that are alive."""
     flat = values[alive]
     with np.errstate(divide="ignore"):
         share = np.log(alive.sum(axis=1) / max(alive.sum(), 1))
     logs = np.stack([family.log_density(c, flat) for c in candidates]) + share[:, None]
-    return Pool(family, flat, features[alive], logsumexp(logs, axis=0), observed, mask, recordings, variance_floor)
+    return Pool(family, flat, features[alive], logsumexp(logs, axis=0), observed, mask, recordings, floor)
 
 
 def refine(

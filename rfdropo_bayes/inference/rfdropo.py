@@ -1,9 +1,10 @@
 """RF-DROPO: the distribution over simulator parameters that best explains a trajectory, without resets.
 
 phi holds a mean and a standard deviation per parameter; it maximises the likelihood of growing prefixes of the data
-(eq. 2 and 3) under Monte-Carlo rollouts, by a gradient-free optimiser. Two flaws of the published pipeline are mended
-unless ``mended = false``: the horizon ends at the last row, and the finalists (the best of every stage) are scored
-again at the FULL horizon with common random numbers, because losses at different horizons cannot be compared.
+(eq. 2 and 3) under Monte-Carlo rollouts, by a gradient-free optimiser. Three flaws of the published pipeline are mended
+unless ``mended = false``: the horizon ends at the last row; the finalists (the best of every stage) are scored again
+at the FULL horizon with common random numbers, because losses at different horizons cannot be compared; and what is
+measured has noise, whose variance is added to the rollouts', which phi would have to make up for otherwise.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ class RfdropoConfig:
             that half of them stay effective when weighted by what lies beyond the present horizon, and at least on the
             straight line that over the second half of the generations leads to the last row.
         levels: rollouts are simulated to one of this many horizons, the shortest that is long enough.
-        variance_floor: added to the variances, in squared units of the trajectory's root mean square motion.
+        variance_floor: added to the variances, in squared units of the trajectory's root mean square motion; mended,
+            the observation noise at the prior's medians is added as well.
         finalists: candidates scored again at the full horizon.
         parameters: names to search; empty for all that rollouts depend on.
         search: ranges that differ from the central 99 % of the prior, by name.
@@ -61,7 +63,8 @@ class RfdropoConfig:
         polish: distributions tried at the end on the finalists' own rollouts, re-weighted; none costs a rollout.
         bootstrap: repetitions of that with the recordings drawn again, for the scatter of phi; needs two recordings.
         draws: draws of the final distribution.
-        mended: False gives the published schedule (99 of 100 rows) and returns the lowest loss at any horizon.
+        mended: False gives the published schedule (99 of 100 rows), takes measurements for exact, and returns the
+            lowest loss at any horizon.
     """
 
     rollouts: float | None = None
@@ -137,7 +140,11 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
     if config.rollouts is not None:
         generations = _affordable_generations(problem.n_rows, population, finalists, config)
     horizons = _horizons(generations, problem.n_rows, config)
-    return Plan(space, population, horizons, min(finalists, generations + 1), fixed, scale)
+    floor = np.full(np.asarray(problem.observed_mask).shape[1], config.variance_floor)
+    if config.mended and hasattr(problem, "noise_deviation"):
+        middle = {name: float(np.median(values)) for name, values in prior.items()}
+        floor = floor + (np.asarray(problem.noise_deviation(middle), dtype=float) / scale) ** 2
+    return Plan(space, population, horizons, min(finalists, generations + 1), fixed, scale, floor)
 
 
 def _horizons(generations: int, n_rows: int, config: RfdropoConfig) -> tuple[int, ...]:
@@ -194,7 +201,7 @@ def step(
     adaptive = config.horizon == "adaptive"
     simulated = _simulated(min(horizon + 1, n) if adaptive else horizon, n, config.levels)
     found = simulate(problem, plan, asked, uniform, simulated, state.ledger)
-    rows = row_scores(problem, plan, config.variance_floor, found, simulated if adaptive else horizon)
+    rows = row_scores(problem, plan, found, simulated if adaptive else horizon)
     values = -rows[:, :horizon].sum(axis=1)
     facts = {"generation": i, "horizon": horizon, "loss": float(values.min())}
     state.trace.append(facts | {"rollouts": state.ledger.rollouts})
@@ -311,7 +318,7 @@ def _choose(
     m, n = config.rollouts_per_candidate, problem.n_rows
     uniform = uniforms(jax.random.fold_in(key, FINAL), m, plan.space.columns, stratified=True)
     found = simulate(problem, plan, finalists, uniform, n, state.ledger)
-    scores = -row_scores(problem, plan, config.variance_floor, found, n).sum(axis=1)
+    scores = -row_scores(problem, plan, found, n).sum(axis=1)
     details["finalist_losses"] = scores.tolist()
     state.trace.append({"horizon": n, "loss": float(scores.min()), "rollouts": state.ledger.rollouts, "final": True})
     best_finalist = finalists[int(np.argmin(scores))]
@@ -334,7 +341,7 @@ def _reuse(
     """Polish phi, and measure its scatter over recordings, on the finalists' rollouts alone."""
     recordings = int(getattr(problem, "n_recordings", 1))
     observed, mask = target_features(problem, plan, problem.n_rows)
-    pool = make_pool(plan.space, finalists, *found, observed, mask, recordings, config.variance_floor)
+    pool = make_pool(plan.space, finalists, *found, observed, mask, recordings, plan.floor)
     counts = np.ones(recordings)
     before = pool.loss(best, counts)
     polished = refine(pool, best, counts, config.polish, int(generator.integers(2**31))) if config.polish else best

@@ -11,20 +11,20 @@ def step_log_likelihood(
     alive: Bool[np.ndarray, " m"],
     observed: Float[np.ndarray, "time f"],
     mask: Bool[np.ndarray, "time f"],
-    variance_floor: float,
+    variance_floor: float | Float[np.ndarray, " f"],
     weights: Float[np.ndarray, " m"] | None = None,
 ) -> Float[np.ndarray, " time"]:
     """Log density of each observed time step under the Gaussian of the Monte-Carlo rollouts.
 
-    Mean and covariance are those of the live rollouts; ``variance_floor`` times the identity is added, without which
-    the density has no maximum (one trajectory, spread to zero).
+    Mean and covariance are those of the live rollouts; ``variance_floor`` is added to the variances, without which the
+    density has no maximum (one trajectory, spread to zero).
 
     Args:
         features: rollouts of ONE parameter distribution.
         alive: rollouts that ended well; at least two.
         observed: the trajectory, in the units of the features.
         mask: observed entries that count.
-        variance_floor: in squared units of the features.
+        variance_floor: in squared units of the features; one for all, or one of each.
         weights: of the live rollouts, summing to one; None for equal ones.
     """
     good = features[alive]

@@ -199,3 +199,4 @@ def test_methods_that_compare_rollouts_see_the_way_and_the_turn_of_the_body():
     np.testing.assert_allclose(noise[:, 29, 3:6].std(axis=0), 2e-3 * decayed, rtol=0.056)
     np.testing.assert_allclose(noise[:, 29, 6:].std(axis=0), LEVER * 0.05 * decayed, rtol=0.056)
     np.testing.assert_allclose(noise[:, 29, :3].std(axis=0), 1e-3, rtol=0.056)
+    np.testing.assert_allclose(chosen.noise_deviation(TRUTH), [1e-3] * 3 + [2e-3] * 3 + [LEVER * 0.05] * 3)

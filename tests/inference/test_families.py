@@ -97,7 +97,13 @@ def linear_pool(recordings: int = 4, seed: int = 0):
     observed = np.tile(truth, (3, recordings)) + 0.02 * rng.normal(size=(3, 3 * recordings))
     alive = np.ones((2, 400), dtype=bool)
     mask = np.ones_like(observed, dtype=bool)
-    return centre, truth, make_pool(SPACE, candidates, values, features, alive, observed, mask, recordings, 1e-4)
+    return (
+        centre,
+        truth,
+        make_pool(
+            SPACE, candidates, values, features, alive, observed, mask, recordings, np.full(3 * recordings, 1e-4)
+        ),
+    )
 
 
 def test_weights_under_a_source_carry_as_many_rollouts_as_the_mixture_has():

@@ -139,6 +139,29 @@ def test_spread_in_the_data_is_recovered_as_spread():
     assert 0.2 < phi["frequency"]["std"] < 0.5
 
 
+class Noisy(Spring):
+    """Measured with noise, that is known where a search is not as published."""
+
+    sd = 0.01  # a fifth of the amplitude
+
+    def __init__(self, seed):
+        super().__init__()
+        self.observed = self.observed + self.sd * np.random.default_rng(seed).normal(size=self.observed.shape)
+
+    def noise_deviation(self, values):
+        return np.full(2, self.sd)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_noise_of_the_measurement_is_not_taken_for_spread_of_the_parameters(seed):
+    """The spring itself is always the same one. Taken for exact, data with noise can only be had from many."""
+    settings = {"rollouts": 20000.0, "rollouts_per_candidate": 20, "horizon": "full"}
+    exact = rfdropo.run(Noisy(seed), RfdropoConfig(**settings, mended=False), KEY).phi["frequency"]
+    mended = rfdropo.run(Noisy(seed), RfdropoConfig(**settings), KEY).phi["frequency"]
+    assert mended["mean"] == pytest.approx(2.3, abs=0.1)
+    assert mended["std"] < 0.5 * exact["std"]
+
+
 class Deceptive(Spring):
     """Its first two rows are those of a wrong frequency, without noise; the rest is the truth, with much noise.
 
