@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
-from scipy.special import logsumexp
-from scipy.stats import multivariate_t
+from scipy.linalg import solve_triangular
+from scipy.special import gammaln, logsumexp
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.inference.evaluations import evaluate_prior
@@ -48,7 +48,7 @@ class ModeMixture:
         self.share = (1.0 - prior_share) * share / share.sum()
 
     def sample(self, key: PRNGKeyArray, n: int) -> Float[np.ndarray, "n d"]:
-        """Draws; components get their exact shares, up to one draw."""
+        """Draws in random order; components get their exact shares, up to one draw."""
         generator = host_generator(key)
         spread = (np.arange(n) + generator.uniform()) / n
         component = np.searchsorted(np.cumsum(self.share), spread)
@@ -60,7 +60,9 @@ class ModeMixture:
         if from_prior.any():
             values = self.problem.sample_prior(key, int(from_prior.sum()))
             draws[from_prior] = np.asarray(self.problem.to_unconstrained(values), dtype=float)
-        return draws
+        # Halves of the particles move by what the other half looks like, which leaves the target alone only if a
+        # particle's half says nothing of where it is: no order by component.
+        return draws[generator.permutation(n)]
 
     def log_density(self, u: Float[Any, "n d"]) -> Float[np.ndarray, " n"]:
         """Log density, normalised; minus infinity where coordinates are not finite."""
@@ -68,12 +70,26 @@ class ModeMixture:
         held = np.isfinite(u).all(axis=1)
         u = np.where(held[:, None], u, 0.0)
         parts = [
-            np.log(share) + np.atleast_1d(multivariate_t.logpdf(u, mean, factor @ factor.T, df=self.degrees))
+            np.log(share) + _student_t(u, mean, factor, self.degrees)
             for share, mean, factor in zip(self.share, self.means, self.factors, strict=True)
         ]
         if self.prior_share > 0.0:
             parts.append(np.log(self.prior_share) + evaluate_prior(self.problem, u))
         return np.where(held, logsumexp(np.stack(parts), axis=0), -np.inf)
+
+
+def _student_t(
+    u: Float[np.ndarray, "n d"], mean: Float[np.ndarray, " d"], factor: Float[np.ndarray, "d d"], degrees: float
+) -> Float[np.ndarray, " n"]:
+    """Log density of a multivariate Student-t by the Cholesky factor of its scale.
+
+    scipy's takes eigenvalues below 4.5e-10 of the largest for zero and leaves their directions out of the density,
+    which parameters of unlike units (1e-4 beside 10), or a slope and an intercept far off, fall below.
+    """
+    d = len(mean)
+    distance = np.sum(solve_triangular(factor, (u - mean).T, lower=True) ** 2, axis=0)
+    constant = gammaln(0.5 * (degrees + d)) - gammaln(0.5 * degrees) - 0.5 * d * np.log(degrees * np.pi)
+    return constant - np.log(np.diag(factor)).sum() - 0.5 * (degrees + d) * np.log1p(distance / degrees)
 
 
 def covering(problem: Problem, modes: list[Laplace], key: PRNGKeyArray) -> list[Laplace]:

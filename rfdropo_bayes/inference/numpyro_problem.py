@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from numpyro import handlers
 from numpyro.distributions import (
     Cauchy,
+    Delta,
     Distribution,
     ExpandedDistribution,
     ImproperUniform,
@@ -24,6 +25,7 @@ from numpyro.distributions import (
     MaskedDistribution,
     Normal,
     StudentT,
+    TransformedDistribution,
     biject_to,
     constraints,
 )
@@ -33,6 +35,7 @@ from numpyro.primitives import Messenger
 
 from rfdropo_bayes.errors import InputError
 
+TRIALS = 64  # draws of a prior, of which some must be finite
 LOCATED = (Normal, StudentT, Cauchy, Laplace, Logistic)  # priors on the whole line with a location and a scale
 
 Batch = Mapping[str, Float[Array, " n"]]
@@ -291,8 +294,14 @@ def _check_latent(latent: Mapping[str, Any]) -> None:
     for name, site in latent.items():
         if site["fn"].support.is_discrete:
             raise InputError(f"site {name!r} is discrete", where="numpyro model", remedy="sum it out")
+        if _fixed(site["fn"]):
+            raise InputError(
+                f"site {name!r} is no parameter: its prior allows a single value",
+                where="numpyro model",
+                remedy="numpyro.deterministic instead of numpyro.sample",
+            )
         try:
-            proper = not _without_density(site["fn"]) and np.isfinite(site["fn"].sample(jax.random.key(0))).all()
+            proper = not _without_density(site["fn"]) and _draws_finite(site["fn"])
         except NotImplementedError:  # a distribution of the user's own, with a density only
             proper = False
         if not proper:
@@ -308,6 +317,17 @@ def _without_density(fn: Distribution | None) -> bool:
     while fn is not None and not isinstance(fn, ImproperUniform | MaskedDistribution):
         fn = getattr(fn, "base_dist", None)
     return fn is not None
+
+
+def _draws_finite(fn: Distribution) -> bool:
+    """Whether a prior can be sampled; of a proper one some draws may be too large for a number, as 1 / Gamma(0.001)."""
+    return bool(np.isfinite(fn.sample(jax.random.key(0), (TRIALS,))).any(axis=0).all())
+
+
+def _fixed(fn: Distribution) -> bool:
+    while isinstance(fn, Independent | ExpandedDistribution):
+        fn = fn.base_dist
+    return isinstance(fn, Delta)
 
 
 def _check_data(observed: Mapping[str, Any]) -> None:
@@ -331,6 +351,8 @@ def _ends(support: Any) -> tuple[Any, Any]:
     """Bounds of a support that is a plain interval; infinite otherwise."""
     while isinstance(support, constraints.independent):
         support = support.base_constraint
+    if isinstance(support, type(constraints.circular)):  # its ends are one point
+        return -np.inf, np.inf
     return getattr(support, "lower_bound", -np.inf), getattr(support, "upper_bound", np.inf)
 
 
@@ -342,11 +364,16 @@ def _interval(support: Any, shape: tuple[int, ...]) -> list[tuple[float, float]]
 
 def _location_scale(fn: Distribution, shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Of each component of a site; 0 and 1 unless it has them and no bounds."""
-    while isinstance(fn, Independent | ExpandedDistribution):
+    while isinstance(fn, Independent | ExpandedDistribution) or _bijected(fn):
         fn = fn.base_dist
     if type(fn) not in LOCATED:
         return jnp.zeros(int(np.prod(shape))), jnp.ones(int(np.prod(shape)))
     return jnp.ravel(jnp.broadcast_to(fn.loc, shape)), jnp.ravel(jnp.broadcast_to(fn.scale, shape))
+
+
+def _bijected(fn: Distribution) -> bool:
+    """Whether a prior is another seen through its own support's bijection, as LogNormal is a Normal of logarithms."""
+    return isinstance(fn, TransformedDistribution) and fn.transforms == [biject_to(fn.support)]
 
 
 def _row_count(site: Mapping[str, Any]) -> int:

@@ -38,7 +38,7 @@ def fit_reference(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray,
     effective = 1.0 / np.sum(weights**2)
     shrinkage = max(0.0, 1.0 - effective / (2.0 * (d + 1)))
     diagonal = np.diag(covariance)
-    floor = 1e-12 * max(diagonal.max(), 1e-300)
+    floor = 1e-12 * np.maximum(diagonal, 1e-300)  # of each: units may differ by powers of ten
     covariance = (1.0 - shrinkage) * covariance + np.diag(shrinkage * diagonal + floor)
     return Reference(mean, np.linalg.cholesky(covariance))
 

@@ -2,13 +2,14 @@
 
 Data of a plain model are no time series, and a prior a thousand times wider than the posterior makes the first pass
 long: each of its dozens of stages adds to the scatter of the evidence. Where it ended is known well enough, however, to
-fit a distribution that covers the posterior. A second pass from there takes few stages, all with the whole data, and
-what it says of posterior and evidence is as exact as if the distribution had been a lucky guess: it is normalised, and
-a share of it is the prior, which bounds every weight.
+fit distributions that cover the posterior. A second pass from there takes few stages, all with the whole data, and
+what it says of posterior and evidence is as exact as if they had been a lucky guess: their mixture is normalised, and a
+share of it is the prior, which bounds every weight.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from dataclasses import replace
 from typing import Any
@@ -18,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from numpyro.distributions import MultivariateStudentT
+from scipy.linalg import solve_triangular
 from scipy.special import expit, logit
 
 from rfdropo_bayes.bayes.problem import Values
@@ -31,7 +33,7 @@ from rfdropo_bayes.inference.levenberg import Laplace
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.mixture import ModeMixture
 from rfdropo_bayes.inference.numpyro_problem import NumpyroProblem
-from rfdropo_bayes.inference.proposals import fit_reference
+from rfdropo_bayes.inference.proposals import fit_reference, host_generator
 from rfdropo_bayes.inference.result import (
     InferenceResult,
     exclusion_warnings,
@@ -41,7 +43,10 @@ from rfdropo_bayes.inference.result import (
 
 REPLICATES = 4  # instead of a single one, whose evidence would have no deviation
 FORGOTTEN, MOST_MOVES = 0.1, 40  # correlation with its start that a stage of the second pass goes on to, if it can
-INFLATION, DEGREES = 1.1, 5.0  # of the Student-t that is fitted
+INFLATION, DEGREES = 1.1, 5.0  # of the Student-t's that are fitted
+CLUSTERS, FRUITLESS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32), 3  # how many are tried, and in vain before the search ends
+CLUSTER_DRAWS = 10  # that each needs for every coordinate
+NARROWEST = 1e-4  # least deviation of a cluster, as a share of that of all draws
 LEAST_PRIOR = 0.05  # share of the prior beside it
 SHORTER = 0.5  # of the first pass's stages is what a second one may take that has learnt something
 LOST = 0.3  # nats that passes may differ by beyond what their replicates explain
@@ -95,14 +100,16 @@ def run(
     key: PRNGKeyArray,
     logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
-    """Sample a plain model's posterior in two passes, see above; the evidence of prefixes is the first pass's."""
+    """Sample a plain model's posterior in two passes, see above; the evidence of prefixes is the first pass's,
+    corrected by what the second says of the whole."""
     first_key, second_key = jax.random.split(key)
     config = replace(config, replicates=REPLICATES if config.replicates == 1 else config.replicates)
     whole = chosen_kernel(config.kernel, problem, None) == "hamiltonian"
     first = horizon_smc.run(WholeProblem(problem) if whole else problem, config, first_key, logbook.part(0.0, 0.5))
     values = {name: jnp.asarray(first.draws[name].ravel()) for name in problem.names}
     view = centred(problem, _finite(problem.to_unconstrained(values)))
-    bridged = _cover(view, _finite(view.to_unconstrained(values)))
+    seed = int(host_generator(jax.random.fold_in(second_key, 1)).integers(2**31))
+    bridged = _cover(view, _finite(view.to_unconstrained(values)), seed)
     correlation, moves = min(config.correlation, FORGOTTEN), max(config.max_moves, MOST_MOVES)
     settings = replace(config, blocks=1, correlation=correlation, max_moves=moves)
     second = horizon_smc.run(bridged, settings, second_key, logbook.part(0.5, 1.0, "refined"))
@@ -116,20 +123,46 @@ def _finite(u: Float[Any, "n d"]) -> Float[np.ndarray, "m d"]:
     return u[np.isfinite(u).all(axis=1)]
 
 
-def _cover(problem: SlopedProblem, u: Float[np.ndarray, "n d"]) -> SlopedBridge:
-    """A Student-t with mean and covariance of draws, all chains together, and as much of the prior as fits them best.
+def _cover(problem: SlopedProblem, u: Float[np.ndarray, "n d"], seed: int) -> SlopedBridge:
+    """Student-t's that cover draws, all chains together, and as much of the prior as fits them best.
 
     A posterior as sharp as a normal needs none of the prior, but for defence; one that is the prior in some of its
-    parameters, or ends at bounds, may need more of it than of the Student-t.
+    parameters, or ends at bounds, may need more of it than of the Student-t's.
     """
-    mean, factor = fit_reference(u, np.full(len(u), 1.0 / len(u)))
-    mode = Laplace(mean, factor @ factor.T, 0.0)
-    lone = ModeMixture(problem, [mode], INFLATION, DEGREES, 0.0).log_density(u)
+    modes = _clusters(u, seed)
+    lone = ModeMixture(problem, modes, INFLATION, DEGREES, 0.0).log_density(u)
     advantage = evaluate_prior(problem, u) - lone
     share = 0.5
     for _ in range(ROUNDS):
         share = float(np.clip(expit(advantage + logit(share)).mean(), LEAST_PRIOR, 1.0 - LEAST_PRIOR))
-    return SlopedBridge(problem, [mode], BridgeConfig(inflation=INFLATION, degrees=DEGREES, prior_share=share))
+    return SlopedBridge(problem, modes, BridgeConfig(inflation=INFLATION, degrees=DEGREES, prior_share=share))
+
+
+def _clusters(u: Float[np.ndarray, "n d"], seed: int) -> list[Laplace]:
+    """Normals that together describe draws: as many as have the lowest Bayesian information criterion, and draws
+    enough to know their covariances."""
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.mixture import GaussianMixture
+
+    mean, factor = fit_reference(u, np.full(len(u), 1.0 / len(u)))
+    white = np.unique(solve_triangular(factor, (u - mean).T, lower=True).T, axis=0)  # copies are a cluster of no width
+    needed = CLUSTER_DRAWS * (u.shape[1] + 1)
+    best, lowest, fruitless = None, np.inf, 0
+    for count in CLUSTERS:
+        if count * needed > len(white) or fruitless == FRUITLESS:
+            break
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)  # a rough fit covers as well
+            found = GaussianMixture(count, reg_covar=NARROWEST**2, random_state=seed).fit(white)
+        criterion = found.bic(white) if found.weights_.min() * len(white) > 0.5 * needed else np.inf
+        best, lowest, fruitless = (found, criterion, 0) if criterion < lowest else (best, lowest, fruitless + 1)
+    if best is None or len(best.weights_) == 1:
+        return [Laplace(mean, factor @ factor.T, 0.0)]
+    modes = []
+    for share, centre, covariance in zip(best.weights_, best.means_, best.covariances_, strict=True):
+        mode = Laplace(mean + factor @ centre, factor @ covariance @ factor.T, 0.0)
+        modes.append(mode._replace(log_density=float(np.log(share)) - mode.log_evidence))
+    return modes
 
 
 def _joined(
@@ -148,12 +181,20 @@ def _joined(
     evaluations = first.evaluations + second.evaluations + ledger.evaluations
     assert first.prefix_log_evidence is not None
     assert second.log_evidence is not None
-    prefixes, blocks = np.full(problem.n_rows, np.nan), first.block_scores
-    prefixes[-len(first.prefix_log_evidence) :] = first.prefix_log_evidence
-    prefixes[-1] = value = second.log_evidence[0]
-    if len(blocks) == 1:
-        blocks = [{"first_row": 1, "last_row": problem.n_rows, "log_score": value, "sd": second.log_evidence[1]}]
+    prefixes = np.full(problem.n_rows, np.nan)
+    prefixes[-len(first.prefix_log_evidence) :] = _corrected(first, second.log_evidence[0])
+    if len(first.block_scores) == 1:
+        value, sd = second.log_evidence
+        blocks = [{"first_row": 1, "last_row": problem.n_rows, "log_score": value, "sd": sd}]
+    else:
+        before = np.concatenate([[0.0], prefixes])
+        blocks = [
+            b | {"log_score": float(prefixes[b["last_row"] - 1] - before[b["first_row"] - 1])}
+            for b in first.block_scores
+        ]
     replicates = np.asarray(second.details["log_evidence_replicates"])
+    # Replicates that agree need no moves: what covers the posterior has been weighted well enough.
+    apart = replicate_warnings(draws, replicates) + _unlike(first.log_evidence, second.log_evidence, len(replicates))
     return replace(
         first,
         draws=draws,
@@ -168,9 +209,8 @@ def _joined(
         warnings=[
             *prior_warnings(problem, draws),
             *exclusion_warnings(excluded, evaluations),
-            *[sentence for sentence in second.warnings if "last moves" in sentence],
-            *replicate_warnings(draws, replicates),
-            *_lost(first.log_evidence, second.log_evidence, len(replicates)),
+            *([sentence for sentence in second.warnings if "last moves" in sentence] if apart else []),
+            *apart,
         ],
         seconds=first.seconds + second.seconds,
         details=first.details
@@ -184,13 +224,28 @@ def _joined(
     )
 
 
-def _lost(first: tuple[float, float] | None, second: tuple[float, float], replicates: int) -> list[str]:
-    """A sentence where the second pass finds less than the first: an evidence can be too low by what was missed."""
+def _corrected(first: InferenceResult, value: float) -> Float[np.ndarray, " n_rows"]:
+    """Evidence of prefixes by the first pass, given what the second says of the whole.
+
+    Errors of stages add up like the steps of a random walk. Where it ended is known: on the way there it had, on
+    average, as much of the whole error as of the steps.
+    """
+    assert first.prefix_log_evidence is not None
+    assert first.log_evidence is not None
+    ends = np.sort([row["progress"] for row in first.trace if not row.get("final")])
+    rows = np.arange(1, len(first.prefix_log_evidence) + 1)
+    share = np.searchsorted(ends, rows, side="right") / len(ends)
+    return first.prefix_log_evidence + share * (value - first.log_evidence[0])
+
+
+def _unlike(first: tuple[float, float] | None, second: tuple[float, float], replicates: int) -> list[str]:
+    """A sentence where the passes find different evidences: one can be too low by what was missed."""
     assert first is not None
     less = first[0] - second[0]
-    if less < LOST + 4.0 * np.hypot(first[1], second[1]) / np.sqrt(replicates):
+    if abs(less) < LOST + 4.0 * np.hypot(first[1], second[1]) / np.sqrt(replicates):
         return []
+    higher, lower = ("first", "second") if less > 0.0 else ("second", "first")
     return [
-        f"the log evidence of the first pass is higher by {less:.2g}: the second may have lost a part of the "
+        f"the log evidence of the {higher} pass is higher by {abs(less):.2g}: the {lower} may have lost a part of the "
         'posterior; compare with start = "prior"'
     ]

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 OUTERMOST = 0.005  # of the prior, on either side
+SPARSE = 0.1  # of the mean density between the quartiles
+NEIGHBOURS = 5  # prior draws, on the denser side, that tell the density at a place
 PILED = 0.13  # of a standard deviation, between a half-normal (0.10) and a uniform distribution (0.17)
 
 
@@ -33,16 +35,27 @@ def piled_at(draws: Float[np.ndarray, " n"], low: float, high: float, *, logarit
 
 
 def contradicts(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"]) -> bool:
-    """Whether the median of a posterior lies in the outermost 1 % of its prior; False if too few draws tell.
+    """Whether the median of a posterior lies in the outermost 1 % of its prior, and where that is sparse; False if too
+    few draws tell.
+
+    An end of a wide uniform prior, or zero of a half-normal one, is outermost and as dense as any other place; so is,
+    to draws, zero of a log-normal one that ranges over decades.
 
     Args:
         draws: of one parameter's posterior.
         prior: draws of its prior, some 400 at least.
     """
-    if len(prior) < 2.0 / OUTERMOST:
+    prior, centre = np.sort(prior[np.isfinite(prior)]), float(np.median(draws))
+    n, below = len(prior), int(np.searchsorted(prior, centre))
+    if n < 2.0 / OUTERMOST or OUTERMOST * n <= below <= (1.0 - OUTERMOST) * n:
         return False
-    below = float(np.mean(prior < np.median(draws)))
-    return not OUTERMOST <= below <= 1.0 - OUTERMOST
+    distances = (
+        np.sort(np.abs(prior[below:] - centre))[:NEIGHBOURS],
+        np.sort(np.abs(prior[:below] - centre))[:NEIGHBOURS],
+    )
+    nearest = min(side[-1] for side in distances if len(side) == NEIGHBOURS)
+    low, high = np.quantile(prior, [0.25, 0.75])
+    return bool(NEIGHBOURS / n * (high - low) < SPARSE * 0.5 * nearest)
 
 
 def contradiction(names: Sequence[str]) -> str:

@@ -306,6 +306,11 @@ def _not_numbers():
     numpyro.sample("y", dist.Normal(x, 1.0), obs=np.array([1.0, np.nan]))
 
 
+def _fixed():
+    x = numpyro.sample("x", dist.Delta(jnp.zeros(2)).to_event(1))
+    numpyro.sample("y", dist.Normal(x[0], 1.0), obs=1.0)
+
+
 def _discrete():
     x = numpyro.sample("x", dist.Poisson(3.0))
     numpyro.sample("y", dist.Normal(x, 1.0), obs=1.0)
@@ -322,12 +327,30 @@ def _discrete():
         (_optimised, "'centre' is a numpyro.param"),
         (_subsampled, "'data' takes random subsamples"),
         (_not_numbers, "1 values of the observed site 'y' are not numbers"),
+        (_fixed, "'x' is no parameter"),
         (_discrete, "discrete"),
     ],
 )
 def test_models_that_cannot_be_sampled_are_refused(model, words):
     with pytest.raises(InputError, match=words):
         problem_from_numpyro(model)
+
+
+def test_a_proper_prior_may_have_draws_too_large_for_a_number():
+    def model(y):
+        variance = numpyro.sample("variance", dist.InverseGamma(1e-3, 1e-3))
+        numpyro.sample("y", dist.Normal(0.0, jnp.sqrt(variance)), obs=y)
+
+    problem = problem_from_numpyro(model, (np.array([0.3, -0.4]),))
+    assert not np.isfinite(problem.sample_prior(KEY, 100)["variance"]).all()
+
+
+def test_a_circle_has_no_ends():
+    def model(y):
+        angle = numpyro.sample("angle", dist.VonMises(np.pi, 0.1))
+        numpyro.sample("y", dist.VonMises(angle, 4.0), obs=y)
+
+    assert problem_from_numpyro(model, (3.1,)).bounds["angle"] == (-np.inf, np.inf)
 
 
 def linear_effects(y, design):
