@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
@@ -28,20 +29,19 @@ PAPER = {  # mean squared error and its deviation, Table I
 NEEDS_SBI = ("BayesSim", "NPDR")
 OWN = ("ours", "ours + tension")
 TRUTHS = ("paper", "off-centre")
-HEADINGS = (
-    *("row", "fits", "MSE", "MSE, told", "E / mass [%]", "Poisson [%]", "90 % coverage"),
-    *("log score", "held out [mm]", "rollouts", "s"),
-)
-FIGURES = (
-    "mse",
-    "mse_excited",
-    "ratio_error_percent",
-    "poisson_error_percent",
-    "log_score",
-    "held_out_mm",
-    "rollouts",
-    "seconds",
-)
+FIGURES = {
+    "mse": "MSE",
+    "mse_excited": "MSE, told",
+    "ratio_error_percent": "E / mass [%]",
+    "poisson_error_percent": "Poisson [%]",
+    "log_score": "log score",
+    "held_out_mm": "held out [mm]",
+    "rollouts": "rollouts",
+    "seconds": "s",
+}
+"""Figures of a fit, with their headings; coverage, which many fits have together, stands behind the fourth."""
+COMPARED = {"mse": 1, "ratio_error_percent": 1, "poisson_error_percent": 1, "held_out_mm": 1, "log_score": -1}
+"""Figures that rows are compared in, 1 where less is better."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +112,7 @@ def run_table1(
         "paper": PAPER,
         "cells": summarise(found),
         "claims": claims(found),
+        "ahead_of_ours": ahead_of_ours(found),
         "versions": software_versions(),
     }
     (out / "table1.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -208,15 +209,38 @@ def _claim(task: str, words: str, value: float, holds: bool) -> dict[str, Any]:
 
 def _paired(own: Sequence[Mapping[str, Any]], rival: Sequence[Mapping[str, Any]]) -> float | None:
     """Mean excess of our held-out error over a rival's in its standard errors; None for fewer than two pairs."""
-    theirs = {r["index"]: r["held_out_mm"] for r in rival if r["held_out_mm"] is not None}
-    pairs = [
-        (r["held_out_mm"], theirs[r["index"]]) for r in own if r["index"] in theirs and r["held_out_mm"] is not None
-    ]
-    if len(pairs) < 2:
-        return None
-    excess = np.array([a - b for a, b in pairs])
-    error = float(excess.std(ddof=1)) / np.sqrt(len(excess))
-    return float(excess.mean() / max(error, 1e-12))
+    pairs = _pairs(own, rival, "held_out_mm")
+    return None if len(pairs) < 2 else _standard_errors(pairs[:, 0] - pairs[:, 1])
+
+
+def _pairs(own: Sequence[Mapping[str, Any]], rival: Sequence[Mapping[str, Any]], figure: str) -> np.ndarray:
+    """A figure of ours and of a rival's, side by side, for the data sets that both have."""
+    theirs = {r["index"]: r[figure] for r in rival if r[figure] is not None}
+    pairs = [(r[figure], theirs[r["index"]]) for r in own if r["index"] in theirs and r[figure] is not None]
+    return np.array(pairs, dtype=float).reshape(-1, 2)
+
+
+def _standard_errors(excess: Float[np.ndarray, " n"]) -> float:
+    return float(excess.mean() / max(float(excess.std(ddof=1)) / np.sqrt(len(excess)), 1e-12))
+
+
+def ahead_of_ours(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Every figure in which another row is on average better than ours without tension on the data that both have:
+    the two means, and by how many paired standard errors they differ."""
+    listed = []
+    for task in TASKS:
+        for truths in TRUTHS:
+            own = _of(found, task, truths, "ours")
+            for row in (row for row in ROWS if row not in OWN):
+                for figure, sign in COMPARED.items():
+                    pairs = _pairs(own, _of(found, task, truths, row), figure)
+                    excess = sign * (pairs[:, 0] - pairs[:, 1])
+                    if len(pairs) < 2 or excess.mean() <= 0.0:
+                        continue
+                    where = {"task": task, "truths": truths, "row": row, "figure": figure, "data_sets": len(pairs)}
+                    means = {"ours": float(pairs[:, 0].mean()), "theirs": float(pairs[:, 1].mean())}
+                    listed.append(where | means | {"standard_errors": _standard_errors(excess)})
+    return listed
 
 
 def as_markdown(content: Mapping[str, Any]) -> str:
@@ -238,16 +262,17 @@ def as_markdown(content: Mapping[str, Any]) -> str:
     for task in dict.fromkeys(cell["task"] for cell in content["cells"]):
         for truths in TRUTHS:
             lines += [f"## {task}, {'the truth of the paper' if truths == 'paper' else 'off-centre truths'}", ""]
-            lines += [
-                f"| {' | '.join(HEADINGS)} |",
-                f"|{'---|' * len(HEADINGS)}",
-            ]
+            names = list(FIGURES.values())
+            headings = ["row", "fits", *names[:4], "90 % coverage", *names[4:]]
+            lines += [f"| {' | '.join(headings)} |", f"|{'---|' * len(headings)}"]
             cells = [c for c in content["cells"] if (c["task"], c["truths"]) == (task, truths)]
             lines += [_row(cell) for cell in cells] + [""]
     lines += ["## Claims", "", "| claim | value | holds |", "|---|---|---|"]
     lines += [
         f"| {c['task']}: {c['claim']} | {c['value']:.3g} | {'yes' if c['holds'] else 'NO'} |" for c in content["claims"]
     ]
+    lines += ["", "## Where another row is better than ours without tension, on the same data", ""]
+    lines += [_ahead(entry) for entry in content["ahead_of_ours"]] or ["Nowhere."]
     missing = [f"{row}: {reason}" for row, reason in content["left_out"].items()]
     if content["not_done"]:
         missing.append(f"{content['not_done']} fits that were not done; the column of fits says how many were")
@@ -256,6 +281,14 @@ def as_markdown(content: Mapping[str, Any]) -> str:
         lines += ["", "## Left out or failed", "", *(f"- {line}" for line in missing)]
     lines += ["", "The paper: " + "; ".join(_published(task) for task in PAPER) + "."]
     return "\n".join(lines) + "\n"
+
+
+def _ahead(entry: Mapping[str, Any]) -> str:
+    truths = "the paper's truth" if entry["truths"] == "paper" else "off-centre"
+    return (
+        f"- {entry['task']}, {truths}, {FIGURES[entry['figure']]}: {entry['row']} {entry['theirs']:.3g}, ours "
+        f"{entry['ours']:.3g} ({entry['data_sets']} data sets, {entry['standard_errors']:.1f} standard errors)"
+    )
 
 
 def _published(task: str) -> str:
@@ -271,5 +304,5 @@ def _row(cell: Mapping[str, Any]) -> str:
         return f"{entry['mean']:.3g}{spread}"
 
     coverage = "-" if cell["coverage_90"] is None else f"{100 * cell['coverage_90']:.0f} %"
-    figures = [moments(figure) for figure in FIGURES[:4]] + [coverage] + [moments(figure) for figure in FIGURES[4:]]
-    return f"| {cell['row']} | {cell['fits']} | " + " | ".join(figures) + " |"
+    figures = [moments(figure) for figure in FIGURES]
+    return f"| {' | '.join([cell['row'], str(cell['fits']), *figures[:4], coverage, *figures[4:]])} |"

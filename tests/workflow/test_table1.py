@@ -14,7 +14,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.workflow import table1
 from rfdropo_bayes.workflow.comparison import fit, scores
 from rfdropo_bayes.workflow.fits import run_fits
-from rfdropo_bayes.workflow.table1 import Size, as_markdown, claims, list_jobs, run_table1, summarise
+from rfdropo_bayes.workflow.table1 import Size, ahead_of_ours, as_markdown, claims, list_jobs, run_table1, summarise
 from rfdropo_bayes.workflow.tasks import TASKS, draw_truth, excited, task_problem
 
 REACH, PUSH = TASKS["TrunkReach"], TASKS["TrunkPush"]
@@ -154,6 +154,7 @@ def test_cells_claims_and_the_table_follow_from_the_fits(tmp_path):
         "size": {"actions": 1, "budget": 2, "truths": 8, "rival_truths": 4, "repeats": 20},
         "cells": cells,
         "claims": checked,
+        "ahead_of_ours": [],
         "left_out": {},
         "not_done": 0,
         "paper": table1.PAPER,
@@ -161,6 +162,21 @@ def test_cells_claims_and_the_table_follow_from_the_fits(tmp_path):
     text = as_markdown(content)
     assert "| NO |" in text
     assert text.count("| ours |") == 2
+    assert "Nowhere." in text
+
+
+def test_what_another_row_does_better_is_said():
+    """Rivals have three times our figures: worse, but for the log score. One of them is then better in one figure."""
+    found = [r for r in rows() if r["row"] in ("ours", "BayesSim", "NPDR")]
+    ahead = ahead_of_ours(found)
+    assert {(entry["row"], entry["figure"]) for entry in ahead} == {("BayesSim", "log_score"), ("NPDR", "log_score")}
+    for r in found:
+        if r["row"] == "NPDR" and r["truths"] == "paper":
+            r["held_out_mm"] = 0.5
+    (better,) = [entry for entry in ahead_of_ours(found) if entry["figure"] == "held_out_mm"]
+    assert (better["row"], better["truths"], better["data_sets"], better["theirs"]) == ("NPDR", "paper", 4, 0.5)
+    assert better["ours"] == pytest.approx(1.05, abs=0.06)
+    assert better["standard_errors"] > 5.0
 
 
 def test_a_run_writes_its_files(tmp_path, monkeypatch):
