@@ -35,12 +35,20 @@ def fit_reference(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray,
     mean = weights @ position
     centred = position - mean
     covariance = (weights[:, None] * centred).T @ centred
-    effective = 1.0 / np.sum(weights**2)
-    shrinkage = max(0.0, 1.0 - effective / (2.0 * (d + 1)))
+    shrinkage = max(0.0, 1.0 - distinct_size(position, weights) / (2.0 * (d + 1)))
     diagonal = np.diag(covariance)
-    floor = 1e-12 * np.maximum(diagonal, 1e-300)  # of each: units may differ by powers of ten
+    # Of each coordinate: units may differ by powers of ten. Copies of one particle spread by what is rounded off.
+    rounding = np.finfo(float).eps * np.max(np.abs(position), axis=0)
+    floor = np.maximum(1e-12 * diagonal, np.maximum(rounding**2, 1e-200))
     covariance = (1.0 - shrinkage) * covariance + np.diag(shrinkage * diagonal + floor)
     return Reference(mean, np.linalg.cholesky(covariance))
+
+
+def distinct_size(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray, " n"]) -> float:
+    """Effective number of particles where copies of one, which resampling leaves, count together."""
+    _, group = np.unique(position, axis=0, return_inverse=True)
+    merged = np.bincount(group.ravel(), weights)
+    return float(merged.sum() ** 2 / np.sum(merged**2))
 
 
 def initial_scale(kernel: str, d: int) -> float:

@@ -21,6 +21,7 @@ from rfdropo_bayes.inference.proposals import (
     Reference,
     accept,
     adapt_scale,
+    distinct_size,
     fit_reference,
     host_generator,
     propose,
@@ -170,7 +171,7 @@ def cross_references(population: Population) -> tuple[Reference, Reference]:
     found = []
     for half in halves:
         share = weights[half].sum()
-        usable = share > 0.0 and share**2 / np.sum(weights[half] ** 2) > 2.0
+        usable = share > 0.0 and distinct_size(population.position[half], weights[half]) > 2.0
         found.append(fit_reference(population.position[half], weights[half] / share) if usable else whole)
     return found[0], found[1]
 
