@@ -154,7 +154,11 @@ def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], 
         return tuple(sorted(set(horizons))), by_residuals
     if hasattr(problem, "log_likelihood_at"):
         derivatives = log_likelihood_derivatives(problem)
-        return (problem.n_rows,), lambda horizon, ledger, u, noise: SmoothTarget(problem, ledger, derivatives, *prior)
+
+        def by_hessians(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
+            return SmoothTarget(problem, ledger, derivatives, *prior, noise=np.zeros(len(u), dtype=bool))
+
+        return (problem.n_rows,), by_hessians
     raise InputError(
         "this problem has no residuals, and no likelihood that JAX can differentiate",
         where="[inference] method",

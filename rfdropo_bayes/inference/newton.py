@@ -23,6 +23,7 @@ class SmoothTarget(NamedTuple):
         ledger: every evaluation is charged to it; a Hessian in d directions counts as d + 1.
         derivatives: gradient and Hessian of the log likelihood at one point, see `log_likelihood_derivatives`.
         prior_gradient, prior_hessian: of the log prior.
+        noise: no coordinate is one: the Hessian knows about scales.
     """
 
     problem: Problem
@@ -30,11 +31,7 @@ class SmoothTarget(NamedTuple):
     derivatives: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     prior_gradient: Callable[[np.ndarray], np.ndarray]
     prior_hessian: Callable[[np.ndarray], np.ndarray]
-
-    @property
-    def noise(self) -> Bool[np.ndarray, " d"]:
-        """None: the Hessian knows about scales."""
-        return np.zeros(0, dtype=bool)
+    noise: Bool[np.ndarray, " d"]
 
     def density(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         """Log posterior, unnormalised; minus infinity where it is not a number."""
