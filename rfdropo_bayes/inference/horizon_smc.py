@@ -39,6 +39,7 @@ ROLLOUTS_PER_PARTICLE = 20.0
 FEWEST_PARTICLES = 50
 STARTS = ("auto", "prior", "optimum")
 NOT_REPRESENTABLE = "not_representable"
+REDRAWS = 256  # prior draws for each particle, at most
 
 
 @dataclass(frozen=True)
@@ -171,22 +172,30 @@ def make_plan(problem: Problem, config: SmcConfig) -> Plan:
 def init(key: PRNGKeyArray, problem: Problem, plan: Plan, config: SmcConfig) -> SmcState:
     """Prior draws, no rollouts yet.
 
-    A draw that its coordinates cannot hold (a scale of 1e-400, whose logarithm is infinite) keeps its share of the
-    prior, without weight.
+    Draws that their coordinates cannot hold (a scale of 1e-400, whose logarithm is infinite) keep their share of the
+    prior, without weight; others are drawn instead, as long as that takes a bounded number of draws.
     """
-    n = plan.particles
-    u = np.array(problem.to_unconstrained(problem.sample_prior(key, n)), dtype=float)
-    base = evaluate_prior(problem, u)
-    held = np.isfinite(u).all(axis=1) & np.isfinite(base)
-    if not held.any():
+    n, drawn, u, base = plan.particles, 0, np.zeros((0, 0)), np.zeros(0)
+    while len(base) < n and drawn < REDRAWS * n:
+        batch_key = jax.random.fold_in(key, drawn) if drawn else key
+        batch = np.array(problem.to_unconstrained(problem.sample_prior(batch_key, n)), dtype=float)
+        density = evaluate_prior(problem, batch)
+        held = np.isfinite(batch).all(axis=1) & np.isfinite(density)
+        u = np.concatenate([u.reshape(-1, batch.shape[1]), batch[held]])
+        base = np.concatenate([base, density[held]])
+        drawn += n
+    if len(base) == 0:
         raise InputError(
-            f"none of {n} prior draws has a finite prior density", where="[model.priors]", remedy="look at the priors"
+            f"none of {drawn} prior draws has a finite prior density",
+            where="[model.priors]",
+            remedy="look at the priors",
         )
-    stand_in = np.where(held, np.arange(n), np.argmax(held))
-    weights = np.where(held, -np.log(n), -np.inf)
+    ledger = Ledger(excluded=Counter({NOT_REPRESENTABLE: drawn - len(base)} if len(base) < drawn else {}))
+    share, alive = len(base) / drawn, min(n, len(base))
+    weights = np.where(np.arange(n) < alive, np.log(share / alive), -np.inf)
+    stand_in = np.minimum(np.arange(n), alive - 1)
     scale = initial_scale(config.kernel, u.shape[1])
     population = Population(u[stand_in], base[stand_in], np.zeros((n, 0)), weights, 0.0, scale)
-    ledger = Ledger(excluded=Counter({NOT_REPRESENTABLE: int(n - held.sum())} if not held.all() else {}))
     return SmcState(population, -1, 0, 0.0, np.full(problem.n_rows, np.nan), ledger, [], 0.0, False)
 
 

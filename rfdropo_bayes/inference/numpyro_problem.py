@@ -134,6 +134,13 @@ class NumpyroProblem:
         """Prior draws by running the model forward."""
         return self._split(self._draw(jax.random.split(key, n)))
 
+    def sample_starts(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
+        """Where climbs may start: at prior draws, and as many from where numpyro starts its chains, uniformly within 2
+        of zero in every unconstrained coordinate: draws of a prior that says nothing are far from everything."""
+        prior = self.sample_prior(key, n - n // 2)
+        near = jax.random.uniform(jax.random.fold_in(key, 1), (n // 2, len(self.names)), minval=-2.0, maxval=2.0)
+        return {name: jnp.concatenate([prior[name], value]) for name, value in self.from_unconstrained(near).items()}
+
     def to_unconstrained(self, values: Batch) -> Float[Array, "n d"]:
         """Sites mapped by numpyro's bijections, flattened, in the model's order."""
         return self._unconstrain(self._join(values))

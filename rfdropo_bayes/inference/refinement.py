@@ -5,6 +5,9 @@ long: each of its dozens of stages adds to the scatter of the evidence. Where it
 fit distributions that cover the posterior. A second pass from there takes few stages, all with the whole data, and
 what it says of posterior and evidence is as exact as if they had been a lucky guess: their mixture is normalised, and a
 share of it is the prior, which bounds every weight.
+
+Where replicates of the first pass disagree, some or all of them have lost the posterior on the way. Climbs then look
+for its optima, and distributions around these join the mixture.
 """
 
 from __future__ import annotations
@@ -23,15 +26,17 @@ from scipy.linalg import solve_triangular
 from scipy.special import expit, logit
 
 from rfdropo_bayes.bayes.problem import Values
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import horizon_smc
 from rfdropo_bayes.inference.bridge import BridgeConfig, BridgedProblem
 from rfdropo_bayes.inference.centring import CentredProblem, centred
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.hamiltonian import SlopedProblem, chosen_kernel
 from rfdropo_bayes.inference.horizon_smc import SmcConfig
+from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes
 from rfdropo_bayes.inference.levenberg import Laplace
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.mixture import ModeMixture
+from rfdropo_bayes.inference.mixture import LEAST_SHARE, ModeMixture
 from rfdropo_bayes.inference.numpyro_problem import NumpyroProblem
 from rfdropo_bayes.inference.proposals import fit_reference, host_generator
 from rfdropo_bayes.inference.result import (
@@ -51,6 +56,8 @@ LEAST_PRIOR = 0.05  # share of the prior beside it
 SHORTER = 0.5  # of the first pass's stages is what a second one may take that has learnt something
 LOST = 0.3  # nats that passes may differ by beyond what their replicates explain
 ROUNDS = 30  # of expectation maximisation, for that share
+DISAGREEMENT = 0.5  # deviation of the first pass's evidences [nat] from which climbs look for what it lost
+CLIMBED = 0.25  # share of the optima that climbs find, before normalising; the rest is that of the clusters
 
 
 class SlopedBridge(BridgedProblem):
@@ -109,13 +116,41 @@ def run(
     values = {name: jnp.asarray(first.draws[name].ravel()) for name in problem.names}
     view = centred(problem, _finite(problem.to_unconstrained(values)))
     seed = int(host_generator(jax.random.fold_in(second_key, 1)).integers(2**31))
-    bridged = _cover(view, _finite(view.to_unconstrained(values)), seed)
+    assert first.log_evidence is not None
+    lost = view is problem and not first.log_evidence[1] < DISAGREEMENT
+    climbed = _climbed(problem, config, jax.random.fold_in(second_key, 2)) if lost else None
+    bridged = _cover(view, _finite(view.to_unconstrained(values)), climbed.modes if climbed else [], seed)
     correlation, moves = min(config.correlation, FORGOTTEN), max(config.max_moves, MOST_MOVES)
     settings = replace(config, blocks=1, correlation=correlation, max_moves=moves)
     second = horizon_smc.run(bridged, settings, second_key, logbook.part(0.5, 1.0, "refined"))
-    if view is problem and not whole and len(second.trace) > SHORTER * len(first.trace):
+    if view is problem and not whole and not lost and len(second.trace) > SHORTER * len(first.trace):
         return first  # a shape that the fit does not cover: from the prior the way is as short, and misses no mode
-    return _joined(problem, view, bridged, first, second)
+    joined = _joined(problem, view, bridged, first, second)
+    if climbed is None:
+        return joined
+    spent = climbed.climbs
+    return replace(
+        joined,
+        rollouts=joined.rollouts + spent.ledger.rollouts,
+        evaluations=joined.evaluations + spent.ledger.evaluations,
+        seconds=joined.seconds + spent.seconds,
+    )
+
+
+def _climbed(problem: NumpyroProblem, config: SmcConfig, key: PRNGKeyArray) -> Modes | None:
+    """Optima of the whole posterior; None where no climb finds a start."""
+    try:
+        found = find_modes(problem, LaplaceConfig(rollouts=config.rollouts), key)
+    except InputError:
+        return None
+    best = max(mode.log_evidence for mode in found.modes)
+    share = np.array([max(np.exp(mode.log_evidence - best), LEAST_SHARE) for mode in found.modes])
+    modes = [
+        mode._replace(log_density=mode.log_density + float(np.log(CLIMBED * part)) - mode.log_evidence)
+        for mode, part in zip(found.modes, share / share.sum(), strict=True)
+        if np.isfinite(mode.log_evidence)
+    ]
+    return found._replace(modes=modes)
 
 
 def _finite(u: Float[Any, "n d"]) -> Float[np.ndarray, "m d"]:
@@ -123,13 +158,13 @@ def _finite(u: Float[Any, "n d"]) -> Float[np.ndarray, "m d"]:
     return u[np.isfinite(u).all(axis=1)]
 
 
-def _cover(problem: SlopedProblem, u: Float[np.ndarray, "n d"], seed: int) -> SlopedBridge:
-    """Student-t's that cover draws, all chains together, and as much of the prior as fits them best.
+def _cover(problem: SlopedProblem, u: Float[np.ndarray, "n d"], climbed: list[Laplace], seed: int) -> SlopedBridge:
+    """Student-t's that cover draws, all chains together, and optima, and as much of the prior as fits the draws best.
 
     A posterior as sharp as a normal needs none of the prior, but for defence; one that is the prior in some of its
     parameters, or ends at bounds, may need more of it than of the Student-t's.
     """
-    modes = _clusters(u, seed)
+    modes = [*_clusters(u, seed), *climbed]
     lone = ModeMixture(problem, modes, INFLATION, DEGREES, 0.0).log_density(u)
     advantage = evaluate_prior(problem, u) - lone
     share = 0.5
@@ -157,7 +192,8 @@ def _clusters(u: Float[np.ndarray, "n d"], seed: int) -> list[Laplace]:
         criterion = found.bic(white) if found.weights_.min() * len(white) > 0.5 * needed else np.inf
         best, lowest, fruitless = (found, criterion, 0) if criterion < lowest else (best, lowest, fruitless + 1)
     if best is None or len(best.weights_) == 1:
-        return [Laplace(mean, factor @ factor.T, 0.0)]
+        mode = Laplace(mean, factor @ factor.T, 0.0)
+        return [mode._replace(log_density=-mode.log_evidence)]
     modes = []
     for share, centre, covariance in zip(best.weights_, best.means_, best.covariances_, strict=True):
         mode = Laplace(mean + factor @ centre, factor @ covariance @ factor.T, 0.0)
