@@ -6,8 +6,8 @@ fit distributions that cover the posterior. A second pass from there takes few s
 what it says of posterior and evidence is as exact as if they had been a lucky guess: their mixture is normalised, and a
 share of it is the prior, which bounds every weight.
 
-Where replicates of the first pass disagree, some or all of them have lost the posterior on the way. Climbs then look
-for its optima, and distributions around these join the mixture.
+A narrow posterior under priors that say next to nothing may be lost on the first way, by some replicates or by all
+alike. Climbs look for optima beside it, and distributions around these join the mixture.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ LEAST_PRIOR = 0.05  # share of the prior beside it
 SHORTER = 0.5  # of the first pass's stages is what a second one may take that has learnt something
 LOST = 0.3  # nats that passes may differ by beyond what their replicates explain
 ROUNDS = 30  # of expectation maximisation, for that share
-DISAGREEMENT = 0.5  # deviation of the first pass's evidences [nat] from which climbs look for what it lost
+DISAGREEMENT = 0.5  # deviation of evidences [nat] from which some replicates of the first pass have lost something
 CLIMBED = 0.25  # share of the optima that climbs find, before normalising; the rest is that of the clusters
 
 
@@ -117,40 +117,46 @@ def run(
     view = centred(problem, _finite(problem.to_unconstrained(values)))
     seed = int(host_generator(jax.random.fold_in(second_key, 1)).integers(2**31))
     assert first.log_evidence is not None
-    lost = view is problem and not first.log_evidence[1] < DISAGREEMENT
-    climbed = _climbed(problem, config, jax.random.fold_in(second_key, 2)) if lost else None
+    agree = first.log_evidence[1] < DISAGREEMENT
+    climbed = None
+    if view is problem and not (whole and agree):  # Hessians of many parameters take their time
+        climbed = _climbed(problem, jax.random.fold_in(second_key, 2))
     bridged = _cover(view, _finite(view.to_unconstrained(values)), climbed.modes if climbed else [], seed)
     correlation, moves = min(config.correlation, FORGOTTEN), max(config.max_moves, MOST_MOVES)
     settings = replace(config, blocks=1, correlation=correlation, max_moves=moves)
     second = horizon_smc.run(bridged, settings, second_key, logbook.part(0.5, 1.0, "refined"))
-    if view is problem and not whole and not lost and len(second.trace) > SHORTER * len(first.trace):
-        return first  # a shape that the fit does not cover: from the prior the way is as short, and misses no mode
     joined = _joined(problem, view, bridged, first, second)
-    if climbed is None:
-        return joined
-    spent = climbed.climbs
-    return replace(
-        joined,
-        rollouts=joined.rollouts + spent.ledger.rollouts,
-        evaluations=joined.evaluations + spent.ledger.evaluations,
-        seconds=joined.seconds + spent.seconds,
-    )
+    if climbed is not None:
+        ledger = climbed.climbs.ledger
+        joined = replace(
+            joined,
+            rollouts=joined.rollouts + ledger.rollouts,
+            evaluations=joined.evaluations + ledger.evaluations,
+            seconds=joined.seconds + climbed.climbs.seconds,
+        )
+    assert second.log_evidence is not None
+    fruitless = not whole and view is problem and len(second.trace) > SHORTER * len(first.trace)
+    if fruitless and agree and not _unlike(first.log_evidence, second.log_evidence, config.replicates):
+        # A shape that the fit does not cover: from the prior the way is as short, and misses no mode.
+        return replace(first, rollouts=joined.rollouts, evaluations=joined.evaluations, seconds=joined.seconds)
+    return joined
 
 
-def _climbed(problem: NumpyroProblem, config: SmcConfig, key: PRNGKeyArray) -> Modes | None:
-    """Optima of the whole posterior; None where no climb finds a start."""
+def _climbed(problem: NumpyroProblem, key: PRNGKeyArray) -> Modes | None:
+    """Optima of the whole posterior, with their part of the mixture as evidence; None where no climb finds a start."""
     try:
-        found = find_modes(problem, LaplaceConfig(rollouts=config.rollouts), key)
+        found = find_modes(problem, LaplaceConfig(), key)
     except InputError:
         return None
-    best = max(mode.log_evidence for mode in found.modes)
-    share = np.array([max(np.exp(mode.log_evidence - best), LEAST_SHARE) for mode in found.modes])
-    modes = [
-        mode._replace(log_density=mode.log_density + float(np.log(CLIMBED * part)) - mode.log_evidence)
-        for mode, part in zip(found.modes, share / share.sum(), strict=True)
-        if np.isfinite(mode.log_evidence)
-    ]
-    return found._replace(modes=modes)
+    modes = [mode for mode in found.modes if np.isfinite(mode.log_evidence)]
+    relative = np.array([mode.log_evidence for mode in modes]) - max(mode.log_evidence for mode in modes)
+    share = np.maximum(np.exp(relative), LEAST_SHARE)
+    parts = CLIMBED * share / share.sum()
+    return found._replace(modes=[_with_evidence(mode, part) for mode, part in zip(modes, parts, strict=True)])
+
+
+def _with_evidence(mode: Laplace, share: float) -> Laplace:
+    return mode._replace(log_density=mode.log_density + float(np.log(share)) - mode.log_evidence)
 
 
 def _finite(u: Float[Any, "n d"]) -> Float[np.ndarray, "m d"]:
@@ -192,12 +198,10 @@ def _clusters(u: Float[np.ndarray, "n d"], seed: int) -> list[Laplace]:
         criterion = found.bic(white) if found.weights_.min() * len(white) > 0.5 * needed else np.inf
         best, lowest, fruitless = (found, criterion, 0) if criterion < lowest else (best, lowest, fruitless + 1)
     if best is None or len(best.weights_) == 1:
-        mode = Laplace(mean, factor @ factor.T, 0.0)
-        return [mode._replace(log_density=-mode.log_evidence)]
+        return [_with_evidence(Laplace(mean, factor @ factor.T, 0.0), 1.0)]
     modes = []
     for share, centre, covariance in zip(best.weights_, best.means_, best.covariances_, strict=True):
-        mode = Laplace(mean + factor @ centre, factor @ covariance @ factor.T, 0.0)
-        modes.append(mode._replace(log_density=float(np.log(share)) - mode.log_evidence))
+        modes.append(_with_evidence(Laplace(mean + factor @ centre, factor @ covariance @ factor.T, 0.0), share))
     return modes
 
 
