@@ -53,7 +53,6 @@ CLUSTERS, FRUITLESS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32), 3  # how many are trie
 CLUSTER_DRAWS = 10  # that each needs for every coordinate
 NARROWEST = 1e-4  # least deviation of a cluster, as a share of that of all draws
 LEAST_PRIOR = 0.05  # share of the prior beside it
-SHORTER = 0.5  # of the first pass's stages is what a second one may take that has learnt something
 LOST = 0.3  # nats that passes may differ by beyond what their replicates explain
 ROUNDS = 30  # of expectation maximisation, for that share
 DISAGREEMENT = 0.5  # deviation of evidences [nat] from which some replicates of the first pass have lost something
@@ -117,10 +116,9 @@ def run(
     view = centred(problem, _finite(problem.to_unconstrained(values)))
     seed = int(host_generator(jax.random.fold_in(second_key, 1)).integers(2**31))
     assert first.log_evidence is not None
-    agree = first.log_evidence[1] < DISAGREEMENT
-    climbed = None
-    if view is problem and not (whole and agree):  # Hessians of many parameters take their time
-        climbed = _climbed(problem, jax.random.fold_in(second_key, 2))
+    lost = first.log_evidence[1] >= DISAGREEMENT
+    # Hessians of many parameters take long.
+    climbed = _climbed(problem, jax.random.fold_in(second_key, 2)) if view is problem and (lost or not whole) else None
     bridged = _cover(view, _finite(view.to_unconstrained(values)), climbed.modes if climbed else [], seed)
     correlation, moves = min(config.correlation, FORGOTTEN), max(config.max_moves, MOST_MOVES)
     settings = replace(config, blocks=1, correlation=correlation, max_moves=moves)
@@ -135,9 +133,9 @@ def run(
             seconds=joined.seconds + climbed.climbs.seconds,
         )
     assert second.log_evidence is not None
-    fruitless = not whole and view is problem and len(second.trace) > SHORTER * len(first.trace)
-    if fruitless and agree and not _unlike(first.log_evidence, second.log_evidence, config.replicates):
-        # A shape that the fit does not cover: from the prior the way is as short, and misses no mode.
+    comparable = not whole and view is problem and not lost
+    if comparable and first.log_evidence[1] < second.log_evidence[1] and not _differ(first, second):
+        # A shape that the fit does not cover: the way from the prior is as good, and misses no mode.
         return replace(first, rollouts=joined.rollouts, evaluations=joined.evaluations, seconds=joined.seconds)
     return joined
 
@@ -234,7 +232,7 @@ def _joined(
         ]
     replicates = np.asarray(second.details["log_evidence_replicates"])
     # Replicates that agree need no moves: what covers the posterior has been weighted well enough.
-    apart = replicate_warnings(draws, replicates) + _unlike(first.log_evidence, second.log_evidence, len(replicates))
+    apart = replicate_warnings(draws, replicates) + _unlike(first, second)
     return replace(
         first,
         draws=draws,
@@ -278,14 +276,23 @@ def _corrected(first: InferenceResult, value: float) -> Float[np.ndarray, " n_ro
     return first.prefix_log_evidence + share * (value - first.log_evidence[0])
 
 
-def _unlike(first: tuple[float, float] | None, second: tuple[float, float], replicates: int) -> list[str]:
+def _differ(first: InferenceResult, second: InferenceResult) -> float:
+    """How much higher the first pass's evidence is; 0 where it is by no more than replicates explain."""
+    assert first.log_evidence is not None
+    assert second.log_evidence is not None
+    replicates = len(second.details["log_evidence_replicates"])
+    more = first.log_evidence[0] - second.log_evidence[0]
+    explained = LOST + 4.0 * np.hypot(first.log_evidence[1], second.log_evidence[1]) / np.sqrt(replicates)
+    return more if abs(more) >= explained else 0.0
+
+
+def _unlike(first: InferenceResult, second: InferenceResult) -> list[str]:
     """A sentence where the passes find different evidences: one can be too low by what was missed."""
-    assert first is not None
-    less = first[0] - second[0]
-    if abs(less) < LOST + 4.0 * np.hypot(first[1], second[1]) / np.sqrt(replicates):
+    more = _differ(first, second)
+    if not more:
         return []
-    higher, lower = ("first", "second") if less > 0.0 else ("second", "first")
+    higher, lower = ("first", "second") if more > 0.0 else ("second", "first")
     return [
-        f"the log evidence of the {higher} pass is higher by {abs(less):.2g}: the {lower} may have lost a part of the "
+        f"the log evidence of the {higher} pass is higher by {abs(more):.2g}: the {lower} may have lost a part of the "
         'posterior; compare with start = "prior"'
     ]
