@@ -339,12 +339,12 @@ def _fixed(fn: Distribution) -> bool:
 
 def _check_data(observed: Mapping[str, Any]) -> None:
     for name, site in observed.items():
-        missing = np.isnan(np.asarray(site["value"], dtype=float))
+        missing = ~np.isfinite(np.asarray(site["value"], dtype=float))
         missing = missing.any(axis=tuple(range(missing.ndim)[missing.ndim - site["fn"].event_dim :]))
         count = int(np.sum(missing & np.asarray(_unmasked(site["fn"]))))
         if count:
             raise InputError(
-                f"{count} values of the observed site {name!r} are not numbers",
+                f"{count} values of the observed site {name!r} are not finite numbers",
                 where="numpyro model",
                 remedy="leave them out, or hide them with numpyro.handlers.mask",
             )

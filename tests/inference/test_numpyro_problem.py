@@ -353,7 +353,7 @@ def _subsampled():
 
 def _not_numbers():
     x = numpyro.sample("x", dist.Normal(0.0, 1.0))
-    numpyro.sample("y", dist.Normal(x, 1.0), obs=np.array([1.0, np.nan]))
+    numpyro.sample("y", dist.Normal(x, 1.0), obs=np.array([1.0, np.nan, np.inf]))
 
 
 def _fixed():
@@ -376,7 +376,7 @@ def _discrete():
         (_endless, "prior of site 'x' is improper"),
         (_optimised, "'centre' is a numpyro.param"),
         (_subsampled, "'data' takes random subsamples"),
-        (_not_numbers, "1 values of the observed site 'y' are not numbers"),
+        (_not_numbers, "2 values of the observed site 'y' are not finite numbers"),
         (_fixed, "'x' is no parameter"),
         (_discrete, "discrete"),
     ],
