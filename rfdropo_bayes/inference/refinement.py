@@ -46,6 +46,7 @@ from rfdropo_bayes.inference.result import (
     replicate_warnings,
 )
 
+MOST_ROWS = 5000  # that a first pass takes one after the other, at the cost of all of them each time
 REPLICATES = 4  # instead of a single one, whose evidence would have no deviation
 FORGOTTEN, MOST_MOVES = 0.1, 40  # correlation with its start that a stage of the second pass goes on to, if it can
 INFLATION, DEGREES = 1.1, 5.0  # of the Student-t's that are fitted
@@ -78,8 +79,8 @@ class SlopedBridge(BridgedProblem):
 class WholeProblem:
     """A plain model whose data come in together: what its rows say is one row.
 
-    Data that speak of many parameters one after the other, as groups of a hierarchy do, make prefixes a longer way than
-    a temperature of them all.
+    Data that are many, or speak of one parameter after the other, as groups of a hierarchy do, make prefixes a longer
+    way than a temperature of them all.
     """
 
     def __init__(self, problem: SlopedProblem) -> None:
@@ -110,7 +111,8 @@ def run(
     corrected by what the second says of the whole."""
     first_key, second_key = jax.random.split(key)
     config = replace(config, replicates=REPLICATES if config.replicates == 1 else config.replicates)
-    whole = chosen_kernel(config.kernel, problem, None) == "hamiltonian"
+    large = chosen_kernel(config.kernel, problem, None) == "hamiltonian"
+    whole = large or problem.n_rows > MOST_ROWS
     first = horizon_smc.run(WholeProblem(problem) if whole else problem, config, first_key, logbook.part(0.0, 0.5))
     values = {name: jnp.asarray(first.draws[name].ravel()) for name in problem.names}
     view = centred(problem, _finite(problem.to_unconstrained(values)))
@@ -118,7 +120,7 @@ def run(
     assert first.log_evidence is not None
     lost = first.log_evidence[1] >= DISAGREEMENT
     # Hessians of many parameters take long.
-    climbed = _climbed(problem, jax.random.fold_in(second_key, 2)) if view is problem and (lost or not whole) else None
+    climbed = _climbed(problem, jax.random.fold_in(second_key, 2)) if view is problem and (lost or not large) else None
     bridged = _cover(view, _finite(view.to_unconstrained(values)), climbed.modes if climbed else [], seed)
     correlation, moves = min(config.correlation, FORGOTTEN), max(config.max_moves, MOST_MOVES)
     settings = replace(config, blocks=1, correlation=correlation, max_moves=moves)
