@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 
 FLATTEST = 1e-10  # curvature that a step takes a direction to have at least, as a share of the steepest
@@ -61,6 +62,19 @@ class SmoothTarget(NamedTuple):
 
 
 def log_likelihood_derivatives(problem: Problem) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Gradient and Hessian of the log likelihood of all rows at one unconstrained point, compiled once."""
+    """Gradient and Hessian of the log likelihood of all rows at one unconstrained point, compiled once.
+
+    Raises:
+        InputError: a likelihood that JAX cannot differentiate twice, as one that integrates an equation with `odeint`.
+    """
     density = problem.log_likelihood_at  # type: ignore[attr-defined]
-    return jax.jit(lambda u: (jax.grad(density)(u), jax.hessian(density)(u)))
+    both = jax.jit(lambda u: (jax.grad(density)(u), jax.hessian(density)(u)))
+    try:
+        jax.eval_shape(both, np.zeros(len(problem.names)))
+    except (TypeError, ValueError, NotImplementedError) as reason:
+        raise InputError(
+            f"JAX cannot differentiate this likelihood twice: {str(reason).splitlines()[0]}",
+            where="[inference] method",
+            remedy='use method = "smc"',
+        ) from reason
+    return both

@@ -143,16 +143,29 @@ def run(
 
 
 def _climbed(problem: NumpyroProblem, key: PRNGKeyArray) -> Modes | None:
-    """Optima of the whole posterior, with their part of the mixture as evidence; None where no climb finds a start."""
+    """Optima of the whole posterior, with their part of the mixture as evidence.
+
+    None where no climb finds a start, or the model has no second derivatives.
+    """
     try:
         found = find_modes(problem, LaplaceConfig(), key)
     except InputError:
         return None
-    modes = [mode for mode in found.modes if np.isfinite(mode.log_evidence)]
+    modes = [mode for mode in found.modes if _proper(mode)]
+    if not modes:
+        return None
     relative = np.array([mode.log_evidence for mode in modes]) - max(mode.log_evidence for mode in modes)
     share = np.maximum(np.exp(relative), LEAST_SHARE)
     parts = CLIMBED * share / share.sum()
     return found._replace(modes=[_with_evidence(mode, part) for mode, part in zip(modes, parts, strict=True)])
+
+
+def _proper(mode: Laplace) -> bool:
+    try:
+        np.linalg.cholesky(mode.covariance)
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.isfinite(mode.log_evidence))
 
 
 def _with_evidence(mode: Laplace, share: float) -> Laplace:

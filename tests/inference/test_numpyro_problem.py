@@ -386,6 +386,21 @@ def test_models_that_cannot_be_sampled_are_refused(model, words):
         problem_from_numpyro(model)
 
 
+def test_a_likelihood_without_second_derivatives_is_not_climbed():
+    def model(y):
+        rate = numpyro.sample("rate", dist.LogNormal(0.0, 1.0))
+        power = jax.lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] * rate), (0, 1.0))[1]
+        numpyro.sample("y", dist.Normal(power, 1.0), obs=y)
+
+    problem = problem_from_numpyro(model, (np.array([0.3, 0.4]),))
+    with pytest.raises(InputError, match=r"cannot differentiate this likelihood twice: .*while_loop"):
+        methods.run(problem, "laplace", {}, KEY)
+    rates = methods.run(problem, "smc", {"particles": 200}, KEY).draws["rate"]
+    grid = np.linspace(0.001, 3.0, 3000)
+    density = np.exp(-0.5 * np.log(grid) ** 2 - np.sum((np.array([[0.3], [0.4]]) - grid**3) ** 2, axis=0) / 2.0) / grid
+    assert rates.mean() == pytest.approx(grid @ density / density.sum(), abs=0.06)
+
+
 def test_a_proper_prior_may_have_draws_too_large_for_a_number():
     def model(y):
         variance = numpyro.sample("variance", dist.InverseGamma(1e-3, 1e-3))
