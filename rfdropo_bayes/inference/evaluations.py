@@ -7,13 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem
 
 NOT_A_NUMBER = "not_a_number"
+REDRAWS = 256  # times as many prior draws as are wanted, at most
 
 
 @dataclass
@@ -73,3 +75,21 @@ def evaluate_prior(problem: Problem, u: Float[np.ndarray, "n d"]) -> Float[np.nd
     """Log prior at unconstrained points; minus infinity where it is not a number."""
     density = np.asarray(problem.log_prior(jnp.asarray(u)), dtype=np.float64)
     return np.where(np.isnan(density) | (density == np.inf), -np.inf, density)
+
+
+def representable_draws(
+    problem: Problem, key: PRNGKeyArray, n: int
+) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, " m"], int]:
+    """Unconstrained prior draws that coordinates can hold, at least ``n`` where `REDRAWS` times as many suffice; their
+    log density; and how many were drawn for them. A scale of 1e-400 is none: its logarithm is infinite."""
+    batches: list[tuple[np.ndarray, np.ndarray]] = []
+    drawn = found = 0
+    while found < n and drawn < REDRAWS * n:
+        values = problem.sample_prior(jax.random.fold_in(key, drawn) if drawn else key, n)
+        u = np.array(problem.to_unconstrained(values), dtype=float)
+        base = evaluate_prior(problem, u)
+        held = np.isfinite(u).all(axis=1) & np.isfinite(base)
+        batches.append((u[held], base[held]))
+        drawn, found = drawn + n, found + int(held.sum())
+    positions, densities = zip(*batches, strict=True)
+    return np.concatenate(positions), np.concatenate(densities), drawn

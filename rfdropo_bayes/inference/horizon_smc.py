@@ -20,7 +20,7 @@ from jaxtyping import Float, PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
-from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows, representable_draws
 from rfdropo_bayes.inference.hamiltonian import MOST_LEAPS, Flow, chosen_kernel, flow_of
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.proposals import KERNELS, initial_scale
@@ -39,7 +39,6 @@ ROLLOUTS_PER_PARTICLE = 20.0
 FEWEST_PARTICLES = 50
 STARTS = ("auto", "prior", "optimum")
 NOT_REPRESENTABLE = "not_representable"
-REDRAWS = 256  # prior draws for each particle, at most
 
 
 @dataclass(frozen=True)
@@ -172,18 +171,10 @@ def make_plan(problem: Problem, config: SmcConfig) -> Plan:
 def init(key: PRNGKeyArray, problem: Problem, plan: Plan, config: SmcConfig) -> SmcState:
     """Prior draws, no rollouts yet.
 
-    Draws that their coordinates cannot hold (a scale of 1e-400, whose logarithm is infinite) keep their share of the
-    prior, without weight; others are drawn instead, as long as that takes a bounded number of draws.
+    Draws that their coordinates cannot hold keep their share of the prior, without weight.
     """
-    n, drawn, u, base = plan.particles, 0, np.zeros((0, 0)), np.zeros(0)
-    while len(base) < n and drawn < REDRAWS * n:
-        batch_key = jax.random.fold_in(key, drawn) if drawn else key
-        batch = np.array(problem.to_unconstrained(problem.sample_prior(batch_key, n)), dtype=float)
-        density = evaluate_prior(problem, batch)
-        held = np.isfinite(batch).all(axis=1) & np.isfinite(density)
-        u = np.concatenate([u.reshape(-1, batch.shape[1]), batch[held]])
-        base = np.concatenate([base, density[held]])
-        drawn += n
+    n = plan.particles
+    u, base, drawn = representable_draws(problem, key, n)
     if len(base) == 0:
         raise InputError(
             f"none of {drawn} prior draws has a finite prior density",
