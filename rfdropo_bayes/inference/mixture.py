@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
-from scipy.linalg import solve_triangular
 from scipy.special import gammaln, logsumexp
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.inference.evaluations import evaluate_prior
 from rfdropo_bayes.inference.levenberg import SAME, Laplace, divergence, positive_part
-from rfdropo_bayes.inference.proposals import host_generator
+from rfdropo_bayes.inference.proposals import host_generator, squared_distance
 
 LEAST_SHARE = 0.05  # of a mode, before normalising: Laplace evidences of ill-shaped modes are off by nats
 MOMENTS = 1000  # prior draws behind its mean and covariance
@@ -87,7 +86,7 @@ def _student_t(
     which parameters of unlike units (1e-4 beside 10), or a slope and an intercept far off, fall below.
     """
     d = len(mean)
-    distance = np.sum(solve_triangular(factor, (u - mean).T, lower=True) ** 2, axis=0)
+    distance = squared_distance(factor, u - mean)
     constant = gammaln(0.5 * (degrees + d)) - gammaln(0.5 * degrees) - 0.5 * d * np.log(degrees * np.pi)
     return constant - np.log(np.diag(factor)).sum() - 0.5 * (degrees + d) * np.log1p(distance / degrees)
 

@@ -99,10 +99,10 @@ def propose(
     if kernel == "random_walk":
         return position + scale * step, np.zeros(n)
     centred = position - reference.mean
-    distance = _squared_distance(reference, centred)
+    distance = squared_distance(reference.cholesky, centred)
     spread = 0.5 * (degrees + distance) / generator.standard_gamma(0.5 * (d + degrees), n)
     moved = np.sqrt(1.0 - scale**2) * centred + scale * np.sqrt(spread)[:, None] * step
-    change = np.log1p(_squared_distance(reference, moved) / degrees) - np.log1p(distance / degrees)
+    change = np.log1p(squared_distance(reference.cholesky, moved) / degrees) - np.log1p(distance / degrees)
     return reference.mean + moved, 0.5 * (d + degrees) * change
 
 
@@ -121,5 +121,6 @@ def slowest_correlation(
     return float(np.max(np.sum(first * second, axis=1) / np.maximum(spread, 1e-300)))
 
 
-def _squared_distance(reference: Reference, centred: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-    return np.sum(solve_triangular(reference.cholesky, centred.T, lower=True) ** 2, axis=0)
+def squared_distance(factor: Float[np.ndarray, "d d"], centred: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+    """Of each point from the centre, in deviations of the covariance whose Cholesky factor is given."""
+    return np.sum(solve_triangular(factor, centred.T, lower=True) ** 2, axis=0)

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from numpyro.distributions import MultivariateStudentT
 from scipy.linalg import solve_triangular
-from scipy.special import expit, logit
+from scipy.special import expit, logit, logsumexp
 
 from rfdropo_bayes.bayes.problem import Values
 from rfdropo_bayes.errors import InputError
@@ -36,7 +36,7 @@ from rfdropo_bayes.inference.horizon_smc import SmcConfig
 from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes
 from rfdropo_bayes.inference.levenberg import Laplace
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.mixture import LEAST_SHARE, ModeMixture
+from rfdropo_bayes.inference.mixture import ModeMixture
 from rfdropo_bayes.inference.numpyro_problem import NumpyroProblem
 from rfdropo_bayes.inference.proposals import fit_reference, host_generator
 from rfdropo_bayes.inference.result import (
@@ -143,7 +143,7 @@ def run(
 
 
 def _climbed(problem: NumpyroProblem, key: PRNGKeyArray) -> Modes | None:
-    """Optima of the whole posterior, with their part of the mixture as evidence.
+    """Optima of the whole posterior, their evidences scaled to their part of the mixture.
 
     None where no climb finds a start, or the model has no second derivatives.
     """
@@ -154,10 +154,8 @@ def _climbed(problem: NumpyroProblem, key: PRNGKeyArray) -> Modes | None:
     modes = [mode for mode in found.modes if _proper(mode)]
     if not modes:
         return None
-    relative = np.array([mode.log_evidence for mode in modes]) - max(mode.log_evidence for mode in modes)
-    share = np.maximum(np.exp(relative), LEAST_SHARE)
-    parts = CLIMBED * share / share.sum()
-    return found._replace(modes=[_with_evidence(mode, part) for mode, part in zip(modes, parts, strict=True)])
+    shift = float(np.log(CLIMBED) - logsumexp([mode.log_evidence for mode in modes]))
+    return found._replace(modes=[mode._replace(log_density=mode.log_density + shift) for mode in modes])
 
 
 def _proper(mode: Laplace) -> bool:
