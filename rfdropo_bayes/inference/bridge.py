@@ -126,8 +126,8 @@ def run(
     climb_key, sample_key = jax.random.split(key)
     digest = run_digest(problem, "bridge", config, key)
     checkpoint = logbook.checkpoint("bridge_climbs", digest)
-    found = find_modes(problem, config.climb, climb_key, checkpoint, logbook)
-    return sample_from_modes(problem, config, found, sample_key, logbook)
+    found = find_modes(problem, config.climb, climb_key, checkpoint, logbook.part(0.0, 0.5))
+    return sample_from_modes(problem, config, found, sample_key, logbook.part(0.5, 1.0))
 
 
 def sample_from_modes(

@@ -316,15 +316,15 @@ def _replicate(
 ) -> SmcState:
     init_key, stage_key = jax.random.split(key)
     saved = checkpoint.load()
-    state = init(init_key, problem, plan, config) if saved is None else _unpack(*saved)
+    state = init(init_key, problem, plan, config) if saved is None else unpack(*saved)
     while not state.finished:
         state, _ = step(stage_key, state, problem, plan, config)
-        checkpoint.save(*_pack(state))
+        checkpoint.save(*pack(state))
         report(state)
     return state
 
 
-def _pack(state: SmcState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def pack(state: SmcState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     population = state.population
     arrays = {name: getattr(population, name) for name in ("position", "base", "rows", "log_weights")}
     meta = {name: getattr(state, name) for name in ("block", "stage", "log_evidence", "trace", "seconds", "finished")}
@@ -332,7 +332,7 @@ def _pack(state: SmcState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     return arrays | {"prefix_log_evidence": state.prefix_log_evidence}, meta
 
 
-def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SmcState:
+def unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SmcState:
     population = Population(
         arrays["position"], arrays["base"], arrays["rows"], arrays["log_weights"], meta["progress"], meta["scale"]
     )

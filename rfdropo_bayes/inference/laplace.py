@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.basins import OneSummit, one_point, one_ridge, summits
 from rfdropo_bayes.inference.checkpoints import UNSAVED, Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
@@ -23,10 +25,14 @@ from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.newton import SmoothTarget, log_likelihood_derivatives
 from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_warnings, prior_warnings
 from rfdropo_bayes.inference.schedules import block_boundaries
-from rfdropo_bayes.inference.survey import survey
+from rfdropo_bayes.inference.survey import Survey, survey
 
 JACOBIANS = ("auto", "forward", "central")
 SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before them may take
+SURVEYS = 2  # of the last prefixes, whose draws climbs start from
+# Horizons of climbs after a survey, as shares of the recording. From half of it to all of it in one step most climbs of
+# a push, where contacts begin and end, came to rest on the way.
+CONTINUED = (0.75, 0.875, 1.0)
 FEWEST_STEPS = 4.0  # of a climb at the last horizon that is worth its start
 RIVAL = 30.0  # [nat]: an optimum that far below the best matters to no posterior
 
@@ -40,7 +46,8 @@ class LaplaceConfig:
         screen: draws, from the prior or from where the problem says that climbs may start, judged at the first
             horizon: the best is the first start, the others lie apart from it among the best quarter.
         survey: particles of a tempered population that finds the starts instead, for posteriors with many summits; it
-            takes the place of the climbs at short horizons; 0 for none. Only for problems with residuals.
+            takes the place of the climbs at short horizons, and those at longer ones begin at `CONTINUED`; 0 for none.
+            Only for problems with residuals.
         blocks: horizons of a climb, doubling; short ones first, because a long recording has many local optima.
         max_steps: most steps of a climb at one horizon.
         tolerance: a climb ends when a step promises less [nat].
@@ -119,8 +126,12 @@ def find_modes(
             screened draws has a finite likelihood.
     """
     horizons, target_at = _targets(problem, config)
+    same: OneSummit = one_point
+    began_at = 0.0
+    if config.survey and isinstance(problem, ResidualProblem):
+        same, began_at = one_ridge(problem, key), SURVEY_OF_CLIMBS
     saved = checkpoint.load()
-    climbs = _first(problem, config, key, horizons[0], logbook) if saved is None else _unpack(*saved)
+    climbs = _unpack(*saved) if saved else _first(problem, config, key, horizons[0], logbook.part(0.0, began_at))
     target = None
     while climbs.level < len(horizons):
         began = time.monotonic()
@@ -129,13 +140,13 @@ def find_modes(
             target = target_at(horizons[climbs.level], climbs.ledger, best, climbs.noise)
         allowed = _affordable_steps(problem.n_rows, config, climbs, horizons, int(target.noise.sum()))
         state, steps = maximise(target, climbs.positions[climbs.done], max_steps=allowed, tolerance=config.tolerance)
-        climbs = _record(climbs, state, len(steps), horizons[climbs.level], target.noise)
+        climbs = _record(climbs, state, len(steps), horizons[climbs.level], target, same)
         climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
         if climbs.done == 0:
             target = None
         checkpoint.save(*_pack(climbs))
         share = (climbs.level + climbs.done / config.starts) / len(horizons)
-        logbook.stage(share, method="laplace", **climbs.trace[-1])
+        logbook.part(began_at, 1.0).stage(share, method="laplace", **climbs.trace[-1])
     assert climbs.noise is not None
     return _collect(climbs, target_at(problem.n_rows, climbs.ledger, climbs.positions[0], climbs.noise))
 
@@ -150,7 +161,7 @@ def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], 
 
         horizons = block_boundaries(problem.n_rows, config.blocks)
         if config.survey:
-            horizons = (_surveyed(problem, config)[-1], problem.n_rows)
+            horizons = tuple(math.ceil(share * problem.n_rows) for share in CONTINUED)
         return tuple(sorted(set(horizons))), by_residuals
     if hasattr(problem, "log_likelihood_at"):
         derivatives = log_likelihood_derivatives(problem)
@@ -199,8 +210,25 @@ def _first(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: 
     ledger, began = Ledger(), time.monotonic()
     budget = None if config.rollouts is None else SURVEY_OF_CLIMBS * config.rollouts
     found = survey(problem, _surveyed(problem, config), config.survey, budget, key, ledger, logbook)
-    order = _spread_starts(found.positions, found.log_density, config.starts)
-    return _at_starts(found.positions[order], found.log_density[order], ledger, began)
+    return _at_starts(*_surveyed_starts(found, config.starts), ledger, began)
+
+
+def _surveyed_starts(
+    found: list[Survey], count: int
+) -> tuple[Float[np.ndarray, "start d"], Float[np.ndarray, " start"]]:
+    """Draws of the last prefixes, as many of each.
+
+    The longest knows best where the summit is, unless all its particles are in one valley and the summit beyond the
+    next; when those of a shorter one were drawn there was no ridge between.
+    """
+    found = found[-SURVEYS:]
+    positions, density = [], []
+    for index, population in enumerate(reversed(found)):
+        wanted = count // len(found) + (index < count % len(found))
+        order = _spread_starts(population.positions, population.log_density, wanted)[:wanted]
+        positions.append(population.positions[order])
+        density.append(population.log_density[order])
+    return np.concatenate(positions), np.concatenate(density)
 
 
 def _at_starts(
@@ -246,8 +274,10 @@ def _spread_starts(u: Float[np.ndarray, "n d"], density: Float[np.ndarray, " n"]
     return order[chosen]
 
 
-def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, noise: np.ndarray) -> Climbs:
-    """Put down one finished climb; after the last one of a horizon drop duplicates and go to the next horizon.
+def _record(
+    climbs: Climbs, state: LevenbergState, steps: int, horizon: int, target: Climbable, same: OneSummit
+) -> Climbs:
+    """Put down one finished climb; after the last one of a horizon keep one of each summit and go to the next horizon.
 
     Of the climbs of a horizon the better half goes on (successive halving), and every rival of the best.
     """
@@ -257,18 +287,12 @@ def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, noi
     facts = {"horizon": horizon, "start": climbs.done, "steps": steps, "log_density": state.log_density}
     climbs.trace.append(facts | {"converged": state.converged, "rollouts": climbs.ledger.rollouts})
     climbs = climbs._replace(
-        positions=positions, log_density=density, converged=converged, done=climbs.done + 1, noise=noise
+        positions=positions, log_density=density, converged=converged, done=climbs.done + 1, noise=target.noise
     )
     if climbs.done < len(positions):
         return climbs
-    order = np.argsort(-density, kind="stable")
-    kept: list[int] = []
-    for index in order:
-        if all(np.max(np.abs(positions[index] - positions[other])) > 0.02 for other in kept):
-            kept.append(int(index))
-    kept = [
-        index for rank, index in enumerate(kept) if 2 * rank < len(kept) or density[index] > density[kept[0]] - RIVAL
-    ]
+    kept = summits(positions, density, target.density, same)
+    kept = kept[(2 * np.arange(len(kept)) < len(kept)) | (density[kept] > density[kept[0]] - RIVAL)]
     return climbs._replace(
         positions=positions[kept],
         log_density=density[kept],
@@ -281,13 +305,14 @@ def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, noi
 def _collect(climbs: Climbs, target: Climbable) -> Modes:
     """Laplace at every optimum that could matter, in the order of their evidence."""
     warnings = []
-    near = climbs.log_density > climbs.log_density.max() - RIVAL
-    modes = []
-    for position, density, converged in zip(
-        climbs.positions[near], climbs.log_density[near], climbs.converged[near], strict=True
-    ):
-        modes.append(laplace(target, LevenbergState(position, float(density), 0.0, bool(converged))))
-    modes = _distinct(modes)
+    modes: list[Laplace] = []
+    for index in np.argsort(-climbs.log_density, kind="stable"):
+        state = LevenbergState(
+            climbs.positions[index], float(climbs.log_density[index]), 0.0, bool(climbs.converged[index])
+        )
+        if state.log_density > climbs.log_density.max() - RIVAL and _apart(state.position, modes):
+            mode = laplace(target, state)
+            modes += [mode] if _apart(mode.mean, modes) else []
     modes.sort(key=lambda mode: -mode.log_evidence)
     best = np.argmin(np.max(np.abs(climbs.positions - modes[0].mean), axis=1))
     if not climbs.converged[best]:
@@ -303,16 +328,10 @@ def _collect(climbs: Climbs, target: Climbable) -> Modes:
     return Modes(modes, climbs, warnings)
 
 
-def _distinct(modes: list[Laplace]) -> list[Laplace]:
-    """Drop optima that lie within one posterior deviation of a better one: climbs stopped on one flat top."""
-    kept: list[Laplace] = []
-    for mode in sorted(modes, key=lambda mode: -mode.log_density):
-        distances = [
-            (mode.mean - other.mean) @ np.linalg.solve(other.covariance, mode.mean - other.mean) for other in kept
-        ]
-        if all(distance > len(mode.mean) for distance in distances):
-            kept.append(mode)
-    return kept
+def _apart(position: Float[np.ndarray, " d"], modes: list[Laplace]) -> bool:
+    """Whether a point lies beyond one posterior deviation of every mode: climbs also stop on one flat top."""
+    away = [position - mode.mean for mode in modes]
+    return all(u @ np.linalg.solve(mode.covariance, u) > len(u) for u, mode in zip(away, modes, strict=True))
 
 
 def run(

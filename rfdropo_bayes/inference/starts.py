@@ -37,7 +37,9 @@ PER_SURVEYOR = 32.0  # rollouts that a particle of the survey takes, typically
 # With fewer, more than half of the surveys of a rugged ridge missed the summit.
 MOST_SURVEYORS, FEWEST_SURVEYORS = 128, 64
 CLOSE = 1e-2  # nats below its optimum that a climb may end: the sampler starts from a wider distribution
-STEPS = 12.0  # that a climb takes at each horizon, typically
+STEPS, SURVEYED_STEPS = 12.0, 7.0  # that a climb takes at each horizon, typically; and after a survey in all
+SURVEYED_STARTS = 8  # at most
+CLIMBED = 0.6  # share of the work that is done when climbs have ended, for a progress bar
 SCORING = 0.1  # and the evidence of the blocks
 MARGIN = 3.0  # what real posteriors cost over the estimate, which takes them to be normal and data to be even
 WORTH_A_REPLICATE = 100  # particles
@@ -70,12 +72,13 @@ def run(
     digest = run_digest(problem, "smc_climbs", config, key)
     checkpoint = logbook.checkpoint("smc_climbs", digest)
     try:
-        found = find_modes(problem, climbing, climb_key, checkpoint, logbook)
+        found = find_modes(problem, climbing, climb_key, checkpoint, logbook.part(0.0, CLIMBED))
     except InputError:
         if config.start == "optimum":
             raise
         # No screened draw had a likelihood: whether the prior excludes the data is for more particles to say.
         return horizon_smc.run(problem, config, key, logbook)
+    logbook = logbook.part(CLIMBED, 1.0)
     horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
     way = way_from_prior(problem, found.modes[0], horizons, config.target_ess, way_key)
     left = None if config.rollouts is None else config.rollouts - found.climbs.ledger.rollouts
@@ -94,9 +97,10 @@ def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
     if surveyors < FEWEST_SURVEYORS or getattr(problem, "earlier", None):
         surveyors = 0
     budget = CLIMBING * config.rollouts
-    # Three horizons that double cost 1.75 times the last, two 1.5; a step is a Jacobian by differences and 6 dampings.
-    whole = (1.5 if surveyors else 1.75) * STEPS * (4.0 * len(problem.names) + 7.0)
-    starts = int(np.clip(budget / whole, 1, LaplaceConfig().starts))
+    # Three horizons that double cost 1.75 times the last; after a survey few summits are left at the second of them. A
+    # step is a Jacobian by differences and 6 dampings.
+    steps, most = (SURVEYED_STEPS, SURVEYED_STARTS) if surveyors else (1.75 * STEPS, LaplaceConfig().starts)
+    starts = int(np.clip(budget / (steps * (4.0 * len(problem.names) + 7.0)), 1, most))
     limit = budget + surveyors * PER_SURVEYOR
     return LaplaceConfig(starts=starts, survey=surveyors, tolerance=CLOSE, rollouts=limit)
 

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import ResidualProblem, Values
 from rfdropo_bayes.inference import horizon_smc
+from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior
 from rfdropo_bayes.inference.logbook import Logbook
 from rfdropo_bayes.inference.straight import StraightProblem
@@ -29,12 +30,10 @@ class Survey(NamedTuple):
     Attributes:
         positions: unconstrained, in the problem's own coordinates.
         log_density: log posterior of the prefix there, unnormalised.
-        trace: of the sampler.
     """
 
     positions: Float[np.ndarray, "n d"]
     log_density: Float[np.ndarray, " n"]
-    trace: list[dict[str, Any]]
 
 
 class BlockProblem:
@@ -63,17 +62,20 @@ def survey(
     key: PRNGKeyArray,
     ledger: Ledger,
     logbook: Logbook,
-) -> Survey:
-    """Sample the posterior of a prefix, on the way through shorter ones.
+) -> list[Survey]:
+    """Sample the posteriors of growing prefixes.
 
     Args:
         problem: to be climbed.
-        horizons: prefixes on the way, and the last one.
+        horizons: the prefixes.
         particles: their number.
         rollouts: budget in full-length rollouts; None for no limit.
         key: random key.
         ledger: is charged.
-        logbook: for checkpoints, in a folder of their own.
+        logbook: for the checkpoint, and where stages are reported.
+
+    Returns:
+        one survey for each prefix.
 
     Raises:
         InputError: no particle has a positive likelihood.
@@ -83,16 +85,52 @@ def survey(
     # The sampler takes blocks for rows of equal cost, which is more than short ones cost.
     whole = None if rollouts is None else rollouts * problem.n_rows / horizons[-1]
     config = horizon_smc.SmcConfig(
-        rollouts=whole, particles=particles, blocks=len(horizons), spacing="linear", max_moves=MOST_MOVES, draws=1
+        rollouts=whole,
+        particles=particles,
+        kernel="crank_nicolson",
+        blocks=len(horizons),
+        spacing="linear",
+        max_moves=MOST_MOVES,
+        draws=1,
     )
-    folder = None if logbook.folder is None else logbook.folder / "survey"
-    found = horizon_smc.run(blocks, config, run_key, Logbook(folder, logbook.resume))
-    _charge(problem, horizons, found.trace, ledger)
-    ledger.excluded.update(found.excluded)
-    values = {name: jnp.asarray(found.draws[name][0]) for name in problem.names}
-    u = np.asarray(problem.to_unconstrained(values), dtype=float)
-    assert found.log_likelihood is not None
-    return Survey(u, evaluate_prior(problem, u) + found.log_likelihood[0].sum(axis=1), found.trace)
+    checkpoint = logbook.checkpoint("survey", run_digest(blocks, "survey", config, run_key))
+    populations, state = _populations(blocks, config, run_key, checkpoint, logbook)
+    _charge(problem, horizons, state.trace, ledger)
+    ledger.excluded.update(state.ledger.excluded)
+    found = []
+    for block, (position, rows) in enumerate(populations, start=1):
+        values = blocks.from_unconstrained(jnp.asarray(position))
+        u = np.asarray(problem.to_unconstrained(values), dtype=float)
+        found.append(Survey(u, evaluate_prior(problem, u) + rows[:, :block].sum(axis=1)))
+    return found
+
+
+def _populations(
+    blocks: BlockProblem, config: horizon_smc.SmcConfig, key: PRNGKeyArray, checkpoint: Checkpoint, logbook: Logbook
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], horizon_smc.SmcState]:
+    """Positions and rows of the particles at the end of each block, and the sampler's last state."""
+    init_key, stage_key = jax.random.split(key)
+    plan = horizon_smc.make_plan(blocks, config)
+    ends: list[tuple[np.ndarray, np.ndarray]] = []
+    saved = checkpoint.load()
+    if saved is None:
+        state = horizon_smc.init(init_key, blocks, plan, config)
+    else:
+        arrays, meta = saved
+        state = horizon_smc.unpack(arrays, meta)
+        ends = [(arrays[f"positions_{block}"], arrays[f"rows_{block}"]) for block in range(meta["ends"])]
+    while not state.finished:
+        state, _ = horizon_smc.step(stage_key, state, blocks, plan, config)
+        population = state.population
+        if population.progress == len(ends) + 1:
+            ends.append((population.position, population.rows))
+        arrays, meta = horizon_smc.pack(state)
+        for block, (position, rows) in enumerate(ends):
+            arrays |= {f"positions_{block}": position, f"rows_{block}": rows}
+        checkpoint.save(arrays, meta | {"ends": len(ends)})
+        facts = state.trace[-1] | {"horizon": blocks.horizons[state.block]}
+        logbook.stage(population.progress / blocks.n_rows, method="survey", stage=state.stage, **facts)
+    return ends, state
 
 
 def _charge(problem: ResidualProblem, horizons: tuple[int, ...], trace: list[dict[str, Any]], ledger: Ledger) -> None:

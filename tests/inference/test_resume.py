@@ -31,7 +31,11 @@ OPTIONS = {
     "bridge": {"particles": 40, "replicates": 2, "climb": {"starts": 1, "blocks": 1}},
     "rfdropo": {"evaluations": 60, "rollouts_per_candidate": 10},
 }
-CASES = [*OPTIONS.items(), ("rfdropo", {**OPTIONS["rfdropo"], "optimiser": "cem", "horizon": "adaptive"})]
+CASES = [
+    *OPTIONS.items(),
+    ("laplace", {"starts": 4, "survey": 40, "rollouts": 2000.0, "draws": 50}),
+    ("rfdropo", {**OPTIONS["rfdropo"], "optimiser": "cem", "horizon": "adaptive"}),
+]
 
 
 class Killed(Exception):

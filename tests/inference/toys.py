@@ -237,6 +237,29 @@ class Washboard(LinearGaussian):
         return sum(np.log(np.trapezoid(shape * norm.pdf(c + away, 2.0, 3.0), away)) for c in self.centre)
 
 
+class LateVerdict(LinearGaussian):
+    """Two valleys: the narrower is out of reach for who samples half of the rows, and the rest says it is the true one.
+
+    The first quarter of the rows leaves both open with a hill of some nats between them.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(n_rows=8, d=1)
+        self.mean, self.sd = np.zeros(1), np.full(1, 1.5)
+        self.scale = jnp.array([0.01, 0.01, 10.0, 10.0])
+
+    def _fit(self, x, horizon):
+        bend = (x**2 - 1.0) * (1.0 + 400.0 * jax.nn.sigmoid(-8.0 * x))
+        late = jnp.ones(4) * 3.0 * (x + 1.0)[..., None]
+        return jnp.concatenate([self.scale * bend[..., None], late], axis=-1)[..., :horizon]
+
+    def _row_density(self, u, horizon):
+        return jax.scipy.stats.norm.logpdf(self._fit(u[:, 0], horizon))
+
+    def residuals(self, values, horizon):
+        return self._fit(values["x0"], horizon)
+
+
 class Spring:
     """Features of a damped oscillation whose frequency and damping differ from rollout to rollout, for RF-DROPO."""
 
