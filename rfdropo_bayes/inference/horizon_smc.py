@@ -325,20 +325,21 @@ def _replicate(
 
 
 def pack(state: SmcState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays of a state and the rest of it, for a checkpoint."""
     population = state.population
     arrays = {name: getattr(population, name) for name in ("position", "base", "rows", "log_weights")}
     meta = {name: getattr(state, name) for name in ("block", "stage", "log_evidence", "trace", "seconds", "finished")}
     meta |= {"progress": population.progress, "scale": population.scale, "ledger": state.ledger.record()}
-    return arrays | {"prefix_log_evidence": state.prefix_log_evidence}, meta
+    return {**arrays, "prefix_log_evidence": state.prefix_log_evidence}, meta
 
 
 def unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SmcState:
-    population = Population(
-        arrays["position"], arrays["base"], arrays["rows"], arrays["log_weights"], meta["progress"], meta["scale"]
-    )
-    ledger = Ledger.from_record(meta["ledger"])
+    """The state that `pack` took apart."""
+    own = {name: arrays[name] for name in ("position", "base", "rows", "log_weights")}
+    population = Population(**own, progress=meta["progress"], scale=meta["scale"])
     named = {name: meta[name] for name in ("block", "stage", "log_evidence", "trace", "seconds", "finished")}
-    return SmcState(population, prefix_log_evidence=arrays["prefix_log_evidence"], ledger=ledger, **named)
+    prefixes, ledger = arrays["prefix_log_evidence"], Ledger.from_record(meta["ledger"])
+    return SmcState(population, prefix_log_evidence=prefixes, ledger=ledger, **named)
 
 
 def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcState]) -> InferenceResult:
@@ -391,8 +392,7 @@ def _stage_warnings(trace: list[dict[str, Any]], config: SmcConfig) -> list[str]
             f"the budget of {config.rollouts:g} rollouts ran out at row {leaps[0]['progress']:g}: the last rows were "
             f"brought in by reweighting only (effective share {worst:.2%}); allow more rollouts or use fewer particles"
         )
-    stuck = max(row["correlation"] for row in trace if row.get("final"))
-    if stuck > max(0.7, config.correlation):
+    if (stuck := max(row["correlation"] for row in trace if row.get("final"))) > max(0.7, config.correlation):
         sentences.append(
             f"the last moves left the particles {stuck:.2f} correlated with where they were: several modes, or a shape "
             "that the moves cannot follow; compare replicates"
