@@ -1,4 +1,4 @@
-"""The one error a user's input can raise: it says what is wrong, where, and what to do."""
+"""The error a user's input can raise: it says what is wrong, where, and what to do."""
 
 from __future__ import annotations
 
@@ -20,3 +20,7 @@ class InputError(ValueError):
         if remedy:
             parts.append(remedy)
         super().__init__("; ".join(" ".join(part.split()) for part in parts))
+
+
+class NoLikelihoodError(InputError):
+    """No parameter set that was tried has a positive likelihood: the prior excludes the data, or more must be tried."""

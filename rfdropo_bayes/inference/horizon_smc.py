@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem
-from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows, representable_draws
 from rfdropo_bayes.inference.hamiltonian import MOST_LEAPS, Flow, chosen_kernel, flow_of
@@ -271,9 +271,9 @@ def _facts(info: StageInfo) -> dict[str, Any]:
     return {name: getattr(info, name) for name in kept}
 
 
-def _nothing_left(state: SmcState, horizon: int) -> InputError:
+def _nothing_left(state: SmcState, horizon: int) -> NoLikelihoodError:
     reasons = ", ".join(f"{name} {count}" for name, count in sorted(state.ledger.excluded.items())) or "no reason given"
-    return InputError(
+    return NoLikelihoodError(
         f"the prior excludes the data: no parameter set has a positive likelihood up to row {horizon} ({reasons})",
         where="[model.priors]",
         remedy="widen the priors, or look at what the simulator reports for them",

@@ -11,25 +11,26 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Bool, Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.basins import OneSummit, one_point, one_ridge, summits
 from rfdropo_bayes.inference.checkpoints import UNSAVED, Checkpoint, run_digest
-from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.evaluations import Ledger
+from rfdropo_bayes.inference.first_climbs import screened, surveyed
 from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
 from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES
 from rfdropo_bayes.inference.levenberg import NOISE_GRID, Climbable, Laplace, LevenbergState, laplace, maximise
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.newton import SmoothTarget, log_likelihood_derivatives
+from rfdropo_bayes.inference.proposals import squared_distance
 from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_warnings, prior_warnings
 from rfdropo_bayes.inference.schedules import block_boundaries
-from rfdropo_bayes.inference.survey import Survey, survey
+from rfdropo_bayes.inference.survey import survey
 
 JACOBIANS = ("auto", "forward", "central")
 SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before them may take
-SURVEYS = 2  # of the last prefixes, whose draws climbs start from
 # Horizons of climbs after a survey, as shares of the recording. From half of it to all of it in one step most climbs of
 # a push, where contacts begin and end, came to rest on the way.
 CONTINUED = (0.75, 0.875, 1.0)
@@ -42,7 +43,8 @@ class LaplaceConfig:
     """Levenberg-Marquardt and Laplace.
 
     Attributes:
-        starts: number of climbs at the first horizon; half of them go on to each longer one.
+        starts: number of climbs at the first horizon; the better half of their summits go on to each longer one, and
+            every rival of the best.
         screen: draws, from the prior or from where the problem says that climbs may start, judged at the first
             horizon: the best is the first start, the others lie apart from it among the best quarter.
         survey: particles of a tempered population that finds the starts instead, for posteriors with many summits; it
@@ -136,11 +138,11 @@ def find_modes(
     while climbs.level < len(horizons):
         began = time.monotonic()
         if target is None:
-            best = climbs.positions[np.argmax(climbs.log_density)] if climbs.done == 0 else climbs.positions[0]
-            target = target_at(horizons[climbs.level], climbs.ledger, best, climbs.noise)
+            target = target_at(horizons[climbs.level], climbs.ledger, climbs.positions[0], climbs.noise)
         allowed = _affordable_steps(problem.n_rows, config, climbs, horizons, int(target.noise.sum()))
         state, steps = maximise(target, climbs.positions[climbs.done], max_steps=allowed, tolerance=config.tolerance)
-        climbs = _record(climbs, state, len(steps), horizons[climbs.level], target, same)
+        rule = one_point if horizons[climbs.level] == horizons[-1] else same
+        climbs = _record(climbs, state, len(steps), horizons[climbs.level], target, rule)
         climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
         if climbs.done == 0:
             target = None
@@ -177,12 +179,6 @@ def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], 
     )
 
 
-def _surveyed(problem: Problem, config: LaplaceConfig) -> tuple[int, ...]:
-    """Horizons of the survey: from one block shorter than climbs would begin with to the last but one."""
-    horizons = block_boundaries(problem.n_rows, config.blocks + 1)
-    return horizons[:-1] or horizons
-
-
 def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizons: tuple[int, ...], noise: int) -> int:
     """Steps the present climb may take: what is left of the budget is shared among climbs by their horizons.
 
@@ -204,74 +200,16 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
 
 
 def _first(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int, logbook: Logbook) -> Climbs:
-    """Where climbs start: at survivors of a survey, or at screened draws."""
-    if not config.survey or not isinstance(problem, ResidualProblem):
-        return _screen(problem, config, key, horizon)
+    """Climbs at their starts."""
     ledger, began = Ledger(), time.monotonic()
-    budget = None if config.rollouts is None else SURVEY_OF_CLIMBS * config.rollouts
-    found = survey(problem, _surveyed(problem, config), config.survey, budget, key, ledger, logbook)
-    return _at_starts(*_surveyed_starts(found, config.starts), ledger, began)
-
-
-def _surveyed_starts(
-    found: list[Survey], count: int
-) -> tuple[Float[np.ndarray, "start d"], Float[np.ndarray, " start"]]:
-    """Draws of the last prefixes, as many of each.
-
-    The longest knows best where the summit is, unless all its particles are in one valley and the summit beyond the
-    next; when those of a shorter one were drawn there was no ridge between.
-    """
-    found = found[-SURVEYS:]
-    positions, density = [], []
-    for index, population in enumerate(reversed(found)):
-        wanted = count // len(found) + (index < count % len(found))
-        order = _spread_starts(population.positions, population.log_density, wanted)[:wanted]
-        positions.append(population.positions[order])
-        density.append(population.log_density[order])
-    return np.concatenate(positions), np.concatenate(density)
-
-
-def _at_starts(
-    u: Float[np.ndarray, "start d"], density: Float[np.ndarray, " start"], ledger: Ledger, began: float
-) -> Climbs:
-    seconds = time.monotonic() - began
-    return Climbs(u, density, np.zeros(len(u), dtype=bool), 0, 0, None, ledger, [], seconds)
-
-
-def _screen(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int) -> Climbs:
-    ledger = Ledger()
-    began = time.monotonic()
-    draw = getattr(problem, "sample_starts", problem.sample_prior)
-    u = np.asarray(problem.to_unconstrained(draw(key, max(config.screen, config.starts))), dtype=float)
-    density = evaluate_prior(problem, u) + evaluate_rows(problem, u, horizon, ledger).sum(axis=1)
-    order = _spread_starts(u, density, config.starts)
-    if len(order) == 0:
-        reasons = ", ".join(f"{name} {count}" for name, count in sorted(ledger.excluded.items())) or "no reason given"
-        raise InputError(
-            f"none of {len(u)} prior draws has a positive likelihood up to row {horizon} ({reasons})",
-            where="[model.priors]",
-            remedy="widen the priors, or look at what the simulator reports for them",
-        )
-    return _at_starts(u[order], density[order], ledger, began)
-
-
-def _spread_starts(u: Float[np.ndarray, "n d"], density: Float[np.ndarray, " n"], count: int) -> Int[np.ndarray, " k"]:
-    """The best draw, and then always the one of the best quarter that is farthest from those chosen.
-
-    The best few alone often lie together, and then all climb to one optimum of several.
-    """
-    order = np.argsort(-density, kind="stable")
-    order = order[np.isfinite(density[order]) & np.isfinite(u[order]).all(axis=1)]
-    if len(order) == 0:
-        return order
-    spread = u[order].std(axis=0)
-    order = order[: max(count, len(u) // 4)]
-    scaled = u[order] / np.maximum(spread, 1e-300)
-    chosen = [0]
-    while len(chosen) < min(count, len(order)):
-        distance = np.linalg.norm(scaled[:, None] - scaled[chosen], axis=2).min(axis=1)
-        chosen.append(int(np.argmax(distance)))
-    return order[chosen]
+    if config.survey and isinstance(problem, ResidualProblem):
+        budget = None if config.rollouts is None else SURVEY_OF_CLIMBS * config.rollouts
+        prefixes = block_boundaries(problem.n_rows, config.blocks + 1)
+        found = survey(problem, prefixes[:-1] or prefixes, config.survey, budget, key, ledger, logbook)
+        u, density = surveyed(problem, found, horizon, config.starts, ledger)
+    else:
+        u, density = screened(problem, config.screen, horizon, config.starts, key, ledger)
+    return Climbs(u, density, np.zeros(len(u), dtype=bool), 0, 0, None, ledger, [], seconds=time.monotonic() - began)
 
 
 def _record(
@@ -330,8 +268,9 @@ def _collect(climbs: Climbs, target: Climbable) -> Modes:
 
 def _apart(position: Float[np.ndarray, " d"], modes: list[Laplace]) -> bool:
     """Whether a point lies beyond one posterior deviation of every mode: climbs also stop on one flat top."""
-    away = [position - mode.mean for mode in modes]
-    return all(u @ np.linalg.solve(mode.covariance, u) > len(u) for u, mode in zip(away, modes, strict=True))
+    factors = [np.linalg.cholesky(mode.covariance) for mode in modes]
+    away = [squared_distance(factor, (position - mode.mean)[None]) for factor, mode in zip(factors, modes, strict=True)]
+    return all(distance > len(position) for distance in away)
 
 
 def run(

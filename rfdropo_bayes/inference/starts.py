@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
-from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference import bridge, horizon_smc, refinement
 from rfdropo_bayes.inference.checkpoints import run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
@@ -37,7 +37,8 @@ PER_SURVEYOR = 32.0  # rollouts that a particle of the survey takes, typically
 # With fewer, more than half of the surveys of a rugged ridge missed the summit.
 MOST_SURVEYORS, FEWEST_SURVEYORS = 128, 64
 CLOSE = 1e-2  # nats below its optimum that a climb may end: the sampler starts from a wider distribution
-STEPS, SURVEYED_STEPS = 12.0, 7.0  # that a climb takes at each horizon, typically; and after a survey in all
+STEPS = 12.0  # that a climb takes at each horizon, typically
+SURVEYED_STEPS = 7.0  # of the length of the whole recording that a climb after a survey takes, typically
 SURVEYED_STARTS = 8  # at most
 CLIMBED = 0.6  # share of the work that is done when climbs have ended, for a progress bar
 SCORING = 0.1  # and the evidence of the blocks
@@ -73,10 +74,10 @@ def run(
     checkpoint = logbook.checkpoint("smc_climbs", digest)
     try:
         found = find_modes(problem, climbing, climb_key, checkpoint, logbook.part(0.0, CLIMBED))
-    except InputError:
+    except NoLikelihoodError:
         if config.start == "optimum":
             raise
-        # No screened draw had a likelihood: whether the prior excludes the data is for more particles to say.
+        # No draw to climb from had a likelihood: whether the prior excludes the data is for more particles to say.
         return horizon_smc.run(problem, config, key, logbook)
     logbook = logbook.part(CLIMBED, 1.0)
     horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)

@@ -25,11 +25,11 @@ MOST_MOVES = 8  # of a stage: climbs need a place in the right basins, not a fai
 
 
 class Survey(NamedTuple):
-    """Particles at the posterior of a prefix.
+    """Particles that have arrived at the posterior of a prefix, and not been moved there yet: places to climb from.
 
     Attributes:
         positions: unconstrained, in the problem's own coordinates.
-        log_density: log posterior of the prefix there, unnormalised.
+        log_density: log posterior of the prefix there, unnormalised; minus infinity where the rollout is lost.
     """
 
     positions: Float[np.ndarray, "n d"]
@@ -63,7 +63,7 @@ def survey(
     ledger: Ledger,
     logbook: Logbook,
 ) -> list[Survey]:
-    """Sample the posteriors of growing prefixes.
+    """Temper particles to the posteriors of growing prefixes.
 
     Args:
         problem: to be climbed.
@@ -78,7 +78,7 @@ def survey(
         one survey for each prefix.
 
     Raises:
-        InputError: no particle has a positive likelihood.
+        NoLikelihoodError: no particle has a positive likelihood.
     """
     straight_key, run_key = jax.random.split(key)
     blocks = BlockProblem(StraightProblem(problem, straight_key), horizons)
@@ -128,8 +128,9 @@ def _populations(
         for block, (position, rows) in enumerate(ends):
             arrays |= {f"positions_{block}": position, f"rows_{block}": rows}
         checkpoint.save(arrays, meta | {"ends": len(ends)})
-        facts = state.trace[-1] | {"horizon": blocks.horizons[state.block]}
-        logbook.stage(population.progress / blocks.n_rows, method="survey", stage=state.stage, **facts)
+        facts = {name: state.trace[-1][name] for name in ("ess", "acceptance", "moves")}
+        share, horizon = population.progress / blocks.n_rows, blocks.horizons[state.block]
+        logbook.stage(share, method="survey", stage=state.stage, horizon=horizon, **facts)
     return ends, state
 
 

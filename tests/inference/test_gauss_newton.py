@@ -154,7 +154,7 @@ def test_a_problem_without_residuals_is_refused():
 
 
 def test_starts_that_all_fail_are_refused():
-    with pytest.raises(InputError, match=r"none of 64 prior draws.*diverged 64"):
+    with pytest.raises(InputError, match=r"none of 64 draws.*diverged 64"):
         laplace.run(Decay(fails_above=-1.0), LaplaceConfig(), KEY)
 
 

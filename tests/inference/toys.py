@@ -238,9 +238,9 @@ class Washboard(LinearGaussian):
 
 
 class LateVerdict(LinearGaussian):
-    """Two valleys: the narrower is out of reach for who samples half of the rows, and the rest says it is the true one.
+    """Two basins: the narrower is out of reach for who samples half of the rows, and the rest says it is the true one.
 
-    The first quarter of the rows leaves both open with a hill of some nats between them.
+    The first quarter of the rows leaves both open, with a barrier of eleven nats between them.
     """
 
     def __init__(self) -> None:
