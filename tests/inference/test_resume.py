@@ -240,6 +240,15 @@ def test_a_damaged_checkpoint_is_refused(damage, tmp_path):
         methods.run(decay(), "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path, resume=True)
 
 
+@pytest.mark.parametrize("part", ["survey", "smc_climbs"])
+def test_a_damaged_checkpoint_of_climbs_does_not_start_them_over(part, tmp_path):
+    """They fall back to the prior, but only where no draw to climb from has a likelihood."""
+    (tmp_path / f"{part}.npz").write_bytes(b"")
+    options = {"rollouts": 6000.0, "particles": 60}
+    with pytest.raises(InputError, match="damaged"):
+        methods.run(decay(), "smc", options, KEY, checkpoint_dir=tmp_path, resume=True)
+
+
 def test_without_resume_an_old_checkpoint_is_not_used(tmp_path):
     methods.run(decay(), "smc", OPTIONS["smc"], jax.random.key(1), checkpoint_dir=tmp_path)
     fresh = methods.run(decay(), "smc", OPTIONS["smc"], KEY, checkpoint_dir=tmp_path)
