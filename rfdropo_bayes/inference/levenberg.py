@@ -131,7 +131,7 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
     # An engine in single precision promises for ever what it does not deliver. Where six decades of damping gain
     # nothing, the differences left are those of rounding, or the model is useless here: smaller steps, if any.
     if gain < tolerance:
-        stuck = dampings[-1] > 1e8 or promised < 100.0 * tolerance
+        stuck = bool(dampings[-1] > 1e8 or promised < 100.0 * tolerance)
         moved = LevenbergState(position, density, state.damping * 1e5, stuck)
     else:
         moved = LevenbergState(position, density, float(np.clip(dampings[best], 1e-9, 1e9)), False)

@@ -148,6 +148,16 @@ def test_the_bridge_keeps_two_modes_that_the_climbs_found():
     assert any("further optima" in sentence for sentence in alone.warnings)
 
 
+def test_a_climb_ends_where_nothing_comes_of_what_it_promises():
+    """Single precision may round all gains away. What is recorded of it is Python's own, which JSON can hold."""
+    problem = LinearGaussian(n_rows=20, d=2)
+    target = make_target(problem, 20, Ledger(), np.zeros(2), prior_derivatives(problem))
+    flat = target._replace(density=lambda u: np.zeros(len(u)))
+    state, steps = maximise(flat, np.full(2, 3.0), max_steps=60, tolerance=1e-4)
+    assert state.converged is True
+    assert len(steps) < 5
+
+
 def test_a_problem_without_residuals_is_refused():
     with pytest.raises(InputError, match=r'no residuals.*method = "smc"'):
         laplace.run(Spring(), LaplaceConfig(), KEY)
