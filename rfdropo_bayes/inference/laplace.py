@@ -30,7 +30,7 @@ from rfdropo_bayes.inference.schedules import block_boundaries
 from rfdropo_bayes.inference.survey import survey
 
 JACOBIANS = ("auto", "forward", "central")
-SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before them may take
+SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before them may take, and of their progress
 # Horizons of climbs after a survey, as shares of the recording. From half of it to all of it in one step most climbs of
 # a push, where contacts begin and end, came to rest on the way.
 CONTINUED = (0.75, 0.875, 1.0)
@@ -50,7 +50,8 @@ class LaplaceConfig:
         survey: particles of a tempered population that finds the starts instead, for posteriors with many summits; it
             takes the place of the climbs at short horizons, and those at longer ones begin at `CONTINUED`; 0 for none.
             Only for problems with residuals.
-        blocks: horizons of a climb, doubling; short ones first, because a long recording has many local optima.
+        blocks: horizons of a climb, or of the survey, doubling; short ones first, because a long recording has many
+            local optima.
         max_steps: most steps of a climb at one horizon.
         tolerance: a climb ends when a step promises less [nat].
         jacobian: "forward", "central" or "auto".
@@ -121,11 +122,11 @@ def find_modes(
     checkpoint: Checkpoint = UNSAVED,
     logbook: Logbook = UNRECORDED,
 ) -> Modes:
-    """Climb from the best of some prior draws to the optima of the full posterior.
+    """Climb from the best of some prior draws, or from the particles of a survey, to the optima of the full posterior.
 
     Raises:
-        InputError: a problem without residuals whose likelihood JAX cannot differentiate either, or none of the
-            screened draws has a finite likelihood.
+        InputError: a problem without residuals whose likelihood JAX cannot differentiate either.
+        NoLikelihoodError: none of the draws has a positive likelihood.
     """
     horizons, target_at = _targets(problem, config)
     same: OneSummit = one_point
