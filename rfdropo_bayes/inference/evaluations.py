@@ -34,6 +34,11 @@ class Ledger:
     evaluations: int = 0
     excluded: Counter[str] = field(default_factory=Counter)
 
+    @property
+    def reasons(self) -> str:
+        """What was left out for which reason, in words."""
+        return ", ".join(f"{name} {count}" for name, count in sorted(self.excluded.items())) or "no reason given"
+
     def record(self) -> dict[str, Any]:
         """For a checkpoint's JSON. (`dataclasses.asdict` counts the items of a Counter instead of copying them.)"""
         return {"rollouts": self.rollouts, "evaluations": self.evaluations, "excluded": dict(self.excluded)}

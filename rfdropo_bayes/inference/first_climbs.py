@@ -65,9 +65,8 @@ def _heights(problem: Problem, u: Float[np.ndarray, "n d"], horizon: int, ledger
     """
     density = evaluate_prior(problem, u) + evaluate_rows(problem, u, horizon, ledger).sum(axis=1)
     if not np.isfinite(density).any():
-        reasons = ", ".join(f"{name} {count}" for name, count in sorted(ledger.excluded.items())) or "no reason given"
         raise NoLikelihoodError(
-            f"none of {len(u)} draws has a positive likelihood up to row {horizon} ({reasons})",
+            f"none of {len(u)} draws has a positive likelihood up to row {horizon} ({ledger.reasons})",
             where="[model.priors]",
             remedy="widen the priors, or look at what the simulator reports for them",
         )

@@ -272,9 +272,9 @@ def _facts(info: StageInfo) -> dict[str, Any]:
 
 
 def _nothing_left(state: SmcState, horizon: int) -> NoLikelihoodError:
-    reasons = ", ".join(f"{name} {count}" for name, count in sorted(state.ledger.excluded.items())) or "no reason given"
     return NoLikelihoodError(
-        f"the prior excludes the data: no parameter set has a positive likelihood up to row {horizon} ({reasons})",
+        "the prior excludes the data: no parameter set has a positive likelihood "
+        f"up to row {horizon} ({state.ledger.reasons})",
         where="[model.priors]",
         remedy="widen the priors, or look at what the simulator reports for them",
     )

@@ -121,8 +121,17 @@ def find_modes(
     key: PRNGKeyArray,
     checkpoint: Checkpoint = UNSAVED,
     logbook: Logbook = UNRECORDED,
+    ledger: Ledger | None = None,
 ) -> Modes:
     """Climb from the best of some prior draws, or from the particles of a survey, to the optima of the full posterior.
+
+    Args:
+        problem: to be climbed.
+        config: settings.
+        key: random key.
+        checkpoint: of the climbs.
+        logbook: of the survey before them, and where stages are reported.
+        ledger: is charged; after an error it knows what was spent in vain.
 
     Raises:
         InputError: a problem without residuals whose likelihood JAX cannot differentiate either.
@@ -134,7 +143,11 @@ def find_modes(
     if config.survey and isinstance(problem, ResidualProblem):
         same, began_at = one_ridge(problem, key), SURVEY_OF_CLIMBS
     saved = checkpoint.load()
-    climbs = _unpack(*saved) if saved else _first(problem, config, key, horizons[0], logbook.part(0.0, began_at))
+    if saved is None:
+        ledger = Ledger() if ledger is None else ledger
+        climbs = _first(problem, config, key, horizons[0], ledger, logbook.part(0.0, began_at))
+    else:
+        climbs = _unpack(*saved)
     target = None
     while climbs.level < len(horizons):
         began = time.monotonic()
@@ -200,9 +213,11 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
     return int(np.clip((rows / served - grid) / step, 0, config.max_steps))
 
 
-def _first(problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int, logbook: Logbook) -> Climbs:
+def _first(
+    problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int, ledger: Ledger, logbook: Logbook
+) -> Climbs:
     """Climbs at their starts."""
-    ledger, began = Ledger(), time.monotonic()
+    began = time.monotonic()
     if config.survey and isinstance(problem, ResidualProblem):
         budget = None if config.rollouts is None else SURVEY_OF_CLIMBS * config.rollouts
         prefixes = block_boundaries(problem.n_rows, config.blocks + 1)

@@ -72,13 +72,15 @@ def run(
     climbing = _climbing(problem, config)
     digest = run_digest(problem, "smc_climbs", config, key)
     checkpoint = logbook.checkpoint("smc_climbs", digest)
+    spent = Ledger()
     try:
-        found = find_modes(problem, climbing, climb_key, checkpoint, logbook.part(0.0, CLIMBED))
+        found = find_modes(problem, climbing, climb_key, checkpoint, logbook.part(0.0, CLIMBED), spent)
     except NoLikelihoodError:
         if config.start == "optimum":
             raise
         # No draw to climb from had a likelihood: whether the prior excludes the data is for more particles to say.
-        return horizon_smc.run(problem, config, key, logbook)
+        left = None if config.rollouts is None else config.rollouts - spent.rollouts
+        return _with_cost(horizon_smc.run(problem, replace(config, rollouts=left), key, logbook), spent)
     logbook = logbook.part(CLIMBED, 1.0)
     horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
     way = way_from_prior(problem, found.modes[0], horizons, config.target_ess, way_key)
@@ -126,14 +128,20 @@ def _affordable(way: Way, config: SmcConfig, left: float | None) -> bool:
 
 
 def _with_climbs(result: InferenceResult, found: Modes, way: Way) -> InferenceResult:
-    ledger = found.climbs.ledger
+    return replace(
+        _with_cost(result, found.climbs.ledger),
+        seconds=result.seconds + found.climbs.seconds,
+        details=result.details | {"start": "prior", "expected_stages": way.stages, "information_nats": way.information},
+    )
+
+
+def _with_cost(result: InferenceResult, ledger: Ledger) -> InferenceResult:
+    """What was spent before the sampler began, too."""
     return replace(
         result,
         rollouts=result.rollouts + ledger.rollouts,
         evaluations=result.evaluations + ledger.evaluations,
         excluded=dict(Counter(result.excluded) + ledger.excluded),
-        seconds=result.seconds + found.climbs.seconds,
-        details=result.details | {"start": "prior", "expected_stages": way.stages, "information_nats": way.information},
     )
 
 

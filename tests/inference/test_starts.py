@@ -151,6 +151,28 @@ def test_the_budget_covers_climbs_sampler_and_scores(budget):
     assert sum(n * h for n, h in problem.calls) / problem.n_rows <= budget
 
 
+class Deaf(LinearGaussian):
+    """Loses every rollout of the first look at three quarters of the rows, where climbs would begin."""
+
+    heard = False
+
+    def row_log_likelihood(self, values, horizon):
+        rows, status = super().row_log_likelihood(values, horizon)
+        if horizon == 30 and not self.heard:
+            self.heard = True
+            return np.full(np.shape(rows), -np.inf), np.ones(np.shape(status), dtype=int)
+        return rows, status
+
+
+def test_a_survey_in_vain_is_part_of_the_budget():
+    """The sampler goes on from the prior with what is left of it."""
+    problem = Deaf(n_rows=40, d=2, noise=1e-2)
+    result = methods.run(problem, "smc", {"rollouts": 8000.0, "blocks": 2}, KEY)
+    assert problem.heard
+    assert sum(n * h for n, h in problem.calls) / problem.n_rows <= result.rollouts * (1.0 + 1e-9)
+    assert result.rollouts <= 8000.0
+
+
 def test_a_start_at_the_optima_needs_residuals():
     with pytest.raises(InputError, match="no residuals"):
         methods.run(Spring(), "smc", {"start": "optimum"}, KEY)
