@@ -15,12 +15,11 @@ from rfdropo_bayes.audit.score import likeness
 from rfdropo_bayes.audit.screen import Look, Row
 from rfdropo_bayes.audit.sentence import sentence
 from rfdropo_bayes.audit.verdict import NO_DISCREPANCY, UNEXPLAINED
+from rfdropo_bayes.bayes.units import force_power
 
 SCHEMA_VERSION = 1
 MILLIMETRES = 1e3
 STIFFNESS = "young_modulus"
-# Units that carry a force, and the power of it; the first that fits counts.
-FORCES = (("/N", -1), ("kg", 1), ("N", 1), ("Pa", 1))
 
 
 def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_experiment: Any) -> dict[str, Any]:
@@ -172,7 +171,7 @@ def _relative_sizes(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any]:
     found = {}
     for i in indices:
         name, unit = coordinates.names[i], coordinates.space.parameters[i].spec.unit
-        power = next((p for token, p in FORCES if token in unit), 0)
+        power = force_power(unit)
         if power == 0 or i not in place or named[name] == 0.0:
             continue
         gradient = np.zeros(len(fit.free))

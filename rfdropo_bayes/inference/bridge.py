@@ -26,6 +26,7 @@ from rfdropo_bayes.inference.levenberg import Laplace
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.mixture import ModeMixture, covering
 from rfdropo_bayes.inference.result import InferenceResult, exclusion_warnings, prior_warnings, replicate_warnings
+from rfdropo_bayes.inference.soundings import Sounding, sounded
 from rfdropo_bayes.inference.straight import StraightProblem
 
 
@@ -140,16 +141,19 @@ def sample_from_modes(
     """Sample from around optima that are known to the posterior; the climbs' cost is part of the result's."""
     moment_key, run_key = jax.random.split(key)
     view: Problem = problem
-    modes = found.modes
-    if isinstance(problem, ResidualProblem):
+    modes, ledger, sampler = found.modes, found.climbs.ledger, config.sampler
+    if isinstance(problem, ResidualProblem) and found.climbs.noise is not None:
         view = straight = StraightProblem(problem, moment_key)
-        modes = [straight.mode(mode) for mode in modes]
+        before = ledger.rollouts
+        sounding = Sounding(straight, straight.logarithmic, found.climbs.noise, ledger)
+        modes = sounded(sounding, [straight.mode(mode) for mode in modes], moment_key, config.rollouts)
+        if sampler.rollouts is not None:
+            sampler = replace(sampler, rollouts=sampler.rollouts - (ledger.rollouts - before))
     bridged = BridgedProblem(view, covering(view, modes, moment_key), config)
-    sampled = horizon_smc.run(bridged, config.sampler, run_key, logbook)
+    sampled = horizon_smc.run(bridged, sampler, run_key, logbook)
     u = np.stack([sampled.draws[name] for name in bridged.names], axis=-1)
     values = view.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
     draws = {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in problem.names}
-    ledger = found.climbs.ledger
     excluded = ledger.excluded + Counter(sampled.excluded)
     evaluations = ledger.evaluations + sampled.evaluations
     # Several optima are what the mixture is for: no warning here, unlike in Laplace alone.

@@ -21,9 +21,19 @@ from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.first_climbs import screened, surveyed
 from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
 from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES
-from rfdropo_bayes.inference.levenberg import NOISE_GRID, Climbable, Laplace, LevenbergState, laplace, maximise
+from rfdropo_bayes.inference.levenberg import (
+    Climbable,
+    Laplace,
+    LevenbergState,
+    climb_cost,
+    laplace,
+    maximise,
+    normal_at,
+)
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
+from rfdropo_bayes.inference.mixture import prior_moments
 from rfdropo_bayes.inference.newton import SmoothTarget, log_likelihood_derivatives
+from rfdropo_bayes.inference.plateaus import climbs_from, plateaus
 from rfdropo_bayes.inference.proposals import squared_distance
 from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_warnings, prior_warnings
 from rfdropo_bayes.inference.schedules import block_boundaries
@@ -48,8 +58,8 @@ class LaplaceConfig:
         screen: draws, from the prior or from where the problem says that climbs may start, judged at the first
             horizon: the best is the first start, the others lie apart from it among the best quarter.
         survey: particles of a tempered population that finds the starts instead, for posteriors with many summits; it
-            takes the place of the climbs at short horizons, and those at longer ones begin at `CONTINUED`; 0 for none.
-            Only for problems with residuals.
+            takes the place of the climbs at short horizons, and those at longer ones begin at `CONTINUED`; then
+            plateaus are looked for, see `plateaus`; 0 for none. Only for problems with residuals.
         blocks: horizons of a climb, or of the survey, doubling; short ones first, because a long recording has many
             local optima.
         max_steps: most steps of a climb at one horizon.
@@ -164,7 +174,10 @@ def find_modes(
         share = (climbs.level + climbs.done / config.starts) / len(horizons)
         logbook.part(began_at, 1.0).stage(share, method="laplace", **climbs.trace[-1])
     assert climbs.noise is not None
-    return _collect(climbs, target_at(problem.n_rows, climbs.ledger, climbs.positions[0], climbs.noise))
+    target = target_at(problem.n_rows, climbs.ledger, climbs.positions[0], climbs.noise)
+    if config.survey and isinstance(problem, ResidualProblem):
+        climbs = _with_plateaus(problem, config, climbs, target, key)
+    return _collect(climbs, target)
 
 
 def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], Callable[..., Climbable]]:
@@ -206,8 +219,7 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
     waiting = starts - climbs.done
     share = now * waiting / (now * waiting + later)
     rows = (config.rollouts - climbs.ledger.rollouts) * share * n_rows / now
-    # The grid of the noise; then a Jacobian by central differences, two more rows per noise, six dampings tried.
-    grid, step = NOISE_GRID * noise, 4.0 * d + 7.0
+    grid, step = climb_cost(d, noise)
     # More rivals than expected may have come to the last horizon: the best climb on, rather than none.
     served = waiting if later else int(np.clip(rows / (grid + FEWEST_STEPS * step), 1, waiting))
     return int(np.clip((rows / served - grid) / step, 0, config.max_steps))
@@ -253,6 +265,28 @@ def _record(
         converged=converged[kept],
         level=climbs.level + 1,
         done=0,
+    )
+
+
+def _with_plateaus(
+    problem: Problem, config: LaplaceConfig, climbs: Climbs, target: Climbable, key: PRNGKeyArray
+) -> Climbs:
+    """The climbs, and those from plateaus beside the best of them."""
+    best = int(np.argmax(climbs.log_density))
+    state = LevenbergState(climbs.positions[best], float(climbs.log_density[best]), 0.0, bool(climbs.converged[best]))
+    widths = np.sqrt(np.diag(np.linalg.inv(prior_moments(problem, key)[1])))
+    places = plateaus(target, normal_at(target, state), widths, RIVAL)
+    left = math.inf if config.rollouts is None else config.rollouts - climbs.ledger.rollouts
+    found = climbs_from(target, places, config.tolerance, left)
+    if not found:
+        return climbs
+    for index, end in enumerate(found):
+        facts = {"horizon": problem.n_rows, "plateau": index, "log_density": end.log_density}
+        climbs.trace.append(facts | {"converged": end.converged, "rollouts": climbs.ledger.rollouts})
+    return climbs._replace(
+        positions=np.concatenate([climbs.positions, np.stack([end.position for end in found])]),
+        log_density=np.append(climbs.log_density, [end.log_density for end in found]),
+        converged=np.append(climbs.converged, [end.converged for end in found]),
     )
 
 

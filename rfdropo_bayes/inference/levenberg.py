@@ -166,21 +166,28 @@ def maximise(
     return state, trace
 
 
+def climb_cost(d: int, noise: int) -> tuple[float, float]:
+    """Rollouts, of its horizon, of a climb's beginning and of each of its steps, for so many coordinates in all and of
+    the noise: the grid of the noise; a Jacobian by central differences, two more per noise, six dampings."""
+    return float(NOISE_GRID * noise), 4.0 * d + 7.0
+
+
 def laplace(target: Climbable, state: LevenbergState) -> Laplace:
     """Normal approximation at a mode; where derivatives are differences, the last of them are along its own axes."""
-    found = _normal(target, state)
+    found = normal_at(target, state)
     for _ in range(ROUNDS):
         nearer = target.along(_axes(found.covariance, target.noise))
         if nearer is None:
             break
         moved, _ = step(nearer, state._replace(position=found.mean, log_density=found.log_density), SAME**2)
-        before, found = found, _normal(nearer, moved)
+        before, found = found, normal_at(nearer, moved)
         if divergence(before, found) < SAME:
             break
     return found
 
 
-def _normal(target: Climbable, state: LevenbergState) -> Laplace:
+def normal_at(target: Climbable, state: LevenbergState) -> Laplace:
+    """Normal approximation by the derivatives that climbs use."""
     u = state.position
     information = positive_part(target.information(u))
     values, vectors = np.linalg.eigh(information + positive_part(-target.prior_hessian(u)))

@@ -93,15 +93,20 @@ def _student_t(
 
 def covering(problem: Problem, modes: list[Laplace], key: PRNGKeyArray) -> list[Laplace]:
     """The modes, and for each the normal distribution of its likelihood and the prior's moments, if that is another."""
-    drawn = np.asarray(problem.to_unconstrained(problem.sample_prior(key, MOMENTS)), dtype=float)
-    drawn = drawn[np.isfinite(drawn).all(axis=1)]
-    drawn = np.clip(drawn, *np.quantile(drawn, [0.01, 0.99], axis=0))  # heavy tails have no moments
-    mean, precision = drawn.mean(axis=0), np.linalg.inv(np.atleast_2d(np.cov(drawn.T)))
+    mean, precision = prior_moments(problem, key)
     found = []
     for mode in modes:
         wide = _with_prior_moments(mode, mean, precision)
         found += [mode] if wide is None or divergence(mode, wide) < SAME else [mode, wide]
     return found
+
+
+def prior_moments(problem: Problem, key: PRNGKeyArray) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
+    """Mean and inverse covariance of the prior, by draws."""
+    drawn = np.asarray(problem.to_unconstrained(problem.sample_prior(key, MOMENTS)), dtype=float)
+    drawn = drawn[np.isfinite(drawn).all(axis=1)]
+    drawn = np.clip(drawn, *np.quantile(drawn, [0.01, 0.99], axis=0))  # heavy tails have no moments
+    return drawn.mean(axis=0), np.linalg.inv(np.atleast_2d(np.cov(drawn.T)))
 
 
 def _with_prior_moments(

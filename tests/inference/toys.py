@@ -312,3 +312,70 @@ class Spring:
 
 def _logit(value, low, high):
     return jnp.log(value - low) - jnp.log(high - value)
+
+
+class Stuck(LinearGaussian):
+    """A weight on a rough table: beyond 1 it does not slip, and nothing tells how heavy it is.
+
+    Rows see the pull, and the slip ``min(weight - 1, 0)``. They ask for a little slip, which a weight just below 1
+    has: a summit a few nats above the plateau, and far narrower.
+    """
+
+    edge = 1.0
+
+    def __init__(self, slip: float = 0.012, noise: float = 0.02) -> None:
+        super().__init__(n_rows=10, d=2)
+        self.names = ("pull", "weight")
+        self.units = dict.fromkeys(self.names, "1")
+        self.bounds = dict.fromkeys(self.names, (-np.inf, np.inf))
+        self.mean, self.sd, self.noise = np.array([0.5, 1.0]), np.array([1.0, 2.0]), np.full(10, noise)
+        self.design = np.stack([np.linspace(0.5, 2.0, 10), np.ones(10)], axis=1)
+        self.data = self.design @ np.array([1.2, -slip])
+
+    def _fit(self, pull, weight, horizon):
+        slip = jnp.minimum(weight - self.edge, 0.0)
+        return jnp.stack([pull, slip], axis=-1) @ self.design[:horizon].T
+
+    def _row_density(self, u, horizon):
+        return jax.scipy.stats.norm.logpdf(self.data[:horizon], self._fit(u[:, 0], u[:, 1], horizon), self.noise[0])
+
+    def residuals(self, values, horizon):
+        fit = self._fit(values["pull"], values["weight"], horizon)
+        return (self.data[:horizon] - fit) / self.noise[:horizon]
+
+    def by_quadrature(self):
+        """Log evidence, and the posterior's share on the plateau."""
+        pull = np.linspace(1.1, 1.3, 801)
+        below, above = self.edge + np.linspace(-0.3, 0.0, 1201), np.linspace(self.edge, 15.0, 1201)
+        parts = []
+        for weight in (below, above):
+            u = np.stack(np.meshgrid(pull, weight, indexing="ij"), axis=-1).reshape(-1, 2)
+            log = np.asarray(self.log_prior(u)) + np.asarray(self._row_density(u, self.n_rows)).sum(axis=1)
+            density = np.exp(log.reshape(len(pull), len(weight)))
+            parts.append(np.trapezoid(np.trapezoid(density, weight, axis=1), pull))
+        return float(np.log(sum(parts))), float(parts[1] / sum(parts))
+
+
+class Crooked(LinearGaussian):
+    """Log likelihood ``-x^2 / 2 s^2`` with another ``s`` on either side of its kink, in turned coordinates."""
+
+    def __init__(self, right: tuple[float, ...] = (0.02, 0.3), left: tuple[float, ...] = (0.4, 0.3)) -> None:
+        super().__init__(n_rows=2, d=2)
+        self.mean, self.sd = np.zeros(2), np.full(2, 5.0)
+        self.right, self.left = jnp.array(right), jnp.array(left)
+        self.turn = jnp.array([[0.8, 0.6], [-0.6, 0.8]])
+
+    def _parts(self, u):
+        along = u @ self.turn.T
+        return along / jnp.where(along > 0.0, self.right, self.left)
+
+    def _row_density(self, u, horizon):
+        return -0.5 * self._parts(u)[:, :horizon] ** 2
+
+    def residuals(self, values, horizon):
+        return self._parts(jnp.stack([values[name] for name in self.names]))[:horizon]
+
+    def log_evidence(self):
+        """The prior is as good as constant where the likelihood is."""
+        sides = np.sqrt(2.0 * np.pi) * 0.5 * (np.asarray(self.right) + np.asarray(self.left))
+        return float(np.log(sides).sum() - np.log(2.0 * np.pi * 25.0))

@@ -1,0 +1,206 @@
+"""Kinks and plateaus: where derivatives mislead, the density itself is followed."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rfdropo_bayes.inference import methods
+from rfdropo_bayes.inference.evaluations import Ledger
+from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
+from rfdropo_bayes.inference.laplace import RIVAL, LaplaceConfig, find_modes
+from rfdropo_bayes.inference.levenberg import Laplace, init, laplace, maximise
+from rfdropo_bayes.inference.plateaus import Held, climbs_from, plateaus
+from rfdropo_bayes.inference.soundings import DEAREST, Sounding, sounded
+from rfdropo_bayes.inference.straight import StraightProblem
+
+from .toys import Crooked, LinearGaussian, Ratio, Stuck
+
+KEY = jax.random.key(12)
+
+
+class Seen(NamedTuple):
+    """An optimum with what found it."""
+
+    problem: object
+    target: object
+    mode: Laplace
+    ledger: Ledger
+
+
+def climbed(problem, start) -> Seen:
+    ledger = Ledger()
+    noise = np.zeros(len(problem.names), dtype=bool)
+    target = make_target(problem, problem.n_rows, ledger, np.array(start), prior_derivatives(problem), "central", noise)
+    state, _ = maximise(target, np.array(start), max_steps=60, tolerance=1e-6)
+    return Seen(problem, target, laplace(target, state), ledger)
+
+
+def look(seen: Seen, *, logarithmic: bool = False) -> Sounding:
+    d = len(seen.problem.names)
+    return Sounding(seen.problem, np.full(d, logarithmic), np.zeros(d, dtype=bool), Ledger())
+
+
+def test_a_normal_posterior_is_left_as_it_is():
+    problem = LinearGaussian(n_rows=20, d=4)
+    seen = climbed(problem, problem.mean)
+    sounding = look(seen)
+    assert sounded(sounding, [seen.mode], KEY, 1000.0)[0] is seen.mode
+    assert sounding.ledger.rollouts == 1 + 4 * 4
+
+
+def test_a_ridge_that_ends_at_bounds_is_left_as_it_is():
+    """What the prior cuts off says nothing against the model of the likelihood, and is not simulated."""
+    problem = Ratio()
+    seen = climbed(problem, np.zeros(2))
+    straight = StraightProblem(problem, KEY)
+    sounding = Sounding(straight, straight.logarithmic, np.zeros(2, dtype=bool), Ledger())
+    mode = straight.mode(seen.mode)
+    assert sounded(sounding, [mode], KEY, None)[0] is mode
+    assert sounding.ledger.rollouts < 1 + 4 * 2
+
+
+def test_the_widths_on_both_sides_of_a_kink_are_found():
+    problem = Crooked()
+    seen = climbed(problem, np.array([0.3, 0.2]))
+    found = sounded(look(seen), [seen.mode], KEY, 1000.0)[0]
+    assert found is not seen.mode
+    turn = np.asarray(problem.turn)
+    centre, deviation = turn @ found.mean, np.sqrt(np.diag(turn @ found.covariance @ turn.T))
+    # Two nats below the top on either side. Axes are those of derivatives, not quite those of the kink.
+    np.testing.assert_allclose(deviation, 0.5 * (problem.right + problem.left), rtol=0.15)
+    assert centre[0] - 2.0 * deviation[0] == pytest.approx(-0.8, rel=0.2)
+    assert abs(centre[1]) < 0.1
+
+
+def test_the_evidence_of_a_kinked_posterior_is_exact():
+    """The mean of 4 replicates of 250 scatters by 0.03; the threshold is five times that."""
+    problem = Crooked()
+    result = methods.run(problem, "bridge", {"particles": 250, "replicates": 4}, KEY)
+    assert result.log_evidence[0] == pytest.approx(problem.log_evidence(), abs=0.15)
+
+
+def test_soundings_keep_to_their_share_of_the_budget():
+    seen = climbed(Crooked(), np.array([0.3, 0.2]))
+    sounding = look(seen)
+    modes = sounded(sounding, [seen.mode] * 50, KEY, 1000.0)
+    one = look(seen)
+    sounded(one, [seen.mode], KEY, None)
+    assert len(modes) == 50
+    assert modes[-1] is seen.mode
+    assert sounding.ledger.rollouts < DEAREST * 1000.0 + one.ledger.rollouts
+
+
+class Weighed(Ratio):
+    """The ratio of a stiffness and a mass, by data with a kink: derivatives across it have both determined."""
+
+    def __init__(self, unit: str = "kg") -> None:
+        super().__init__()
+        self.units = {"stiffness": "Pa" if unit == "kg" else "1", "mass": unit}
+
+    def _row_density(self, u, horizon):
+        values = self.from_unconstrained(u)
+        return (
+            -0.5
+            * jax.vmap(lambda s, m: self.residuals({"stiffness": s, "mass": m}, horizon))(
+                values["stiffness"], values["mass"]
+            )
+            ** 2
+        )
+
+    def residuals(self, values, horizon):
+        away = jnp.log(values["stiffness"] / values["mass"]) - jnp.log(4.0)
+        return jnp.where(away > 0.0, 10.0, 300.0) * away * self.gain[:horizon]
+
+
+@pytest.mark.parametrize(("unit", "free"), [("kg", True), ("1", False)])
+def test_a_common_scale_that_data_leave_free_is_as_wide_as_the_prior(unit, free):
+    """The mode's information says otherwise, as differences across kinks do; only units tell where to look."""
+    problem = Weighed(unit)
+    straight = StraightProblem(problem, KEY)
+    top = np.log([[2.8, 0.7]])
+    information = np.array([[4e4, -3e4], [-3e4, 9e4]])
+    density = float(np.asarray(straight.log_prior(top))[0])
+    mode = Laplace(top[0], np.linalg.inv(information), density, information, np.zeros(2))
+    sounding = Sounding(straight, straight.logarithmic, np.zeros(2, dtype=bool), Ledger())
+    found = sounded(sounding, [mode], KEY, None)[0]
+    along = np.array([1.0, 1.0]) / np.sqrt(2.0)
+    deviation = np.sqrt(along @ found.covariance @ along)
+    # From 2 to 4 of stiffness, where the mass ends: the logarithm of 2, times the root of 2, by four deviations.
+    assert (deviation > 0.15) == free
+
+
+def test_a_plateau_beside_a_summit_is_found():
+    problem = Stuck()
+    seen = climbed(problem, np.array([1.0, 0.7]))
+    assert seen.mode.mean[1] == pytest.approx(0.988, abs=2e-3)
+    found = plateaus(seen.target, seen.mode, problem.sd, RIVAL)
+    assert [plateau.coordinate for plateau in found] == [1]
+    assert found[0].point[1] > problem.edge
+    before = seen.ledger.rollouts
+    (end,) = climbs_from(seen.target, found, 1e-6, 500.0)
+    assert seen.ledger.rollouts - before <= 500.0
+    assert end.position[1] == found[0].point[1]
+    # Least squares of the pull alone, its prior being wide.
+    design = problem.design[:, 0]
+    assert end.position[0] == pytest.approx(design @ problem.data / (design @ design), abs=1e-3)
+
+
+def test_no_budget_no_climb():
+    problem = Stuck()
+    seen = climbed(problem, np.array([1.0, 0.7]))
+    found = plateaus(seen.target, seen.mode, problem.sd, RIVAL)
+    assert climbs_from(seen.target, found, 1e-6, 3.0) == []
+
+
+@pytest.mark.parametrize("start", [0.3, 2.0])
+def test_a_posterior_without_plateaus_has_none(start):
+    problem = LinearGaussian(n_rows=20, d=3)
+    seen = climbed(problem, start * problem.mean)
+    assert plateaus(seen.target, seen.mode, problem.sd, RIVAL) == []
+
+
+def test_what_is_flat_as_far_as_derivatives_say_is_no_plateau():
+    """A direction that only the prior limits: the normal approximation has it."""
+    problem = LinearGaussian(n_rows=20, d=3)
+    problem.design[:, 2] = 0.0
+    seen = climbed(problem, problem.mean)
+    assert plateaus(seen.target, seen.mode, problem.sd, RIVAL) == []
+
+
+def test_the_plateau_holds_its_share_of_the_posterior():
+    """Most of the posterior, though the summit beside it is higher. 4 replicates: the evidence's mean scatters by 0.05,
+    the share by 0.03."""
+    problem = Stuck()
+    evidence, share = problem.by_quadrature()
+    assert share > 0.6
+    found = find_modes(problem, LaplaceConfig(starts=2, survey=64, rollouts=4000.0), KEY)
+    assert {"plateau", "horizon"} <= set(found.climbs.trace[-1])
+    result = methods.run(problem, "smc", {"rollouts": 12000, "start": "optimum", "blocks": 1}, KEY)
+    assert result.rollouts <= 12000
+    assert result.log_evidence[0] == pytest.approx(evidence, abs=0.25)
+    assert np.mean(result.draws["weight"] > problem.edge) == pytest.approx(share, abs=0.15)
+
+
+def test_a_held_coordinate_has_no_gradient():
+    problem = LinearGaussian(n_rows=20, d=3)
+    seen = climbed(problem, problem.mean)
+    gradient, curvature = Held(seen.target, 1).quadratic(problem.mean)
+    whole = seen.target.quadratic(problem.mean)
+    assert gradient[1] == 0.0
+    np.testing.assert_array_equal(gradient[[0, 2]], whole[0][[0, 2]])
+    np.testing.assert_array_equal(curvature[np.ix_([0, 2], [0, 2])], whole[1][np.ix_([0, 2], [0, 2])])
+    assert np.count_nonzero(curvature[1]) == 1
+    assert init(Held(seen.target, 1), problem.mean).log_density == init(seen.target, problem.mean).log_density
+
+
+def test_where_all_coordinates_are_noise_there_is_nothing_to_look_for():
+    problem = LinearGaussian(n_rows=20, d=2)
+    seen = climbed(problem, problem.mean)
+    assert plateaus(seen.target._replace(noise=np.ones(2, dtype=bool)), seen.mode, problem.sd, RIVAL) == []
+    sounding = look(seen)._replace(noise=np.ones(2, dtype=bool))
+    assert sounded(sounding, [seen.mode], KEY, None)[0] is seen.mode
