@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
 
-# Parts of units that carry a force, and its power; the first that fits counts.
-FORCES = (("/N", -1), ("kg", 1), ("N", 1), ("Pa", 1))
+FORCES = frozenset({"N", "kg", "Pa", "J", "W"})  # units that hold one force each
 
 
 def force_power(unit: str) -> int:
-    """Power of the unit of force in a unit: 1 for masses, forces and stiffnesses, -1 for compliances, 0 for the rest.
+    """Power of the unit of force in a unit such as "kg", "N/m", "Pa s" or "1/Pa"; exponents of its parts do not count.
 
-    Of equations of motion in which every such parameter is multiplied by one factor to that power, no motion changes:
-    where only positions are measured and lengths commanded, data say nothing of that factor (Buckingham's theorem).
+    1 for masses, forces and stiffnesses, -1 for compliances. Of equations of motion in which every such parameter is
+    multiplied by one factor to that power, no motion changes: where only positions are measured and lengths commanded,
+    data say nothing of that factor (Buckingham's theorem).
     """
-    return next((power for token, power in FORCES if token in unit), 0)
+    above, *below = [sum(part in FORCES for part in re.findall(r"[A-Za-z]+", side)) for side in unit.split("/")]
+    return above - sum(below)
 
 
 def common_scale(units: Mapping[str, str], names: tuple[str, ...]) -> Float[np.ndarray, " d"]:

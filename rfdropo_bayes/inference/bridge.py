@@ -7,6 +7,7 @@ particles that start at the prior, which are few.
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -29,6 +30,8 @@ from rfdropo_bayes.inference.result import InferenceResult, exclusion_warnings, 
 from rfdropo_bayes.inference.soundings import Sounding, sounded
 from rfdropo_bayes.inference.straight import StraightProblem
 
+SOUNDINGS = 0.1  # share of the budget that soundings may take, see `soundings`
+
 
 @dataclass(frozen=True)
 class BridgeConfig:
@@ -39,7 +42,8 @@ class BridgeConfig:
         inflation: of the Student-t's scale over the Laplace standard deviation.
         degrees: of freedom of the Student-t.
         prior_share: of the particles that start at prior draws, for what no climb has found.
-        rollouts: budget of the sampler in full-length rollouts, of all replicates together; None for no limit.
+        rollouts: budget of soundings and sampler in full-length rollouts, of all replicates together; None for no
+            limit.
         particles: per replicate; None takes as many as the budget serves.
         replicates: independent repetitions.
         target_ess: share of effective particles kept from one target to the next.
@@ -61,6 +65,15 @@ class BridgeConfig:
             raise InputError("inflation must be at least 1 and degrees positive", where="[inference]")
         if not 0.0 <= self.prior_share < 1.0:
             raise InputError("prior_share must be at least 0 and below 1", where="[inference]")
+
+    @property
+    def for_soundings(self) -> float:
+        """Rollouts that soundings may take: a share of the budget, and nothing of the least that the sampler needs."""
+        if self.rollouts is None:
+            return float("inf")
+        # Every particle is looked at once and moved once.
+        least = 2.0 * self.replicates * (self.particles or horizon_smc.FEWEST_PARTICLES)
+        return max(0.0, min(SOUNDINGS * self.rollouts, self.rollouts - least))
 
     @property
     def sampler(self) -> horizon_smc.SmcConfig:
@@ -142,13 +155,15 @@ def sample_from_modes(
     moment_key, run_key = jax.random.split(key)
     view: Problem = problem
     modes, ledger, sampler = found.modes, found.climbs.ledger, config.sampler
+    began, before = time.monotonic(), ledger.rollouts
     if isinstance(problem, ResidualProblem) and found.climbs.noise is not None:
         view = straight = StraightProblem(problem, moment_key)
-        before = ledger.rollouts
         sounding = Sounding(straight, straight.logarithmic, found.climbs.noise, ledger)
-        modes = sounded(sounding, [straight.mode(mode) for mode in modes], moment_key, config.rollouts)
+        modes = sounded(sounding, [straight.mode(mode) for mode in modes], moment_key, config.for_soundings)
         if sampler.rollouts is not None:
             sampler = replace(sampler, rollouts=sampler.rollouts - (ledger.rollouts - before))
+    facts = {"sounded": len(modes) - len(found.modes), "sounding_rollouts": ledger.rollouts - before}
+    seconds = time.monotonic() - began
     bridged = BridgedProblem(view, covering(view, modes, moment_key), config)
     sampled = horizon_smc.run(bridged, sampler, run_key, logbook)
     u = np.stack([sampled.draws[name] for name in bridged.names], axis=-1)
@@ -174,8 +189,9 @@ def sample_from_modes(
         evaluations=evaluations,
         excluded=dict(excluded),
         warnings=[*kept, *prior_warnings(problem, draws), *exclusion_warnings(excluded, evaluations)],
-        seconds=found.climbs.seconds + sampled.seconds,
+        seconds=found.climbs.seconds + seconds + sampled.seconds,
         optimum=mode_values(problem, found.modes[0]),
         details=sampled.details
+        | facts
         | {"laplace_log_evidence": [mode.log_evidence for mode in found.modes], "modes": len(found.modes)},
     )

@@ -44,6 +44,7 @@ SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before the
 # Horizons of climbs after a survey, as shares of the recording. From half of it to all of it in one step most climbs of
 # a push, where contacts begin and end, came to rest on the way.
 CONTINUED = (0.75, 0.875, 1.0)
+FOR_PLATEAUS = 0.1  # share of the budget of climbs, and of a survey, that is held back for plateaus
 FEWEST_STEPS = 4.0  # of a climb at the last horizon that is worth its start
 RIVAL = 30.0  # [nat]: an optimum that far below the best matters to no posterior
 
@@ -175,9 +176,12 @@ def find_modes(
         logbook.part(began_at, 1.0).stage(share, method="laplace", **climbs.trace[-1])
     assert climbs.noise is not None
     target = target_at(problem.n_rows, climbs.ledger, climbs.positions[0], climbs.noise)
+    on_plateaus: list[Laplace] = []
     if config.survey and isinstance(problem, ResidualProblem):
-        climbs = _with_plateaus(problem, config, climbs, target, key)
-    return _collect(climbs, target)
+        began = time.monotonic()
+        on_plateaus = _on_plateaus(problem, config, climbs, target, key)
+        climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
+    return _collect(climbs, target, on_plateaus)
 
 
 def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], Callable[..., Climbable]]:
@@ -218,7 +222,8 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
     later = sum(-(-starts // 2**ahead) * rows for ahead, rows in enumerate(horizons[climbs.level + 1 :], start=1))
     waiting = starts - climbs.done
     share = now * waiting / (now * waiting + later)
-    rows = (config.rollouts - climbs.ledger.rollouts) * share * n_rows / now
+    budget = config.rollouts * (1.0 - FOR_PLATEAUS * (config.survey > 0))
+    rows = max(budget - climbs.ledger.rollouts, 0.0) * share * n_rows / now
     grid, step = climb_cost(d, noise)
     # More rivals than expected may have come to the last horizon: the best climb on, rather than none.
     served = waiting if later else int(np.clip(rows / (grid + FEWEST_STEPS * step), 1, waiting))
@@ -268,29 +273,29 @@ def _record(
     )
 
 
-def _with_plateaus(
+def _on_plateaus(
     problem: Problem, config: LaplaceConfig, climbs: Climbs, target: Climbable, key: PRNGKeyArray
-) -> Climbs:
-    """The climbs, and those from plateaus beside the best of them."""
+) -> list[Laplace]:
+    """Normal approximations on plateaus beside the best of the climbs."""
     best = int(np.argmax(climbs.log_density))
     state = LevenbergState(climbs.positions[best], float(climbs.log_density[best]), 0.0, bool(climbs.converged[best]))
-    widths = np.sqrt(np.diag(np.linalg.inv(prior_moments(problem, key)[1])))
+    widths = np.sqrt(np.diag(prior_moments(problem, key)[1]))
     places = plateaus(target, normal_at(target, state), widths, RIVAL)
     left = math.inf if config.rollouts is None else config.rollouts - climbs.ledger.rollouts
-    found = climbs_from(target, places, config.tolerance, left)
-    if not found:
-        return climbs
-    for index, end in enumerate(found):
-        facts = {"horizon": problem.n_rows, "plateau": index, "log_density": end.log_density}
+    modes = []
+    for place, end in zip(places, climbs_from(target, places, config.tolerance, left), strict=False):
+        facts = {"horizon": problem.n_rows, "plateau": place.coordinate, "log_density": end.log_density}
         climbs.trace.append(facts | {"converged": end.converged, "rollouts": climbs.ledger.rollouts})
-    return climbs._replace(
-        positions=np.concatenate([climbs.positions, np.stack([end.position for end in found])]),
-        log_density=np.append(climbs.log_density, [end.log_density for end in found]),
-        converged=np.append(climbs.converged, [end.converged for end in found]),
-    )
+        if end.log_density > state.log_density - RIVAL:
+            mode = laplace(target, end)
+            assert mode.slope is not None
+            # No summit along that coordinate: its likelihood is level, whatever the slope of the prior.
+            slope = np.where(np.arange(len(mode.mean)) == place.coordinate, 0.0, mode.slope)
+            modes.append(mode._replace(slope=slope))
+    return modes
 
 
-def _collect(climbs: Climbs, target: Climbable) -> Modes:
+def _collect(climbs: Climbs, target: Climbable, on_plateaus: list[Laplace]) -> Modes:
     """Laplace at every optimum that could matter, in the order of their evidence."""
     warnings = []
     modes: list[Laplace] = []
@@ -301,6 +306,7 @@ def _collect(climbs: Climbs, target: Climbable) -> Modes:
         if state.log_density > climbs.log_density.max() - RIVAL and _apart(state.position, modes):
             mode = laplace(target, state)
             modes += [mode] if _apart(mode.mean, modes) else []
+    modes += [mode for mode in on_plateaus if _apart(mode.mean, modes)]
     modes.sort(key=lambda mode: -mode.log_evidence)
     best = np.argmin(np.max(np.abs(climbs.positions - modes[0].mean), axis=1))
     if not climbs.converged[best]:

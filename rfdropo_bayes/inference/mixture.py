@@ -93,7 +93,8 @@ def _student_t(
 
 def covering(problem: Problem, modes: list[Laplace], key: PRNGKeyArray) -> list[Laplace]:
     """The modes, and for each the normal distribution of its likelihood and the prior's moments, if that is another."""
-    mean, precision = prior_moments(problem, key)
+    mean, prior = prior_moments(problem, key)
+    precision = np.linalg.inv(prior)
     found = []
     for mode in modes:
         wide = _with_prior_moments(mode, mean, precision)
@@ -102,11 +103,11 @@ def covering(problem: Problem, modes: list[Laplace], key: PRNGKeyArray) -> list[
 
 
 def prior_moments(problem: Problem, key: PRNGKeyArray) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
-    """Mean and inverse covariance of the prior, by draws."""
+    """Mean and covariance of the prior, by draws."""
     drawn = np.asarray(problem.to_unconstrained(problem.sample_prior(key, MOMENTS)), dtype=float)
     drawn = drawn[np.isfinite(drawn).all(axis=1)]
     drawn = np.clip(drawn, *np.quantile(drawn, [0.01, 0.99], axis=0))  # heavy tails have no moments
-    return drawn.mean(axis=0), np.linalg.inv(np.atleast_2d(np.cov(drawn.T)))
+    return drawn.mean(axis=0), np.atleast_2d(np.cov(drawn.T))
 
 
 def _with_prior_moments(

@@ -28,7 +28,7 @@ DROP = 2.0  # nats: of a normal density at two deviations
 HIGHER = 0.5  # nats above the mode from which on the way up goes on
 ROUNDS = 3
 SHIFTS = np.array([0.25, 0.5, 0.75, 1.0])
-DEAREST = 0.1  # share of the sampler's rollouts that soundings may take
+FAVOUR = 3.0  # share of a sounded distribution over that of the one it goes with
 
 
 class Sounding(NamedTuple):
@@ -63,20 +63,30 @@ class Sounding(NamedTuple):
         return np.where(np.isfinite(prior), prior, 0.0) + likelihood
 
 
-def sounded(sounding: Sounding, modes: list[Laplace], key: PRNGKeyArray, budget: float | None) -> list[Laplace]:
-    """The modes, those at kinks with the widths that soundings found.
+def sounded(sounding: Sounding, modes: list[Laplace], key: PRNGKeyArray, rollouts: float) -> list[Laplace]:
+    """The modes, each at a kink followed by another with the widths that soundings found.
+
+    The first stays, as what soundings miss, off the axes or beyond a dip, may be covered by it. Of the two together the
+    sounded one has the larger share of a mixture.
 
     Args:
         sounding: what to sound.
         modes: normal approximations, best first.
         key: for the prior draws that bound what data do not.
-        budget: rollouts of what follows, of which soundings take at most `DEAREST`; None for no limit.
+        rollouts: that all soundings may take; modes for which they do not suffice are left alone.
     """
-    found, before = [], sounding.ledger.rollouts
+    found, last = [], sounding.ledger.rollouts + rollouts
+    physical = int(np.sum(~sounding.noise))
     for mode in modes:
-        spent = sounding.ledger.rollouts - before
-        allowed = budget is None or spent < DEAREST * budget
-        found.append(_with_widths(sounding, mode, key) if allowed and _kinked(sounding, mode) else mode)
+        found.append(mode)
+        if sounding.ledger.rollouts + 1 + 4 * physical > last or not _kinked(sounding, mode):
+            continue
+        round_cost = 2 * len(LADDER) * physical
+        rounds = int(min(ROUNDS, (last - sounding.ledger.rollouts - 4 - len(SHIFTS)) / round_cost))
+        if rounds > 0:
+            other = _with_widths(sounding, mode, key, rounds)
+            favoured = max(mode.log_evidence, other.log_evidence) + np.log(FAVOUR)
+            found.append(other._replace(log_density=other.log_density + favoured - other.log_evidence))
     return found
 
 
@@ -92,25 +102,24 @@ def _kinked(sounding: Sounding, mode: Laplace) -> bool:
     return bool(np.any((np.abs(values[1:] - values[0] - promised) > KINK)[np.isfinite(prior[1:])]))
 
 
-def _with_widths(sounding: Sounding, mode: Laplace, key: PRNGKeyArray) -> Laplace:
-    assert mode.information is not None
+def _with_widths(sounding: Sounding, mode: Laplace, key: PRNGKeyArray, rounds: int) -> Laplace:
+    """A normal distribution around the highest point found in so many rounds, as wide as the density is there."""
     information = _without_free_scale(sounding, mode)
-    covariance = np.linalg.inv(information + prior_moments(sounding.problem, key)[1])
+    covariance = np.linalg.inv(information + np.linalg.inv(prior_moments(sounding.problem, key)[1]))
     axes = _axes(covariance, sounding.noise)
     centre, top = mode.mean, float(sounding.density(mode.mean[None])[0])
-    for _ in range(ROUNDS):
+    for rounds_left in reversed(range(rounds)):
         points = centre + np.concatenate([np.outer(side * LADDER, axis) for axis in axes.T for side in (1.0, -1.0)])
         values = sounding.density(points)
-        widths = _widths(top - values.reshape(axes.shape[1], 2, len(LADDER)))
         best = int(np.argmax(values))
-        if values[best] < top + HIGHER:
+        if rounds_left == 0 or values[best] < top + HIGHER:
             break
         centre, top = points[best], float(values[best])
+    widths = _widths(top - values.reshape(axes.shape[1], 2, len(LADDER)))
     shift = axes @ (0.5 * (widths[:, 0] - widths[:, 1]))
-    reached = sounding.density(centre + np.outer(SHIFTS, shift))
-    near = np.flatnonzero(reached > top - DROP)
+    near = np.flatnonzero(sounding.density(centre + np.outer(SHIFTS, shift)) > top - DROP)
     if len(near):
-        centre, top = centre + SHIFTS[near[-1]] * shift, float(reached[near[-1]])
+        centre = centre + SHIFTS[near[-1]] * shift
     scaled = axes * 0.25 * widths.sum(axis=1)  # DROP lies two deviations off on either side
     rescaled = scaled @ scaled.T
     noise = np.ix_(sounding.noise, sounding.noise)

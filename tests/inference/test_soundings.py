@@ -8,14 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import norm
 
+from rfdropo_bayes.bayes.units import force_power
 from rfdropo_bayes.inference import methods
+from rfdropo_bayes.inference.bridge import BridgeConfig, sample_from_modes
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
-from rfdropo_bayes.inference.laplace import RIVAL, LaplaceConfig, find_modes
+from rfdropo_bayes.inference.laplace import RIVAL, LaplaceConfig, Modes, find_modes
 from rfdropo_bayes.inference.levenberg import Laplace, init, laplace, maximise
 from rfdropo_bayes.inference.plateaus import Held, climbs_from, plateaus
-from rfdropo_bayes.inference.soundings import DEAREST, Sounding, sounded
+from rfdropo_bayes.inference.soundings import Sounding, sounded
 from rfdropo_bayes.inference.straight import StraightProblem
 
 from .toys import Crooked, LinearGaussian, Ratio, Stuck
@@ -49,7 +52,7 @@ def test_a_normal_posterior_is_left_as_it_is():
     problem = LinearGaussian(n_rows=20, d=4)
     seen = climbed(problem, problem.mean)
     sounding = look(seen)
-    assert sounded(sounding, [seen.mode], KEY, 1000.0)[0] is seen.mode
+    assert sounded(sounding, [seen.mode], KEY, 300.0)[0] is seen.mode
     assert sounding.ledger.rollouts == 1 + 4 * 4
 
 
@@ -60,15 +63,15 @@ def test_a_ridge_that_ends_at_bounds_is_left_as_it_is():
     straight = StraightProblem(problem, KEY)
     sounding = Sounding(straight, straight.logarithmic, np.zeros(2, dtype=bool), Ledger())
     mode = straight.mode(seen.mode)
-    assert sounded(sounding, [mode], KEY, None)[0] is mode
+    assert sounded(sounding, [mode], KEY, np.inf)[0] is mode
     assert sounding.ledger.rollouts < 1 + 4 * 2
 
 
 def test_the_widths_on_both_sides_of_a_kink_are_found():
     problem = Crooked()
     seen = climbed(problem, np.array([0.3, 0.2]))
-    found = sounded(look(seen), [seen.mode], KEY, 1000.0)[0]
-    assert found is not seen.mode
+    first, found = sounded(look(seen), [seen.mode], KEY, 300.0)
+    assert first is seen.mode
     turn = np.asarray(problem.turn)
     centre, deviation = turn @ found.mean, np.sqrt(np.diag(turn @ found.covariance @ turn.T))
     # Two nats below the top on either side. Axes are those of derivatives, not quite those of the kink.
@@ -84,15 +87,53 @@ def test_the_evidence_of_a_kinked_posterior_is_exact():
     assert result.log_evidence[0] == pytest.approx(problem.log_evidence(), abs=0.15)
 
 
-def test_soundings_keep_to_their_share_of_the_budget():
+@pytest.mark.parametrize("rollouts", [5.0, 30.0, 60.0, 250.0, 1000.0])
+def test_soundings_keep_to_their_budget(rollouts):
     seen = climbed(Crooked(), np.array([0.3, 0.2]))
     sounding = look(seen)
-    modes = sounded(sounding, [seen.mode] * 50, KEY, 1000.0)
-    one = look(seen)
-    sounded(one, [seen.mode], KEY, None)
-    assert len(modes) == 50
-    assert modes[-1] is seen.mode
-    assert sounding.ledger.rollouts < DEAREST * 1000.0 + one.ledger.rollouts
+    modes = sounded(sounding, [seen.mode] * 50, KEY, rollouts)
+    assert sounding.ledger.rollouts <= rollouts
+    assert 50 + (rollouts >= 60.0) <= len(modes) < 100
+
+
+@pytest.mark.parametrize("rollouts", [1000, 1010, 1200])
+def test_soundings_leave_the_sampler_what_it_needs(rollouts):
+    """At least two rollouts a particle: with less it would refuse to start."""
+    for problem in (LinearGaussian(n_rows=20, d=4), Crooked()):
+        result = methods.run(problem, "bridge", {"particles": 250, "replicates": 2, "rollouts": rollouts}, KEY)
+        assert result.details["sounding_rollouts"] <= rollouts - 1000
+
+
+class Aside(Crooked):
+    """Two modes: the right one with a kink, wide, holds most of the mass; the left one, narrow, is higher."""
+
+    def _parts(self, u):
+        wide = jnp.where(u[..., 0] > 0.0, (u[..., 0] - 1.0) / jnp.where(u[..., 0] > 1.0, 0.5, 0.1), 60.0)
+        narrow = jnp.where(u[..., 0] > 0.0, 60.0, (u[..., 0] + 1.0) / 0.02)
+        first = jnp.where(u[..., 0] > 0.0, jnp.sqrt(wide**2 + 4.0), narrow)
+        return jnp.stack([first, u[..., 1] / 0.3], axis=-1)
+
+    def by_quadrature(self):
+        """Log evidence, and the share of the right mode."""
+        x = np.linspace(-3.0, 8.0, 220001)
+        first = np.asarray(self._parts(jnp.stack([jnp.array(x), jnp.zeros_like(x)], axis=-1)))[:, 0]
+        density = np.exp(-0.5 * first**2) * norm.pdf(x, 0.0, 5.0)
+        right = x > 0.0
+        parts = [np.trapezoid(density[side], x[side]) for side in (right, ~right)]
+        other = norm.pdf(0.0, 0.0, np.hypot(0.3, 5.0)) * np.sqrt(2.0 * np.pi) * 0.3
+        return float(np.log(sum(parts) * other)), float(parts[0] / sum(parts))
+
+
+def test_a_mode_that_soundings_leave_for_another_keeps_its_mass():
+    """Replicates of 250 have a share of the right mode that scatters by 0.03, and evidences that scatter by 0.1."""
+    problem = Aside()
+    evidence, share = problem.by_quadrature()
+    modes = [climbed(problem, np.array(start)).mode for start in ([1.2, 0.1], [-0.99, 0.1])]
+    climbs = find_modes(problem, LaplaceConfig(starts=1), KEY).climbs
+    result = sample_from_modes(problem, BridgeConfig(particles=250, replicates=4), Modes(modes, climbs, []), KEY)
+    assert result.details["sounded"] >= 1
+    assert result.log_evidence[0] == pytest.approx(evidence, abs=0.2)
+    assert np.mean(result.draws["x0"] > 0.0) == pytest.approx(share, abs=0.1)
 
 
 class Weighed(Ratio):
@@ -127,7 +168,7 @@ def test_a_common_scale_that_data_leave_free_is_as_wide_as_the_prior(unit, free)
     density = float(np.asarray(straight.log_prior(top))[0])
     mode = Laplace(top[0], np.linalg.inv(information), density, information, np.zeros(2))
     sounding = Sounding(straight, straight.logarithmic, np.zeros(2, dtype=bool), Ledger())
-    found = sounded(sounding, [mode], KEY, None)[0]
+    found = sounded(sounding, [mode], KEY, np.inf)[-1]
     along = np.array([1.0, 1.0]) / np.sqrt(2.0)
     deviation = np.sqrt(along @ found.covariance @ along)
     # From 2 to 4 of stiffness, where the mass ends: the logarithm of 2, times the root of 2, by four deviations.
@@ -137,7 +178,7 @@ def test_a_common_scale_that_data_leave_free_is_as_wide_as_the_prior(unit, free)
 def test_a_plateau_beside_a_summit_is_found():
     problem = Stuck()
     seen = climbed(problem, np.array([1.0, 0.7]))
-    assert seen.mode.mean[1] == pytest.approx(0.988, abs=2e-3)
+    assert seen.mode.mean[1] == pytest.approx(0.974, abs=2e-3)
     found = plateaus(seen.target, seen.mode, problem.sd, RIVAL)
     assert [plateau.coordinate for plateau in found] == [1]
     assert found[0].point[1] > problem.edge
@@ -150,11 +191,12 @@ def test_a_plateau_beside_a_summit_is_found():
     assert end.position[0] == pytest.approx(design @ problem.data / (design @ design), abs=1e-3)
 
 
-def test_no_budget_no_climb():
+def test_without_a_budget_a_plateau_is_where_it_was_found():
     problem = Stuck()
     seen = climbed(problem, np.array([1.0, 0.7]))
     found = plateaus(seen.target, seen.mode, problem.sd, RIVAL)
-    assert climbs_from(seen.target, found, 1e-6, 3.0) == []
+    (end,) = climbs_from(seen.target, found, 1e-6, 0.0)
+    np.testing.assert_array_equal(end.position, found[0].point)
 
 
 @pytest.mark.parametrize("start", [0.3, 2.0])
@@ -172,18 +214,26 @@ def test_what_is_flat_as_far_as_derivatives_say_is_no_plateau():
     assert plateaus(seen.target, seen.mode, problem.sd, RIVAL) == []
 
 
-def test_the_plateau_holds_its_share_of_the_posterior():
-    """Most of the posterior, though the summit beside it is higher. 4 replicates: the evidence's mean scatters by 0.05,
-    the share by 0.03."""
+def test_the_plateau_and_the_summit_beside_it_keep_their_shares():
+    """The survey of this key leads to the summit alone, which without plateaus has all the particles. 4 replicates: the
+    evidence's mean scatters by 0.03, the share by 0.04."""
     problem = Stuck()
     evidence, share = problem.by_quadrature()
-    assert share > 0.6
-    found = find_modes(problem, LaplaceConfig(starts=2, survey=64, rollouts=4000.0), KEY)
-    assert {"plateau", "horizon"} <= set(found.climbs.trace[-1])
-    result = methods.run(problem, "smc", {"rollouts": 12000, "start": "optimum", "blocks": 1}, KEY)
-    assert result.rollouts <= 12000
-    assert result.log_evidence[0] == pytest.approx(evidence, abs=0.25)
+    found = find_modes(problem, LaplaceConfig(starts=2, survey=64, rollouts=4000.0), jax.random.key(15))
+    held = [row for row in found.climbs.trace if "plateau" in row]
+    assert [row["plateau"] for row in held] == [1]
+    assert found.climbs.positions[:, 1].max() < problem.edge
+    result = sample_from_modes(problem, BridgeConfig(particles=250, replicates=4), found, KEY)
+    assert result.log_evidence[0] == pytest.approx(evidence, abs=0.15)
     assert np.mean(result.draws["weight"] > problem.edge) == pytest.approx(share, abs=0.15)
+
+
+def test_a_slope_is_no_plateau():
+    """Behind a kink the likelihood falls more slowly, but falls: nine nats and more from one reach to the next."""
+    problem = Crooked(right=(0.02, 0.3), left=(0.1, 0.3))
+    problem.turn = jnp.eye(2)
+    seen = climbed(problem, np.array([0.01, 0.2]))
+    assert plateaus(seen.target, seen.mode, problem.sd, RIVAL) == []
 
 
 def test_a_held_coordinate_has_no_gradient():
@@ -203,4 +253,16 @@ def test_where_all_coordinates_are_noise_there_is_nothing_to_look_for():
     seen = climbed(problem, problem.mean)
     assert plateaus(seen.target._replace(noise=np.ones(2, dtype=bool)), seen.mode, problem.sd, RIVAL) == []
     sounding = look(seen)._replace(noise=np.ones(2, dtype=bool))
-    assert sounded(sounding, [seen.mode], KEY, None)[0] is seen.mode
+    assert sounded(sounding, [seen.mode], KEY, np.inf)[0] is seen.mode
+
+
+POWERS = {
+    1: ("kg", "Pa", "N/m", "N m", "Pa s", "kg/m3", "N/m2", "J"),
+    -1: ("1/Pa", "m/N"),
+    0: ("N/kg", "m/s", "rad", "-"),
+}
+
+
+@pytest.mark.parametrize(("unit", "power"), [(unit, power) for power, units in POWERS.items() for unit in units])
+def test_the_power_of_a_force_in_a_unit(unit, power):
+    assert force_power(unit) == power

@@ -323,12 +323,12 @@ class Stuck(LinearGaussian):
 
     edge = 1.0
 
-    def __init__(self, slip: float = 0.012, noise: float = 0.02) -> None:
+    def __init__(self, slip: float = 0.026, noise: float = 0.01) -> None:
         super().__init__(n_rows=10, d=2)
         self.names = ("pull", "weight")
         self.units = dict.fromkeys(self.names, "1")
         self.bounds = dict.fromkeys(self.names, (-np.inf, np.inf))
-        self.mean, self.sd, self.noise = np.array([0.5, 1.0]), np.array([1.0, 2.0]), np.full(10, noise)
+        self.mean, self.sd, self.noise = np.array([0.5, 1.8]), np.array([1.0, 2.0]), np.full(10, noise)
         self.design = np.stack([np.linspace(0.5, 2.0, 10), np.ones(10)], axis=1)
         self.data = self.design @ np.array([1.2, -slip])
 
