@@ -60,7 +60,7 @@ def fit(job: Mapping[str, Any]) -> dict[str, Any]:
         replica = problem.with_measured(measured._replace(tension=None))
     began = time.monotonic()
     try:
-        draws, rollouts = infer(job, replica, fit_key)
+        draws, spent = infer(job, replica, fit_key)
     except InputError as error:
         return {"failed": str(error), "truth": truth}
     seconds = time.monotonic() - began
@@ -69,27 +69,28 @@ def fit(job: Mapping[str, Any]) -> dict[str, Any]:
         "truth": truth,
         **scores(task, draws, truth, excited(task, with_tension, truth)),
         "held_out_mm": held_out_error(held, draws, truth),
-        "rollouts": rollouts,
+        **spent,
         "seconds": seconds,
     }
 
 
 def infer(
     job: Mapping[str, Any], problem: CalibrationProblem, key: jax.Array
-) -> tuple[dict[str, Float[np.ndarray, " n"]], float]:
-    """Draws of the task's parameters by the method of a row, and the rollouts it took."""
+) -> tuple[dict[str, Float[np.ndarray, " n"]], dict[str, Any]]:
+    """Draws of the task's parameters by the method of a row, and the ``rollouts`` and ``warnings`` they came with."""
     ranges = TASKS[job["task"]].ranges
     method, options = ROWS[job["row"]]
     if job["row"] == "prior":
         drawn = problem.sample_prior(key, 1000)
-        return {name: np.asarray(drawn[name]) for name in ranges}, 0.0
+        return {name: np.asarray(drawn[name]) for name in ranges}, {"rollouts": 0.0}
     if job["row"] == "mid-range":
-        return {name: np.full(10, 0.5 * sum(ends)) for name, ends in ranges.items()}, 0.0
+        return {name: np.full(10, 0.5 * sum(ends)) for name, ends in ranges.items()}, {"rollouts": 0.0}
     extra: dict[str, Any] = {} if method == "udr" else {"rollouts": job["budget"]}
     if method == "rfdropo":
         extra |= {"parameters": list(ranges), "search": {name: list(ends) for name, ends in ranges.items()}}
     result = methods.run(problem, method, {**options, **extra}, key)
-    return {name: np.asarray(result.draws[name]).reshape(-1) for name in ranges}, float(result.rollouts)
+    draws = {name: np.asarray(result.draws[name]).reshape(-1) for name in ranges}
+    return draws, {"rollouts": float(result.rollouts), "warnings": list(result.warnings)}
 
 
 def scores(
@@ -124,6 +125,16 @@ def _log_score(offsets: Float[np.ndarray, "d n"]) -> float | None:
     covariance = covariance + 1e-8 * np.eye(len(mean))
     white = np.linalg.solve(np.linalg.cholesky(covariance), mean)
     return float(-0.5 * white @ white - 0.5 * np.linalg.slogdet(2.0 * np.pi * covariance)[1])
+
+
+def prior_log_score(task: Task, truth: Mapping[str, float]) -> float:
+    """The same of the uniform prior, in closed form: what a posterior that is worth having must exceed."""
+    variance = WIDTH**2 / 12.0
+    total = 0.0
+    for name, (low, high) in task.ranges.items():
+        offset = WIDTH * (0.5 * (low + high) - truth[name]) / (high - low)
+        total -= 0.5 * (offset**2 / variance + np.log(2.0 * np.pi * variance))
+    return float(total)
 
 
 def held_out_error(

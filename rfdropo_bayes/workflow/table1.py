@@ -16,7 +16,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.rivals import import_sbi
 from rfdropo_bayes.report.facts import software_versions
-from rfdropo_bayes.workflow.comparison import RIVALS, ROWS, fit
+from rfdropo_bayes.workflow.comparison import RIVALS, ROWS, fit, prior_log_score
 from rfdropo_bayes.workflow.files import output_folder
 from rfdropo_bayes.workflow.fits import finished, run_fits
 from rfdropo_bayes.workflow.table1_figure import draw_figure
@@ -113,6 +113,7 @@ def run_table1(
         "cells": summarise(found),
         "claims": claims(found),
         "ahead_of_ours": ahead_of_ours(found),
+        "misleading": misleading(found),
         "versions": software_versions(),
     }
     (out / "table1.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -161,8 +162,26 @@ def summarise(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 # A point has no interval to cover anything with.
                 inside = [hit for r in done for hit in r["inside_90"]] if row != "mid-range" else []
                 cell["coverage_90"] = float(np.mean(inside)) if inside else None
+                cell["misleading"] = sum(map(_misleads, done))
                 cells.append(cell)
     return cells
+
+
+def _misleads(result: Mapping[str, Any]) -> bool:
+    """Whether a fit says less of its truth than the prior does: too narrow where the truth is not."""
+    score = result["log_score"]
+    return score is not None and score < prior_log_score(TASKS[result["task"]], result["truth"])
+
+
+def misleading(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Our fits that say less of their truths than the prior does, worst first, with the warnings they gave.
+
+    Warnings are None where the fit is older than their record.
+    """
+    wrong = [r for r in found if r["row"] in OWN and "failed" not in r and _misleads(r)]
+    kept = ("task", "truths", "row", "index", "log_score")
+    entries = [{**{name: r[name] for name in kept}, "warnings": r.get("warnings")} for r in wrong]
+    return sorted(entries, key=lambda entry: entry["log_score"])
 
 
 def _moments(values: Sequence[float | None]) -> dict[str, float | None]:
@@ -256,14 +275,14 @@ def as_markdown(content: Mapping[str, Any]) -> str:
         f"paper; the others {size['rival_truths']} of each. Mean ± standard deviation. "
         "MSE: the paper's, in ranges scaled to [0, 4]; told: of the parameters that the motion tells of, which are "
         "those of a cube only where it is pushed by 5 mm. Held out: tip error of the mean prediction under commands "
-        "that no fit saw.",
+        "that no fit saw. Misleading: fits whose log score at the truth is below that of the prior.",
         "",
     ]
     for task in dict.fromkeys(cell["task"] for cell in content["cells"]):
         for truths in TRUTHS:
             lines += [f"## {task}, {'the truth of the paper' if truths == 'paper' else 'off-centre truths'}", ""]
             names = list(FIGURES.values())
-            headings = ["row", "fits", *names[:4], "90 % coverage", *names[4:]]
+            headings = ["row", "fits", *names[:4], "90 % coverage", "misleading", *names[4:]]
             lines += [f"| {' | '.join(headings)} |", f"|{'---|' * len(headings)}"]
             cells = [c for c in content["cells"] if (c["task"], c["truths"]) == (task, truths)]
             lines += [_row(cell) for cell in cells] + [""]
@@ -273,6 +292,8 @@ def as_markdown(content: Mapping[str, Any]) -> str:
     ]
     lines += ["", "## Where another row is better than ours without tension, on the same data", ""]
     lines += [_ahead(entry) for entry in content["ahead_of_ours"]] or ["Nowhere."]
+    lines += ["", "## Posteriors of ours that mislead, and whether they said so", ""]
+    lines += [_misled(entry) for entry in content["misleading"]] or ["None."]
     missing = [f"{row}: {reason}" for row, reason in content["left_out"].items()]
     if content["not_done"]:
         missing.append(f"{content['not_done']} fits that were not done; the column of fits says how many were")
@@ -283,11 +304,22 @@ def as_markdown(content: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _kind(truths: str) -> str:
+    return "the paper's truth" if truths == "paper" else "off-centre"
+
+
+def _misled(entry: Mapping[str, Any]) -> str:
+    warnings = entry["warnings"]
+    said = "warnings not recorded" if warnings is None else "; ".join(warnings) or "no warning"
+    place = f"{entry['task']}, {_kind(entry['truths'])} {entry['index']}, {entry['row']}"
+    return f"- {place}: log score {entry['log_score']:.3g}; {said}"
+
+
 def _ahead(entry: Mapping[str, Any]) -> str:
-    truths = "the paper's truth" if entry["truths"] == "paper" else "off-centre"
+    place = f"{entry['task']}, {_kind(entry['truths'])}, {FIGURES[entry['figure']]}"
     return (
-        f"- {entry['task']}, {truths}, {FIGURES[entry['figure']]}: {entry['row']} {entry['theirs']:.3g}, ours "
-        f"{entry['ours']:.3g} ({entry['data_sets']} data sets, {entry['standard_errors']:.1f} standard errors)"
+        f"- {place}: {entry['row']} {entry['theirs']:.3g}, ours {entry['ours']:.3g} "
+        f"({entry['data_sets']} data sets, {entry['standard_errors']:.1f} standard errors)"
     )
 
 
@@ -305,4 +337,5 @@ def _row(cell: Mapping[str, Any]) -> str:
 
     coverage = "-" if cell["coverage_90"] is None else f"{100 * cell['coverage_90']:.0f} %"
     figures = [moments(figure) for figure in FIGURES]
-    return f"| {' | '.join([cell['row'], str(cell['fits']), *figures[:4], coverage, *figures[4:]])} |"
+    entries = [cell["row"], cell["fits"], *figures[:4], coverage, cell["misleading"], *figures[4:]]
+    return f"| {' | '.join(map(str, entries))} |"

@@ -12,9 +12,18 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.workflow import table1
-from rfdropo_bayes.workflow.comparison import fit, scores
+from rfdropo_bayes.workflow.comparison import fit, prior_log_score, scores
 from rfdropo_bayes.workflow.fits import run_fits
-from rfdropo_bayes.workflow.table1 import Size, ahead_of_ours, as_markdown, claims, list_jobs, run_table1, summarise
+from rfdropo_bayes.workflow.table1 import (
+    Size,
+    ahead_of_ours,
+    as_markdown,
+    claims,
+    list_jobs,
+    misleading,
+    run_table1,
+    summarise,
+)
 from rfdropo_bayes.workflow.tasks import TASKS, draw_truth, excited, task_problem
 
 REACH, PUSH = TASKS["TrunkReach"], TASKS["TrunkPush"]
@@ -106,6 +115,14 @@ def test_a_uniform_prior_scores_what_the_paper_s_does_about():
     assert scores(REACH, middle, dict(REACH.truth), ())["mse"] == pytest.approx(0.11, abs=0.02)
 
 
+@pytest.mark.parametrize("task", [REACH, PUSH])
+def test_the_prior_s_log_score_is_that_of_its_draws(task):
+    rng = np.random.default_rng(2)
+    draws = {name: rng.uniform(*ends, size=400000) for name, ends in task.ranges.items()}
+    truth = draw_truth(task, "off-centre", tuple(task.ranges), rng)
+    assert prior_log_score(task, truth) == pytest.approx(scores(task, draws, truth, ())["log_score"], abs=0.03)
+
+
 def test_off_centre_truths_stay_out_of_the_middle():
     for index in range(50):
         truth = draw_truth(PUSH, "off-centre", tuple(PUSH.ranges), np.random.default_rng([0, index]))
@@ -122,7 +139,7 @@ def rows():
     for job in list_jobs(Size(truths=8, rival_truths=4), list(table1.ROWS), ["TrunkReach"]):
         worse = 3.0 if job["row"] in table1.RIVALS else 1.0
         figures = {name: worse * (1.0 + 0.1 * rng.uniform()) for name in table1.FIGURES}
-        found.append({**job, **figures, "inside_90": [True] * 9 + [False]})
+        found.append({**job, **figures, "truth": dict(REACH.truth), "inside_90": [True] * 9 + [False]})
     found[-1] = {**list_jobs(Size(truths=8), ["ours"], ["TrunkReach"])[-1], "failed": "no reason"}
     return found
 
@@ -155,6 +172,7 @@ def test_cells_claims_and_the_table_follow_from_the_fits(tmp_path):
         "cells": cells,
         "claims": checked,
         "ahead_of_ours": [],
+        "misleading": [],
         "left_out": {},
         "not_done": 0,
         "paper": table1.PAPER,
@@ -163,6 +181,23 @@ def test_cells_claims_and_the_table_follow_from_the_fits(tmp_path):
     assert "| NO |" in text
     assert text.count("| ours |") == 2
     assert "Nowhere." in text
+    assert "None." in text
+
+
+def test_a_posterior_that_says_less_than_the_prior_is_counted_and_named():
+    """The prior's log score at the paper's truth of TrunkReach is -3.23."""
+    found = [r for r in rows() if r["row"] in ("ours", "UDR") and "failed" not in r]
+    ours, rival = ([r for r in found if (r["row"], r["truths"]) == (row, "paper")] for row in ("ours", "UDR"))
+    ours[0]["log_score"], ours[1]["log_score"], ours[2]["log_score"] = -3.5, -100.0, -3.0
+    ours[1]["warnings"] = ["the last moves left the particles where they were"]
+    rival[0]["log_score"], rival[1]["log_score"] = -4.0, None
+    counted = {(c["row"], c["truths"]): c["misleading"] for c in summarise(found)}
+    assert counted == {("ours", "paper"): 2, ("UDR", "paper"): 1, ("ours", "off-centre"): 0, ("UDR", "off-centre"): 0}
+    named = misleading(found)
+    assert [(entry["row"], entry["index"], entry["warnings"]) for entry in named] == [
+        ("ours", ours[1]["index"], ours[1]["warnings"]),
+        ("ours", ours[0]["index"], None),
+    ]
 
 
 def test_what_another_row_does_better_is_said():
@@ -180,7 +215,11 @@ def test_what_another_row_does_better_is_said():
 
 
 def test_a_run_writes_its_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(table1, "fit", lambda job: {**dict.fromkeys(table1.FIGURES, 1.0), "inside_90": [True]})
+    monkeypatch.setattr(
+        table1,
+        "fit",
+        lambda job: {**dict.fromkeys(table1.FIGURES, 1.0), "truth": dict(PUSH.truth), "inside_90": [True]},
+    )
     run_table1(tmp_path, Size(1, 1), rows=["prior", "ours"], command="rfdropo benchmark table1")
     content = json.loads((tmp_path / "table1.json").read_text())
     assert {cell["row"] for cell in content["cells"]} == {"prior", "ours"}
