@@ -15,11 +15,12 @@ from scipy.special import gammaln, logsumexp
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.inference.evaluations import evaluate_prior
-from rfdropo_bayes.inference.levenberg import SAME, Laplace, divergence, positive_part
+from rfdropo_bayes.inference.levenberg import SAME, Laplace, divergence
 from rfdropo_bayes.inference.proposals import host_generator, squared_distance
 
 LEAST_SHARE = 0.05  # of a mode, before normalising: Laplace evidences of ill-shaped modes are off by nats
 MOMENTS = 1000  # prior draws behind its mean and covariance
+NARROWEST = 1e-6  # least deviation of a normal approximation in any direction, as a share of its largest
 
 
 class ModeMixture:
@@ -94,10 +95,9 @@ def _student_t(
 def covering(problem: Problem, modes: list[Laplace], key: PRNGKeyArray) -> list[Laplace]:
     """The modes, and for each the normal distribution of its likelihood and the prior's moments, if that is another."""
     mean, prior = prior_moments(problem, key)
-    precision = np.linalg.inv(prior)
     found = []
     for mode in modes:
-        wide = _with_prior_moments(mode, mean, precision)
+        wide = _with_prior_moments(mode, mean, prior)
         found += [mode] if wide is None or divergence(mode, wide) < SAME else [mode, wide]
     return found
 
@@ -110,14 +110,27 @@ def prior_moments(problem: Problem, key: PRNGKeyArray) -> tuple[Float[np.ndarray
     return drawn.mean(axis=0), np.atleast_2d(np.cov(drawn.T))
 
 
+def joint_covariance(information: Float[np.ndarray, "d d"], prior: Float[np.ndarray, "d d"]) -> np.ndarray:
+    """Covariance of a normal posterior, by the likelihood's information and the prior's covariance.
+
+    Differences across a cliff of the likelihood may promise 1e20 times the prior's precision. The sum of the two,
+    rounded, would know nothing of the prior, and its inverse have directions without a variance. Measured in deviations
+    of the prior, none is therefore less than `NARROWEST` of the largest. Negative information is none.
+    """
+    root = np.linalg.cholesky(prior)
+    values, vectors = np.linalg.eigh(root.T @ information @ root)
+    precision = 1.0 + np.maximum(values, 0.0)
+    half = root @ (vectors / np.sqrt(np.minimum(precision, precision.min() / NARROWEST**2)))
+    return half @ half.T
+
+
 def _with_prior_moments(
-    mode: Laplace, mean: Float[np.ndarray, " d"], precision: Float[np.ndarray, "d d"]
+    mode: Laplace, mean: Float[np.ndarray, " d"], prior: Float[np.ndarray, "d d"]
 ) -> Laplace | None:
     if mode.information is None or mode.slope is None:
         return None
-    information = positive_part(mode.information)
-    covariance = np.linalg.inv(information + precision)
-    centre = covariance @ (information @ mode.mean + mode.slope + precision @ mean)
+    covariance = joint_covariance(mode.information, prior)
+    centre = mode.mean + covariance @ (mode.slope + np.linalg.solve(prior, mean - mode.mean))
     # Of the two neither is known to be the better: they get equal shares.
     wide = Laplace(centre, covariance, 0.0)
     return wide._replace(log_density=mode.log_evidence - wide.log_evidence)

@@ -18,7 +18,7 @@ from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.bayes.units import common_scale
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.levenberg import Laplace, positive_part
-from rfdropo_bayes.inference.mixture import prior_moments
+from rfdropo_bayes.inference.mixture import NARROWEST, joint_covariance, prior_moments
 
 TRIED = np.array([0.5, 2.0])  # deviations from the mode at which the quadratic model of the likelihood is looked at
 KINK = 1.0  # nats by which it may be wrong there
@@ -105,7 +105,7 @@ def _kinked(sounding: Sounding, mode: Laplace) -> bool:
 def _with_widths(sounding: Sounding, mode: Laplace, key: PRNGKeyArray, rounds: int) -> Laplace:
     """A normal distribution around the highest point found in so many rounds, as wide as the density is there."""
     information = _without_free_scale(sounding, mode)
-    covariance = np.linalg.inv(information + np.linalg.inv(prior_moments(sounding.problem, key)[1]))
+    covariance = joint_covariance(information, prior_moments(sounding.problem, key)[1])
     axes = _axes(covariance, sounding.noise)
     centre, top = mode.mean, float(sounding.density(mode.mean[None])[0])
     for rounds_left in reversed(range(rounds)):
@@ -121,6 +121,8 @@ def _with_widths(sounding: Sounding, mode: Laplace, key: PRNGKeyArray, rounds: i
     if len(near):
         centre = centre + SHIFTS[near[-1]] * shift
     scaled = axes * 0.25 * widths.sum(axis=1)  # DROP lies two deviations off on either side
+    lengths = np.linalg.norm(scaled, axis=0)
+    scaled *= np.maximum(1.0, NARROWEST * lengths.max() / lengths)
     rescaled = scaled @ scaled.T
     noise = np.ix_(sounding.noise, sounding.noise)
     rescaled[noise] = mode.covariance[noise]

@@ -17,6 +17,7 @@ from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
 from rfdropo_bayes.inference.laplace import RIVAL, LaplaceConfig, Modes, find_modes
 from rfdropo_bayes.inference.levenberg import Laplace, init, laplace, maximise
+from rfdropo_bayes.inference.mixture import NARROWEST
 from rfdropo_bayes.inference.plateaus import Held, climbs_from, plateaus
 from rfdropo_bayes.inference.soundings import Sounding, sounded
 from rfdropo_bayes.inference.straight import StraightProblem
@@ -78,6 +79,20 @@ def test_the_widths_on_both_sides_of_a_kink_are_found():
     np.testing.assert_allclose(deviation, 0.5 * (problem.right + problem.left), rtol=0.15)
     assert centre[0] - 2.0 * deviation[0] == pytest.approx(-0.8, rel=0.2)
     assert abs(centre[1]) < 0.1
+
+
+def test_a_cliff_between_wide_shelves_leaves_a_covariance():
+    """Followed along axes that derivatives had too wide and too narrow, deviations are 1e9 apart: more than the square
+    of a double holds."""
+    problem = Crooked(right=(1e-12, 100.0), left=(1e-12, 100.0))
+    turn = np.asarray(problem.turn)
+    information = turn.T @ np.diag([1e14, 10.0]) @ turn
+    mode = Laplace(np.zeros(2), np.linalg.inv(information), 0.0, information, np.zeros(2))
+    none = np.zeros(2, dtype=bool)
+    _, found = sounded(Sounding(problem, none, none, Ledger()), [mode], KEY, np.inf)
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(found.covariance), 0.0))
+    assert spread[1] == pytest.approx(5.0, rel=0.2)
+    assert spread[0] >= 0.9 * NARROWEST * spread[1]
 
 
 def test_the_evidence_of_a_kinked_posterior_is_exact():
