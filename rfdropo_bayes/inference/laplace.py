@@ -6,18 +6,20 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference.basins import OneSummit, one_point, one_ridge, summits
+from rfdropo_bayes.inference.basins import OneSummit, one_point, one_ridge
 from rfdropo_bayes.inference.checkpoints import UNSAVED, Checkpoint, run_digest
+from rfdropo_bayes.inference.climbs import RIVAL, Climbs, begin, go_on, pack, record, unpack, with_starts
 from rfdropo_bayes.inference.evaluations import Ledger
+from rfdropo_bayes.inference.fans import astray, fanned
 from rfdropo_bayes.inference.first_climbs import screened, surveyed
 from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
 from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES
@@ -46,7 +48,6 @@ SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before the
 CONTINUED = (0.75, 0.875, 1.0)
 FOR_PLATEAUS = 0.1  # share of the budget of climbs, and of a survey, that is held back for plateaus
 FEWEST_STEPS = 4.0  # of a climb at the last horizon that is worth its start
-RIVAL = 30.0  # [nat]: an optimum that far below the best matters to no posterior
 
 
 @dataclass(frozen=True)
@@ -95,29 +96,6 @@ class LaplaceConfig:
             )
 
 
-class Climbs(NamedTuple):
-    """State of the climbs.
-
-    Attributes:
-        positions: where each climb stands.
-        log_density: log posterior there, at the horizon of the climb's last visit.
-        converged: of the climb at that horizon.
-        level: index of the present horizon; done: climbs done at it.
-        noise: noise coordinates.
-        ledger, trace, seconds: as in every method.
-    """
-
-    positions: Float[np.ndarray, "start d"]
-    log_density: Float[np.ndarray, " start"]
-    converged: Bool[np.ndarray, " start"]
-    level: int
-    done: int
-    noise: Bool[np.ndarray, " d"] | None
-    ledger: Ledger
-    trace: list[dict[str, Any]]
-    seconds: float
-
-
 class Modes(NamedTuple):
     """Distinct optima at the full horizon, best evidence first, with what it took to find them."""
 
@@ -158,7 +136,7 @@ def find_modes(
         ledger = Ledger() if ledger is None else ledger
         climbs = _first(problem, config, key, horizons[0], ledger, logbook.part(0.0, began_at))
     else:
-        climbs = _unpack(*saved)
+        climbs = unpack(*saved)
     target = None
     while climbs.level < len(horizons):
         began = time.monotonic()
@@ -166,12 +144,14 @@ def find_modes(
             target = target_at(horizons[climbs.level], climbs.ledger, climbs.positions[0], climbs.noise)
         allowed = _affordable_steps(problem.n_rows, config, climbs, horizons, int(target.noise.sum()))
         state, steps = maximise(target, climbs.positions[climbs.done], max_steps=allowed, tolerance=config.tolerance)
-        rule = one_point if horizons[climbs.level] == horizons[-1] else same
-        climbs = _record(climbs, state, len(steps), horizons[climbs.level], target, rule)
-        climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
-        if climbs.done == 0:
+        climbs = record(climbs, state, len(steps), horizons[climbs.level], target)
+        if climbs.level_done and config.survey and isinstance(problem, ResidualProblem):
+            climbs = _with_fan(problem, climbs, horizons, target_at, target, key)
+        if climbs.level_done:
+            climbs = go_on(climbs, target, one_point if horizons[climbs.level] == horizons[-1] else same)
             target = None
-        checkpoint.save(*_pack(climbs))
+        climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
+        checkpoint.save(*pack(climbs))
         share = (climbs.level + climbs.done / config.starts) / len(horizons)
         logbook.part(began_at, 1.0).stage(share, method="laplace", **climbs.trace[-1])
     assert climbs.noise is not None
@@ -242,35 +222,27 @@ def _first(
         u, density = surveyed(problem, found, horizon, config.starts, ledger)
     else:
         u, density = screened(problem, config.screen, horizon, config.starts, key, ledger)
-    return Climbs(u, density, np.zeros(len(u), dtype=bool), 0, 0, None, ledger, [], seconds=time.monotonic() - began)
+    return begin(u, density, ledger, time.monotonic() - began)
 
 
-def _record(
-    climbs: Climbs, state: LevenbergState, steps: int, horizon: int, target: Climbable, same: OneSummit
+def _with_fan(
+    problem: ResidualProblem,
+    climbs: Climbs,
+    horizons: tuple[int, ...],
+    target_at: Callable[..., Climbable],
+    target: Climbable,
+    key: PRNGKeyArray,
 ) -> Climbs:
-    """Put down one finished climb; after the last one of a horizon keep one of each summit and go to the next horizon.
-
-    Of the climbs of a horizon the better half goes on (successive halving), and every rival of the best.
-    """
-    positions, density, converged = climbs.positions.copy(), climbs.log_density.copy(), climbs.converged.copy()
-    positions[climbs.done], density[climbs.done] = state.position, state.log_density
-    converged[climbs.done] = state.converged
-    facts = {"horizon": horizon, "start": climbs.done, "steps": steps, "log_density": state.log_density}
-    climbs.trace.append(facts | {"converged": state.converged, "rollouts": climbs.ledger.rollouts})
-    climbs = climbs._replace(
-        positions=positions, log_density=density, converged=converged, done=climbs.done + 1, noise=target.noise
-    )
-    if climbs.done < len(positions):
+    """Further climbs at a horizon at which even the best went astray, once; see `fans`."""
+    if len(climbs.earlier) == 0:
         return climbs
-    kept = summits(positions, density, target.density, same)
-    kept = kept[(2 * np.arange(len(kept)) < len(kept)) | (density[kept] > density[kept[0]] - RIVAL)]
-    return climbs._replace(
-        positions=positions[kept],
-        log_density=density[kept],
-        converged=converged[kept],
-        level=climbs.level + 1,
-        done=0,
-    )
+    best, rows, more = int(np.argmax(climbs.earlier_density)), *horizons[climbs.level - 1 : climbs.level + 1]
+    before, position = float(climbs.earlier_density[best]), climbs.earlier[best]
+    if not astray(rows, before, more, float(climbs.log_density.max())):
+        return climbs
+    shorter = target_at(rows, climbs.ledger, position, climbs.noise)
+    mode = normal_at(shorter, LevenbergState(position, before, 0.0, True))
+    return with_starts(climbs, fanned(problem, mode, climbs.earlier, target, jax.random.fold_in(key, rows)))
 
 
 def _on_plateaus(
@@ -372,17 +344,3 @@ def mode_values(problem: Problem, mode: Laplace) -> dict[str, float]:
     """A mode in physical units."""
     values = problem.from_unconstrained(jnp.asarray(mode.mean[None]))
     return {name: float(np.asarray(values[name])[0]) for name in problem.names}
-
-
-def _pack(climbs: Climbs) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    assert climbs.noise is not None
-    arrays = {name: getattr(climbs, name) for name in ("positions", "log_density", "converged", "noise")}
-    meta = {name: getattr(climbs, name) for name in ("level", "done", "trace", "seconds")}
-    return arrays, meta | {"ledger": climbs.ledger.record()}
-
-
-def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Climbs:
-    ledger = Ledger.from_record(meta["ledger"])
-    named = {name: meta[name] for name in ("level", "done", "trace", "seconds")}
-    saved: dict[str, Any] = {**arrays, **named}
-    return Climbs(ledger=ledger, **saved)

@@ -13,9 +13,10 @@ from scipy.stats import norm
 from rfdropo_bayes.bayes.units import force_power
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.bridge import BridgeConfig, sample_from_modes
+from rfdropo_bayes.inference.climbs import RIVAL
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
-from rfdropo_bayes.inference.laplace import RIVAL, LaplaceConfig, Modes, find_modes
+from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes
 from rfdropo_bayes.inference.levenberg import Laplace, init, laplace, maximise
 from rfdropo_bayes.inference.mixture import NARROWEST
 from rfdropo_bayes.inference.plateaus import Held, climbs_from, plateaus

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference import climbs as climbs_of
 from rfdropo_bayes.inference import laplace, methods, starts
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.horizon_smc import SmcConfig
@@ -135,7 +136,7 @@ def test_a_survey_finds_the_highest_of_many_summits():
 
 def test_climbs_expect_half_of_their_number_at_the_next_horizon():
     """Four climbs at a quarter of the rows, two at half, one at all: each of the first has a quarter of a third."""
-    climbs = laplace.Climbs(np.zeros((4, 3)), np.zeros(4), np.zeros(4, dtype=bool), 0, 0, None, Ledger(), [], 0.0)
+    climbs = climbs_of.begin(np.zeros((4, 3)), np.zeros(4), Ledger(), 0.0)
     config = laplace.LaplaceConfig(rollouts=1200.0, max_steps=10**6)
     steps = laplace._affordable_steps(40, config, climbs, (10, 20, 40), 0)
     assert steps == int(1200.0 / 3.0 / 4.0 * 4.0 / 19.0)

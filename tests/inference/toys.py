@@ -379,3 +379,33 @@ class Crooked(LinearGaussian):
         """The prior is as good as constant where the likelihood is."""
         sides = np.sqrt(2.0 * np.pi) * 0.5 * (np.asarray(self.right) + np.asarray(self.left))
         return float(np.log(sides).sum() - np.log(2.0 * np.pi * 25.0))
+
+
+class LateContact(LinearGaussian):
+    """The last tenth of the rows has a contact, and is rippled by a weight that the rows before hardly tell of: a climb
+    from the optimum before comes to rest on the nearest ripple, thousands of nats below the posterior."""
+
+    truth = (1.2, 2.6)
+
+    def __init__(self) -> None:
+        super().__init__(n_rows=40, d=2)
+        self.names = ("pull", "weight")
+        self.units = dict.fromkeys(self.names, "1")
+        self.bounds = dict.fromkeys(self.names, (-np.inf, np.inf))
+        self.mean, self.sd = np.array([0.5, 1.0]), np.array([1.0, 1.5])
+        self.noise = np.full(40, 0.05)
+        self.design = np.linspace(0.5, 2.0, 40)
+        rng = np.random.default_rng(4)
+        self.data = np.asarray(self._fit(*map(jnp.array, self.truth), 40)) + self.noise * rng.normal(size=40)
+
+    def _fit(self, pull, weight, horizon):
+        contact = jnp.where(jnp.arange(40) < 36, 1e-3 * weight[..., None], 4.0 * weight[..., None])
+        ripple = jnp.where(jnp.arange(40) < 36, 0.0, 5.0 * jnp.sin(6.0 * weight)[..., None])
+        return (pull[..., None] * self.design + contact + ripple)[..., :horizon]
+
+    def _row_density(self, u, horizon):
+        fit = self._fit(u[:, 0], u[:, 1], horizon)
+        return jax.scipy.stats.norm.logpdf(self.data[:horizon], fit, self.noise[:horizon])
+
+    def residuals(self, values, horizon):
+        return (self.data[:horizon] - self._fit(values["pull"], values["weight"], horizon)) / self.noise[:horizon]
