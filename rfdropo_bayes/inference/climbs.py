@@ -21,8 +21,8 @@ class Climbs(NamedTuple):
         positions: where each climb stands.
         log_density: log posterior there, at the horizon of the climb's last visit.
         converged: of the climb at that horizon.
-        earlier, earlier_density: where all climbs ended at the horizon before, and their log posterior there; empty
-            where nobody needs it any more.
+        earlier: where the best climb of the horizon before ended, as one row; none at the first horizon, nor once
+            other climbs were begun from there.
         level: index of the present horizon; done: climbs done at it.
         noise: noise coordinates.
         ledger, trace, seconds: as in every method.
@@ -31,8 +31,7 @@ class Climbs(NamedTuple):
     positions: Float[np.ndarray, "start d"]
     log_density: Float[np.ndarray, " start"]
     converged: Bool[np.ndarray, " start"]
-    earlier: Float[np.ndarray, "climb d"]
-    earlier_density: Float[np.ndarray, " climb"]
+    earlier: Float[np.ndarray, "end d"]
     level: int
     done: int
     noise: Bool[np.ndarray, " d"] | None
@@ -50,8 +49,8 @@ def begin(
     positions: Float[np.ndarray, "start d"], log_density: Float[np.ndarray, " start"], ledger: Ledger, seconds: float
 ) -> Climbs:
     """Climbs at their starts."""
-    idle, none = np.zeros(len(positions), dtype=bool), positions[:0]
-    return Climbs(positions, log_density, idle, none, log_density[:0], 0, 0, None, ledger, [], seconds)
+    idle = np.zeros(len(positions), dtype=bool)
+    return Climbs(positions, log_density, idle, positions[:0], 0, 0, None, ledger, [], seconds)
 
 
 def record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, target: Climbable) -> Climbs:
@@ -67,13 +66,12 @@ def record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, targ
 
 
 def with_starts(climbs: Climbs, starts: Float[np.ndarray, "start d"]) -> Climbs:
-    """Further climbs at the present horizon, in place of what the horizon before knew."""
+    """Further climbs at the present horizon."""
     return climbs._replace(
         positions=np.concatenate([climbs.positions, starts]),
         log_density=np.concatenate([climbs.log_density, np.full(len(starts), -np.inf)]),
         converged=np.concatenate([climbs.converged, np.zeros(len(starts), dtype=bool)]),
         earlier=climbs.earlier[:0],
-        earlier_density=climbs.earlier_density[:0],
     )
 
 
@@ -89,8 +87,7 @@ def go_on(climbs: Climbs, target: Climbable, same: OneSummit) -> Climbs:
         positions=positions[kept],
         log_density=density[kept],
         converged=climbs.converged[kept],
-        earlier=positions,
-        earlier_density=density,
+        earlier=positions[kept[:1]],
         level=climbs.level + 1,
         done=0,
     )
@@ -99,7 +96,7 @@ def go_on(climbs: Climbs, target: Climbable, same: OneSummit) -> Climbs:
 def pack(climbs: Climbs) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays of the climbs and the rest of them, for a checkpoint."""
     assert climbs.noise is not None
-    of_arrays = ("positions", "log_density", "converged", "earlier", "earlier_density", "noise")
+    of_arrays = ("positions", "log_density", "converged", "earlier", "noise")
     meta = {name: getattr(climbs, name) for name in ("level", "done", "trace", "seconds")}
     return {name: getattr(climbs, name) for name in of_arrays}, meta | {"ledger": climbs.ledger.record()}
 

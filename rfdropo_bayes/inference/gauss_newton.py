@@ -39,6 +39,7 @@ class Target(NamedTuple):
         likelihood: log likelihood of a batch (n, d).
         prior_gradient, prior_hessian: of the log prior.
         linearise: residuals (m,) and their Jacobian (m, d).
+        residuals: of a batch (n, d), as (n, m); zero where there are no data.
         noise: coordinates along which the log determinant changes.
         differences: residuals (m,), and half of what they change by (m, d) from one step against each column of a
             matrix (d, d) to one step along it; None where derivatives are exact.
@@ -49,6 +50,7 @@ class Target(NamedTuple):
     prior_gradient: Callable[[np.ndarray], np.ndarray]
     prior_hessian: Callable[[np.ndarray], np.ndarray]
     linearise: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    residuals: Callable[[np.ndarray], np.ndarray]
     noise: Bool[np.ndarray, " d"]
     differences: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
 
@@ -127,7 +129,12 @@ def make_target(
         noise = _noise_coordinates(
             lambda points: likelihood(points) + 0.5 * np.sum(residuals_at(points) ** 2, axis=1), u
         )
-    return Target(density, likelihood, *prior, linearise, noise, differences)
+
+    def residuals(points: np.ndarray) -> np.ndarray:
+        ledger.charge(problem, len(points), horizon)
+        return residuals_at(points)
+
+    return Target(density, likelihood, *prior, linearise, residuals, noise, differences)
 
 
 def prior_derivatives(problem: Problem) -> tuple[Callable, Callable]:

@@ -14,14 +14,14 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
-from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.basins import OneSummit, one_point, one_ridge
 from rfdropo_bayes.inference.checkpoints import UNSAVED, Checkpoint, run_digest
 from rfdropo_bayes.inference.climbs import RIVAL, Climbs, begin, go_on, pack, record, unpack, with_starts
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.fans import astray, fanned
+from rfdropo_bayes.inference.fans import STARTS, astray, fan_cost, fanned
 from rfdropo_bayes.inference.first_climbs import screened, surveyed
-from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
+from rfdropo_bayes.inference.gauss_newton import Target, make_target, prior_derivatives
 from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES
 from rfdropo_bayes.inference.levenberg import (
     Climbable,
@@ -47,6 +47,7 @@ SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before the
 # a push, where contacts begin and end, came to rest on the way.
 CONTINUED = (0.75, 0.875, 1.0)
 FOR_PLATEAUS = 0.1  # share of the budget of climbs, and of a survey, that is held back for plateaus
+FOR_FANS = 0.1  # the same for climbs that begin again, see `fans`
 FEWEST_STEPS = 4.0  # of a climb at the last horizon that is worth its start
 
 
@@ -146,13 +147,14 @@ def find_modes(
         state, steps = maximise(target, climbs.positions[climbs.done], max_steps=allowed, tolerance=config.tolerance)
         climbs = record(climbs, state, len(steps), horizons[climbs.level], target)
         if climbs.level_done and config.survey and isinstance(problem, ResidualProblem):
-            climbs = _with_fan(problem, climbs, horizons, target_at, target, key)
+            climbs = _with_fan(problem, config, climbs, horizons, target_at, target, key)
         if climbs.level_done:
+            _check_heights(climbs, horizons[climbs.level])
             climbs = go_on(climbs, target, one_point if horizons[climbs.level] == horizons[-1] else same)
             target = None
         climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
         checkpoint.save(*pack(climbs))
-        share = (climbs.level + climbs.done / config.starts) / len(horizons)
+        share = (climbs.level + climbs.done / len(climbs.positions)) / len(horizons)
         logbook.part(began_at, 1.0).stage(share, method="laplace", **climbs.trace[-1])
     assert climbs.noise is not None
     target = target_at(problem.n_rows, climbs.ledger, climbs.positions[0], climbs.noise)
@@ -193,7 +195,7 @@ def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], 
 def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizons: tuple[int, ...], noise: int) -> int:
     """Steps the present climb may take: what is left of the budget is shared among climbs by their horizons.
 
-    Of the climbs of a horizon half are expected at the next, see `_record`.
+    Of the climbs of a horizon half are expected at the next, see `go_on`.
     """
     if config.rollouts is None:
         return config.max_steps
@@ -202,12 +204,17 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
     later = sum(-(-starts // 2**ahead) * rows for ahead, rows in enumerate(horizons[climbs.level + 1 :], start=1))
     waiting = starts - climbs.done
     share = now * waiting / (now * waiting + later)
-    budget = config.rollouts * (1.0 - FOR_PLATEAUS * (config.survey > 0))
+    budget = _for_climbs(config) - FOR_FANS * config.rollouts * (config.survey > 0 and len(climbs.earlier) > 0)
     rows = max(budget - climbs.ledger.rollouts, 0.0) * share * n_rows / now
     grid, step = climb_cost(d, noise)
     # More rivals than expected may have come to the last horizon: the best climb on, rather than none.
     served = waiting if later else int(np.clip(rows / (grid + FEWEST_STEPS * step), 1, waiting))
     return int(np.clip((rows / served - grid) / step, 0, config.max_steps))
+
+
+def _for_climbs(config: LaplaceConfig) -> float:
+    """Rollouts of a survey and of climbs, but for those on plateaus."""
+    return math.inf if config.rollouts is None else config.rollouts * (1.0 - FOR_PLATEAUS * (config.survey > 0))
 
 
 def _first(
@@ -227,22 +234,39 @@ def _first(
 
 def _with_fan(
     problem: ResidualProblem,
+    config: LaplaceConfig,
     climbs: Climbs,
     horizons: tuple[int, ...],
     target_at: Callable[..., Climbable],
     target: Climbable,
     key: PRNGKeyArray,
 ) -> Climbs:
-    """Further climbs at a horizon at which even the best went astray, once; see `fans`."""
+    """Further climbs at a horizon at which even the best went astray, once, if the budget allows; see `fans`."""
     if len(climbs.earlier) == 0:
         return climbs
-    best, rows, more = int(np.argmax(climbs.earlier_density)), *horizons[climbs.level - 1 : climbs.level + 1]
-    before, position = float(climbs.earlier_density[best]), climbs.earlier[best]
-    if not astray(rows, before, more, float(climbs.log_density.max())):
+    rows, (d, noise) = horizons[climbs.level - 1], (climbs.positions.shape[1], int(target.noise.sum()))
+    grid, step = climb_cost(d, noise)
+    needed = (fan_cost(d, noise) + STARTS * (grid + FEWEST_STEPS * step)) * horizons[climbs.level] / problem.n_rows
+    if needed > _for_climbs(config) - climbs.ledger.rollouts:
         return climbs
-    shorter = target_at(rows, climbs.ledger, position, climbs.noise)
-    mode = normal_at(shorter, LevenbergState(position, before, 0.0, True))
-    return with_starts(climbs, fanned(problem, mode, climbs.earlier, target, jax.random.fold_in(key, rows)))
+    before, after = climbs.earlier[0], climbs.positions[int(np.argmax(climbs.log_density))].copy()
+    after[target.noise] = before[target.noise]
+    shorter = target_at(rows, climbs.ledger, before, climbs.noise)
+    assert isinstance(shorter, Target)
+    assert isinstance(target, Target)
+    if not astray(shorter.residuals(before[None])[0], target.residuals(after[None])[0]):
+        return climbs
+    mode = normal_at(shorter, LevenbergState(before, math.nan, 0.0, True))
+    return with_starts(climbs, fanned(problem, mode, target, jax.random.fold_in(key, rows)))
+
+
+def _check_heights(climbs: Climbs, horizon: int) -> None:
+    if not np.isfinite(climbs.log_density).any():
+        raise NoLikelihoodError(
+            f"no climb has a positive likelihood up to row {horizon} ({climbs.ledger.reasons})",
+            where="[inference]",
+            remedy="look at what the simulator reports there, or allow more starts",
+        )
 
 
 def _on_plateaus(

@@ -157,9 +157,14 @@ def with_fitting_noise(target: Climbable, u: Float[np.ndarray, " d"], width: flo
 def maximise(
     target: Climbable, u: Float[np.ndarray, " d"], *, max_steps: int, tolerance: float
 ) -> tuple[LevenbergState, list[dict[str, Any]]]:
-    """Climb from one start, noise first, until a step promises less than ``tolerance`` nats; no steps, no search."""
+    """Climb from one start, noise first, until a step promises less than ``tolerance`` nats; no steps, no search.
+
+    A start without a likelihood has no derivatives either, and is left where it is.
+    """
     state = init(target, with_fitting_noise(target, u) if max_steps else u)
     trace: list[dict[str, Any]] = []
+    if not np.isfinite(state.log_density):
+        return state, trace
     while not state.converged and len(trace) < max_steps:
         state, info = step(target, state, tolerance)
         trace.append({"log_density": state.log_density, "damping": state.damping, **info._asdict()})

@@ -20,7 +20,7 @@ from rfdropo_bayes.inference.proposals import host_generator, squared_distance
 
 LEAST_SHARE = 0.05  # of a mode, before normalising: Laplace evidences of ill-shaped modes are off by nats
 MOMENTS = 1000  # prior draws behind its mean and covariance
-NARROWEST = 1e-6  # least deviation of a normal approximation in any direction, as a share of its largest
+NARROWEST = 1e-6  # least deviation of a normal approximation in any direction, as a share of its largest one
 
 
 class ModeMixture:
@@ -114,14 +114,22 @@ def joint_covariance(information: Float[np.ndarray, "d d"], prior: Float[np.ndar
     """Covariance of a normal posterior, by the likelihood's information and the prior's covariance.
 
     Differences across a cliff of the likelihood may promise 1e20 times the prior's precision. The sum of the two,
-    rounded, would know nothing of the prior, and its inverse have directions without a variance. Measured in deviations
-    of the prior, none is therefore less than `NARROWEST` of the largest. Negative information is none.
+    rounded, would know nothing of the prior, and its inverse have directions without a variance. What rounding leaves
+    of the largest information, and what is negative, is therefore none; and in deviations of the prior, no deviation
+    is less than `NARROWEST` of the largest.
     """
-    root = np.linalg.cholesky(prior)
+    root = _root(prior)
     values, vectors = np.linalg.eigh(root.T @ information @ root)
-    precision = 1.0 + np.maximum(values, 0.0)
+    precision = 1.0 + np.where(values > len(values) * np.finfo(float).eps * values[-1], values, 0.0)
     half = root @ (vectors / np.sqrt(np.minimum(precision, precision.min() / NARROWEST**2)))
     return half @ half.T
+
+
+def _root(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
+    """A matrix R with R R' = covariance, regular where draws are linearly dependent, too."""
+    sd = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(sd, sd))
+    return sd[:, None] * vectors * np.sqrt(np.maximum(values, NARROWEST**2))
 
 
 def _with_prior_moments(
@@ -130,7 +138,9 @@ def _with_prior_moments(
     if mode.information is None or mode.slope is None:
         return None
     covariance = joint_covariance(mode.information, prior)
-    centre = mode.mean + covariance @ (mode.slope + np.linalg.solve(prior, mean - mode.mean))
+    root = _root(prior)
+    pull = np.linalg.solve(root.T, np.linalg.solve(root, mean - mode.mean))
+    centre = mode.mean + covariance @ (mode.slope + pull)
     # Of the two neither is known to be the better: they get equal shares.
     wide = Laplace(centre, covariance, 0.0)
     return wide._replace(log_density=mode.log_evidence - wide.log_evidence)

@@ -127,14 +127,12 @@ def _log_score(offsets: Float[np.ndarray, "d n"]) -> float | None:
     return float(-0.5 * white @ white - 0.5 * np.linalg.slogdet(2.0 * np.pi * covariance)[1])
 
 
-def prior_log_score(task: Task, truth: Mapping[str, float]) -> float:
-    """The same of the uniform prior, in closed form: what a posterior that is worth having must exceed."""
-    variance = WIDTH**2 / 12.0
-    total = 0.0
-    for name, (low, high) in task.ranges.items():
-        offset = WIDTH * (0.5 * (low + high) - truth[name]) / (high - low)
-        total -= 0.5 * (offset**2 / variance + np.log(2.0 * np.pi * variance))
-    return float(total)
+def misleads(task: Task, result: Mapping[str, Any]) -> bool:
+    """Whether the posterior of a fit says less of its truth than the uniform prior did, by its log score against the
+    prior's density; where draws do not vary, whether they miss it."""
+    if result["log_score"] is None:
+        return not all(result["inside_90"])
+    return bool(result["log_score"] < -len(task.ranges) * np.log(WIDTH))
 
 
 def held_out_error(

@@ -16,7 +16,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.rivals import import_sbi
 from rfdropo_bayes.report.facts import software_versions
-from rfdropo_bayes.workflow.comparison import RIVALS, ROWS, fit, prior_log_score
+from rfdropo_bayes.workflow.comparison import RIVALS, ROWS, fit, misleads
 from rfdropo_bayes.workflow.files import output_folder
 from rfdropo_bayes.workflow.fits import finished, run_fits
 from rfdropo_bayes.workflow.table1_figure import draw_figure
@@ -28,6 +28,7 @@ PAPER = {  # mean squared error and its deviation, Table I
 }
 NEEDS_SBI = ("BayesSim", "NPDR")
 OWN = ("ours", "ours + tension")
+NO_FITS = ("prior", "mid-range")
 TRUTHS = ("paper", "off-centre")
 FIGURES = {
     "mse": "MSE",
@@ -162,15 +163,10 @@ def summarise(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 # A point has no interval to cover anything with.
                 inside = [hit for r in done for hit in r["inside_90"]] if row != "mid-range" else []
                 cell["coverage_90"] = float(np.mean(inside)) if inside else None
-                cell["misleading"] = sum(map(_misleads, done))
+                fitted = row not in NO_FITS
+                cell["misleading"] = sum(misleads(TASKS[task], r) for r in done) if fitted else None
                 cells.append(cell)
     return cells
-
-
-def _misleads(result: Mapping[str, Any]) -> bool:
-    """Whether a fit says less of its truth than the prior does: too narrow where the truth is not."""
-    score = result["log_score"]
-    return score is not None and score < prior_log_score(TASKS[result["task"]], result["truth"])
 
 
 def misleading(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -178,10 +174,10 @@ def misleading(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
     Warnings are None where the fit is older than their record.
     """
-    wrong = [r for r in found if r["row"] in OWN and "failed" not in r and _misleads(r)]
+    wrong = [r for r in found if r["row"] in OWN and "failed" not in r and misleads(TASKS[r["task"]], r)]
     kept = ("task", "truths", "row", "index", "log_score")
     entries = [{**{name: r[name] for name in kept}, "warnings": r.get("warnings")} for r in wrong]
-    return sorted(entries, key=lambda entry: entry["log_score"])
+    return sorted(entries, key=lambda entry: -np.inf if entry["log_score"] is None else entry["log_score"])
 
 
 def _moments(values: Sequence[float | None]) -> dict[str, float | None]:
@@ -275,7 +271,7 @@ def as_markdown(content: Mapping[str, Any]) -> str:
         f"paper; the others {size['rival_truths']} of each. Mean ± standard deviation. "
         "MSE: the paper's, in ranges scaled to [0, 4]; told: of the parameters that the motion tells of, which are "
         "those of a cube only where it is pushed by 5 mm. Held out: tip error of the mean prediction under commands "
-        "that no fit saw. Misleading: fits whose log score at the truth is below that of the prior.",
+        "that no fit saw. Misleading: fits whose log score is below the prior's log density at the truth.",
         "",
     ]
     for task in dict.fromkeys(cell["task"] for cell in content["cells"]):
@@ -312,7 +308,8 @@ def _misled(entry: Mapping[str, Any]) -> str:
     warnings = entry["warnings"]
     said = "warnings not recorded" if warnings is None else "; ".join(warnings) or "no warning"
     place = f"{entry['task']}, {_kind(entry['truths'])} {entry['index']}, {entry['row']}"
-    return f"- {place}: log score {entry['log_score']:.3g}; {said}"
+    score = "no spread" if entry["log_score"] is None else f"log score {entry['log_score']:.3g}"
+    return f"- {place}: {score}; {said}"
 
 
 def _ahead(entry: Mapping[str, Any]) -> str:
@@ -337,5 +334,6 @@ def _row(cell: Mapping[str, Any]) -> str:
 
     coverage = "-" if cell["coverage_90"] is None else f"{100 * cell['coverage_90']:.0f} %"
     figures = [moments(figure) for figure in FIGURES]
-    entries = [cell["row"], cell["fits"], *figures[:4], coverage, cell["misleading"], *figures[4:]]
+    misleading = "-" if cell["misleading"] is None else cell["misleading"]
+    entries = [cell["row"], cell["fits"], *figures[:4], coverage, misleading, *figures[4:]]
     return f"| {' | '.join(map(str, entries))} |"

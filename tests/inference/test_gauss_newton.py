@@ -187,7 +187,8 @@ def test_a_climb_ends_where_nothing_is_delivered_of_what_is_promised():
     def steep(u):
         return np.zeros(1), np.array([[1.0]])
 
-    target = Target(density, density, lambda u: np.ones(1), lambda u: np.zeros((1, 1)), steep, np.zeros(1, dtype=bool))
+    prior, noise = (lambda u: np.ones(1), lambda u: np.zeros((1, 1))), np.zeros(1, dtype=bool)
+    target = Target(density, density, *prior, steep, np.zeros_like, noise)
     state, steps = maximise(target, np.zeros(1), max_steps=60, tolerance=1e-4)
     assert state.converged
     assert len(steps) == 3

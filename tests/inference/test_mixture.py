@@ -34,13 +34,29 @@ def test_negative_information_is_none():
     np.testing.assert_allclose(found, [1.0 / 6.0, 1.0, 1.0])
 
 
-def test_what_a_cliff_does_not_tell_is_left_to_the_prior():
-    """The same in units of 1e3 and 1e-3; a share of 1e-12 of the information is what rounding leaves of its zeros."""
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("exponent", [11, 14, 17, 20, 30])
+def test_what_a_cliff_does_not_tell_is_left_to_the_prior(exponent, seed):
+    """In any direction, and any height of the cliff: rounding leaves 1e4 of the zeros beside 1e20."""
+    information, axes = turned([10.0**exponent, 0.0, 0.0, 0.0], seed)
+    found = axes.T @ joint_covariance(information, np.eye(4)) @ axes
+    np.testing.assert_allclose(np.sqrt(np.diag(found))[1:], 1.0, rtol=0.02)
+
+
+def test_units_do_not_matter():
     information, axes = turned([1e11, 0.0, 0.0])
     units = np.diag([1e3, 1.0, 1e-3])
     found = joint_covariance(np.linalg.inv(units) @ information @ np.linalg.inv(units), units @ units)
     deviations = np.sqrt(np.diag(axes.T @ np.linalg.solve(units, found) @ np.linalg.inv(units) @ axes))
     np.testing.assert_allclose(deviations, [10.0**-5.5, 1.0, 1.0], rtol=1e-2)
+
+
+@pytest.mark.parametrize("sizes", [[0.0, 1.0], [1.0, 1.0], [1.0, 1e-9]])
+def test_a_prior_of_dependent_coordinates_is_taken(sizes):
+    """Draws of which one coordinate follows from another have a singular covariance."""
+    drawn = np.random.default_rng(0).normal(size=(2, 500))
+    prior = np.cov(np.stack([drawn[0], sizes[0] * drawn[0] + 1e-12 * drawn[1], sizes[1] * drawn[1]]))
+    np.linalg.cholesky(joint_covariance(np.diag([4.0, 1.0, 0.0]), prior))
 
 
 @pytest.mark.parametrize("exponent", [14, 20, 30])

@@ -12,7 +12,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.workflow import table1
-from rfdropo_bayes.workflow.comparison import fit, prior_log_score, scores
+from rfdropo_bayes.workflow.comparison import fit, misleads, scores
 from rfdropo_bayes.workflow.fits import run_fits
 from rfdropo_bayes.workflow.table1 import (
     Size,
@@ -116,11 +116,23 @@ def test_a_uniform_prior_scores_what_the_paper_s_does_about():
 
 
 @pytest.mark.parametrize("task", [REACH, PUSH])
-def test_the_prior_s_log_score_is_that_of_its_draws(task):
-    rng = np.random.default_rng(2)
-    draws = {name: rng.uniform(*ends, size=400000) for name, ends in task.ranges.items()}
-    truth = draw_truth(task, "off-centre", tuple(task.ranges), rng)
-    assert prior_log_score(task, truth) == pytest.approx(scores(task, draws, truth, ())["log_score"], abs=0.03)
+def test_a_posterior_misleads_where_it_says_less_than_the_prior(task):
+    """Draws at one deviation s on either side of the truth, in units of the paper's range of 4: their log score is
+    -d log(s sqrt(2 pi)), which is the prior's -d log 4 at s = 1.6."""
+    truth, rng = {name: 0.5 * sum(ends) for name, ends in task.ranges.items()}, np.random.default_rng(2)
+    width = {name: (high - low) / 4.0 for name, (low, high) in task.ranges.items()}
+
+    def judged(deviation, offset=0.0, n=20000):
+        z = offset + deviation * rng.choice([-1.0, 1.0], size=(len(width), n))
+        draws = {name: truth[name] + width[name] * column for name, column in zip(width, z, strict=True)}
+        return misleads(task, scores(task, draws, truth, ()))
+
+    assert not judged(1.5)
+    assert judged(1.7)
+    assert not judged(0.1)
+    assert judged(0.1, offset=0.6)
+    assert not judged(0.0)
+    assert judged(0.0, offset=1e-3)
 
 
 def test_off_centre_truths_stay_out_of_the_middle():
@@ -185,14 +197,15 @@ def test_cells_claims_and_the_table_follow_from_the_fits(tmp_path):
 
 
 def test_a_posterior_that_says_less_than_the_prior_is_counted_and_named():
-    """The prior's log score at the paper's truth of TrunkReach is -3.23."""
-    found = [r for r in rows() if r["row"] in ("ours", "UDR") and "failed" not in r]
+    """The prior's log density is -3 log 4 = -4.16."""
+    found = [r for r in rows() if r["row"] in ("ours", "UDR", "prior") and "failed" not in r]
     ours, rival = ([r for r in found if (r["row"], r["truths"]) == (row, "paper")] for row in ("ours", "UDR"))
-    ours[0]["log_score"], ours[1]["log_score"], ours[2]["log_score"] = -3.5, -100.0, -3.0
+    ours[0]["log_score"], ours[1]["log_score"], ours[2]["log_score"] = -4.3, -100.0, -4.1
     ours[1]["warnings"] = ["the last moves left the particles where they were"]
-    rival[0]["log_score"], rival[1]["log_score"] = -4.0, None
+    rival[0]["log_score"], rival[1]["log_score"] = -5.0, None
     counted = {(c["row"], c["truths"]): c["misleading"] for c in summarise(found)}
-    assert counted == {("ours", "paper"): 2, ("UDR", "paper"): 1, ("ours", "off-centre"): 0, ("UDR", "off-centre"): 0}
+    assert [counted[row, "paper"] for row in ("ours", "UDR", "prior")] == [2, 2, None]
+    assert [counted[row, "off-centre"] for row in ("ours", "UDR")] == [0, 0]
     named = misleading(found)
     assert [(entry["row"], entry["index"], entry["warnings"]) for entry in named] == [
         ("ours", ours[1]["index"], ours[1]["warnings"]),
