@@ -139,8 +139,8 @@ def _with_prior_moments(
         return None
     covariance = joint_covariance(mode.information, prior)
     root = _root(prior)
-    pull = np.linalg.solve(root.T, np.linalg.solve(root, mean - mode.mean))
-    centre = mode.mean + covariance @ (mode.slope + pull)
+    of_prior = np.linalg.solve(root.T, np.linalg.solve(root, mean - mode.mean))
+    centre = mode.mean + covariance @ (mode.slope + of_prior)
     # Of the two neither is known to be the better: they get equal shares.
     wide = Laplace(centre, covariance, 0.0)
     return wide._replace(log_density=mode.log_evidence - wide.log_evidence)

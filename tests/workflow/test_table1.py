@@ -168,7 +168,7 @@ def rows():
     for job in list_jobs(Size(truths=8, rival_truths=4), list(table1.ROWS), ["TrunkReach"]):
         worse = 3.0 if job["row"] in table1.RIVALS else 1.0
         figures = {name: worse * (1.0 + 0.1 * rng.uniform()) for name in table1.FIGURES}
-        found.append({**job, **figures, "truth": dict(REACH.truth), "inside_90": [True] * 9 + [False]})
+        found.append({**job, **figures, "inside_90": [True] * 9 + [False]})
     found[-1] = {**list_jobs(Size(truths=8), ["ours"], ["TrunkReach"])[-1], "failed": "no reason"}
     return found
 
@@ -245,11 +245,7 @@ def test_what_another_row_does_better_is_said():
 
 
 def test_a_run_writes_its_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        table1,
-        "fit",
-        lambda job: {**dict.fromkeys(table1.FIGURES, 1.0), "truth": dict(PUSH.truth), "inside_90": [True]},
-    )
+    monkeypatch.setattr(table1, "fit", lambda job: {**dict.fromkeys(table1.FIGURES, 1.0), "inside_90": [True]})
     run_table1(tmp_path, Size(1, 1), rows=["prior", "ours"], command="rfdropo benchmark table1")
     content = json.loads((tmp_path / "table1.json").read_text())
     assert {cell["row"] for cell in content["cells"]} == {"prior", "ours"}
