@@ -15,11 +15,11 @@ from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
+from rfdropo_bayes.inference.astray import affordable_generations, astray, search
 from rfdropo_bayes.inference.basins import OneSummit, one_point, one_ridge
 from rfdropo_bayes.inference.checkpoints import UNSAVED, Checkpoint, run_digest
 from rfdropo_bayes.inference.climbs import RIVAL, Climbs, begin, go_on, pack, record, unpack, with_starts
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.fans import STARTS, astray, fan_cost, fanned
 from rfdropo_bayes.inference.first_climbs import screened, surveyed
 from rfdropo_bayes.inference.gauss_newton import Target, make_target, prior_derivatives
 from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES
@@ -47,7 +47,7 @@ SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before the
 # a push, where contacts begin and end, came to rest on the way.
 CONTINUED = (0.75, 0.875, 1.0)
 FOR_PLATEAUS = 0.1  # share of the budget of climbs, and of a survey, that is held back for plateaus
-FOR_FANS = 0.1  # the same for climbs that begin again, see `fans`
+FOR_SEARCH = 0.1  # the same for climbs that begin again, see `astray`
 FEWEST_STEPS = 4.0  # of a climb at the last horizon that is worth its start
 
 
@@ -147,7 +147,7 @@ def find_modes(
         state, steps = maximise(target, climbs.positions[climbs.done], max_steps=allowed, tolerance=config.tolerance)
         climbs = record(climbs, state, len(steps), horizons[climbs.level], target)
         if climbs.level_done and config.survey and isinstance(problem, ResidualProblem):
-            climbs = _with_fan(problem, config, climbs, horizons, target_at, target, key)
+            climbs = _with_search(problem, config, climbs, horizons, target_at, target, key)
         if climbs.level_done:
             _check_heights(climbs, horizons[climbs.level])
             climbs = go_on(climbs, target, one_point if horizons[climbs.level] == horizons[-1] else same)
@@ -204,9 +204,12 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
     later = sum(-(-starts // 2**ahead) * rows for ahead, rows in enumerate(horizons[climbs.level + 1 :], start=1))
     waiting = starts - climbs.done
     share = now * waiting / (now * waiting + later)
-    budget = _for_climbs(config) - FOR_FANS * config.rollouts * (config.survey > 0 and len(climbs.earlier) > 0)
-    rows = max(budget - climbs.ledger.rollouts, 0.0) * share * n_rows / now
     grid, step = climb_cost(d, noise)
+    left = _for_climbs(config) - climbs.ledger.rollouts
+    held = FOR_SEARCH * config.rollouts * (config.survey > 0 and len(climbs.earlier) > 0)
+    if left - held < (grid + FEWEST_STEPS * step) * now / n_rows:
+        held = 0.0  # a climb rather than a search from where there was none
+    rows = max(left - held, 0.0) * share * n_rows / now
     # More rivals than expected may have come to the last horizon: the best climb on, rather than none.
     served = waiting if later else int(np.clip(rows / (grid + FEWEST_STEPS * step), 1, waiting))
     return int(np.clip((rows / served - grid) / step, 0, config.max_steps))
@@ -232,7 +235,7 @@ def _first(
     return begin(u, density, ledger, time.monotonic() - began)
 
 
-def _with_fan(
+def _with_search(
     problem: ResidualProblem,
     config: LaplaceConfig,
     climbs: Climbs,
@@ -241,13 +244,14 @@ def _with_fan(
     target: Climbable,
     key: PRNGKeyArray,
 ) -> Climbs:
-    """Further climbs at a horizon at which even the best went astray, once, if the budget allows; see `fans`."""
+    """A further climb at a horizon at which even the best went astray, once, if the budget allows; see `astray`."""
     if len(climbs.earlier) == 0:
         return climbs
     rows, (d, noise) = horizons[climbs.level - 1], (climbs.positions.shape[1], int(target.noise.sum()))
     grid, step = climb_cost(d, noise)
-    needed = (fan_cost(d, noise) + STARTS * (grid + FEWEST_STEPS * step)) * horizons[climbs.level] / problem.n_rows
-    if needed > _for_climbs(config) - climbs.ledger.rollouts:
+    left = (_for_climbs(config) - climbs.ledger.rollouts) * problem.n_rows / horizons[climbs.level]
+    generations = affordable_generations(left - grid - FEWEST_STEPS * step, d, noise)
+    if not generations:
         return climbs
     before, after = climbs.earlier[0], climbs.positions[int(np.argmax(climbs.log_density))].copy()
     after[target.noise] = before[target.noise]
@@ -257,7 +261,7 @@ def _with_fan(
     if not astray(shorter.residuals(before[None])[0], target.residuals(after[None])[0]):
         return climbs
     mode = normal_at(shorter, LevenbergState(before, math.nan, 0.0, True))
-    return with_starts(climbs, fanned(problem, mode, target, jax.random.fold_in(key, rows)))
+    return with_starts(climbs, search(problem, mode, target, generations, jax.random.fold_in(key, rows)))
 
 
 def _check_heights(climbs: Climbs, horizon: int) -> None:
