@@ -50,6 +50,7 @@ class CalibrationProblem:
         self.names = model.space.names
         self.units = {p.name: p.spec.unit for p in model.space.parameters}
         self.bounds = {p.name: (p.spec.low, p.spec.high) for p in model.space.parameters}
+        self.prior_ends = {p.name: p.ends for p in model.space.parameters}
         self.n_rows = model.recordings.time.shape[1]
         self.n_recordings = len(model.recordings.names)
         self.status_names = {int(result): result.name.lower() for result in Result}

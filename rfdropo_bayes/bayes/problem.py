@@ -27,6 +27,8 @@ class Problem(Protocol):
     A problem may also have
 
     - ``fingerprint: str``, a digest of its data and model: checkpoints of another problem are then refused;
+    - ``prior_ends: dict[str, tuple[float, float]]``, where each parameter's prior ends: on its hard bounds or between
+      them; without, the bounds are taken for them;
     - ``status_names: Mapping[int, str]``, words for its status codes, used when excluded rollouts are counted;
     - ``log_likelihood_at(u)`` of one unconstrained point, traceable by JAX, as NUTS and nested sampling want it.
     """

@@ -61,6 +61,13 @@ class Parameter:
         """Bijection from the real line to the support of the prior."""
         return dist.biject_to(self.prior.support)
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Where the prior ends: on the hard bounds or between them; infinite where there is neither."""
+        support = self.prior.support
+        low, high = getattr(support, "lower_bound", -np.inf), getattr(support, "upper_bound", np.inf)
+        return max(self.spec.low, float(low)), min(self.spec.high, float(high))
+
     def inside(self, values: Float[Array, " n"], otherwise: Float[Array, " n"]) -> Float[Array, " n"]:
         """Values, those on the edge of the support moved inside, and ``otherwise`` for those beyond it."""
         u = self.transform.inv(values)

@@ -68,22 +68,24 @@ def chains(problem: Problem, positions: list[np.ndarray]) -> Draws:
 
 
 def prior_warnings(problem: Problem, draws: Draws) -> list[str]:
-    """A sentence for every parameter whose posterior is cut off by a bound at its mode, where the bound decides, and
-    one for those that the data put where the prior hardly is.
+    """A sentence for every parameter whose posterior is cut off at its mode by a bound or an end of its prior, which
+    decide there, and one for those that the data put where the prior hardly is.
 
     A prior that is more even in logarithms has its posterior compared with a bound in logarithms: a scale that ranges
     over decades has much of a linear range's mass at the lower end.
     """
-    drawn = problem.sample_prior(jax.random.key(0), PRIOR_DRAWS)
+    drawn, ends = problem.sample_prior(jax.random.key(0), PRIOR_DRAWS), getattr(problem, "prior_ends", problem.bounds)
     sentences, apart = [], []
     for name, values in draws.items():
-        values, (low, high), prior = np.ravel(values), problem.bounds[name], np.asarray(drawn[name], dtype=float)
+        values, (low, high), prior = np.ravel(values), ends[name], np.asarray(drawn[name], dtype=float)
         side = piled_at(values, low, high)
         if side and _even_in_logarithms(prior):
             side = piled_at(values, low, high, logarithmic=True)
         if side:
-            word, bound = ("lower", low) if side == "low" else ("upper", high)
-            sentences.append(f"{name} sits on its {word} bound {bound:g}, which decides there, and not the data")
+            word, end = ("lower", low) if side == "low" else ("upper", high)
+            hard = np.isclose(end, problem.bounds[name], rtol=1e-6, atol=0.0).any()
+            what = f"its {word} bound {end:g}" if hard else f"the {word} end {end:g} of its prior"
+            sentences.append(f"{name} sits on {what}, which decides there, and not the data")
         elif contradicts(values, prior):
             apart.append(name)
     return sentences + [contradiction(apart)] * bool(apart)

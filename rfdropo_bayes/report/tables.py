@@ -1,4 +1,4 @@
-"""The posterior in numbers: moments, quantiles, sampling diagnostics, and whether a hard bound decided."""
+"""The posterior in numbers: moments, quantiles, sampling diagnostics, and whether a bound decided."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ParameterRow:
     Attributes:
         name, unit, description: of the parameter.
         mean, sd, q05, median, q95: of the draws.
-        at_bound: the posterior is piled up at a hard bound.
+        at_bound: the posterior is piled up at a hard bound, or at an end of its prior.
         bound: which one, "low" or "high"; None if neither.
         prior_q05, prior_q95: of the prior draws, None without them.
         contraction: posterior over prior standard deviation, of the logarithm where the prior is logarithmic and for

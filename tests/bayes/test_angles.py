@@ -254,7 +254,9 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
     model = build_model(experiment, simulator, [trunk])
     assert model.motor_angle.measured.shape == (1, 20, 6)
     assert set(model.space.names) == {"actuator_lag", "observation_noise", "motor_angle_noise"}
-    assert CalibrationProblem(model).physical_names == ("actuator_lag",)
+    calibration = CalibrationProblem(model)
+    assert calibration.physical_names == ("actuator_lag",)
+    assert calibration.prior_ends == {parameter.name: parameter.ends for parameter in model.space.parameters}
     measured = {spec.name for spec in measurement_specs(experiment.model)}  # what a posterior may hold beside
     assert measured == {"observation_noise", "motor_angle_noise"}
 

@@ -34,6 +34,23 @@ def test_a_parameter_of_single_recordings_is_free_there_and_absent_elsewhere():
     assert "offset_x" not in space().for_recording(values, "c")
 
 
+@pytest.mark.parametrize(
+    ("prior", "ends"),
+    [
+        ({"distribution": "Uniform", "low": 2e6, "high": 7e6}, (2e6, 7e6)),
+        ({"distribution": "LogUniform", "low": 2e6, "high": 7e6}, (2e6, 7e6)),
+        ({"distribution": "LogNormal", "median": 4e6, "sigma": 0.5}, (1e6, 5e7)),
+        ({"distribution": "Normal", "loc": 4e6, "scale": 1e6}, (1e6, 5e7)),
+        ({"distribution": "HalfNormal", "scale": 8e6}, (1e6, 5e7)),
+    ],
+)
+def test_a_prior_ends_where_it_says_or_at_the_hard_bounds(prior, ends):
+    parameter = build_space(SPECS, {"young_modulus": prior}, {}, ["a"])["young_modulus"]
+    np.testing.assert_allclose(parameter.ends, ends, rtol=1e-6)
+    drawn = parameter.prior.sample(jax.random.key(2), (500,))
+    assert np.all((drawn >= ends[0]) & (drawn <= ends[1]))
+
+
 def test_the_unconstrained_map_is_a_bijection_and_its_density_carries_the_jacobian():
     chosen = space()
     values = chosen.sample(jax.random.key(1), 50)

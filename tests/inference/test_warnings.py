@@ -48,6 +48,24 @@ def test_only_a_posterior_cut_off_at_its_mode_is_warned_of(prior, bounds, draws,
     assert [sentence.split()[4] for sentence in sentences] == ([side] if side else [])
 
 
+@pytest.mark.parametrize(
+    ("ends", "draws", "said"),
+    [
+        ((2.0, 7.0), 7.0 + 1e-3 * np.log(GRID), "x0 sits on the upper end 7 of its prior"),
+        ((2.0, 7.0), 2.0 - 1e-3 * np.log(GRID), "x0 sits on the lower end 2 of its prior"),
+        ((0.0, 7.0), -1e-3 * np.log(GRID), "x0 sits on its lower bound 0"),
+        ((2.0, 7.0), 6.9 + 1e-3 * GRID, ""),
+    ],
+)
+def test_an_end_of_the_prior_between_the_bounds_is_named(ends, draws, said):
+    """Far inside its hard bounds a posterior can be cut off by its prior alone: a uniform one says nothing else."""
+    low, high = ends
+    problem = OneParameter(lambda key, n: jax.random.uniform(key, (n,), minval=low, maxval=high), (0.0, 100.0))
+    problem.prior_ends = {"x0": ends}
+    sentences = prior_warnings(problem, {"x0": draws[None]})
+    assert sentences == [f"{said}, which decides there, and not the data"] * bool(said)
+
+
 def normal(key, n):
     return jax.random.normal(key, (n,))
 

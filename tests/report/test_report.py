@@ -101,7 +101,7 @@ def test_the_page_has_every_section_and_figure(folder: Path, record: PosteriorRe
     for text in (
         "Toy trunk",
         "12 of 20000 rollouts",
-        "rayleigh_stiffness sits on a hard bound",
+        "rayleigh_stiffness sits on a hard bound or at an end of the prior",
         "cubic FIR",
         "Synthetic",
     ):
