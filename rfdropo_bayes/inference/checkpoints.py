@@ -17,7 +17,7 @@ from jaxtyping import PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 _META = "meta_json"
 
 

@@ -22,7 +22,7 @@ class Climbs(NamedTuple):
         log_density: log posterior there, at the horizon of the climb's last visit.
         converged: of the climb at that horizon.
         earlier: where the best climb of the horizon before ended, as one row; none at the first horizon, nor once
-            other climbs were begun from there.
+            another start was looked for around it.
         level: index of the present horizon; done: climbs done at it.
         noise: noise coordinates.
         ledger, trace, seconds: as in every method.
@@ -38,6 +38,11 @@ class Climbs(NamedTuple):
     ledger: Ledger
     trace: list[dict[str, Any]]
     seconds: float
+
+    @property
+    def begins_again(self) -> bool:
+        """Whether the present climb is from another start, looked for at this horizon; see `restarts`."""
+        return self.level > 0 and len(self.earlier) == 0
 
     @property
     def level_done(self) -> bool:

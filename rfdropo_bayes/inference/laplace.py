@@ -15,7 +15,6 @@ from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
-from rfdropo_bayes.inference.astray import affordable_generations, astray, search
 from rfdropo_bayes.inference.basins import OneSummit, one_point, one_ridge
 from rfdropo_bayes.inference.checkpoints import UNSAVED, Checkpoint, run_digest
 from rfdropo_bayes.inference.climbs import RIVAL, Climbs, begin, go_on, pack, record, unpack, with_starts
@@ -37,6 +36,7 @@ from rfdropo_bayes.inference.mixture import prior_moments
 from rfdropo_bayes.inference.newton import SmoothTarget, log_likelihood_derivatives
 from rfdropo_bayes.inference.plateaus import climbs_from, plateaus
 from rfdropo_bayes.inference.proposals import squared_distance
+from rfdropo_bayes.inference.restarts import affordable_generations, astray, search
 from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_warnings, prior_warnings
 from rfdropo_bayes.inference.schedules import block_boundaries
 from rfdropo_bayes.inference.survey import survey
@@ -47,8 +47,8 @@ SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before the
 # a push, where contacts begin and end, came to rest on the way.
 CONTINUED = (0.75, 0.875, 1.0)
 FOR_PLATEAUS = 0.1  # share of the budget of climbs, and of a survey, that is held back for plateaus
-FOR_SEARCH = 0.1  # the same for climbs that begin again, see `astray`
-FEWEST_STEPS = 4.0  # of a climb at the last horizon that is worth its start
+FOR_SEARCH = 0.1  # the same for climbs that begin again, see `restarts`, unless none could be made otherwise
+FEWEST_STEPS = 4.0  # of a climb that is worth its start
 
 
 @dataclass(frozen=True)
@@ -205,11 +205,13 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
     waiting = starts - climbs.done
     share = now * waiting / (now * waiting + later)
     grid, step = climb_cost(d, noise)
-    left = _for_climbs(config) - climbs.ledger.rollouts
-    held = FOR_SEARCH * config.rollouts * (config.survey > 0 and len(climbs.earlier) > 0)
-    if left - held < (grid + FEWEST_STEPS * step) * now / n_rows:
+    left = max(_for_climbs(config) - climbs.ledger.rollouts, 0.0) * n_rows / now
+    held = FOR_SEARCH * config.rollouts * (config.survey > 0 and len(climbs.earlier) > 0) * n_rows / now
+    if climbs.done == 0 and left - held < grid + FEWEST_STEPS * step:
         held = 0.0  # a climb rather than a search from where there was none
-    rows = max(left - held, 0.0) * share * n_rows / now
+    rows = max(left - held, 0.0) * share
+    if climbs.begins_again:
+        rows = max(rows, min(left, grid + FEWEST_STEPS * step))
     # More rivals than expected may have come to the last horizon: the best climb on, rather than none.
     served = waiting if later else int(np.clip(rows / (grid + FEWEST_STEPS * step), 1, waiting))
     return int(np.clip((rows / served - grid) / step, 0, config.max_steps))
@@ -244,13 +246,15 @@ def _with_search(
     target: Climbable,
     key: PRNGKeyArray,
 ) -> Climbs:
-    """A further climb at a horizon at which even the best went astray, once, if the budget allows; see `astray`."""
+    """A further climb at a horizon at which even the best went astray, once, if the budget allows; see `restarts`."""
     if len(climbs.earlier) == 0:
         return climbs
     rows, (d, noise) = horizons[climbs.level - 1], (climbs.positions.shape[1], int(target.noise.sum()))
     grid, step = climb_cost(d, noise)
-    left = (_for_climbs(config) - climbs.ledger.rollouts) * problem.n_rows / horizons[climbs.level]
-    generations = affordable_generations(left - grid - FEWEST_STEPS * step, d, noise)
+    # A climb from what is found, and one at each horizon to come.
+    kept = (grid + FEWEST_STEPS * step) * sum(horizons[climbs.level :]) / problem.n_rows
+    left = (_for_climbs(config) - climbs.ledger.rollouts - kept) * problem.n_rows / horizons[climbs.level]
+    generations = affordable_generations(left, d, noise)
     if not generations:
         return climbs
     before, after = climbs.earlier[0], climbs.positions[int(np.argmax(climbs.log_density))].copy()
@@ -258,7 +262,9 @@ def _with_search(
     shorter = target_at(rows, climbs.ledger, before, climbs.noise)
     assert isinstance(shorter, Target)
     assert isinstance(target, Target)
-    if not astray(shorter.residuals(before[None])[0], target.residuals(after[None])[0]):
+    # Residuals know nothing of a rollout that ended before its time.
+    lost = not np.isfinite(climbs.log_density).any()
+    if not lost and not astray(shorter.residuals(before[None])[0], target.residuals(after[None])[0]):
         return climbs
     mode = normal_at(shorter, LevenbergState(before, math.nan, 0.0, True))
     return with_starts(climbs, search(problem, mode, target, generations, jax.random.fold_in(key, rows)))

@@ -49,6 +49,12 @@ class ParameterInfo:
         """True where the prior is one of the logarithm."""
         return str(self.prior.get("distribution", "")).startswith("Log")
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Where its prior ends: on the hard bounds or between them; infinite where there is neither."""
+        low = 0.0 if self.prior.get("distribution") == "HalfNormal" else self.prior.get("low", -np.inf)
+        return max(self.low, low), min(self.high, self.prior.get("high", np.inf))
+
 
 @dataclass(frozen=True)
 class RecordingPrediction:

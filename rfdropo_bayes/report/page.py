@@ -12,6 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors.bounds import PILED
 from rfdropo_bayes.report import check_figures, posterior_figures, trajectory_figures
 from rfdropo_bayes.report.coverage import coverage, transform_curve
 from rfdropo_bayes.report.headline import best_baseline
@@ -82,6 +83,7 @@ def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str
         recordings=_recording_views(record, summary),
         total_recordings=len(record.recordings),
         limits=limits(summary),
+        piled=PILED,
         config=config,
     )
 

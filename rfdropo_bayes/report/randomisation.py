@@ -97,7 +97,8 @@ def _reservations(summary: Mapping[str, Any]) -> list[str]:
     edge = [name for name, row in summary["parameters"].items() if row["at_bound"]]
     if edge:
         found.append(
-            f"{', '.join(edge)} {'sits' if len(edge) == 1 else 'sit'} on a bound, which decided and not the data"
+            f"{', '.join(edge)} {'sits' if len(edge) == 1 else 'sit'} on a hard bound or at an end of the prior, "
+            "which decided and not the data"
         )
     share = summary["coverage"].get(BAND)
     if share is not None and share > VAGUE:

@@ -87,13 +87,12 @@ def posterior_table(record: PosteriorRecord) -> list[ParameterRow]:
 
 
 def bound_reached(draws: Float[np.ndarray, " n"], info: ParameterInfo) -> str | None:
-    """The bound, "low" or "high", that a posterior is piled up at; None if it is not.
+    """The end of its prior, "low" or "high", that a posterior is piled up at; None if it is not.
 
-    Bounds are the hard ones, or the ends of a uniform prior inside them. Where the prior is logarithmic the comparison
+    Where the prior is logarithmic the comparison
     is in logarithms; see `piled_at`.
     """
-    low, high = max(info.low, info.prior.get("low", -np.inf)), min(info.high, info.prior.get("high", np.inf))
-    return piled_at(draws, low, high, logarithmic=info.logarithmic)
+    return piled_at(draws, *info.ends, logarithmic=info.logarithmic)
 
 
 def _contraction(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"], *, log: bool) -> float | None:

@@ -256,7 +256,8 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
     assert set(model.space.names) == {"actuator_lag", "observation_noise", "motor_angle_noise"}
     calibration = CalibrationProblem(model)
     assert calibration.physical_names == ("actuator_lag",)
-    assert calibration.prior_ends == {parameter.name: parameter.ends for parameter in model.space.parameters}
+    assert calibration.prior_ends.keys() == calibration.bounds.keys()
+    assert calibration.prior_ends["actuator_lag"][0] == 0.0
     measured = {spec.name for spec in measurement_specs(experiment.model)}  # what a posterior may hold beside
     assert measured == {"observation_noise", "motor_angle_noise"}
 

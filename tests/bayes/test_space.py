@@ -51,6 +51,19 @@ def test_a_prior_ends_where_it_says_or_at_the_hard_bounds(prior, ends):
     assert np.all((drawn >= ends[0]) & (drawn <= ends[1]))
 
 
+@pytest.mark.parametrize(
+    ("bounds", "prior", "ends"),
+    [
+        ((-np.inf, np.inf), {"distribution": "Normal", "loc": 0.0, "scale": 1.0}, (-np.inf, np.inf)),
+        ((0.5, np.inf), {"distribution": "LogNormal", "median": 1.0, "sigma": 0.5}, (0.5, np.inf)),
+        ((-1.0, 5.0), {"distribution": "HalfNormal", "scale": 1.0}, (0.0, 5.0)),
+    ],
+)
+def test_a_prior_without_ends_or_with_one_has_no_more(bounds, prior, ends):
+    spec = ParameterSpec("p", "-", *bounds, 1.0, prior, "")
+    assert build_space((spec,), {"p": prior}, {}, ["a"])["p"].ends == ends
+
+
 def test_the_unconstrained_map_is_a_bijection_and_its_density_carries_the_jacobian():
     chosen = space()
     values = chosen.sample(jax.random.key(1), 50)

@@ -325,6 +325,7 @@ class Stuck(LinearGaussian):
 
     def __init__(self, slip: float = 0.026, noise: float = 0.01) -> None:
         super().__init__(n_rows=10, d=2)
+        self.begins = begins
         self.names = ("pull", "weight")
         self.units = dict.fromkeys(self.names, "1")
         self.bounds = dict.fromkeys(self.names, (-np.inf, np.inf))
@@ -382,13 +383,14 @@ class Crooked(LinearGaussian):
 
 
 class LateContact(LinearGaussian):
-    """The last tenth of the rows has a contact, and is rippled by a weight that the rows before hardly tell of: a climb
-    from the optimum before comes to rest on the nearest ripple, thousands of nats below the posterior."""
+    """The last rows have a contact, and are rippled by a weight that the rows before hardly tell of: a climb from the
+    optimum before comes to rest on the nearest ripple, thousands of nats below the posterior."""
 
     truth = (1.2, 2.6)
 
-    def __init__(self) -> None:
+    def __init__(self, begins: int = 36) -> None:
         super().__init__(n_rows=40, d=2)
+        self.begins = begins
         self.names = ("pull", "weight")
         self.units = dict.fromkeys(self.names, "1")
         self.bounds = dict.fromkeys(self.names, (-np.inf, np.inf))
@@ -399,8 +401,8 @@ class LateContact(LinearGaussian):
         self.data = np.asarray(self._fit(*map(jnp.array, self.truth), 40)) + self.noise * rng.normal(size=40)
 
     def _fit(self, pull, weight, horizon):
-        contact = jnp.where(jnp.arange(40) < 36, 1e-3 * weight[..., None], 4.0 * weight[..., None])
-        ripple = jnp.where(jnp.arange(40) < 36, 0.0, 5.0 * jnp.sin(6.0 * weight)[..., None])
+        contact = jnp.where(jnp.arange(40) < self.begins, 1e-3 * weight[..., None], 4.0 * weight[..., None])
+        ripple = jnp.where(jnp.arange(40) < self.begins, 0.0, 5.0 * jnp.sin(6.0 * weight)[..., None])
         return (pull[..., None] * self.design + contact + ripple)[..., :horizon]
 
     def _row_density(self, u, horizon):

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.report.identifiability import identify, product_in_words, spread_in_words
 from rfdropo_bayes.report.tables import bound_reached, posterior_table
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 LOG = {"distribution": "LogNormal"}
 
@@ -92,6 +94,27 @@ def test_piles_at_bounds_are_found_however_wide_the_bounds(draws, expected) -> N
     """Quantiles from 2000 draws: failure rate under other seeds below 1e-2 for the half-normal, far lower elsewhere."""
     info = ParameterInfo("p", "-", 0.0, 100.0)
     assert bound_reached(draws(np.random.default_rng(2)), info) == expected
+
+
+@pytest.mark.parametrize(
+    ("prior", "ends"),
+    [
+        ({}, (-10.0, 10.0)),
+        ({"distribution": "Uniform", "low": 2.0, "high": 7.0}, (2.0, 7.0)),
+        ({"distribution": "HalfNormal", "scale": 1.0}, (0.0, 10.0)),
+        ({"distribution": "Normal", "loc": 0.0, "scale": 1.0}, (-10.0, 10.0)),
+    ],
+)
+def test_piles_are_looked_for_where_the_prior_ends(prior, ends) -> None:
+    """As the warnings of the sampler have it, whose prior is a distribution instead of a table."""
+    info = ParameterInfo("p", "-", -10.0, 10.0, prior)
+    assert info.ends == ends
+    near = np.random.default_rng(5).exponential(1e-2, 2000)
+    assert bound_reached(ends[0] + near, info) == "low"
+    assert bound_reached(ends[1] - near, info) == "high"
+    if prior:
+        spec = ParameterSpec("p", "-", -10.0, 10.0, 0.0, prior, "")
+        np.testing.assert_allclose(build_space((spec,), {"p": prior}, {}, ["r"])["p"].ends, ends, rtol=1e-6)
 
 
 def test_logarithmic_parameters_are_compared_in_logarithms() -> None:

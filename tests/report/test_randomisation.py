@@ -30,7 +30,7 @@ def clean(summary):
 
 def test_a_parameter_at_its_bound_asks_for_care_and_the_report_says_so(run, summary):
     assert summary["randomisation"]["verdict"] == "with care"
-    assert "rayleigh_stiffness sits on a bound" in summary["randomisation"]["sentence"]
+    assert "rayleigh_stiffness sits on a hard bound or at an end of the prior" in summary["randomisation"]["sentence"]
     assert summary["headline"][-1] == summary["randomisation"]["sentence"]
     assert any("Draw whole parameter sets" in sentence for sentence in summary["randomisation"]["advice"])
     assert any(

@@ -28,7 +28,7 @@ REACH = 50.0  # deviations of the shorter posterior, to each side, within which 
 
 def affordable_generations(rollouts: float, d: int, noise: int) -> int:
     """Generations that so many rollouts of the longer prefix serve in so many coordinates, so many of them of noise;
-    none where they are too few to be of use.
+    none where they serve fewer than `FEWEST_GENERATIONS`.
 
     Besides candidates they pay for residuals at two points, and for the derivatives of a normal approximation.
     """
@@ -86,8 +86,10 @@ def search(
         v[:, free] += (candidates - REACH) @ factor.T
         u = np.asarray(problem.to_unconstrained(straight.from_unconstrained(jnp.asarray(v))), dtype=float)
         within = np.isfinite(u).all(axis=1)
-        heights = np.where(within, target.density(np.where(within[:, None], u, mode.mean)), -np.inf)
-        heights[np.isnan(heights)] = -np.inf
+        heights = np.full(POPULATION, -np.inf)
+        if within.any():
+            heights[within] = target.density(u[within])
+            heights[np.isnan(heights)] = -np.inf
         optimiser.tell(candidates, -heights)
         if heights.max() > height:
             best, height = u[[int(np.argmax(heights))]], float(heights.max())
