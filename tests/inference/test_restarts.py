@@ -75,8 +75,8 @@ def late_optimum(key=KEY, begins=36, config=CONFIG):
 @pytest.mark.parametrize("begins", [32, 36])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_climb_that_a_late_contact_leads_astray_is_begun_again(seed, begins):
-    """With a contact after seven eighths of the recording, and before. Of 20 keys all ended on the ripple of the truth, or
-    (three) on the one that explains the data as well, a nat lower by its prior."""
+    """With a contact after seven eighths of the recording, and before. All of 20 keys ended on the ripple of the truth,
+    or (three) on another that explains the data as well, a nat lower by its prior."""
     found, there = late_optimum(jax.random.key(seed), begins)
     assert found.modes[0].log_density > there - 2.0
 
