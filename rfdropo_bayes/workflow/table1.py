@@ -275,7 +275,8 @@ def as_markdown(content: Mapping[str, Any]) -> str:
         "",
     ]
     for task in dict.fromkeys(cell["task"] for cell in content["cells"]):
-        for truths in TRUTHS:
+        done = {cell["truths"] for cell in content["cells"] if cell["task"] == task}
+        for truths in [kind for kind in TRUTHS if kind in done]:
             lines += [f"## {task}, {'the truth of the paper' if truths == 'paper' else 'off-centre truths'}", ""]
             names = list(FIGURES.values())
             headings = ["row", "fits", *names[:4], "90 % coverage", "misleading", *names[4:]]

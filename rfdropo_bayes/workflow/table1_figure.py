@@ -21,10 +21,13 @@ def draw_figure(content: Mapping[str, Any], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     tasks = list(dict.fromkeys(cell["task"] for cell in content["cells"]))
-    figure, axes = plt.subplots(len(tasks), 2, figsize=(11, 0.6 + 3.6 * len(tasks)), squeeze=False, sharey="row")
+    of_task = {task: [cell for cell in content["cells"] if cell["task"] == task] for task in tasks}
+    rows_of = {task: list(dict.fromkeys(cell["row"] for cell in cells)) for task, cells in of_task.items()}
+    heights = [1.3 + 0.35 * len(rows) for rows in rows_of.values()]
+    size = (11, 0.2 + sum(heights))
+    figure, axes = plt.subplots(len(tasks), 2, squeeze=False, sharey="row", figsize=size, height_ratios=heights)
     for task, line in zip(tasks, axes, strict=True):
-        cells = [cell for cell in content["cells"] if cell["task"] == task]
-        rows = list(dict.fromkeys(cell["row"] for cell in cells))
+        cells, rows = of_task[task], rows_of[task]
         for (key, label), ax in zip(PANELS, line, strict=True):
             for cell in cells:
                 mean, sd = cell[key]["mean"], cell[key]["sd"] or 0.0
@@ -37,11 +40,12 @@ def draw_figure(content: Mapping[str, Any], path: Path) -> None:
                     mean, rows.index(cell["row"]) + shift, xerr=spread, fmt="o", ms=4, color=COLOURS[cell["truths"]]
                 )
             ax.set(xscale="log", xlabel=label, yticks=range(len(rows)), yticklabels=rows, title=task)
+            ax.xaxis.set_minor_formatter("")  # within one decade its labels lie upon each other
             ax.grid(axis="x", alpha=0.3)
         for name, (mean, _) in content["paper"][task].items():
             beside = [i for i, row in enumerate(rows) if row.startswith(name)][:1]
             line[0].plot([mean] * len(beside), beside, "kx")
-        line[0].invert_yaxis()
+        line[0].set_ylim(len(rows) - 0.5, -0.5)
     handles = [plt.Line2D([], [], marker="o", ls="", color=c, label=f"{k} truth") for k, c in COLOURS.items()]
     handles.append(plt.Line2D([], [], marker="x", ls="", color="k", label="published"))
     axes[0, 1].legend(handles=handles, fontsize=8)
