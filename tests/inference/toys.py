@@ -325,7 +325,6 @@ class Stuck(LinearGaussian):
 
     def __init__(self, slip: float = 0.026, noise: float = 0.01) -> None:
         super().__init__(n_rows=10, d=2)
-        self.begins = begins
         self.names = ("pull", "weight")
         self.units = dict.fromkeys(self.names, "1")
         self.bounds = dict.fromkeys(self.names, (-np.inf, np.inf))
