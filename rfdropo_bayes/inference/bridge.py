@@ -173,8 +173,7 @@ def sample_from_modes(
     evaluations = ledger.evaluations + sampled.evaluations
     # Several optima are what the mixture is for: no warning here, unlike in Laplace alone.
     # What the sampler says of coordinates, and of its share of rollouts, is said below of parameters and of all.
-    again = ("got no weight", "scatter by", "disagree about")
-    kept = [sentence for sentence in sampled.warnings if not any(words in sentence for words in again)]
+    kept = horizon_smc.stage_warnings(sampled.trace, sampler)
     kept += replicate_warnings(draws, np.asarray(sampled.details["log_evidence_replicates"]))
     kept += [sentence for sentence in found.warnings if "converged" in sentence]
     return replace(

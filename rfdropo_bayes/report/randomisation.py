@@ -16,7 +16,8 @@ OVERCONFIDENT, VAGUE = 0.8, 0.97  # share of measurements in the 90 % band
 FEW_DRAWS = 100.0  # effective ones
 UNMIXED = 1.1  # R-hat
 LOST = 0.05  # share of rollouts without weight
-SMALLEST_SPREAD = "sits on its smallest value"  # in the warnings of RF-DROPO
+# In the warnings of samplers and climbs that a budget cut off, of particles that did not move, and of RF-DROPO.
+UNFINISHED = ("ran out", "left the particles", "sits on its smallest value")
 
 WORDS = {
     "safe": "Safe to randomise over",
@@ -78,7 +79,7 @@ def _sampling(summary: Mapping[str, Any]) -> list[str]:
     apart = [name for name, row in rows.items() if (row.get("r_hat") or 1.0) > UNMIXED]
     if apart:
         found.append(f"independent runs disagree about {', '.join(apart)}")
-    found += [sentence for sentence in summary["warnings"] if "ran out" in sentence or SMALLEST_SPREAD in sentence]
+    found += [sentence for sentence in summary["warnings"] if any(words in sentence for words in UNFINISHED)]
     total = sum(summary["excluded"].values())
     if summary["evaluations"] and total > LOST * summary["evaluations"]:
         found.append(f"{100 * total / summary['evaluations']:.0f} % of the rollouts failed")

@@ -16,6 +16,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.rivals import import_sbi
 from rfdropo_bayes.report.facts import software_versions
+from rfdropo_bayes.report.randomisation import UNFINISHED
 from rfdropo_bayes.workflow.comparison import RIVALS, ROWS, fit, misleads
 from rfdropo_bayes.workflow.files import output_folder
 from rfdropo_bayes.workflow.fits import finished, run_fits
@@ -115,6 +116,7 @@ def run_table1(
         "claims": claims(found),
         "ahead_of_ours": ahead_of_ours(found),
         "misleading": misleading(found),
+        "by_warning": by_warning(found),
         "versions": software_versions(),
     }
     (out / "table1.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -178,6 +180,23 @@ def misleading(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     kept = ("task", "truths", "row", "index", "log_score")
     entries = [{**{name: r[name] for name in kept}, "warnings": r.get("warnings")} for r in wrong]
     return sorted(entries, key=lambda entry: -np.inf if entry["log_score"] is None else entry["log_score"])
+
+
+def by_warning(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Coverage of our fits off the centre whose sampler said that it did not arrive, and of those where it did not, as
+    the report's verdict tells them apart; without fits older than the record of warnings."""
+    cells = []
+    for task in TASKS:
+        for row in OWN:
+            known = [r for r in _of(found, task, "off-centre", row) if r.get("warnings") is not None]
+            for said in (False, True):
+                fits = [r for r in known if said == any(part in text for text in r["warnings"] for part in UNFINISHED)]
+                if fits:
+                    share = float(np.mean([hit for r in fits for hit in r["inside_90"]]))
+                    misled = sum(misleads(TASKS[task], r) for r in fits)
+                    facts = {"task": task, "row": row, "said": said, "fits": len(fits)}
+                    cells.append(facts | {"coverage_90": share, "misleading": misled})
+    return cells
 
 
 def _moments(values: Sequence[float | None]) -> dict[str, float | None]:
@@ -289,6 +308,10 @@ def as_markdown(content: Mapping[str, Any]) -> str:
     ]
     lines += ["", "## Where another row is better than ours without tension, on the same data", ""]
     lines += [_ahead(entry) for entry in content["ahead_of_ours"]] or ["Nowhere."]
+    if content["by_warning"]:
+        lines += ["", "## Off-centre fits of ours by whether the sampler said that it did not arrive", ""]
+        lines += ["| task | row | it said so | fits | 90 % coverage | misleading |", "|---|---|---|---|---|---|"]
+        lines += [_told(cell) for cell in content["by_warning"]]
     lines += ["", "## Posteriors of ours that mislead, and whether they said so", ""]
     lines += [_misled(entry) for entry in content["misleading"]] or ["None."]
     missing = [f"{row}: {reason}" for row, reason in content["left_out"].items()]
@@ -303,6 +326,12 @@ def as_markdown(content: Mapping[str, Any]) -> str:
 
 def _kind(truths: str) -> str:
     return "the paper's truth" if truths == "paper" else "off-centre"
+
+
+def _told(cell: Mapping[str, Any]) -> str:
+    share = f"{100 * cell['coverage_90']:.1f} %"
+    entries = [cell["task"], cell["row"], "yes" if cell["said"] else "no", cell["fits"], share, cell["misleading"]]
+    return f"| {' | '.join(map(str, entries))} |"
 
 
 def _misled(entry: Mapping[str, Any]) -> str:

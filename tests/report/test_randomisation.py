@@ -52,6 +52,7 @@ def test_without_grounds_against_it_is_safe(run, summary):
         (lambda s: s["parameters"]["sigma"].update(r_hat=1.4), "independent runs disagree about sigma"),
         (lambda s: s["parameters"]["sigma"].update(ess_bulk=3.0), "fewer than 100 effective draws of sigma"),
         (lambda s: s["warnings"].append("the budget of 10 rollouts ran out at row 3"), "ran out"),
+        (lambda s: s["warnings"].append("the last moves left the particles 0.98 correlated"), "0.98 correlated"),
         (lambda s: s["excluded"].update(diverged=9000), "45 % of the rollouts failed"),
     ],
 )

@@ -18,6 +18,7 @@ from rfdropo_bayes.workflow.table1 import (
     Size,
     ahead_of_ours,
     as_markdown,
+    by_warning,
     claims,
     list_jobs,
     misleading,
@@ -202,6 +203,7 @@ def test_cells_claims_and_the_table_follow_from_the_fits(tmp_path):
         "claims": checked,
         "ahead_of_ours": [],
         "misleading": [],
+        "by_warning": [],
         "left_out": {},
         "not_done": 0,
         "paper": table1.PAPER,
@@ -228,6 +230,20 @@ def test_a_posterior_that_says_less_than_the_prior_is_counted_and_named():
         ("ours", ours[1]["index"], ours[1]["warnings"]),
         ("ours", ours[0]["index"], None),
     ]
+
+
+def test_coverage_is_told_apart_by_whether_the_sampler_arrived():
+    found = [r for r in rows() if r["row"] == "ours" and "failed" not in r]
+    ours = [r for r in found if r["truths"] == "off-centre"]
+    assert by_warning(found) == []  # older than the record of warnings
+    for r in ours[1:]:
+        r["warnings"], r["inside_90"] = ["friction sits on its lower bound"], [True, True, True]
+    ours[1]["warnings"] = ["the last moves left the particles 0.98 correlated with where they were"]
+    ours[1]["inside_90"], ours[1]["log_score"] = [True, False, False], -100.0
+    arrived, stuck = by_warning(found)
+    assert (arrived["said"], arrived["fits"], arrived["coverage_90"]) == (False, len(ours) - 2, 1.0)
+    assert (stuck["said"], stuck["fits"], stuck["misleading"]) == (True, 1, 1)
+    assert stuck["coverage_90"] == pytest.approx(1.0 / 3.0)
 
 
 def test_what_another_row_does_better_is_said():
