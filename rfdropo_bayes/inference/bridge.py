@@ -26,7 +26,13 @@ from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes, mo
 from rfdropo_bayes.inference.levenberg import Laplace
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.mixture import ModeMixture, covering
-from rfdropo_bayes.inference.result import InferenceResult, exclusion_warnings, prior_warnings, replicate_warnings
+from rfdropo_bayes.inference.result import (
+    InferenceResult,
+    exclusion_warnings,
+    prior_warnings,
+    replicate_warnings,
+    stage_warnings,
+)
 from rfdropo_bayes.inference.soundings import Sounding, sounded
 from rfdropo_bayes.inference.straight import StraightProblem
 
@@ -173,7 +179,7 @@ def sample_from_modes(
     evaluations = ledger.evaluations + sampled.evaluations
     # Several optima are what the mixture is for: no warning here, unlike in Laplace alone.
     # What the sampler says of coordinates, and of its share of rollouts, is said below of parameters and of all.
-    kept = horizon_smc.stage_warnings(sampled.trace, sampler)
+    kept = stage_warnings(sampled.trace, sampler.rollouts, sampler.correlation)
     kept += replicate_warnings(draws, np.asarray(sampled.details["log_evidence_replicates"]))
     kept += [sentence for sentence in found.warnings if "converged" in sentence]
     return replace(

@@ -30,6 +30,7 @@ from rfdropo_bayes.inference.result import (
     exclusion_warnings,
     prior_warnings,
     replicate_warnings,
+    stage_warnings,
 )
 from rfdropo_bayes.inference.schedules import SPACINGS, block_boundaries
 from rfdropo_bayes.inference.tempering import Population, StageInfo, Tuning, prolong, refresh, stage
@@ -365,7 +366,7 @@ def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcSta
         warnings=[
             *prior_warnings(problem, draws),
             *exclusion_warnings(excluded, evaluations),
-            *stage_warnings(trace, config),
+            *stage_warnings(trace, config.rollouts, config.correlation),
             *replicate_warnings(draws, values),
         ],
         seconds=sum(state.seconds for state in states),
@@ -381,27 +382,3 @@ def _block_scores(horizons: tuple[int, ...], prefixes: Float[np.ndarray, "r n_ro
         scores.append({"first_row": first + 1, "last_row": last, "log_score": float(block.mean()), "sd": sd})
         first = last
     return scores
-
-
-def stage_warnings(trace: list[dict[str, Any]], config: SmcConfig) -> list[str]:
-    """What the stages of all replicates say against the draws: a budget that ran out, particles that did not move.
-
-    Args:
-        trace: a dictionary per stage, as in the result.
-        config: settings that they were run with.
-    """
-    sentences = []
-    leaps = [row for row in trace if row["budget_exhausted"] and not row.get("final")]
-    if leaps:
-        worst, whole = min(row["ess"] for row in leaps), max(row["progress"] for row in trace)
-        place = f" at row {leaps[0]['progress']:g}" if whole > 1.0 else ""
-        sentences.append(
-            f"the budget of {config.rollouts:.0f} rollouts ran out{place}: the rest of the data was brought in by "
-            f"reweighting only (effective share {worst:.2%}); allow more rollouts or use fewer particles"
-        )
-    if (stuck := max(row["correlation"] for row in trace if row.get("final"))) > max(0.7, config.correlation):
-        sentences.append(
-            f"the last moves left the particles {stuck:.2f} correlated with where they were, so that the posterior may "
-            "be too narrow: several modes, a rugged likelihood, or a shape that moves cannot follow; compare replicates"
-        )
-    return sentences

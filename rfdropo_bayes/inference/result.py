@@ -17,6 +17,7 @@ from rfdropo_bayes.posteriors import contradiction, contradicts, piled_at
 
 SCATTERED = 0.5  # nats
 APART = 1.1  # R-hat: the means of replicates scatter by nearly half of the posterior's width
+STUCK = 0.7  # correlation with their start that last moves may leave unsaid
 PRIOR_DRAWS = 2000  # that tell where a prior is, and whether it is one of logarithms
 
 Draws = dict[str, Float[np.ndarray, "chain draw"]]
@@ -93,6 +94,31 @@ def prior_warnings(problem: Problem, draws: Draws) -> list[str]:
 
 def _even_in_logarithms(prior: Float[np.ndarray, " n"]) -> bool:
     return bool(np.all(prior > 0.0) and abs(skew(np.log(prior))) < abs(skew(prior)))
+
+
+def stage_warnings(trace: list[dict[str, Any]], rollouts: float | None, correlation: float) -> list[str]:
+    """What the stages of all replicates say against the draws: a budget that ran out, particles that did not move.
+
+    Args:
+        trace: a dictionary per stage, as in the result of `horizon_smc`.
+        rollouts: their budget.
+        correlation: that moves were to leave at most.
+    """
+    sentences = []
+    leaps = [row for row in trace if row["budget_exhausted"] and not row.get("final")]
+    if leaps:
+        worst, whole = min(row["ess"] for row in leaps), max(row["progress"] for row in trace)
+        place = f" at row {leaps[0]['progress']:g}" if whole > 1.0 else ""
+        sentences.append(
+            f"the budget of {rollouts:.0f} rollouts ran out{place}: the rest of the data was brought in by "
+            f"reweighting only (effective share {worst:.2%}); allow more rollouts or use fewer particles"
+        )
+    if (stuck := max(row["correlation"] for row in trace if row.get("final"))) > max(STUCK, correlation):
+        sentences.append(
+            f"the last moves left the particles {stuck:.2f} correlated with where they were, so that the posterior may "
+            "be too narrow: several modes, a rugged likelihood, or a shape that moves cannot follow; compare replicates"
+        )
+    return sentences
 
 
 def replicate_warnings(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) -> list[str]:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.horizon_smc import SmcConfig, stage_warnings
-from rfdropo_bayes.inference.result import prior_warnings, replicate_warnings
+from rfdropo_bayes.inference.result import prior_warnings, replicate_warnings, stage_warnings
 
 from .toys import LinearGaussian, Ratio
 
@@ -119,12 +118,12 @@ def test_replicates_that_disagree_are_named():
 def test_stages_say_that_particles_stayed_and_where_a_budget_ran_out():
     """A run of one row, as from around optima, has no row to name."""
     moved = {"budget_exhausted": False, "progress": 1.0, "ess": 0.6, "correlation": 0.2}
-    config = SmcConfig(rollouts=3743.15)
-    assert stage_warnings([moved, moved | {"final": True}], config) == []
-    (stuck,) = stage_warnings([moved | {"correlation": 0.9}, moved | {"correlation": 0.97, "final": True}], config)
+    settings = 3743.15, 0.3
+    assert stage_warnings([moved, moved | {"final": True}], *settings) == []
+    (stuck,) = stage_warnings([moved | {"correlation": 0.9}, moved | {"correlation": 0.97, "final": True}], *settings)
     assert stuck.startswith("the last moves left the particles 0.97 correlated")
     leap = moved | {"budget_exhausted": True, "ess": 0.08}
-    (said,) = stage_warnings([leap, moved | {"final": True}], config)
+    (said,) = stage_warnings([leap, moved | {"final": True}], *settings)
     assert said.startswith("the budget of 3743 rollouts ran out: the rest of the data")
-    (said,) = stage_warnings([leap | {"progress": 7.0}, moved | {"final": True, "progress": 20.0}], config)
+    (said,) = stage_warnings([leap | {"progress": 7.0}, moved | {"final": True, "progress": 20.0}], *settings)
     assert "ran out at row 7" in said
