@@ -38,10 +38,9 @@ MAY_IMPORT["__main__"] = {"cli"}
 WITHOUT_JAX = {"data", "posteriors", "robots", "deployment"}  # read recordings and drive motors on a small computer
 JAX_FAMILY = {"jax", "jaxlib", "numpyro", "blackjax"}
 
-MODULE_LINES, MODULE_LINES_EVER = 400, 450
+MODULE_LINES = 700
 FUNCTION_LINES, FUNCTION_LINES_EVER = 60, 80  # the first without the docstring, the second with it
-# Longer than the rule, though never than the second figure, for the reason given: "room/module.py" or
-# "room/module.py:function".
+# Functions longer than the rule, though never than the second figure, with the reason: "room/module.py:function".
 LONGER_FOR_A_REASON: dict[str, str] = {}
 NAMELESS = re.compile(r"(^|_)(utils?|utilities|helpers?|managers?|magic|misc|common|stuff)(_|$)")
 
@@ -139,8 +138,8 @@ def without_docstring(node: ast.FunctionDef | ast.AsyncFunctionDef, lines: int) 
 @pytest.mark.parametrize("path", MODULES, ids=relative)
 def test_modules_and_functions_are_short(path: Path) -> None:
     text, name = path.read_text(), relative(path)
-    length, limit = text.count("\n"), MODULE_LINES_EVER if name in LONGER_FOR_A_REASON else MODULE_LINES
-    assert length <= limit, f"{name}: {length} lines"
+    length = text.count("\n")
+    assert length <= MODULE_LINES, f"{name}: {length} lines"
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             function = f"{name}:{node.name}"
