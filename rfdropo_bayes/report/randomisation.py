@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -79,11 +79,16 @@ def _sampling(summary: Mapping[str, Any]) -> list[str]:
     apart = [name for name, row in rows.items() if (row.get("r_hat") or 1.0) > UNMIXED]
     if apart:
         found.append(f"independent runs disagree about {', '.join(apart)}")
-    found += [sentence for sentence in summary["warnings"] if any(words in sentence for words in UNFINISHED)]
+    found += unfinished(summary["warnings"])
     total = sum(summary["excluded"].values())
     if summary["evaluations"] and total > LOST * summary["evaluations"]:
         found.append(f"{100 * total / summary['evaluations']:.0f} % of the rollouts failed")
     return found
+
+
+def unfinished(warnings: Sequence[str]) -> list[str]:
+    """Those of a method's warnings that say that it did not arrive at its posterior."""
+    return [sentence for sentence in warnings if any(words in sentence for words in UNFINISHED)]
 
 
 def _conflicts(record: PosteriorRecord) -> list[str]:

@@ -16,7 +16,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.rivals import import_sbi
 from rfdropo_bayes.report.facts import software_versions
-from rfdropo_bayes.report.randomisation import UNFINISHED
+from rfdropo_bayes.report.randomisation import unfinished
 from rfdropo_bayes.workflow.comparison import RIVALS, ROWS, fit, misleads
 from rfdropo_bayes.workflow.files import output_folder
 from rfdropo_bayes.workflow.fits import finished, run_fits
@@ -190,7 +190,7 @@ def by_warning(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         for row in OWN:
             known = [r for r in _of(found, task, "off-centre", row) if r.get("warnings") is not None]
             for said in (False, True):
-                fits = [r for r in known if said == any(part in text for text in r["warnings"] for part in UNFINISHED)]
+                fits = [r for r in known if bool(unfinished(r["warnings"])) == said]
                 if fits:
                     share = float(np.mean([hit for r in fits for hit in r["inside_90"]]))
                     misled = sum(misleads(TASKS[task], r) for r in fits)

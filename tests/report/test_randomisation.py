@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rfdropo_bayes.inference.result import stage_warnings
 from rfdropo_bayes.posteriors import ParameterInfo
 from rfdropo_bayes.report.randomisation import judge
 from rfdropo_bayes.report.summary import build_summary
@@ -38,6 +39,11 @@ def test_a_parameter_at_its_bound_asks_for_care_and_the_report_says_so(run, summ
     )
 
 
+LAST = {"budget_exhausted": False, "progress": 1.0, "ess": 0.6, "correlation": 0.2, "final": True}
+LEAP = {"budget_exhausted": True, "progress": 1.0, "ess": 0.1, "correlation": float("nan")}
+"""Stages of a sampler: the last, and one for whose moves nothing was left."""
+
+
 def test_without_grounds_against_it_is_safe(run, summary):
     safety = judge(run.record, clean(summary))
     assert safety.verdict == "safe"
@@ -51,8 +57,8 @@ def test_without_grounds_against_it_is_safe(run, summary):
         (lambda s: s["rmse"]["test"].update({list(s["rmse"]["test"])[-1]: 1e3}), "no better than one without physics"),
         (lambda s: s["parameters"]["sigma"].update(r_hat=1.4), "independent runs disagree about sigma"),
         (lambda s: s["parameters"]["sigma"].update(ess_bulk=3.0), "fewer than 100 effective draws of sigma"),
-        (lambda s: s["warnings"].append("the budget of 10 rollouts ran out at row 3"), "ran out"),
-        (lambda s: s["warnings"].append("the last moves left the particles 0.98 correlated"), "0.98 correlated"),
+        (lambda s: s["warnings"].extend(stage_warnings([LEAP, LAST], 10.0, 0.3)), "10 rollouts ran out"),
+        (lambda s: s["warnings"].extend(stage_warnings([LAST | {"correlation": 0.98}], 10.0, 0.3)), "0.98 correlated"),
         (lambda s: s["excluded"].update(diverged=9000), "45 % of the rollouts failed"),
     ],
 )
