@@ -1,8 +1,8 @@
-"""At how many of Table I's truths does the motion of TrunkPush jump as a parameter changes, and do posteriors mislead there?
+"""Where does the motion of TrunkPush jump as a parameter changes, and do posteriors mislead there?
 
-Along each of three parameters, 1 % to either side of the truth, the largest change of a marker between neighbours of a
-scan, then of a scan of that interval, and so on: four scans of 33 values, so that in a continuous motion what is left
-is the change over a millionth of the first interval. What is left beyond 0.1 mm is a jump. See reports/table1/README.md.
+Each parameter is scanned 1 % to either side of a truth of Table I: 33 values, then 33 values within the interval of the
+largest change, four times in all. In a continuous motion the change that is left is that over a millionth of the first
+interval. A change beyond 0.1 mm is a jump. See reports/table1/README.md.
 
     python benchmarks/motion_jumps.py        (4 minutes on 2 processors)
 """
