@@ -1,0 +1,145 @@
+"""What a policy sees and what it does, in which order and in which units: shared by training and by motors.
+
+Environments build their observations from a layout, an exported policy carries it in its metadata, and a deployment
+refuses a policy whose layout is not that of the robot in front of it. No JAX, no PyTorch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rfdropo_bayes.errors import InputError
+
+
+@dataclass(frozen=True)
+class ObservationPart:
+    """A named piece of the observation.
+
+    Attributes:
+        name: what it is, e.g. ``"markers"``, ``"goal"``, ``"commands"``.
+        size: how many numbers it has.
+        unit: their SI unit, "-" if they have none.
+    """
+
+    name: str
+    size: int
+    unit: str
+
+
+@dataclass(frozen=True)
+class PolicyLayout:
+    """Observation and action of a policy.
+
+    Attributes:
+        task: the environment it was trained in.
+        period_s: time from one action to the next [s].
+        observation: parts of the observation, in order.
+        channels: command channels that it moves, in order.
+        unit: of the commands: "m" of cable or "rad" of a motor.
+        kind: "discrete" actions are rows of ``moves``; a "continuous" one is a number from -1 to 1 for every channel.
+        moves: what an action adds to the commands [unit]: (action, channel) if discrete; if continuous, one row, the
+            change at 1.
+        low, high: limits of each channel's command [unit].
+    """
+
+    task: str
+    period_s: float
+    observation: tuple[ObservationPart, ...]
+    channels: tuple[str, ...]
+    unit: Literal["m", "rad"]
+    kind: Literal["discrete", "continuous"]
+    moves: tuple[tuple[float, ...], ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        channels = len(self.channels)
+        widths = {len(row) for row in self.moves} | {len(self.low), len(self.high)}
+        if widths != {channels}:
+            raise InputError(f"moves and limits do not fit the {channels} channels", where=self.task)
+        if self.kind == "continuous" and len(self.moves) != 1:
+            raise InputError("a continuous action needs one row of moves", where=self.task)
+        if self.period_s <= 0 or any(low > high for low, high in zip(self.low, self.high, strict=True)):
+            raise InputError("the period must be positive and each limit's ends in order", where=self.task)
+
+    @property
+    def size(self) -> int:
+        """How many numbers an observation has."""
+        return sum(part.size for part in self.observation)
+
+    def assemble(self, parts: Mapping[str, Float[np.ndarray, "*lane size"]]) -> Float[np.ndarray, "*lane total"]:
+        """An observation from its parts, of one lane or of many.
+
+        Raises:
+            InputError: a part is missing, or has another size.
+        """
+        columns = []
+        for part in self.observation:
+            if part.name not in parts:
+                known = ", ".join(sorted(parts))
+                raise InputError(
+                    f"there is no {part.name!r}", where=f"observation of {self.task}", remedy=f"has {known}"
+                )
+            column = np.asarray(parts[part.name], dtype=np.float32)
+            if column.shape[-1] != part.size:
+                raise InputError(f"{part.name!r} has {column.shape[-1]} numbers, not {part.size}", where=self.task)
+            columns.append(column)
+        return np.concatenate(columns, axis=-1)
+
+    def change(
+        self, action: Int[np.ndarray, "*lane"] | Float[np.ndarray, "*lane channel"]
+    ) -> Float[np.ndarray, "*lane channel"]:
+        """What an action adds to the commands [unit]; continuous actions beyond -1 and 1 count as these."""
+        moves = np.asarray(self.moves)
+        if self.kind == "discrete":
+            return moves[np.asarray(action)]
+        return moves[0] * np.clip(action, -1.0, 1.0)
+
+    def to_json(self) -> str:
+        """The layout as one line of text, keys in a fixed order."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str, *, where: str) -> PolicyLayout:
+        """The layout that `to_json` wrote; InputError with ``where`` it was found if it is none."""
+        try:
+            table: dict[str, Any] = json.loads(text)
+            table["observation"] = tuple(ObservationPart(**part) for part in table["observation"])
+            table["moves"] = tuple(tuple(row) for row in table["moves"])
+            for name in ("channels", "low", "high"):
+                table[name] = tuple(table[name])
+            return cls(**table)
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(
+                f"the layout of the policy cannot be read: {error}", where=where, remedy="export the policy again"
+            ) from None
+
+    @property
+    def sha256(self) -> str:
+        """Digest: two policies with one digest see and do the same."""
+        return hashlib.sha256(self.to_json().encode()).hexdigest()
+
+    def require(self, other: PolicyLayout, *, where: str) -> None:
+        """Raise an InputError that names the first difference to the layout that is needed here."""
+        for name, wanted in asdict(self).items():
+            found = asdict(other)[name]
+            if found != wanted:
+                raise InputError(
+                    f"the policy's {name} is {_brief(found)}, here it is {_brief(wanted)}",
+                    where=where,
+                    remedy="use a policy that was trained for this layout",
+                )
+
+
+def _brief(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 120 else f"{text[:117]}..."
