@@ -28,7 +28,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "audit": {"data", "posteriors", "simulators", "mechanisms", "bayes", "inference"},
     "report": {"data", "posteriors", "bayes", "inference", "audit"},
     "envs": {"posteriors", "robots", "simulators", "mechanisms"},
-    "training": {"posteriors", "envs"},
+    "training": {"posteriors", "robots", "inference", "envs"},
     "deployment": {"data", "robots"},
 }
 MAY_IMPORT["workflow"] = set(MAY_IMPORT) - {"envs", "training", "deployment"}

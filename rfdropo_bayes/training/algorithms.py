@@ -1,0 +1,91 @@
+"""Algorithms of Stable-Baselines3 by name, their options checked before anything is simulated."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+from rfdropo_bayes.errors import InputError
+
+ALGORITHMS = ("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN")
+CONTINUOUS_ONLY, DISCRETE_ONLY = ("SAC", "TD3", "DDPG"), ("DQN",)
+OURS = ("policy", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model")
+"""Arguments that the training sets itself."""
+
+PPO_DEFAULTS: dict[str, Any] = {
+    "n_steps": 16,
+    "batch_size": 512,
+    "n_epochs": 5,
+    "learning_rate": 7e-4,
+    "gae_lambda": 0.95,
+}
+"""For a hundred environments or more at once: short rollouts, large batches."""
+
+
+def algorithm_class(name: str, kind: str) -> Any:
+    """The class of an algorithm that can drive actions of a kind, "discrete" or "continuous".
+
+    Raises:
+        InputError: no such algorithm, or one for the other kind of actions.
+    """
+    if name not in ALGORITHMS:
+        close = difflib.get_close_matches(name.upper(), ALGORITHMS, n=1)
+        raise InputError(
+            f"unknown algorithm {name!r}",
+            where="[training] algorithm",
+            remedy=f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(ALGORITHMS)}",
+        )
+    wrong = CONTINUOUS_ONLY if kind == "discrete" else DISCRETE_ONLY
+    if name in wrong:
+        others = ", ".join(other for other in ALGORITHMS if other not in wrong)
+        raise InputError(f"{name} cannot drive {kind} actions", where="[training] algorithm", remedy=f"use {others}")
+    import stable_baselines3
+
+    return getattr(stable_baselines3, name)
+
+
+def algorithm_options(name: str, kind: str, gamma: float, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of an algorithm: ours for these tasks, then what was given.
+
+    Args:
+        name: of the algorithm.
+        kind: of actions.
+        gamma: discount factor of one control period, unless ``given`` has another.
+        given: options of the algorithm by Stable-Baselines3's own names; ``net_arch``, ``log_std_init`` and
+            ``activation`` (tanh, relu or elu) may stand among them without ``policy_kwargs``.
+
+    Raises:
+        InputError: an option that the algorithm does not have, or another activation.
+    """
+    known = [p for p in inspect.signature(algorithm_class(name, kind).__init__).parameters if p not in ("self", *OURS)]
+    short = ("net_arch", "log_std_init", "activation")
+    for option in given:
+        if option not in (*known, *short):
+            close = difflib.get_close_matches(option, [*known, *short], n=1)
+            raise InputError(
+                f"{name} has no option {option!r}",
+                where="[training.options]",
+                remedy=f"did you mean {close[0]!r}?" if close else f"it has {', '.join(known)}",
+            )
+    policy: dict[str, Any] = {"net_arch": [128, 128]}
+    if name in ("PPO", "A2C") and kind == "continuous":
+        policy["log_std_init"] = -1.0
+    policy |= given.get("policy_kwargs", {}) | {key: given[key] for key in short if key in given}
+    if "activation" in policy:
+        policy["activation_fn"] = _activation(policy.pop("activation"))
+    ours = PPO_DEFAULTS if name == "PPO" else {}
+    rest = {key: value for key, value in given.items() if key not in (*short, "policy_kwargs")}
+    return {**ours, "gamma": gamma, **rest, "policy_kwargs": policy}
+
+
+def _activation(name: str) -> Any:
+    from torch import nn
+
+    known = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
+    if name not in known:
+        raise InputError(
+            f"unknown activation {name!r}", where="[training.options]", remedy=f"use one of {', '.join(known)}"
+        )
+    return known[name]

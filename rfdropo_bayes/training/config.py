@@ -1,0 +1,49 @@
+"""The table [training] of an experiment file."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class TrainingTable(BaseModel):
+    """[training]: a task, an algorithm and a budget."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    task: Literal["TrunkReach-v0", "TrunkPush-v0"] = Field(
+        default="TrunkReach-v0", description="environment in which the policy is trained"
+    )
+    actions: Literal["continuous", "discrete"] = Field(
+        default="continuous", description="a rate for every channel, or one channel moved up or down by a step"
+    )
+    observation: Literal["full", "paper", "markers"] = Field(
+        default="full",
+        description="full: centre line, goal, object, cable levels and changes; paper: without cable levels and "
+        "changes; markers: what motion capture sees of the robot, with cable levels and changes",
+    )
+    algorithm: str = Field(default="PPO", description="an algorithm of Stable-Baselines3 by its name")
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="options of the algorithm by Stable-Baselines3's names, net_arch among them"
+    )
+    steps: int = Field(default=1_000_000, ge=1, description="environment steps, over all environments")
+    environments: int = Field(default=128, ge=1, le=4096, description="environments that are simulated at once")
+    randomisation: Literal["posterior", "phi", "uniform", "none"] = Field(
+        default="none",
+        description="where every episode's parameters come from: draws of a posterior, RF-DROPO's phi, the ranges of "
+        "[training.ranges], or nowhere: nominal and fixed values",
+    )
+    source: str | None = Field(
+        default=None, description="run folder or posterior.nc that the posterior or phi is read from"
+    )
+    ranges: dict[str, tuple[float, float]] = Field(
+        default_factory=dict, description="lowest and highest value of each parameter, for uniform randomisation"
+    )
+    normalise: bool = Field(default=True, description="scale observations and rewards by their running moments")
+    evaluate_every: int = Field(
+        default=100_000,
+        ge=1,
+        description="environment steps between evaluations; a run that was killed goes on from the last",
+    )
+    evaluation_episodes: int = Field(default=64, ge=1, description="episodes of an evaluation during training")

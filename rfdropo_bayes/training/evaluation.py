@@ -1,0 +1,174 @@
+"""Policies judged on the same episodes: success within a distance, with intervals.
+
+A case is what an episode starts from: parameters of the simulator and a goal. Policies that are compared see the same
+cases, in the same order. An episode succeeds if the distance to the goal at its end is within a threshold, as in the
+paper's Table II.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from scipy.stats import binomtest, bootstrap, trim_mean
+
+from rfdropo_bayes.errors import InputError
+
+Act = Callable[[Float[np.ndarray, "lane size"]], np.ndarray]
+"""From observations to actions of the environments."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Where an episode starts: values of the simulator's parameters [SI] and the goal [m]."""
+
+    parameters: Mapping[str, float]
+    goal: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What came of a case.
+
+    Attributes:
+        case: its index.
+        distances: distance to the goal after every action [m].
+        total: sum of rewards.
+        diverged: whether the simulation failed; the episode then counts as a failure at every distance.
+        actions: the actions taken, to see the episode again.
+    """
+
+    case: int
+    distances: Float[np.ndarray, " action"]
+    total: float
+    diverged: bool
+    actions: np.ndarray = field(repr=False)
+
+    @property
+    def distance(self) -> float:
+        """Distance to the goal at the end [m]; infinite if the simulation failed."""
+        return float("inf") if self.diverged else float(self.distances[-1])
+
+
+def draw_cases(venv: Any, count: int, seed: int) -> list[Case]:
+    """Cases from the distribution that an environment's resets draw from."""
+    cases: list[Case] = []
+    for turn in range(-(-count // venv.num_envs)):
+        venv.seed(seed + turn * venv.num_envs)
+        venv.reset()
+        cases += [
+            Case({name: float(value) for name, value in info["parameters"].items()}, tuple(map(float, info["goal"])))
+            for info in venv.reset_infos
+        ]
+    return cases[:count]
+
+
+def play(act: Act, venv: Any, cases: Sequence[Case], longest: int = 10_000) -> list[Episode]:
+    """Play every case once.
+
+    Args:
+        act: the policy; it sees observations as the environments give them.
+        venv: environments that take ``parameters`` and ``goal`` as reset options and report ``distance`` and
+            ``diverged`` in their info.
+        cases: what to start from.
+        longest: no episode has more actions.
+
+    Returns:
+        an episode for every case, in order.
+    """
+    episodes: list[Episode] = []
+    for first in range(0, len(cases), venv.num_envs):
+        chunk = list(cases[first : first + venv.num_envs])
+        lanes = chunk + [chunk[-1]] * (venv.num_envs - len(chunk))
+        venv.set_options([{"parameters": dict(case.parameters), "goal": list(case.goal)} for case in lanes])
+        episodes += _play_lanes(act, venv, len(chunk), first, longest)
+    return episodes
+
+
+def _play_lanes(act: Act, venv: Any, count: int, first: int, longest: int) -> list[Episode]:
+    """One episode in each of the first ``count`` lanes."""
+    distances: list[list[float]] = [[] for _ in range(count)]
+    actions: list[list[np.ndarray]] = [[] for _ in range(count)]
+    total, diverged, done = np.zeros(count), np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    seen = venv.reset()
+    for _ in range(longest):
+        action = act(seen)
+        seen, reward, ended, infos = venv.step(action)
+        for lane in np.flatnonzero(~done):
+            distances[lane].append(float(infos[lane]["distance"]))
+            actions[lane].append(np.asarray(action[lane]))
+            total[lane] += reward[lane]
+            diverged[lane] |= bool(infos[lane].get("diverged", False))
+        done |= ended[:count]
+        if done.all():
+            return [
+                Episode(first + k, np.array(distances[k]), float(total[k]), bool(diverged[k]), np.array(actions[k]))
+                for k in range(count)
+            ]
+    raise InputError(f"an episode did not end within {longest} actions", where="evaluation", remedy="give it a limit")
+
+
+def success(episodes: Sequence[Episode], threshold: float, level: float = 0.95) -> tuple[float, float, float]:
+    """Share of the episodes that end within ``threshold`` [m], with the ends of its Wilson interval."""
+    hits = int(np.sum([episode.distance <= threshold for episode in episodes]))
+    interval = binomtest(hits, len(episodes)).proportion_ci(level, method="wilson")
+    return hits / len(episodes), float(interval.low), float(interval.high)
+
+
+def interquartile_mean(
+    groups: Sequence[Sequence[Episode]], seed: int, level: float = 0.95, resamples: int = 2000
+) -> tuple[float, float, float]:
+    """Mean of the middle half of all final distances [m], with a bootstrap interval stratified by group.
+
+    Args:
+        groups: episodes of each training seed (Agarwal et al. 2021, "Deep RL at the edge of the statistical
+            precipice").
+        seed: of the bootstrap.
+        level: of the interval.
+        resamples: of the bootstrap.
+    """
+    distances = [np.array([episode.distance for episode in group]) for group in groups]
+
+    def middle(*parts: np.ndarray, axis: int = -1) -> np.ndarray:
+        return trim_mean(np.concatenate(parts, axis=axis), 0.25, axis=axis)
+
+    found = float(middle(*distances))
+    # Strata are resampled apart: each argument of `bootstrap` is one.
+    interval = bootstrap(
+        distances,
+        middle,
+        n_resamples=resamples,
+        confidence_level=level,
+        method="percentile",
+        vectorized=True,
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return found, float(interval.low), float(interval.high)
+
+
+def episode_table(policies: Mapping[str, Sequence[Episode]], cases: Sequence[Case]) -> pd.DataFrame:
+    """A row for every policy and case: final and smallest distance [m], sum of rewards, goal and parameters."""
+    rows = [
+        {
+            "policy": name,
+            "case": episode.case,
+            "distance": episode.distance,
+            "smallest_distance": float(np.min(episode.distances)),
+            "total_reward": episode.total,
+            "diverged": episode.diverged,
+            **{f"goal_{axis}": value for axis, value in zip("xyz", cases[episode.case].goal, strict=False)},
+            **dict(cases[episode.case].parameters),
+        }
+        for name, episodes in policies.items()
+        for episode in episodes
+    ]
+    return pd.DataFrame(rows)
+
+
+def median_episode(episodes: Sequence[Episode]) -> Episode:
+    """The episode whose final distance is the (lower) median."""
+    return sorted(episodes, key=lambda episode: episode.distance)[(len(episodes) - 1) // 2]

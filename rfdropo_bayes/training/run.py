@@ -1,0 +1,242 @@
+"""Training in legs: each starts from a checkpoint, so that a run that was killed goes on as if it had not been.
+
+At the end of a leg the policy is evaluated on the same cases as before, and everything is saved. The next leg begins
+with all environments reset and all generators seeded by the run's seed and the leg's number, in the same process or in
+a new one. The learning curve therefore does not depend on interruptions.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.training.algorithms import algorithm_class, algorithm_options
+from rfdropo_bayes.training.config import TrainingTable
+from rfdropo_bayes.training.evaluation import Case, Episode, draw_cases, play
+
+EVALUATION_SEED = 1_000_003  # cases of an evaluation are none of the episodes that training begins with
+CHECKPOINT = "checkpoint"
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A trained policy.
+
+    Attributes:
+        model: of Stable-Baselines3.
+        normalisation: the ``VecNormalize`` around its environments, or None.
+        curve: a row for each leg: steps, seconds, mean reward of the evaluation, quantiles of the final distance [m].
+        diverged: training episodes that ended because the simulation failed.
+        seconds: of all legs.
+    """
+
+    model: Any
+    normalisation: Any
+    curve: list[dict[str, float]]
+    diverged: int
+    seconds: float
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """The policy's most likely action for observations as the environments give them."""
+        if self.normalisation is not None:
+            observation = self.normalisation.normalize_obs(observation)
+        return self.model.predict(observation, deterministic=True)[0]
+
+
+def train(
+    environments: Callable[[int], Any],
+    table: TrainingTable,
+    out: Path,
+    *,
+    seed: int,
+    gamma: float,
+    resume: bool = False,
+    fingerprint: Mapping[str, Any] | None = None,
+) -> Trained:
+    """Train a policy.
+
+    Args:
+        environments: makes so many environments as one ``VecEnv`` with a ``layout``.
+        table: algorithm and budget.
+        out: folder for ``log.jsonl``, TensorBoard's files and the checkpoint.
+        seed: of everything.
+        gamma: discount factor of a control period, unless the options have one.
+        resume: go on from the checkpoint in ``out``.
+        fingerprint: what a checkpoint must agree with: settings, posterior, versions.
+
+    Raises:
+        InputError: an unknown algorithm or option, or a checkpoint of another run.
+    """
+    import torch
+
+    torch.set_num_threads(1)  # networks this small are slower on two
+    venv = environments(table.environments)
+    kind = venv.get_attr("layout")[0].kind
+    options = algorithm_options(table.algorithm, kind, gamma, table.options)
+    maker = algorithm_class(table.algorithm, kind)
+    known = {"table": table.model_dump(mode="json"), "seed": seed, **(fingerprint or {})}
+    folder = Path(out) / CHECKPOINT
+    state = _load_state(folder, known) if resume else None
+    model, normalisation = _begin(maker, options, venv, table, folder, state, out, seed)
+    judges = environments(min(table.environments, table.evaluation_episodes))
+    cases = draw_cases(judges, table.evaluation_episodes, EVALUATION_SEED + seed)
+    state = state or {"known": known, "leg": 0, "seconds": 0.0, "diverged": 0, "curve": []}
+    with Progress(f"{table.algorithm} {table.task}", show=None, log=Path(out) / "log.jsonl") as progress:
+        while model.num_timesteps < table.steps:
+            state = _leg(model, normalisation, venv, judges, cases, table, state, seed)
+            _save(model, normalisation, folder, state)
+            progress.stage(model.num_timesteps / table.steps, **state["curve"][-1])
+    return Trained(model, normalisation, state["curve"], state["diverged"], state["seconds"])
+
+
+def _begin(
+    maker: Any,
+    options: Mapping[str, Any],
+    venv: Any,
+    table: TrainingTable,
+    folder: Path,
+    state: Mapping[str, Any] | None,
+    out: Path,
+    seed: int,
+) -> tuple[Any, Any]:
+    """A model and its normalisation, new or as they were saved."""
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    tensorboard = str(Path(out) / "tensorboard")
+    if state is None:
+        normalisation = VecNormalize(venv, gamma=options["gamma"]) if table.normalise else None
+        model = maker(
+            "MlpPolicy",
+            normalisation or venv,
+            seed=seed,
+            device="cpu",
+            tensorboard_log=tensorboard,
+            **options,
+        )
+        return model, normalisation
+    normalisation = VecNormalize.load(str(folder / "normalisation.pkl"), venv) if table.normalise else None
+    model = maker.load(folder / "model.zip", env=normalisation or venv, device="cpu", tensorboard_log=tensorboard)
+    if (folder / "replay.pkl").exists():
+        model.load_replay_buffer(folder / "replay.pkl")
+    return model, normalisation
+
+
+def _leg(
+    model: Any,
+    normalisation: Any,
+    venv: Any,
+    judges: Any,
+    cases: Sequence[Case],
+    table: TrainingTable,
+    state: Mapping[str, Any],
+    seed: int,
+) -> dict[str, Any]:
+    """Learn until the next evaluation, and evaluate."""
+    began = time.monotonic()
+    leg = int(state["leg"]) + 1
+    model.set_random_seed(int(np.random.SeedSequence([seed, leg]).generate_state(1)[0] % 2**31))
+    model.set_env(normalisation or venv, force_reset=True)
+    count = _Failures()
+    steps = min(table.evaluate_every, table.steps - model.num_timesteps)
+    model.learn(steps, callback=count.callback(), reset_num_timesteps=False, tb_log_name="run", log_interval=None)
+    policy = Trained(model, normalisation, [], 0, 0.0)
+    if normalisation is not None:
+        normalisation.training = False
+    episodes = play(policy.act, judges, cases)
+    if normalisation is not None:
+        normalisation.training = True
+    seconds = state["seconds"] + time.monotonic() - began
+    row = {"steps": int(model.num_timesteps), "seconds": seconds, **_summary(episodes)}
+    return {
+        **state,
+        "leg": leg,
+        "seconds": seconds,
+        "diverged": state["diverged"] + count.failed,
+        "curve": [*state["curve"], row],
+    }
+
+
+class _Failures:
+    """Counts training episodes that ended because the simulation failed."""
+
+    def __init__(self) -> None:
+        self.failed = 0
+
+    def callback(self) -> Any:
+        """As a callback of Stable-Baselines3."""
+
+        def count(known: dict[str, Any], _: dict[str, Any]) -> bool:
+            self.failed += sum(bool(info.get("diverged", False)) for info in known["infos"])
+            return True
+
+        return count
+
+
+def _summary(episodes: Sequence[Episode]) -> dict[str, float]:
+    distance = np.array([episode.distance for episode in episodes])
+    low, middle, high = np.quantile(distance, [0.05, 0.5, 0.95])
+    return {
+        "reward": float(np.mean([episode.total for episode in episodes])),
+        "distance_q05": float(low),
+        "distance_median": float(middle),
+        "distance_q95": float(high),
+    }
+
+
+def _save(model: Any, normalisation: Any, folder: Path, state: Mapping[str, Any]) -> None:
+    """Write a checkpoint beside the last one, then put it in its place: a kill leaves one of the two."""
+    partial = folder.with_name(f"{CHECKPOINT}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        model.save(partial / "model.zip")
+        if normalisation is not None:
+            normalisation.save(str(partial / "normalisation.pkl"))
+        if getattr(model, "replay_buffer", None) is not None:
+            model.save_replay_buffer(partial / "replay.pkl")
+        (partial / "state.json").write_text(json.dumps(state), encoding="utf-8")
+    except OSError as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise InputError(
+            f"cannot write the checkpoint: {error.strerror}", where=str(folder), remedy="free some space, then --resume"
+        ) from None
+    old = folder.with_name(f"{CHECKPOINT}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        os.replace(folder, old)
+    os.replace(partial, folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _load_state(folder: Path, known: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers of a checkpoint; InputError if it is missing, damaged, or of other settings."""
+    old = folder.with_name(f"{CHECKPOINT}.old")
+    if not folder.exists() and old.exists():  # killed between the two renames
+        os.replace(old, folder)
+    try:
+        state = json.loads((folder / "state.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise InputError(
+            "there is no checkpoint to go on from", where=str(folder), remedy="leave out --resume"
+        ) from None
+    before = json.loads(json.dumps(state["known"]))
+    now = json.loads(json.dumps(known))
+    changed = [name for name in now if name != "table" and now[name] != before.get(name)]
+    changed += [name for name in now["table"] if name != "steps" and now["table"][name] != before["table"].get(name)]
+    if changed:
+        raise InputError(
+            f"the checkpoint is of other settings: {', '.join(changed)}",
+            where=str(folder),
+            remedy="restore them, or leave out --resume",
+        )
+    return {**state, "known": dict(known)}

@@ -1,0 +1,209 @@
+"""Training, resume, evaluation and export, on points whose best policy is known."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.training.algorithms import ALGORITHMS, algorithm_class, algorithm_options
+from rfdropo_bayes.training.config import TrainingTable
+from rfdropo_bayes.training.evaluation import (
+    Case,
+    Episode,
+    draw_cases,
+    episode_table,
+    interquartile_mean,
+    median_episode,
+    play,
+    success,
+)
+from rfdropo_bayes.training.export import ExportedPolicy, export_policy, latency
+from rfdropo_bayes.training.run import train
+from tests.training.toys import STEP, Points, layout
+
+OPTIONS = {"n_steps": 20, "batch_size": 160, "n_epochs": 5, "learning_rate": 3e-3, "net_arch": [32]}
+TABLE = TrainingTable(
+    options=OPTIONS, steps=6400, environments=16, evaluate_every=3200, evaluation_episodes=20, actions="continuous"
+)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    return out, train(Points, TABLE, out, seed=3, gamma=0.9)
+
+
+def to_the_goal(seen: np.ndarray) -> np.ndarray:
+    """The best policy: straight to the goal."""
+    return np.clip((seen[:, 1:] - seen[:, :1]) / STEP, -1.0, 1.0)
+
+
+def test_the_policy_gets_better_and_the_log_says_so(trained) -> None:
+    out, policy = trained
+    rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    assert [row["steps"] for row in rows] == [3200, 6400]
+    idle = play(lambda seen: np.zeros((len(seen), 1)), Points(16), draw_cases(Points(16), 50, 5))
+    found = play(policy.act, Points(16), draw_cases(Points(16), 50, 5))
+    assert np.median([e.distance for e in found]) < 0.3 * np.median([e.distance for e in idle])
+
+
+def test_same_seed_same_curve_and_another_seed_another(trained, tmp_path) -> None:
+    _, policy = trained
+    again = train(Points, TABLE, tmp_path / "again", seed=3, gamma=0.9)
+    other = train(Points, TABLE, tmp_path / "other", seed=4, gamma=0.9)
+
+    def curve(run):
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in run.curve]
+
+    assert curve(again) == curve(policy) != curve(other)
+
+
+def test_a_run_that_was_killed_goes_on_as_if_it_had_not_been(trained, tmp_path) -> None:
+    _, policy = trained
+    train(Points, TABLE.model_copy(update={"steps": 3200}), tmp_path, seed=3, gamma=0.9)
+    resumed = train(Points, TABLE, tmp_path, seed=3, gamma=0.9, resume=True)
+    for mine, theirs in zip(resumed.model.policy.parameters(), policy.model.policy.parameters(), strict=True):
+        assert np.array_equal(mine.detach().numpy(), theirs.detach().numpy())
+
+
+def test_a_kill_between_two_renames_loses_nothing(trained, tmp_path) -> None:
+    source, _ = trained
+    shutil.copytree(source / "checkpoint", tmp_path / "checkpoint.old")
+    assert train(Points, TABLE, tmp_path, seed=3, gamma=0.9, resume=True).curve[-1]["steps"] == 6400
+
+
+@pytest.mark.parametrize(
+    ("change", "seed", "words"),
+    [({"environments": 8}, 3, "environments"), ({}, 4, "seed")],
+)
+def test_a_checkpoint_of_other_settings_is_refused(trained, tmp_path, change, seed, words) -> None:
+    source, _ = trained
+    shutil.copytree(source / "checkpoint", tmp_path / "checkpoint")
+    with pytest.raises(InputError, match=f"other settings: .*{words}"):
+        train(Points, TABLE.model_copy(update=change), tmp_path, seed=seed, gamma=0.9, resume=True)
+
+
+def test_nothing_to_resume_is_an_error(tmp_path) -> None:
+    with pytest.raises(InputError, match="no checkpoint"):
+        train(Points, TABLE, tmp_path, seed=3, gamma=0.9, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("kind", "algorithm", "options"),
+    [
+        ("continuous", "PPO", OPTIONS),
+        ("discrete", "PPO", OPTIONS | {"activation": "elu"}),
+        ("continuous", "SAC", {"learning_starts": 100, "net_arch": [16]}),
+        ("continuous", "TD3", {"learning_starts": 100, "net_arch": [16]}),
+        ("discrete", "DQN", {"learning_starts": 100, "net_arch": [16]}),
+        ("continuous", "A2C", {"net_arch": [16]}),
+    ],
+)
+@pytest.mark.parametrize("normalise", [True, False])
+def test_an_exported_policy_acts_as_the_trained_one(tmp_path, kind, algorithm, options, normalise) -> None:
+    table = TrainingTable(
+        algorithm=algorithm,
+        options=options,
+        steps=640,
+        environments=16,
+        evaluate_every=640,
+        evaluation_episodes=4,
+        normalise=normalise,
+    )
+    policy = train(partial(Points, kind=kind), table, tmp_path, seed=1, gamma=0.9)
+    path = export_policy(policy.model, policy.normalisation, layout(kind), tmp_path / "policy.onnx", {"seed": "1"})
+    exported = ExportedPolicy(path)
+    assert exported.layout == layout(kind)
+    assert exported.facts == {"seed": "1"}
+    seen = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2)).astype(np.float32)
+    assert exported.act(seen) == pytest.approx(policy.act(seen), abs=2e-6)
+    assert exported.change(seen) == pytest.approx(layout(kind).change(policy.act(seen)), abs=2e-7)
+
+
+def test_a_decision_takes_less_than_a_control_period(trained, tmp_path) -> None:
+    _, policy = trained
+    path = export_policy(policy.model, policy.normalisation, layout("continuous"), tmp_path / "policy.onnx", {})
+    times = latency(ExportedPolicy(path), calls=200)
+    assert 0 < times["median_s"] <= times["p99_s"] < layout("continuous").period_s
+
+
+@pytest.mark.parametrize("content", [b"", b"not a model"])
+def test_a_file_that_is_no_policy_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="cannot read the policy"):
+        ExportedPolicy(path)
+
+
+def test_cases_are_the_same_for_all_policies_and_episodes_follow_them() -> None:
+    venv = Points(7)
+    cases = draw_cases(venv, 20, seed=9)
+    assert cases == draw_cases(Points(7), 20, seed=9) != draw_cases(venv, 20, seed=10)
+    episodes = play(to_the_goal, venv, cases)
+    assert [episode.case for episode in episodes] == list(range(20))
+    assert max(episode.distance for episode in episodes) < 0.1  # gains off by 20 % overshoot by less than a step
+    idle = play(lambda seen: np.zeros((len(seen), 1)), venv, cases)
+    assert [e.distance for e in idle] == pytest.approx([abs(case.goal[0]) for case in cases])
+
+
+def test_a_failed_simulation_is_a_failure_at_every_distance() -> None:
+    episodes = play(to_the_goal, Points(2), [Case({"gain": 3.0}, (0.0,)), Case({"gain": 1.0}, (0.0,))])
+    assert [e.diverged for e in episodes] == [True, False]
+    assert success(episodes, 1e9)[0] == 0.5
+
+
+def episodes_with(distances) -> list[Episode]:
+    return [Episode(k, np.array([d]), 0.0, False, np.zeros(1)) for k, d in enumerate(distances)]
+
+
+def test_success_has_wilsons_interval() -> None:
+    share, low, high = success(episodes_with([0.01] * 8 + [0.03] * 2), 0.02)
+    # Wilson (1927) for 8 of 10 at 95 %: (p + z^2/2n -+ z sqrt(p q / n + z^2/4n^2)) / (1 + z^2/n)
+    z, n, p = 1.959964, 10, 0.8
+    half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
+    middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+    assert (share, low, high) == pytest.approx((0.8, middle - half, middle + half), abs=1e-6)
+    assert low != pytest.approx(binomtest(8, 10).proportion_ci(method="exact").low)
+
+
+def test_the_interquartile_mean_ignores_the_outer_halves_and_its_interval_holds_it() -> None:
+    rng = np.random.default_rng(2)
+    groups = [episodes_with(np.concatenate([rng.normal(0.02, 0.001, 60), [9.0] * 5])) for _ in range(3)]
+    found, low, high = interquartile_mean(groups, seed=0)
+    assert found == pytest.approx(0.02, abs=5e-4)
+    assert low < found < high < 0.021
+
+
+def test_the_table_has_a_row_for_every_policy_and_case() -> None:
+    cases = draw_cases(Points(5), 5, seed=1)
+    episodes = play(to_the_goal, Points(5), cases)
+    table = episode_table({"a": episodes, "b": episodes}, cases)
+    assert len(table) == 10
+    assert set(table.columns) >= {"policy", "case", "distance", "goal_x", "gain", "diverged"}
+    assert median_episode(episodes).distance == np.sort([e.distance for e in episodes])[2]
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "words"),
+    [("PPo", "continuous", "did you mean 'PPO'"), ("SAC", "discrete", "cannot drive"), ("DQN", "continuous", "use")],
+)
+def test_algorithms_that_do_not_fit_are_refused(name, kind, words) -> None:
+    with pytest.raises(InputError, match=words):
+        algorithm_class(name, kind)
+
+
+def test_options_are_checked_by_name_for_every_algorithm() -> None:
+    for name in ALGORITHMS:
+        kind = "discrete" if name == "DQN" else "continuous"
+        assert algorithm_options(name, kind, 0.95, {"gamma": 0.9})["gamma"] == 0.9
+        with pytest.raises(InputError, match="did you mean 'learning_rate'"):
+            algorithm_options(name, kind, 0.95, {"learning_rat": 1.0})
+        with pytest.raises(InputError, match="unknown activation"):
+            algorithm_options(name, kind, 0.95, {"activation": "rulu"})
