@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -45,6 +45,7 @@ class Question:
         stated_noise: from the experiment file, used where nothing was repeated; None without.
         start: values of base parameters to start from, of an earlier calibration; None for a search.
         rules, seed: see `Rules`.
+        left_out: mechanisms that do not run on this body or engine, with the reason.
     """
 
     lanes: Lanes
@@ -57,6 +58,7 @@ class Question:
     start: dict[str, float] | None
     rules: Rules
     seed: int
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

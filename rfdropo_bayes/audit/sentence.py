@@ -23,7 +23,10 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
 
 def _unexamined(answer: Answer) -> str:
     names = " and ".join(name.replace("_", " ") for name in answer.unexamined)
-    return f" Not examined, as it would have taken too long: {names}." if names else ""
+    slow = f" Not examined, as it would have taken too long: {names}." if names else ""
+    count = len(answer.question.left_out)
+    does = "candidate does" if count == 1 else "candidates do"
+    return slow + (f" Left out: {count} {does} not run on this body or engine." if count else "")
 
 
 def _suspicion(answer: Answer) -> str:
