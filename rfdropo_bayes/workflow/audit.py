@@ -15,6 +15,7 @@ import numpy as np
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
+from rfdropo_bayes.audit.fit import widening
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.noise import STATED, NoiseModel
@@ -303,7 +304,7 @@ def _space(
     pooled = pooling(experiment, specs, fitted, others)
     base = build_space(specs, priors, scopes, fitted, pooled=pooled)
     taken = {p.spec.name for p in base.parameters} | set(fixed)
-    extra = {name: table.priors.get(name, {}) for name in [s.name for s in specs if s.name in added - taken]}
+    extra = {name: given.get(name, {}) for name in [s.name for s in specs if s.name in added - taken]}
     whole = build_space(specs, {**priors, **extra}, scopes, fitted, pooled=pooled)
     return whole, len(base.parameters)
 
@@ -346,10 +347,7 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path) -> dic
         else:
             candidate = next(c for c in answer.question.candidates if c.name == step.name)
             model["mechanisms"] = [*model.get("mechanisms", []), _found_again(candidate.source, folder)]
-            fixed = model.get("fixed", {})
-            for spec in candidate.mechanism.parameters if candidate.mechanism else ():
-                if spec.name not in fixed:
-                    model.setdefault("priors", {}).setdefault(spec.name, dict(spec.prior))
+            model.setdefault("priors", {}).update(sized_priors(answer, candidate))
     audit = extended.get("audit", {})
     if "candidates" in audit:
         taken = {c.source for c in answer.question.candidates if c.name in {step.name for step in answer.adopted}}
@@ -361,6 +359,20 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path) -> dic
     for role in ("fit", "test"):
         data[role] = [_placed(entry, folder) for entry in data.get(role, [])]
     return extended
+
+
+def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, Any]]:
+    """The priors under which the sizes of a mechanism were found: no narrower than these sizes, see `widened`."""
+    coordinates = answer.question.coordinates
+    factor = widening(answer.extended, coordinates)
+    found = {}
+    for index in candidate.indices:
+        parameter = coordinates.space.parameters[index]
+        table = dict(parameter.table or parameter.spec.prior)
+        if factor[index] > 1.0:
+            table["scale"] = float(f"{table['scale'] * factor[index]:.3g}")
+        found[parameter.spec.name] = table
+    return found
 
 
 def _found_again(source: str, folder: Path) -> str:
