@@ -58,3 +58,9 @@ def _fitted(measurements: Measurements, noise: NoiseModel, base: np.ndarray, dra
 def tail(observed: float, simulated: Float[np.ndarray, " count"]) -> float:
     """Share of simulated statistics at least as large, the observed one among them."""
     return float((1 + np.sum(simulated >= observed)) / (1 + len(simulated)))
+
+
+def p_in_words(p: float, simulated: int) -> str:
+    """A bootstrap's p-value, "= 0.02"; "< 0.001" where none of the simulated statistics was as large."""
+    least = 1.0 / (1 + simulated)
+    return f"= {p:.2g}" if p > 1.5 * least else f"< {least:.2g}"

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import Candidate, Probe, discretisation_probe, fixed_drop, lead, probe_all
 from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb
 from rfdropo_bayes.audit.forward import Forward
@@ -122,7 +123,8 @@ class Inquiry:
             found, _ = self.look_at(fit, named)
             if not steps and found.omnibus.p > self.rules.base_passes:
                 return steps, found
-            self.report(f"joint test p = {found.omnibus.p:.3g}; first: {found.rows[0].name if found.rows else 'none'}")
+            p = p_in_words(found.omnibus.p, self.rules.bootstraps)
+            self.report(f"joint test p {p}; first: {found.rows[0].name if found.rows else 'none'}")
             if len(steps) >= self.rules.effects or found.omnibus.p > self.rules.extended_passes:
                 return steps, found
             step = self._extend(found, named)

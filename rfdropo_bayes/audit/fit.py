@@ -172,15 +172,20 @@ def widened(fit: Fit, coordinates: Coordinates) -> Fit:
     size of many prior deviations would be drawn back towards null by several posterior deviations. Sizes below one
     prior deviation stay as they are.
     """
-    z = np.where(coordinates.affine, fit.x / coordinates.prior_sd, 0.0)[fit.free]
     sd = coordinates.prior_sd[fit.free]
-    less = (1.0 - 1.0 / np.maximum(np.abs(z), 1.0) ** 2) / sd**2
+    less = (1.0 - 1.0 / widening(fit, coordinates)[fit.free] ** 2) / sd**2
     if not less.any():
         return fit
     covariance = np.linalg.inv(np.linalg.inv(fit.covariance) - np.diag(less))
     x = fit.x.copy()
     x[fit.free] += covariance @ (less * x[fit.free])
     return replace(fit, x=np.clip(x, *coordinates.bounds), covariance=covariance)
+
+
+def widening(fit: Fit, coordinates: Coordinates) -> Float[np.ndarray, " d"]:
+    """By how much the scale of each prior is widened for a fit's sizes; 1 where it stays as it is."""
+    free = np.isin(np.arange(len(fit.x)), fit.free) & coordinates.affine
+    return np.where(free, np.maximum(np.abs(fit.x / coordinates.prior_sd), 1.0), 1.0)
 
 
 def fit_base(

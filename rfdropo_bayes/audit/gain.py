@@ -18,6 +18,7 @@ DIFFERENCE_FROM = 6  # trajectories below which an ELPD difference has no standa
 RESAMPLES = 2000
 BANDS = 12
 SURE = 3.0  # standard errors by which a discrepancy must exceed the noise to be taken for one
+CLEAR = 2.0  # standard errors of the ELPD difference from which on one model is clearly the better one
 LEVELS = (0.5, 0.9)
 
 
@@ -62,6 +63,18 @@ class Gain:
     interval: tuple[float, float]
     floor: float
     trajectories: int
+
+    @property
+    def worse(self) -> bool:
+        """Whether unseen trajectories are predicted worse: their error grows, or surely more of the discrepancy."""
+        return self.rmse_extended > self.rmse_base or self.interval[1] < 0.0
+
+    @property
+    def clear(self) -> bool:
+        """Whether unseen trajectories clearly support the extension: it surely takes a part of the discrepancy away,
+        their error does not grow, and they are clearly likelier."""
+        likelier = self.elpd_difference > CLEAR * (self.elpd_difference_se or 0.0)
+        return self.interval[0] > 0.0 and likelier and not self.worse
 
 
 def measure_gain(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.affordable import unaffordable
+from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step
@@ -45,6 +46,7 @@ class Question:
         stated_noise: from the experiment file, used where nothing was repeated; None without.
         start: values of base parameters to start from, of an earlier calibration; None for a search.
         rules, seed: see `Rules`.
+        left_out: mechanisms that do not run on this body or engine, with the reason.
     """
 
     lanes: Lanes
@@ -57,17 +59,19 @@ class Question:
     start: dict[str, float] | None
     rules: Rules
     seed: int
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Answer:
     """What an audit found; see the attributes' own classes.
 
-    ``unexamined`` holds candidates that would have taken too long, with the minutes; ``looks`` are the looks at the
-    base model and after each step; ``stages`` the explained fraction after each step; ``sizes`` is the last model's fit
-    under priors that do not pull, and ``draws`` are from it; ``suspected`` is a noise under which the base model would
-    pass, where a stated one leaves a discrepancy that is not explained; ``shift`` is the distance by which constants
-    tell repeats apart [m].
+    ``unexamined`` holds candidates that would have taken too long, with the minutes; ``unsupported`` names mechanisms
+    that the fitted recordings asked for and unseen ones do not support; ``looks`` are the looks at the base model and
+    after each step; ``stages`` the explained fraction after each step; ``sizes`` is the last model's fit under priors
+    that do not pull, and ``draws`` are from it; ``suspected`` is a noise under which the base model would pass, where a
+    stated one leaves a discrepancy that is not explained; ``shift`` is the distance by which constants tell repeats
+    apart [m].
     """
 
     verdict: str
@@ -76,6 +80,7 @@ class Answer:
     base: Fit
     unexamined: dict[str, float]
     steps: list[Step]
+    unsupported: list[str]
     looks: list[Look]
     gain: Gain | None
     stages: list[float]
@@ -97,8 +102,9 @@ class Answer:
 
     @property
     def adopted(self) -> list[Step]:
-        """Steps that join the model for good: none where unseen recordings are surely predicted worse with them."""
-        return [] if self.gain is not None and self.gain.interval[1] < 0.0 else self.steps
+        """Steps that join the model for good: those that unseen recordings clearly support, in a model that explains
+        more than next to nothing."""
+        return self.steps if self.gain is not None and self.gain.clear and self.verdict != UNEXPLAINED else []
 
 
 def audit(
@@ -131,11 +137,18 @@ def audit(
     if steps and target.noise.source == RESIDUALS:
         inquiry, base = _asked_again(inquiry, base, steps[-1].fit)
         target, (steps, last) = inquiry.target, inquiry.name_causes(base)
+    held_out = _held_out(question, target, inquiry, base, steps)
+    kept = held_out.supported() if held_out else 0
+    unsupported = [step.name for step in steps[kept:]] if kept else []
+    if unsupported:
+        report(f"unseen recordings do not support {' and '.join(unsupported)}")
+        steps, last = steps[:kept], steps[kept].before
     extended = steps[-1].fit if steps else base
     if steps and target.noise.source == RESIDUALS:
         last = _final_look(inquiry, extended, steps)
     looks = [*(step.before for step in steps), last]
-    gain, stages, held_out, predictions, unseen = _measured(question, target, inquiry, base, steps, rng)
+    stages = [held_out.gain(0, k) for k in range(1, len(steps) + 1)] if held_out else []
+    gain = stages[-1] if stages else None
     members = [len(step.members) for step in steps]
     verdict = decide(
         question.rules, looks[0].omnibus.p, last.omnibus.p if steps else None, members, gain, target.noise.doubtful
@@ -150,13 +163,14 @@ def audit(
         base,
         unexamined,
         steps,
+        unsupported,
         looks,
         gain,
-        stages,
-        held_out,
+        [stage.explained for stage in stages],
+        held_out.which if held_out else "",
         describe_remainder(target.measurements, extended.residual, target.noise),
-        predictions,
-        unseen,
+        (held_out.predictions[0], held_out.predictions[len(steps)]) if held_out else None,
+        held_out.unseen if held_out else None,
         sizes,
         sizes.draws(np.random.default_rng([question.seed, 5]), 1000, low, high),
         _suspected(inquiry, base) if unexplained else None,
@@ -252,7 +266,8 @@ def _final_look(inquiry: Inquiry, extended: Fit, steps: Sequence[Step]) -> Look:
     renewed = replace(inquiry.target, noise=residual_noise(inquiry.target, extended))
     fit = climb(renewed, extended.x, extended.free)
     found, _ = replace(inquiry, target=renewed).look_at(fit, [step.name for step in steps])
-    inquiry.report(f"joint test under the noise that it leaves: p = {found.omnibus.p:.3g}")
+    p = p_in_words(found.omnibus.p, inquiry.rules.bootstraps)
+    inquiry.report(f"joint test under the noise that it leaves: p {p}")
     return found
 
 
@@ -276,18 +291,49 @@ def _predict(forward: Forward, fit: Fit, seed: Sequence[int]) -> Prediction:
     return Prediction(centre + np.tensordot(z, slopes, axes=1))
 
 
-def _measured(
-    question: Question, target: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step], rng: np.random.Generator
-) -> tuple[Gain | None, list[float], str, tuple[Prediction, Prediction] | None, Unseen | None]:
-    """Gain on the test recordings, or on fitted ones that are left out in turn."""
+@dataclass(frozen=True)
+class HeldOut:
+    """Recordings that no fit has seen, as the base model and the model after each step predict them.
+
+    Attributes:
+        which: in words.
+        unseen: the measurements.
+        predictions: of the base model, then after each step.
+        patterns: what each of these models leaves where it was fitted, see `measure_gain`.
+        noise: of the measurements.
+        seed: of the gain's interval.
+    """
+
+    which: str
+    unseen: Unseen
+    predictions: list[Prediction]
+    patterns: list[np.ndarray]
+    noise: NoiseModel
+    seed: int
+
+    def gain(self, before: int, after: int) -> Gain:
+        """What the model after some steps is worth beside that after fewer."""
+        first, second, rng = self.predictions[before], self.predictions[after], np.random.default_rng([self.seed, 4])
+        return measure_gain(self.unseen, first, second, self.noise, self.patterns[before], rng)
+
+    def supported(self) -> int:
+        """Number of steps that the unseen recordings clearly support, each beside the last one that they do."""
+        last = 0
+        for after in range(1, len(self.predictions)):
+            if self.gain(last, after).clear:
+                last = after
+        return last
+
+
+def _held_out(question: Question, target: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step]) -> HeldOut | None:
+    """The test recordings, or fitted ones that are left out in turn; None where the model was not extended."""
     if not steps:
-        return None, [], "", None, None
+        return None
     count, every = len(question.trajectories), len(question.recordings.names)
-    pattern = base.residual.reshape(target.measurements.position.shape)
     fits = [base, *(step.fit for step in steps)]
     names = ["", *(step.name for step in steps)]
     if every > count:
-        held_out = "test recordings"
+        which = "test recordings"
         unseen = _unseen(question.recordings, range(count, every))
         tested = {question.recordings.names[i]: i for i in range(count, every)}
         predictions = [
@@ -295,12 +341,9 @@ def _measured(
             for i, fit in enumerate(fits)
         ]
     else:
-        held_out, unseen, predictions = _left_out(question, target, inquiry, fits, names)
-    gains = [
-        measure_gain(unseen, predictions[0], later, target.noise, pattern, np.random.default_rng([question.seed, 4]))
-        for later in predictions[1:]
-    ]
-    return gains[-1], [gain.explained for gain in gains], held_out, (predictions[0], predictions[-1]), unseen
+        which, unseen, predictions = _left_out(question, target, inquiry, fits, names)
+    patterns = [fit.residual.reshape(target.measurements.position.shape) for fit in fits]
+    return HeldOut(which, unseen, predictions, patterns, target.noise, question.seed)
 
 
 def _unseen(recordings: RecordingSet, chosen: Sequence[int]) -> Unseen:

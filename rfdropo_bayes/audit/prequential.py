@@ -55,7 +55,7 @@ def prequential(target: Target, fit: Fit) -> Prequential:
         square = float(left @ left - (j.T @ left) @ gain)  # left' (I + J P J')^-1 left, by Woodbury's identity
         growth = float(np.linalg.slogdet(after)[1] - np.linalg.slogdet(precision)[1])
         scores.append(-0.5 * (square + growth + len(r) * np.log(2.0 * np.pi)))
-        p.append(float(chi2.sf(square, len(r))) if len(r) else 1.0)
+        p.append(max(float(chi2.sf(square, len(r))), float(np.finfo(float).tiny)) if len(r) else 1.0)
         surprise.append(square / max(len(r), 1))
         mean, precision = mean + gain, after
     clock = target.measurements.time[int(np.argmax(valid.any(axis=2).sum(axis=1)))]

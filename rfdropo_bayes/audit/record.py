@@ -33,6 +33,10 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         "findings": findings,
         "candidates": _candidates(answer),
         "not_examined": {name: round(minutes, 1) for name, minutes in answer.unexamined.items()},
+        "left_out": dict(answer.question.left_out),
+        "adopted": [step.name for step in answer.adopted],
+        "unsupported": list(answer.unsupported),
+        "bootstraps": answer.question.rules.bootstraps,
         "omnibus": [{"after": n, **_omnibus(look)} for n, look in enumerate(answer.looks)],
         "gain": None
         if gain is None

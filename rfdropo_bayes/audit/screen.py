@@ -113,7 +113,12 @@ def _row(name: str, seen: Sequence[Probe], surprises: np.ndarray, most: np.ndarr
     probe = seen[best]
     lm = float(statistic(probe.mark, fit.residual)[0])
     score = lm - probe.mark.rank * np.log(len(fit.residual))
-    return Row(name, probe, lm, probe.mark.rank, float(np.exp(-surprises[best])), tail(surprises[best], most), score)
+    return Row(name, probe, lm, probe.mark.rank, _p_value(surprises[best]), tail(surprises[best], most), score)
+
+
+def _p_value(surprise: float) -> float:
+    """Never zero, which no p-value is: the smallest number that is left."""
+    return max(float(np.exp(-surprise)), float(np.finfo(float).tiny))
 
 
 def _statistics(

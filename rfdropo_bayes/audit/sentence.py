@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.extension import DISCRETISATION, TOLD_APART
 from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.noise import REPEATS, STATED
@@ -23,7 +24,10 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
 
 def _unexamined(answer: Answer) -> str:
     names = " and ".join(name.replace("_", " ") for name in answer.unexamined)
-    return f" Not examined, as it would have taken too long: {names}." if names else ""
+    slow = f" Not examined, as it would have taken too long: {names}." if names else ""
+    count = len(answer.question.left_out)
+    does = "candidate does" if count == 1 else "candidates do"
+    return slow + (f" Left out: {count} {does} not run on this body or engine." if count else "")
 
 
 def _suspicion(answer: Answer) -> str:
@@ -51,14 +55,14 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if answer.verdict == NO_DISCREPANCY:
         return (
             f"No discrepancy: what the base model leaves is noise as far as these data can tell "
-            f"(joint test p = {answer.looks[0].omnibus.p:.2g}{_resolution(answer)}{_assumption(answer)})."
+            f"(joint test p {_p(answer)}{_resolution(answer)}{_assumption(answer)})."
         )
     if not findings and answer.looks[0].omnibus.p > answer.question.rules.base_passes:
         left = 1e3 * noise_distance(answer.target.noise)
         return (
             f"What the base model leaves, {left:.2g} mm, changes too slowly to be the noise of a measurement, but "
             f"without repeats it cannot be told from noise, and no candidate stands out of it "
-            f"(joint test p = {answer.looks[0].omnibus.p:.2g})."
+            f"(joint test p {_p(answer)})."
         )
     if not findings:
         tail = f"what remains has a standard deviation of {1e3 * answer.remainder.amplitude:.2g} mm"
@@ -75,11 +79,9 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
             f"{named} {verb} named, but the discrepancy is too small to say how much of it that explains "
             f"([{low:.0f}, {high:.0f}] %); unseen recordings are {likelier}likelier with it"
         )
-    elif not answer.adopted:
-        head = (
-            f"Unexplained: with the best of the library, {named}, unseen recordings are predicted worse, and "
-            "extended.toml keeps the base model"
-        )
+    elif gain.worse:
+        errors = f"{1e3 * gain.rmse_base:.3g} mm without, {1e3 * gain.rmse_extended:.3g} mm with it"
+        head = f"Unexplained: with the best of the library, {named}, unseen recordings are predicted worse ({errors})"
     elif answer.verdict == UNEXPLAINED:
         head = f"Unexplained: the best of the library, {named}, explains only {share}"
     elif answer.verdict in (EXPLAINED, "equivalent"):
@@ -88,7 +90,21 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         head = f"The best of the library, {named}, explains {share}; the rest may be noise, but that is not certain"
     else:
         head = f"The best of the library, {named}, explains {share}, but not all: something else is at work"
-    return f"{head}{_excluded(answer)}; {_remains(answer)}{_assumption(answer)}."
+    return f"{head}{_excluded(answer)}; {_remains(answer)}{_assumption(answer)}.{_adoption(answer)}"
+
+
+def _p(answer: Answer) -> str:
+    return p_in_words(answer.looks[0].omnibus.p, answer.question.rules.bootstraps)
+
+
+def _adoption(answer: Answer) -> str:
+    """What of the findings joins the model for good."""
+    if not answer.adopted:
+        return " Unseen recordings do not clearly support this: extended.toml keeps the base model."
+    if answer.unsupported:
+        names = " and ".join(name.replace("_", " ") for name in answer.unsupported)
+        return f" The fitted recordings asked for {names}, too, which unseen ones do not support: not adopted."
+    return ""
 
 
 def _named(finding: dict[str, Any]) -> str:

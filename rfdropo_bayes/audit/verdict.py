@@ -33,9 +33,10 @@ def decide(
     """Apply the rules.
 
     - no_discrepancy: the base model passes the joint test (p > .01), under a noise that may be one;
-    - unexplained: it does not, and no candidate is significant, or all together explain at most 20 %;
-    - explained: the extended model passes (p > .05) and the lower bound of the explained fraction exceeds 80 %;
-      equivalent where a named class has several members;
+    - unexplained: it does not, and no candidate is significant, or all together explain at most 20 %, or unseen
+      trajectories are predicted worse with them;
+    - explained: the extended model passes (p > .05), the lower bound of the explained fraction exceeds 80 %, and unseen
+      trajectories clearly support it; equivalent where a named class has several members;
     - partly_explained: a significant gain, but one of these fails.
 
     Args:
@@ -51,8 +52,8 @@ def decide(
         return UNEXPLAINED
     if gain is None:
         return PARTLY
-    if gain.explained <= rules.significant:
+    if gain.worse or gain.explained <= rules.significant:
         return UNEXPLAINED
-    if extended_p > rules.extended_passes and gain.interval[0] > rules.explained:
+    if extended_p > rules.extended_passes and gain.clear and gain.interval[0] > rules.explained:
         return EQUIVALENT if max(class_sizes) > 1 else EXPLAINED
     return PARTLY

@@ -10,6 +10,12 @@ from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
+def kept_over(time_step: float, time_constant: Float[Array, ""]) -> Float[Array, ""]:
+    """Share of a first-order filter's distance from a held input that is left after a step; none at tau = 0."""
+    memory = time_constant > 1e-3 * time_step  # exp(-1000) is zero in any precision
+    return jnp.where(memory, jnp.exp(-time_step / jnp.where(memory, time_constant, 1.0)), 0.0)
+
+
 class CommandDelay:
     """Pure transport delay: the command acts ``command_delay`` seconds late; zero is the base simulator."""
 
@@ -38,7 +44,10 @@ class CommandDelay:
 
 
 class ActuatorLag:
-    """First-order lag of the drives, ``tau y' = u - y`` (backward Euler); tau = 0 is the base simulator."""
+    """First-order lag of the drives, ``tau y' = u - y`` with u held over each step; tau = 0 is the base simulator.
+
+    A lag much shorter than a time step changes nothing that can be seen: the derivative at tau = 0 is zero.
+    """
 
     name = "actuator_lag"
     stage = "actuation"
@@ -55,8 +64,7 @@ class ActuatorLag:
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
     ) -> Float[Array, "step channel"]:
         """Filter the command, starting from rest at its initial value."""
-        # The share that is kept back, so that none is exactly the base simulator.
-        kept = values["actuator_lag"] / (time_step + values["actuator_lag"])
+        kept = kept_over(time_step, values["actuator_lag"])
 
         def advance(last: Array, sent: Array) -> tuple[Array, Array]:
             reached = sent + kept * (last - sent)

@@ -15,7 +15,7 @@ NUMBERED = tuple(str(k + 1) for k in range(8))
 
 
 class CableGain:
-    """Each command scaled by its own ``1 + error``, less the mean error, which is `command_gain`'s; zero at null.
+    """Each command scaled by its own ``1 + error``; zero at null. Equal errors of all are `command_gain`'s.
 
     Args:
         channels: names of the command channels; numbers by default.
@@ -36,7 +36,7 @@ class CableGain:
                 2.0,
                 0.0,
                 {"distribution": "Normal", "loc": 0.0, "scale": 0.1},
-                f"relative error of the displacement of {channel}, less the mean over all",
+                f"relative error of the displacement of {channel}",
             )
             for channel in channels
         )
@@ -52,4 +52,4 @@ class CableGain:
         """Scale the displacements from the initial command."""
         count = command.shape[-1]
         error = jnp.stack([values[spec.name] for spec in self.parameters[:count]])
-        return initial + (1.0 + error - jnp.mean(error)) * (command - initial)
+        return initial + (1.0 + error) * (command - initial)

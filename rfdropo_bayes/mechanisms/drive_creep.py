@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from rfdropo_bayes.mechanisms.actuation import kept_over
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -44,7 +45,7 @@ class DriveCreep:
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
     ) -> Float[Array, "step channel"]:
         """Take away a share of the slowly following command."""
-        kept = values["drive_creep_time"] / (time_step + values["drive_creep_time"])
+        kept = kept_over(time_step, values["drive_creep_time"])
 
         def relax(last: Array, sent: Array) -> tuple[Array, Array]:
             slow = sent + kept * (last - sent)

@@ -20,6 +20,7 @@ class ViscoelasticBranch:
 
     name = "viscoelasticity"
     stage = "body"
+    bodies = ("layered",)
     cause = "relaxation of the elastomer: it creeps in holds and is stiffer when moved fast"
     remedy = "record a hold of a minute after a fast move, or a relaxation test of a sample"
     parameters = (
@@ -55,6 +56,7 @@ class BendingStiffening:
 
     name = "bending_stiffening"
     stage = "body"
+    bodies = ("layered",)
     cause = "strain stiffening of the elastomer, notches that close, or cables that stiffen the body as it bends"
     remedy = "measure force against deflection of the tip up to large bends"
     parameters = (
@@ -79,6 +81,7 @@ class PlaneAnisotropy:
 
     name = "plane_anisotropy"
     stage = "body"
+    bodies = ("layered",)
     cause = "a section that is not round: casting seams, cable channels, embedded tubes"
     remedy = "measure the deflection under a weight at the tip in several directions about the axis"
     parameters = (
@@ -112,6 +115,7 @@ class BendTwistCoupling:
 
     name = "bend_twist_coupling"
     stage = "body"
+    bodies = ("layered",)
     cause = "cables or fibres that run helically, or a section without mirror planes"
     remedy = "watch for twist of the tip when one cable is pulled; check the routing of the cables"
     parameters = tuple(
@@ -137,6 +141,7 @@ class Softening:
 
     name = "softening"
     stage = "body"
+    bodies = ("layered",)
     cause = "warming of the body or its drives, or softening of the elastomer with use (Mullins)"
     remedy = "warm up before recording, repeat the same commands at the end, and log the temperature"
     parameters = (

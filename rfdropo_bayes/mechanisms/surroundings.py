@@ -14,6 +14,7 @@ class QuadraticDrag:
 
     name = "quadratic_drag"
     stage = "body"
+    bodies = ("layered",)
     cause = "resistance of the surrounding air or water"
     remedy = "compare slow and fast sweeps of the same path"
     parameters = (
@@ -38,6 +39,7 @@ class WallContact:
 
     name = "wall_contact"
     stage = "body"
+    bodies = ("layered",)
     cause = "the body touches its mount, a table, a cable bundle or itself"
     remedy = "look where the trajectory ends on one side; clear the workspace or measure where the surface is"
     parameters = (

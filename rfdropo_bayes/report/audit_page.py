@@ -9,6 +9,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.omnibus import BLOCK
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.score import likeness
@@ -26,6 +27,7 @@ SECTIONS = (
     ("limits", "Limits"),
 )
 MOST_COSINES = 16
+LEAST_P = 1e-16
 
 
 def render_audit(answer: Answer, content: Mapping[str, Any], title: str, config: str) -> str:
@@ -45,6 +47,7 @@ def render_audit(answer: Answer, content: Mapping[str, Any], title: str, config:
         lstrip_blocks=True,
     )
     environment.filters |= {"number": number, "words": display_name, "duration": duration, "breakable": breakable}
+    environment.filters |= {"bootstrap_p": _bootstrap_p, "p_value": p_value}
     stylesheet = environment.loader.get_source(environment, "page.css")[0] if environment.loader else ""
     return environment.get_template("audit.html.j2").render(
         audit=content,
@@ -54,6 +57,16 @@ def render_audit(answer: Answer, content: Mapping[str, Any], title: str, config:
         pictures=_pictures(answer),
         config=config,
     )
+
+
+def _bootstrap_p(p: float, simulated: int) -> str:
+    """A bootstrap's p-value in a table."""
+    return p_in_words(p, simulated).removeprefix("= ")
+
+
+def p_value(p: float) -> str:
+    """A p-value from a distribution, which holds only so far out."""
+    return number(p, 2) if p >= LEAST_P else f"< {LEAST_P:.0e}"
 
 
 def residuals_of(answer: Answer) -> figures.Residuals:

@@ -19,6 +19,8 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 Values = Mapping[str, Float[Array, ""]]
 
 STAGES = ("actuation", "body", "contact", "sensing")
+BODIES = ("layered", "tetrahedra")
+ENGINES = ("jax", "numba")
 
 
 class Mechanism(Protocol):
@@ -31,6 +33,9 @@ class Mechanism(Protocol):
             null value that is a bound makes the effect one-sided.
         cause: one line on the physical cause.
         remedy: one line on what a lab would do about it.
+
+    Three more may be left out, where a mechanism runs everywhere: ``bodies`` and ``engines``, those of `BODIES` and
+    `ENGINES` on which it runs, and ``beside_cube``, False where it does not run with a cube before the trunk.
     """
 
     name: str
@@ -83,6 +88,27 @@ class TimedSensingMechanism(Mechanism, Protocol):
 def inside_drive(mechanism: Mechanism) -> bool:
     """Whether an encoder on the motor shows what a mechanism of actuation does."""
     return bool(getattr(mechanism, "inside_drive", True))
+
+
+def bodies_of(mechanism: Mechanism | type) -> tuple[str, ...]:
+    """Kinds of body that a mechanism runs on."""
+    return tuple(getattr(mechanism, "bodies", BODIES))
+
+
+def engines_of(mechanism: Mechanism | type) -> tuple[str, ...]:
+    """Engines that a mechanism runs on."""
+    return tuple(getattr(mechanism, "engines", ENGINES))
+
+
+def obstacle(mechanism: Mechanism, body: str, engine: str, cube: bool) -> str | None:
+    """Why a mechanism does not run on a body, on an engine, or beside a cube; None where it runs."""
+    if body not in bodies_of(mechanism):
+        return f"it acts on {' and '.join(bodies_of(mechanism))} bodies only"
+    if engine not in engines_of(mechanism):
+        return f"it runs on the engine {' or '.join(engines_of(mechanism))} only"
+    if cube and not getattr(mechanism, "beside_cube", True):
+        return "it cannot be combined with a cube"
+    return None
 
 
 def code_of(mechanisms: Iterable[Mechanism]) -> bytes:

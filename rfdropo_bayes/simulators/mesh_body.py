@@ -130,9 +130,15 @@ def _node_share(body: TetrahedralBody, masses: str) -> Float[np.ndarray, " nodes
 
 
 def _station_share(body: TetrahedralBody, station: Float[np.ndarray, " stations"]) -> np.ndarray:
-    """A mass at a station rests in equal parts on the nodes that are nearer to it than to other stations."""
-    nearest = np.argmin(np.abs(body.rest[:, 2:] - station), axis=1)
-    share = (nearest[:, None] == np.arange(len(station))).astype(float)
-    for index in np.flatnonzero(share.sum(axis=0) == 0.0):  # no node so near: the nearest one
-        share[np.argmin(np.abs(body.rest[:, 2] - station[index])), index] = 1.0
+    """A mass at a station rests where the edges of the mesh pass the station's plane: its centre is at that height."""
+    pairs = np.array([(a, b) for a in range(4) for b in range(a + 1, 4)])
+    edge = np.unique(np.sort(body.element[:, pairs].reshape(-1, 2), axis=1), axis=0)
+    height = body.rest[edge, 2]
+    share = np.zeros((len(body.rest), len(station)))
+    for index, plane in enumerate(np.clip(station, height.min(), height.max())):
+        lower, upper = (height - plane).T
+        crosses = (lower * upper <= 0.0) & (lower != upper)
+        way = lower[crosses] / (lower[crosses] - upper[crosses])
+        np.add.at(share[:, index], edge[crosses, 0], 1.0 - way)
+        np.add.at(share[:, index], edge[crosses, 1], way)
     return share / share.sum(axis=0)

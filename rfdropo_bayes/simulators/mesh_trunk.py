@@ -29,7 +29,7 @@ class MeshTrunkSimulator(RobotSimulator):
     """A trunk of tetrahedra with mechanisms, behind the `Simulator` protocol, started undeformed.
 
     Order of a rollout: as `TrunkSimulator`. Mechanisms of the body see the robot's layers and stations; what they do to
-    a layer holds for the elements in it, and a mass at a station rests on the nodes around it.
+    a layer holds for the elements in it, and a mass at a station rests on the section at its height.
 
     Attributes:
         robot: what is simulated.

@@ -9,11 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
+from rfdropo_bayes.audit.fit import widening
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.noise import STATED, NoiseModel
@@ -23,14 +25,14 @@ from rfdropo_bayes.bayes.model import gather_recordings
 from rfdropo_bayes.bayes.space import ParameterSpace, build_space
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.mechanisms import REGISTRY
+from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.audit_page import render_audit
 from rfdropo_bayes.report.summary import combined_hash
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.compiled import CompiledEngine, effects_costly
-from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism
+from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, obstacle
 from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
@@ -122,9 +124,13 @@ def build_question(
     where it is not all.
     """
     robot = find_robot(experiment, folder)
-    names = candidate_names(experiment) if names is None else names
-    simulator = build_simulator(_with(experiment, names), robot, folder)
     trajectories = [*fitted, *tested]
+    left_out: dict[str, str] = {}
+    if names is None:
+        names = candidate_names(experiment)
+        left_out = obstacles(experiment, names, robot, folder, trajectories[0])
+        names = [name for name in names if name not in left_out]
+    simulator = build_simulator(_with(experiment, names), robot, folder)
     recordings = gather_recordings(simulator, trajectories)
     added = simulator.mechanisms[len(experiment.model.mechanisms) :]
     recorded, count = recordings.names, len(fitted)
@@ -164,6 +170,7 @@ def build_question(
         start,
         Rules(bootstraps=experiment.audit.bootstraps, minutes=experiment.audit.minutes),
         seed,
+        {name: why for name, why in left_out.items() if name not in experiment.audit.exclude},
     )
 
 
@@ -181,6 +188,37 @@ def candidate_names(experiment: Experiment) -> list[str]:
         if name not in known:
             raise InputError(f"unknown mechanism {name!r}", where="[audit] exclude", remedy=nearest(name, known))
     return [name for name in known if name not in experiment.model.mechanisms]
+
+
+def obstacles(
+    experiment: Experiment, names: Sequence[str], robot: Robot, folder: Path, recording: Trajectory
+) -> dict[str, str]:
+    """Which of the candidates cannot run on the experiment's body and engine, and why.
+
+    A mechanism of the library says where it runs; one of a user's own is tried, too.
+    """
+    simulator = build_simulator(experiment, robot, folder)
+    engine = str(simulator.description["engine"])
+    commands = gather_recordings(simulator, [recording]).commands
+    found = {}
+    for name in names:
+        (mechanism,) = mechanisms_named([name], robot, folder=folder, where="[audit] candidates")
+        table = experiment.simulator
+        why = obstacle(mechanism, table.body, engine, table.push)
+        if why is None and name not in REGISTRY:
+            why = _refusal(build_simulator(_with(experiment, [name]), robot, folder), commands)
+        if why is not None:
+            found[name] = why
+    return found
+
+
+def _refusal(simulator: RobotSimulator, commands: Commands) -> str | None:
+    """What a simulator says against rollouts of its mechanisms, before anything is computed."""
+    try:
+        jax.eval_shape(jax.vmap(lambda given: simulator.rollout({}, given)), commands)
+    except InputError as error:
+        return error.what
+    return None
 
 
 def _with(experiment: Experiment, names: Sequence[str]) -> Experiment:
@@ -266,7 +304,7 @@ def _space(
     pooled = pooling(experiment, specs, fitted, others)
     base = build_space(specs, priors, scopes, fitted, pooled=pooled)
     taken = {p.spec.name for p in base.parameters} | set(fixed)
-    extra = {name: table.priors.get(name, {}) for name in [s.name for s in specs if s.name in added - taken]}
+    extra = {name: given.get(name, {}) for name in [s.name for s in specs if s.name in added - taken]}
     whole = build_space(specs, {**priors, **extra}, scopes, fitted, pooled=pooled)
     return whole, len(base.parameters)
 
@@ -309,10 +347,7 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path) -> dic
         else:
             candidate = next(c for c in answer.question.candidates if c.name == step.name)
             model["mechanisms"] = [*model.get("mechanisms", []), _found_again(candidate.source, folder)]
-            fixed = model.get("fixed", {})
-            for spec in candidate.mechanism.parameters if candidate.mechanism else ():
-                if spec.name not in fixed:
-                    model.setdefault("priors", {}).setdefault(spec.name, dict(spec.prior))
+            model.setdefault("priors", {}).update(sized_priors(answer, candidate))
     audit = extended.get("audit", {})
     if "candidates" in audit:
         taken = {c.source for c in answer.question.candidates if c.name in {step.name for step in answer.adopted}}
@@ -324,6 +359,20 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path) -> dic
     for role in ("fit", "test"):
         data[role] = [_placed(entry, folder) for entry in data.get(role, [])]
     return extended
+
+
+def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, Any]]:
+    """The priors under which the sizes of a mechanism were found: no narrower than these sizes, see `widened`."""
+    coordinates = answer.question.coordinates
+    factor = widening(answer.extended, coordinates)
+    found = {}
+    for index in candidate.indices:
+        parameter = coordinates.space.parameters[index]
+        table = dict(parameter.table or parameter.spec.prior)
+        if factor[index] > 1.0:
+            table["scale"] = float(f"{table['scale'] * factor[index]:.3g}")
+        found[parameter.spec.name] = table
+    return found
 
 
 def _found_again(source: str, folder: Path) -> str:

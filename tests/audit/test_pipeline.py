@@ -11,19 +11,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import lead
 from rfdropo_bayes.audit.experiment_design import Hypothesis, at_hand, outlooks
-from rfdropo_bayes.audit.extension import Inquiry, Step
+from rfdropo_bayes.audit.extension import Inquiry, Rules, Step
 from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
+from rfdropo_bayes.audit.gain import Gain
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import gather_measurements
 from rfdropo_bayes.audit.noise import STATED, NoiseModel
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.audit.sentence import _named
+from rfdropo_bayes.audit.verdict import decide
 from rfdropo_bayes.bayes.model import gather_recordings
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.report.audit_page import p_value
 from rfdropo_bayes.simulators.commands import Commands
 
 from .toys import CANDIDATES, NOISE, ROWS, STEP, Toy, question, recordings
@@ -323,7 +327,62 @@ def test_what_predicts_unseen_recordings_worse_is_named_and_not_adopted():
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
     assert answer.steps
     assert answer.adopted == []
+    assert answer.verdict == "unexplained"
     assert "predicted worse" in content["sentence"]
+    assert content["gain"]["rmse_extended_mm"] > content["gain"]["rmse_base_mm"]
+    assert "extended.toml keeps the base model" in content["sentence"]
+
+
+def test_what_only_the_fitted_recordings_have_is_not_adopted_beside_what_all_have():
+    """Play is in every recording, a delay in the fitted ones alone."""
+    fitted = unrepeated({"play": 3.0, "delay": 0.3}, 7)
+    single = [*fitted.trajectories, *recordings({**TRUTH, "play": 3.0}, 7)[4:]]
+    answer = audit(replace(fitted, recordings=gather_recordings(Toy(), single), trajectories=single[:2]))
+    content = record(answer, versions={}, data_sha256="", next_experiment=None)
+    assert [step.name for step in answer.steps] == ["play"]
+    assert [step.name for step in answer.adopted] == ["play"]
+    assert content["unsupported"][0] in ("delay", "lag")
+    assert "unseen ones do not support: not adopted" in content["sentence"]
+    assert len(content["omnibus"]) == 2
+    assert content["gain"]["rmse_extended_mm"] < content["gain"]["rmse_base_mm"]
+
+
+def test_what_unseen_recordings_clearly_support_is_adopted_and_no_p_value_is_zero():
+    content = found({"play": 1.0}, 1)
+    assert content["adopted"] == ["play"]
+    assert content["omnibus"][0]["p"] == 1 / (1 + content["bootstraps"])
+    assert all(row["p"] > 0.0 for row in content["candidates"])
+    assert min(content["where"]["block_p"]) > 0.0
+
+
+def test_the_smallest_p_value_of_a_bootstrap_is_a_bound():
+    assert p_in_words(1 / 200, 199) == "< 0.005"
+    assert p_in_words(2 / 200, 199) == "= 0.01"
+    assert p_value(1e-300) == "< 1e-16"
+    assert p_value(0.012) == "0.012"
+
+
+GAIN = Gain(2.0, 1.0, 50.0, 5.0, {}, 0.5, (0.3, 0.7), 0.5, 6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "worse", "clear"),
+    [
+        ({}, False, True),
+        ({"rmse_extended": 2.1}, True, False),  # the error grows
+        ({"interval": (-0.9, -0.1)}, True, False),
+        ({"interval": (-0.1, 0.7)}, False, False),  # perhaps nothing
+        ({"elpd_difference": 9.0}, False, False),  # less than two standard errors
+        ({"elpd_difference": 1.0, "elpd_difference_se": None}, False, True),  # too few recordings to have one
+    ],
+)
+def test_a_verdict_agrees_with_the_errors(changes, worse, clear):
+    gain = replace(GAIN, **changes)
+    assert (gain.worse, gain.clear) == (worse, clear)
+    verdict = decide(Rules(), 0.001, 0.5, [1], gain)
+    assert (verdict == "unexplained") == worse
+    if not clear:
+        assert decide(Rules(), 0.001, 0.5, [1], replace(gain, explained=0.95)) not in ("explained", "equivalent")
 
 
 def test_of_many_sizes_the_surest_are_said_in_their_order():

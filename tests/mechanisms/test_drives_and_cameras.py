@@ -79,7 +79,8 @@ def test_the_derivative_at_null_is_the_one_sided_difference(name):
         ahead = applied(name, {spec.name: jnp.asarray(spec.nominal + step)})
         difference = (ahead - applied(name, {spec.name: jnp.asarray(spec.nominal)})) / step
         np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=2e-5)
-        if not spec.grid and not spec.name.startswith("cable_gain_error"):
+        channels_beyond = spec.name.startswith("cable_gain_error") and int(spec.name[-1]) > COMMAND.shape[1]
+        if not spec.grid and not channels_beyond:
             assert np.abs(slope).max() > 0
 
 
@@ -116,9 +117,9 @@ def test_a_rate_limit_slows():
     np.testing.assert_allclose(slow[:, 1], COMMAND[:, 1], atol=1e-15)  # never faster than 0.062 m/s
 
 
-def test_gains_of_cables_sum_to_zero():
+def test_each_cable_has_its_own_gain_and_a_wrong_one_leaves_the_others_alone():
     errors = {f"cable_gain_error_{k + 1}": jnp.asarray(v) for k, v in enumerate((0.3, 0.1))}
-    np.testing.assert_allclose(applied("cable_gain", errors), COMMAND * jnp.array([1.1, 0.9]), atol=1e-15)
+    np.testing.assert_allclose(applied("cable_gain", errors), COMMAND * jnp.array([1.3, 1.1]), atol=1e-15)
     (mechanism,) = mechanisms_named(["cable_gain"], load_robot("smooth_arm"))
     assert [spec.name for spec in mechanism.parameters] == [
         f"cable_gain_error_{channel}" for channel in ("up", "left", "down", "right")
@@ -126,12 +127,12 @@ def test_gains_of_cables_sum_to_zero():
 
 
 def test_a_held_command_creeps_exponentially():
-    """Backward Euler: the loss is g (1 - (1 + dt / tau)^-k)."""
+    """The loss is g (1 - exp(-t / tau)), whatever the time step."""
     held = jnp.full((60, 1), 0.01)
     values = {"drive_creep": jnp.asarray(0.2), "drive_creep_time": jnp.asarray(0.3)}
     crept = REGISTRY["drive_creep"]().actuate(values, held, jnp.zeros(1), STEP)[:, 0]
     k = np.arange(1, 61)
-    np.testing.assert_allclose(crept, 0.01 * (1 - 0.2 * (1 - (1 + STEP / 0.3) ** -k.astype(float))), rtol=1e-12)
+    np.testing.assert_allclose(crept, 0.01 * (1 - 0.2 * (1 - np.exp(-k * STEP / 0.3))), rtol=1e-12)
 
 
 def test_a_lagging_camera_answers_a_ramp_in_closed_form():

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.mechanisms import mechanisms_named
+from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators import Result, Simulator
 from rfdropo_bayes.simulators.commands import animated_on_grid
+from rfdropo_bayes.simulators.mechanisms import bodies_of, obstacle
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
 from rfdropo_bayes.simulators.mesh_engines import CompiledMeshEngine, ReferenceMeshEngine
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
@@ -182,3 +185,25 @@ def test_animated_commands_follow_their_own_clock():
     for uneven in ([0.0, 0.05, 0.11, 0.15], [0.05, 0.1, 0.15, 0.2], [0.0, 0.01, 0.02, 0.03]):
         with pytest.raises(InputError, match="not evenly spaced"):
             animated_on_grid(np.array(uneven), value, initial, 0.05 * np.arange(6), time_step=0.01)
+
+
+def test_a_mass_at_a_station_has_its_centre_at_the_height_of_the_station(sofa):
+    """However coarse the mesh is there, and however long the layers beside the station are: a payload is at the tip."""
+    height = sofa.assembly.system.body.rest[:, 2]
+    station = np.asarray(sofa.robot.body.station_m)
+    share = sofa.assembly.station_share
+    assert (share >= 0.0).all()
+    np.testing.assert_allclose(share.sum(axis=0), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(height @ share, np.clip(station, height.min(), height.max()), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", sorted(REGISTRY))
+def test_every_mechanism_says_whether_it_runs_on_a_mesh(sofa, name):
+    (mechanism,) = mechanisms_named([name], ROBOT)
+    simulator = replace(sofa, mechanisms=(mechanism,))
+    if "tetrahedra" in bodies_of(mechanism):
+        jax.eval_shape(lambda commands: simulator.rollout({}, commands), pulls(sofa))
+    else:
+        assert obstacle(mechanism, "tetrahedra", "numba", False) is not None
+        with pytest.raises(InputError, match="layered bodies only"):
+            jax.eval_shape(lambda commands: simulator.rollout({}, commands), pulls(sofa))
