@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -19,6 +20,7 @@ from rfdropo_bayes.bayes.forces import tension_specs
 from rfdropo_bayes.bayes.model import Measured, TrajectoryModel
 from rfdropo_bayes.bayes.noise import draw_noise, noise_specs
 from rfdropo_bayes.bayes.objects import draw_feature_error, feature_deviation, object_features, object_specs, offset_of
+from rfdropo_bayes.bayes.space import ParameterSpace
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
@@ -77,6 +79,14 @@ class CalibrationProblem:
         )
         digest.update(repr(rest).encode())
         return digest.hexdigest()
+
+    def holding(self, values: Mapping[str, float]) -> CalibrationProblem:
+        """The same problem with some parameters known, and no longer inferred; itself where none is."""
+        if not values:
+            return self
+        space = ParameterSpace(tuple(p for p in self.model.space.parameters if p.name not in values))
+        model = replace(self.model, space=space, fixed={**self.model.fixed, **values})
+        return CalibrationProblem(model, chunk=self.chunk)
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
         """Independent prior draws."""
@@ -178,7 +188,7 @@ class CalibrationProblem:
         values."""
         recordings, _, markers, _ = self.model.recordings.position.shape
         known = {**self.model.fixed, **values}
-        deviation = np.full(3 * markers, known["observation_noise"])
+        deviation = np.full(3 * markers, float(self.model.noise_of(values).deviation))
         if self.model.object_pose is not None:
             deviation = np.concatenate([deviation, feature_deviation(known)])
         return np.tile(deviation, recordings)
@@ -260,8 +270,7 @@ class CalibrationProblem:
     def _marker_noise(
         self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
     ) -> Float[Array, "time marker 3"]:
-        sigma, tau = self.model.noise_of(values)
-        return draw_noise(key, time, self.model.recordings.position.shape[2], sigma, tau)
+        return draw_noise(key, time, self.model.recordings.position.shape[2], self.model.noise_of(values))
 
     def _pose_noise(
         self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]

@@ -24,9 +24,9 @@ from rfdropo_bayes.bayes.forces import (
     weighed_log_density,
     weighed_residuals,
 )
-from rfdropo_bayes.bayes.noise import Timeline, draw_noise, row_log_density, timeline, whiten
+from rfdropo_bayes.bayes.noise import Noise, Timeline, draw_noise, noise_values, row_log_density, timeline, whiten
 from rfdropo_bayes.bayes.objects import ObjectData, Placing, object_log_density, object_residuals, offset_of
-from rfdropo_bayes.bayes.space import ParameterSpace
+from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
@@ -61,26 +61,25 @@ class TrajectoryNoise(dist.Distribution):
     def __init__(
         self,
         position: Float[Array, "time marker 3"],
-        sigma: Float[Array, ""],
-        tau: Float[Array, ""] | None,
+        noise: Noise,
         time: Float[Array, " time"],
         line: Timeline,
         *,
         validate_args: bool | None = None,
     ) -> None:
-        self.position, self.sigma, self.tau, self.time, self.line = position, sigma, tau, time, line
+        self.position, self.noise, self.time, self.line = position, noise, time, line
         super().__init__((), position.shape, validate_args=validate_args)
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Array:
         """Simulated positions plus one realisation of the noise."""
         count = int(np.prod(sample_shape))
-        draw = partial(draw_noise, time=self.time, markers=self.position.shape[1], sigma=self.sigma, tau=self.tau)
+        draw = partial(draw_noise, time=self.time, markers=self.position.shape[1], noise=self.noise)
         noise = jax.vmap(draw)(jax.random.split(key, count)).reshape(sample_shape + self.position.shape)
         return self.position + noise
 
     def log_prob(self, value: Float[Array, "time marker 3"]) -> Float[Array, ""]:
         """Log density of all valid rows."""
-        return jnp.sum(row_log_density(value - self.position, self.sigma, self.tau, self.line))
+        return jnp.sum(row_log_density(value - self.position, self.noise, self.line))
 
 
 @dataclass(frozen=True)
@@ -183,8 +182,9 @@ class TrajectoryModel:
     Attributes:
         simulator: anything that satisfies `Simulator`, mechanisms included.
         space: inferred parameters, those of the noise among them.
-        fixed: values of parameters that are not inferred and differ from their nominal value.
-        noise: ``"white"`` or ``"ar1"``.
+        fixed: values of parameters that are not inferred and differ from their nominal value; of all recordings, or of
+            one (``name@recording``).
+        noise: name of the noise model, one of `NOISE_MODELS`.
         recordings: data.
         tension: measured cable tensions; None where they are not used.
         weighed: parameters known from measurements of their own.
@@ -203,10 +203,9 @@ class TrajectoryModel:
     motor_angle: AngleData | None = None
     object_pose: ObjectData | None = None
 
-    def noise_of(self, values: Values) -> tuple[Any, Any]:
-        """Standard deviation [m] and correlation time [s] (None for white noise) among a set of values."""
-        known = {**self.fixed, **values}
-        return known["observation_noise"], known["noise_correlation_time"] if self.noise == "ar1" else None
+    def noise_of(self, values: Mapping[str, Any]) -> Noise:
+        """Values of the noise of the positions among a set of values."""
+        return noise_values(self.noise, {**self.fixed, **values})
 
     @cached_property
     def _physical(self) -> frozenset[str]:
@@ -216,11 +215,14 @@ class TrajectoryModel:
     def _absent(self) -> dict[str, float]:
         """Nominal values of parameters that belong to some recordings only: the others have these."""
         own = {parameter.spec.name for parameter in self.space.parameters if parameter.recording}
+        own |= {name.partition(SEPARATOR)[0] for name in self.fixed if SEPARATOR in name}
         return {spec.name: spec.nominal for spec in self.simulator.parameters if spec.name in own}
 
     def rollout_values(self, values: Values, recording: str) -> dict[str, Array]:
         """What the simulator is given for one recording: fixed and inferred physical parameters."""
-        chosen = {**self._absent, **self.fixed, **self.space.for_recording(values, recording)}
+        parts = ((name.partition(SEPARATOR), value) for name, value in self.fixed.items())
+        fixed = {name: value for (name, _, owner), value in parts if owner in ("", recording)}
+        chosen = {**self._absent, **fixed, **self.space.for_recording(values, recording)}
         physical = {name: jnp.asarray(value) for name, value in chosen.items() if name in self._physical}
         if self.object_pose is None:
             return physical
@@ -262,9 +264,9 @@ class TrajectoryModel:
         """
         data = self.measured if measured is None else measured
         observation = self.simulate(values, steps)
-        sigma, tau = self.noise_of(values)
+        noise = self.noise_of(values)
         residual = data.position - observation.position
-        density = jax.vmap(lambda r, line: row_log_density(r, sigma, tau, line))(residual, self.recordings.line)
+        density = jax.vmap(lambda r, line: row_log_density(r, noise, line))(residual, self.recordings.line)
         weighed = [entry._replace(value=value) for entry, value in zip(self.weighed, data.weighed, strict=True)]
         rows = jnp.sum(density, axis=0).at[0].add(weighed_log_density(values, weighed))
         if self.tension is not None:
@@ -285,8 +287,8 @@ class TrajectoryModel:
         weighed parts; None for what there is not."""
         data = self.measured if measured is None else measured
         observation = self.simulate(values, steps)
-        sigma, tau = self.noise_of(values)
-        white = jax.vmap(lambda r, line: whiten(r, sigma, tau, line)[0])(
+        noise = self.noise_of(values)
+        white = jax.vmap(lambda r, line: whiten(r, noise, line)[0])(
             data.position - observation.position, self.recordings.line
         )
         pulled = turned = moved = weighed = None
@@ -318,16 +320,16 @@ class TrajectoryModel:
         """The numpyro model; ``observe=False`` leaves the positions free, for predictive draws."""
         values = {p.name: numpyro.sample(p.name, p.prior) for p in self.space.parameters}
         observation = self.simulate(values)
-        sigma, tau = self.noise_of(values)
+        noise = self.noise_of(values)
         numpyro.deterministic("status", observation.status)
         for index, name in enumerate(self.recordings.names):
             rows = int(self.recordings.rows[index])
             line = Timeline(*(part[index, :rows] for part in self.recordings.line))
-            noise = TrajectoryNoise(
-                observation.position[index, :rows], sigma, tau, jnp.asarray(self.recordings.time[index, :rows]), line
+            seen = TrajectoryNoise(
+                observation.position[index, :rows], noise, jnp.asarray(self.recordings.time[index, :rows]), line
             )
             measured = jnp.asarray(self.recordings.position[index, :rows]) if observe else None
-            numpyro.sample(f"position@{name}", noise, obs=measured)
+            numpyro.sample(f"position@{name}", seen, obs=measured)
         if observe and self.tension is not None:
             numpyro.factor("tension", tension_log_density(observation.tension, {**self.fixed, **values}, self.tension))
         if observe and self.motor_angle is not None:

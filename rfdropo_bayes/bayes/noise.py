@@ -1,23 +1,29 @@
-"""Observation noise: Gaussian, white or autoregressive in time, with masked rows left out.
+"""Observation noise: white, correlated in time, both at once, or heavy-tailed; masked rows are left out.
 
-For every marker coordinate the noise is a stationary Ornstein-Uhlenbeck process seen at the times that are not
-masked: given the last valid row, ``gap`` seconds before, the residual is normal with mean ``phi r`` and variance
-``sigma^2 (1 - phi^2)``, ``phi = exp(-gap / tau)``. The white model is its limit for tau -> 0.
+``auto`` is the sum of white noise and of a stationary Ornstein-Uhlenbeck process (AR(1) where rows are evenly spaced),
+for every coordinate of every marker alike. It becomes ``white`` where the lasting part vanishes, and ``ar1`` where the
+white part does. Its density given the rows before comes from a Kalman filter with one state (Sarkka, Bayesian Filtering
+and Smoothing, 2013, section 4.3), which takes irregular and masked rows as they are. ``ar1`` needs no filter: given the
+last valid row, ``gap`` seconds before, the residual is normal with mean ``phi r`` and variance ``sigma^2 (1 - phi^2)``,
+``phi = exp(-gap / tau)``. ``student-t`` is independent in time; its tails hold single rows that are far off.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from scipy import stats
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
-NOISE_MODELS = ("white", "ar1")
+NOISE_MODELS = ("auto", "white", "ar1", "student-t")
 
 OBSERVATION_NOISE = ParameterSpec(
     "observation_noise",
@@ -28,6 +34,15 @@ OBSERVATION_NOISE = ParameterSpec(
     {"distribution": "LogNormal", "median": 2e-3, "sigma": 1.5},
     "standard deviation of one coordinate of one marker: sensor noise and what the simulator misses",
 )
+LASTING_NOISE = ParameterSpec(
+    "lasting_noise",
+    "m",
+    1e-6,
+    0.2,
+    1e-3,
+    {"distribution": "LogNormal", "median": 2e-3, "sigma": 1.5},
+    "standard deviation of the part of the noise that lasts from row to row: mostly what the simulator misses",
+)
 NOISE_CORRELATION_TIME = ParameterSpec(
     "noise_correlation_time",
     "s",
@@ -37,6 +52,31 @@ NOISE_CORRELATION_TIME = ParameterSpec(
     {"distribution": "LogNormal", "median": 0.5, "sigma": 1.5},
     "time over which the residual forgets its sign (Ornstein-Uhlenbeck)",
 )
+NOISE_DEGREES = ParameterSpec(
+    "noise_degrees",
+    "-",
+    1.0,
+    1000.0,
+    30.0,
+    {"distribution": "LogNormal", "median": 10.0, "sigma": 1.0},
+    "degrees of freedom of the noise: few where single rows are far off, many where it is normal",
+)
+_SPECS = {
+    "auto": (OBSERVATION_NOISE, LASTING_NOISE, NOISE_CORRELATION_TIME),
+    "white": (OBSERVATION_NOISE,),
+    "ar1": (OBSERVATION_NOISE, NOISE_CORRELATION_TIME),
+    "student-t": (OBSERVATION_NOISE, NOISE_DEGREES),
+}
+_FIELDS = {
+    "observation_noise": "sigma",
+    "noise_correlation_time": "tau",
+    "lasting_noise": "lasting",
+    "noise_degrees": "degrees",
+}
+
+# Half-width of the central 68 % of a Student-t of unit scale: a normal distribution's standard deviation.
+_DEGREES = np.geomspace(NOISE_DEGREES.low, NOISE_DEGREES.high, 2000)
+_CORE = stats.t.ppf(stats.norm.cdf(1.0), _DEGREES)
 
 # Finite, because an infinite gap would turn the derivative of exp(-gap / tau) into NaN.
 LONG_AGO = 1e6
@@ -65,53 +105,153 @@ def timeline(time: Float[np.ndarray, " time"], valid: Bool[np.ndarray, "time mar
     return Timeline(valid, np.where(previous >= 0, previous, rows).astype(np.int32), gap)
 
 
+class Noise(NamedTuple):
+    """Values of a noise model; the parts that are None are not there.
+
+    Attributes:
+        sigma: standard deviation [m] of one coordinate of one marker: of the white part, or of everything without one.
+            Of heavy-tailed noise half the width of the central 68 %, which tails do not change.
+        tau: correlation time [s] of the lasting part; None for independent rows.
+        lasting: standard deviation [m] of the lasting part beside a white one; None where all of the noise lasts.
+        degrees: of freedom of a Student-t; None for normal noise.
+    """
+
+    sigma: Any
+    tau: Any = None
+    lasting: Any = None
+    degrees: Any = None
+
+    @property
+    def deviation(self) -> Any:
+        """Standard deviation [m] of one coordinate; of heavy-tailed noise without its tails."""
+        return self.sigma if self.lasting is None else (self.sigma**2 + self.lasting**2) ** 0.5
+
+
 def noise_specs(model: str) -> tuple[ParameterSpec, ...]:
-    """Parameters of a noise model, ``"white"`` or ``"ar1"``."""
+    """Parameters of a noise model, one of `NOISE_MODELS`.
+
+    Raises:
+        InputError: no such model.
+    """
     if model not in NOISE_MODELS:
         raise InputError(f"unknown noise model {model!r}", where="[model] noise", remedy=f"use one of {NOISE_MODELS}")
-    return (OBSERVATION_NOISE,) if model == "white" else (OBSERVATION_NOISE, NOISE_CORRELATION_TIME)
+    return _SPECS[model]
 
 
-def _conditional(
-    sigma: Float[Array, ""], tau: Float[Array, ""] | None, line: Timeline
-) -> tuple[Float[Array, "time marker"], Float[Array, "time marker"]]:
-    """Coefficient on the previous residual and conditional standard deviation of each row and marker."""
-    if tau is None:
-        return jnp.zeros_like(line.gap), jnp.broadcast_to(sigma, line.gap.shape)
-    phi = jnp.exp(-line.gap / tau)
-    return phi, sigma * jnp.sqrt(-jnp.expm1(-2.0 * line.gap / tau))
+def noise_values(model: str, known: Mapping[str, Any]) -> Noise:
+    """The values of a noise model among those of all parameters.
+
+    Raises:
+        InputError: one of them is missing.
+    """
+    missing = [spec.name for spec in noise_specs(model) if spec.name not in known]
+    if missing:
+        raise InputError(
+            f"noise = {model!r} has a parameter {missing[0]!r}, which has no value here",
+            where="[model] noise",
+            remedy="name the noise that the posterior was fitted with, or calibrate again",
+        )
+    return Noise(**{_FIELDS[spec.name]: known[spec.name] for spec in noise_specs(model)})
 
 
 def whiten(
-    residual: Float[Array, "time marker 3"], sigma: Float[Array, ""], tau: Float[Array, ""] | None, line: Timeline
+    residual: Float[Array, "time marker 3"], noise: Noise, line: Timeline
 ) -> tuple[Float[Array, "time marker 3"], Float[Array, "time marker"]]:
-    """Independent unit-variance residuals (zero where masked), and the standard deviation each was divided by [m]."""
-    phi, scale = _conditional(sigma, tau, line)
-    before = jnp.take_along_axis(residual, line.previous[:, :, None], axis=0)
-    white = (residual - phi[:, :, None] * before) / scale[:, :, None]
+    """Independent residuals of unit size (zero where masked), and the scale [m] that normalises each.
+
+    With white residuals w and scales s the log density of a coordinate is ``-w^2 / 2 - log(s) - log(2 pi) / 2``; s
+    depends on the noise and the timeline alone. Normal noise makes w standard normal. Of heavy-tailed noise w is the
+    signed root of the deviance, which is nearly normal.
+    """
+    if noise.degrees is not None:
+        white, scale = _student(residual, noise.sigma, noise.degrees)
+        scale = jnp.broadcast_to(scale, line.gap.shape)
+    elif noise.tau is None:
+        white, scale = residual / noise.sigma, jnp.broadcast_to(noise.sigma, line.gap.shape)
+    elif noise.lasting is None:
+        phi, scale = jnp.exp(-line.gap / noise.tau), _innovation(noise.sigma, line.gap, noise.tau)
+        before = jnp.take_along_axis(residual, line.previous[:, :, None], axis=0)
+        white = (residual - phi[:, :, None] * before) / scale[:, :, None]
+    else:
+        white, scale = _filtered(residual, noise, line)
     return jnp.where(line.valid[:, :, None], white, 0.0), scale
 
 
-def row_log_density(
-    residual: Float[Array, "time marker 3"], sigma: Float[Array, ""], tau: Float[Array, ""] | None, line: Timeline
-) -> Float[Array, " time"]:
+def _innovation(sigma: Float[Array, ""], gap: Float[Array, "..."], tau: Float[Array, ""]) -> Float[Array, "..."]:
+    """Standard deviation of an Ornstein-Uhlenbeck process given its value ``gap`` seconds before."""
+    return sigma * jnp.sqrt(-jnp.expm1(-2.0 * gap / tau))
+
+
+def _student(
+    residual: Float[Array, "time marker 3"], sigma: Float[Array, ""], degrees: Float[Array, ""]
+) -> tuple[Float[Array, "time marker 3"], Float[Array, ""]]:
+    scale = _student_scale(sigma, degrees)
+    square = (residual / scale) ** 2 / degrees
+    # log1p(x) / x is 1 at zero, where neither a quotient nor the derivative of a root exists.
+    small = square < 1e-8
+    ratio = jnp.where(small, 1.0 - 0.5 * square, jnp.log1p(square) / jnp.where(small, 1.0, square))
+    white = residual / scale * jnp.sqrt((degrees + 1.0) / degrees * ratio)
+    constant = gammaln(0.5 * (degrees + 1.0)) - gammaln(0.5 * degrees) - 0.5 * jnp.log(0.5 * degrees)
+    return white, scale * jnp.exp(-constant)
+
+
+def _student_scale(sigma: Float[Array, ""], degrees: Float[Array, ""]) -> Float[Array, ""]:
+    return sigma / jnp.interp(jnp.log(degrees), np.log(_DEGREES), _CORE)
+
+
+def _filtered(
+    residual: Float[Array, "time marker 3"], noise: Noise, line: Timeline
+) -> tuple[Float[Array, "time marker 3"], Float[Array, "time marker"]]:
+    """Innovations of the Kalman filter over their standard deviations, and these: white noise on a lasting part."""
+    white, power = noise.sigma**2, noise.lasting**2
+
+    def advance(state: tuple[Array, Array], row: tuple[Array, Array, Array]) -> tuple[Any, tuple[Array, Array]]:
+        mean, short = state  # of the lasting part at the last valid row; its variance is ``power - short``
+        value, valid, phi = row
+        short_now = phi**2 * short
+        variance = power - short_now + white
+        surprise = value - phi[:, None] * mean
+        gain = (power - short_now) / variance
+        updated = phi[:, None] * mean + gain[:, None] * surprise
+        left = power - white * gain
+        state = jnp.where(valid[:, None], updated, mean), jnp.where(valid, left, short)
+        return state, (surprise / jnp.sqrt(variance)[:, None], jnp.sqrt(variance))
+
+    nothing = jnp.zeros(residual.shape[1:]), jnp.zeros(residual.shape[1])
+    return jax.lax.scan(advance, nothing, (residual, line.valid, jnp.exp(-line.gap / noise.tau)))[1]
+
+
+def row_log_density(residual: Float[Array, "time marker 3"], noise: Noise, line: Timeline) -> Float[Array, " time"]:
     """Log density of each row given the rows before it; the sum over a prefix is that prefix's log likelihood."""
-    white, scale = whiten(residual, sigma, tau, line)
+    white, scale = whiten(residual, noise, line)
     normaliser = jnp.where(line.valid, 1.5 * jnp.log(2.0 * jnp.pi) + 3.0 * jnp.log(scale), 0.0)
     return -0.5 * jnp.sum(white**2, axis=(1, 2)) - jnp.sum(normaliser, axis=1)
 
 
 def draw_noise(
-    key: PRNGKeyArray, time: Float[Array, " time"], markers: int, sigma: Float[Array, ""], tau: Float[Array, ""] | None
+    key: PRNGKeyArray, time: Float[Array, " time"], markers: int, noise: Noise
 ) -> Float[Array, "time marker 3"]:
     """One realisation of the noise at the given times [m]."""
-    white = jax.random.normal(key, (len(time), markers, 3))
-    if tau is None:
-        return sigma * white
-    gap = jnp.diff(jnp.asarray(time), prepend=time[0] - LONG_AGO)
-    phi, scale = jnp.exp(-gap / tau), sigma * jnp.sqrt(-jnp.expm1(-2.0 * gap / tau))
+    shape = (len(time), markers, 3)
+    if noise.degrees is not None:
+        return _student_scale(noise.sigma, noise.degrees) * jax.random.t(key, noise.degrees, shape)
+    if noise.tau is None:
+        return noise.sigma * jax.random.normal(key, shape)
+    if noise.lasting is None:
+        return _lasting(key, time, markers, noise.sigma, noise.tau)
+    lasting = _lasting(key, time, markers, noise.lasting, noise.tau)
+    return lasting + noise.sigma * jax.random.normal(jax.random.fold_in(key, 1), shape)
 
-    def advance(last, row):
+
+def _lasting(
+    key: PRNGKeyArray, time: Float[Array, " time"], markers: int, sigma: Float[Array, ""], tau: Float[Array, ""]
+) -> Float[Array, "time marker 3"]:
+    """An Ornstein-Uhlenbeck process."""
+    white = jax.random.normal(key, (len(time), markers, 3))
+    gap = jnp.diff(jnp.asarray(time), prepend=time[0] - LONG_AGO)
+    phi, scale = jnp.exp(-gap / tau), _innovation(sigma, gap, tau)
+
+    def advance(last: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         coefficient, spread, innovation = row
         now = coefficient * last + spread * innovation
         return now, now

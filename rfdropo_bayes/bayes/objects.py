@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from rfdropo_bayes.bayes.noise import Timeline, draw_noise, timeline, whiten
+from rfdropo_bayes.bayes.noise import Noise, Timeline, draw_noise, timeline, whiten
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -131,7 +131,7 @@ def object_residuals(
     for left, size in ((centre, values[OBJECT_NOISE.name]), (turned, values[OBJECT_TURN_NOISE.name])):
         # A masked row must not reach the next one, nor make a NaN of a derivative.
         left = jnp.where(data.line.valid, left, 0.0)[:, :, None]
-        own, scale = jax.vmap(lambda r, line, size=size: whiten(r, size, tau, line))(left, data.line)
+        own, scale = jax.vmap(lambda r, line, size=size: whiten(r, Noise(size, tau), line))(left, data.line)
         white.append(own)
         normaliser += 1.5 * jnp.log(2.0 * jnp.pi) + 3.0 * jnp.log(scale[:, :, 0])
     counted = data.line.valid[:, :, 0].copy()
@@ -190,7 +190,7 @@ def _error(key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, 
     """
     tau = values[OBJECT_CORRELATION_TIME.name]
     sizes = jnp.stack([values[OBJECT_NOISE.name], values[OBJECT_TURN_NOISE.name]])
-    error = sizes[:, None] * draw_noise(key, time, 2, jnp.ones(()), tau)
+    error = sizes[:, None] * draw_noise(key, time, 2, Noise(jnp.ones(()), tau))
     return error - jnp.exp(-(time - time[0]) / tau)[:, None, None] * error[0]
 
 

@@ -41,6 +41,7 @@ class InferenceResult:
         warnings: sentences for the report.
         seconds: time spent, earlier parts of a resumed run included.
         phi: distribution to randomise over, {name: {mean, std, low, high, unit}}, of RF-DROPO; else None.
+        held: {name: value} of the parameters that the method did not infer and took for known.
         optimum: posterior mode {name: value} where the method finds one; else None.
         details: further numbers of the method, plain values.
     """
@@ -58,6 +59,7 @@ class InferenceResult:
     warnings: list[str] = field(default_factory=list)
     seconds: float = 0.0
     phi: dict[str, dict[str, Any]] | None = None
+    held: dict[str, float] = field(default_factory=dict)
     optimum: dict[str, float] | None = None
     details: dict[str, Any] = field(default_factory=dict)
 

@@ -268,6 +268,7 @@ def run(
         warnings=[*plan.space.edge_warnings(chosen), *exclusion_warnings(ledger.excluded, ledger.evaluations)],
         seconds=state.seconds,
         phi=plan.space.describe(chosen, problem.units),
+        held=dict(plan.fixed),
         details=details,
     )
 

@@ -26,6 +26,7 @@ from rfdropo_bayes.workflow.experiment import Experiment, describe, load_experim
 from rfdropo_bayes.workflow.files import output_folder
 from rfdropo_bayes.workflow.prediction import (
     FITTED,
+    HELD,
     MARKER_ERRORS,
     Batch,
     marker_errors,
@@ -72,6 +73,7 @@ def run_calibration(
     key, predicting = jax.random.split(jax.random.key(experiment.seed))
     with Progress(method, show=None, log=out / "log.jsonl") as progress:
         result = run(problem, method, config, key, checkpoint_dir=out / "checkpoints", resume=resume, progress=progress)
+    problem = problem.holding(result.held)
     attributes = _attributes(experiment, [*fitted, *tested])
     record = record_posterior(problem, result, tested, predicting, attributes, experiment.model.groups)
     facts = gather_facts(experiment, path.stem, problem, result, fitted, tested, record.recordings)
@@ -133,7 +135,7 @@ def record_posterior(
         trace=result.trace,
         block_scores=result.block_scores,
         log_likelihood=result.log_likelihood,
-        attrs={**attributes, FITTED: fitted, MARKER_ERRORS: errors},
+        attrs={**attributes, FITTED: fitted, MARKER_ERRORS: errors, HELD: result.held},
     )
     return record.with_derived(scale_free_ratios(problem.names))
 

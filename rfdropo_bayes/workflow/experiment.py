@@ -45,7 +45,7 @@ class ModelTable(Table):
     """
 
     mechanisms: list[str] = Field(default_factory=list)
-    noise: Literal["white", "ar1"] = "white"
+    noise: Literal["auto", "white", "ar1", "student-t"] = "auto"
     priors: dict[str, dict[str, Any]] = Field(default_factory=dict)
     fixed: dict[str, float] = Field(default_factory=dict)
     per_recording: dict[str, str | list[str]] = Field(default_factory=dict)

@@ -24,7 +24,7 @@ from rfdropo_bayes.audit.measurements import gather_measurements
 from rfdropo_bayes.audit.noise import STATED, NoiseModel
 from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.bayes.model import gather_recordings
-from rfdropo_bayes.bayes.noise import draw_noise
+from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot
 from rfdropo_bayes.workflow.audit import Workshop, build_question
@@ -267,7 +267,7 @@ def _write(
     for index, (recording, position) in enumerate(zip(blank, clean, strict=True)):
         key = jax.random.fold_in(jax.random.key(seed), index)
         memory = jnp.asarray(-step / np.log(MEMORY))
-        noise = draw_noise(key, jnp.asarray(recording.time), position.shape[1], jnp.asarray(NOISE), memory)
+        noise = draw_noise(key, jnp.asarray(recording.time), position.shape[1], Noise(jnp.asarray(NOISE), memory))
         dataset = recording.dataset.copy()
         dataset["position"] = dataset["position"].copy(data=position + np.asarray(noise))
         Trajectory(dataset).save(out / f"{recording.name}.nc")

@@ -19,7 +19,8 @@ from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.workflow.cube_start import measured_objects, with_measured_starts
 from rfdropo_bayes.workflow.first_row import match_first_row, weighed_by_first_row
 
-FITTED, MARKER_ERRORS = "fitted_recordings", "marker_errors_m"  # among the attributes of a posterior
+# Among the attributes of a posterior.
+FITTED, MARKER_ERRORS, HELD = "fitted_recordings", "marker_errors_m", "held_parameters"
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, PRNGKeyArray
 
-from rfdropo_bayes.bayes.noise import draw_noise
+from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import nearest
@@ -164,7 +164,7 @@ def _as_trajectory(
 
 
 def _noise(table: NoiseTable, key: PRNGKeyArray, time: Float[np.ndarray, " time"], markers: int) -> np.ndarray:
-    return np.asarray(draw_noise(key, time, markers, table.standard_deviation, table.correlation_time))
+    return np.asarray(draw_noise(key, time, markers, Noise(table.standard_deviation, table.correlation_time)))
 
 
 def _table(source: Trajectory, simulated: Trajectory) -> pd.DataFrame:

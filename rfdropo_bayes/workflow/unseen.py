@@ -24,7 +24,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values, measurement_specs
 from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.files import output_folder
-from rfdropo_bayes.workflow.prediction import FITTED, MARKER_ERRORS, predict_new, thin
+from rfdropo_bayes.workflow.prediction import FITTED, HELD, MARKER_ERRORS, predict_new, thin
 
 DRAWS = 200
 LEVELS = {"q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
@@ -68,7 +68,7 @@ def run_prediction(
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
     unseen = load_unseen(experiment.data, folder, commands, start, rows)
     simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
-    fixed = fixed_values(experiment, simulator)
+    fixed = {**fixed_values(experiment, simulator), **record.attrs.get(HELD, {})}
     specs = simulator.parameters + measurement_specs(experiment.model)
     space = _fitted_space(record, specs)
     model = TrajectoryModel(simulator, space, fixed, experiment.model.noise, gather_recordings(simulator, [unseen]))

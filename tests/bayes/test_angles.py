@@ -253,13 +253,14 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
     )
     model = build_model(experiment, simulator, [trunk])
     assert model.motor_angle.measured.shape == (1, 20, 6)
-    assert set(model.space.names) == {"actuator_lag", "observation_noise", "motor_angle_noise"}
+    noise = {spec.name for spec in noise_specs("auto")}
+    assert set(model.space.names) == {"actuator_lag", "motor_angle_noise"} | noise
     calibration = CalibrationProblem(model)
     assert calibration.physical_names == ("actuator_lag",)
     assert calibration.prior_ends.keys() == calibration.bounds.keys()
     assert calibration.prior_ends["actuator_lag"][0] == 0.0
     measured = {spec.name for spec in measurement_specs(experiment.model)}  # what a posterior may hold beside
-    assert measured == {"observation_noise", "motor_angle_noise"}
+    assert measured == {"motor_angle_noise"} | noise
 
 
 def test_what_cannot_be_used_is_refused():
