@@ -98,6 +98,7 @@ class MeshTrunkSimulator(RobotSimulator):
             InputError: a name that is not a parameter of this simulator.
         """
         values = self.complete(parameters)
+        steps = self.steps_seen(values, commands, self.time_step, steps)
         motion = self.engine.motion(self.material(values), self.displacements(values, commands), steps)
         status = jnp.where(
             motion.diverged,

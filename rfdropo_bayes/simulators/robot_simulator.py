@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from rfdropo_bayes.fem.balance import Balance
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.commands import Commands, sample
+from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
 from rfdropo_bayes.simulators.mechanisms import (
     ActuationMechanism,
     Mechanism,
@@ -168,6 +168,34 @@ class RobotSimulator:
         levels = jax.lax.scan(wind, initial, moves)[1]
         pretension = self.pretension(values)
         return initial + pretension, levels + pretension
+
+    def steps_seen(
+        self, values: Values, commands: Commands, time_step: float, steps: Int[Array, ""] | None
+    ) -> Int[Array, ""] | None:
+        """Time steps to simulate so that all rows within the first ``steps`` are measured as in a whole rollout.
+
+        Mechanisms of sensing may look at later rows, as cameras on a clock that is late do. How far is found from what
+        they make of positions that are unknown from some row on.
+        """
+        if steps is None or not any(isinstance(mechanism, TimedSensingMechanism) for mechanism in self.mechanisms):
+            return steps
+        values = {name: jax.lax.stop_gradient(value) for name, value in values.items()}
+        end = jnp.asarray(commands.sample_step + (commands.sample_fraction > 0))
+        time, rows = observed_at(commands, time_step), len(end)
+        wanted = end <= steps
+        place = jnp.asarray(self.robot.marker_points())
+
+        def suffices(later: Array) -> Array:
+            known = jnp.arange(rows) < wanted.sum() + later
+            position = jnp.where(known[:, None, None], place, jnp.nan)
+            seen = jnp.isfinite(self.measured(values, position, time)).all(axis=(1, 2))
+            return jnp.all(seen | ~wanted)
+
+        later = jnp.concatenate([jnp.zeros(1, int), 2 ** jnp.arange(max(rows - 1, 1).bit_length() + 1)])
+        enough = jax.vmap(suffices)(later)
+        found = jnp.where(enough.any(), later[jnp.argmax(enough)], rows)
+        last = jnp.clip(wanted.sum() + found - 1, 0, rows - 1)
+        return jnp.where(found > 0, jnp.maximum(steps, end[last]), steps)
 
     def measured(
         self,

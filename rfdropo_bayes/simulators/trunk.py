@@ -168,14 +168,16 @@ class TrunkSimulator(RobotSimulator):
         Args:
             parameters: values by name; those left out are nominal.
             commands: from `commands`.
-            steps: simulate only so many time steps; rows beyond hold no meaning. None simulates all and is
-                differentiable in reverse mode.
+            steps: simulate only so many time steps, and those that mechanisms of sensing look ahead; rows beyond hold
+                no meaning. None simulates all and is differentiable in reverse mode.
 
         Raises:
             InputError: a name that is not a parameter of this simulator.
         """
         values = self.complete(parameters)
-        start, displacement = self.wound(values, commands, self.discretisation.time_step)
+        time_step = self.discretisation.time_step
+        start, displacement = self.wound(values, commands, time_step)
+        steps = self.steps_seen(values, commands, time_step, steps)
         motion = self.engine.motion(self.material(values), start, displacement, steps)
         cases = (
             (motion.diverged, Result.DIVERGED),
@@ -183,9 +185,8 @@ class TrunkSimulator(RobotSimulator):
             (~motion.cables_converged, Result.CABLE_LIMIT),
         )
         status = jnp.select([case for case, _ in cases], [int(code) for _, code in cases], int(Result.OK))
-        seen = observed_at(commands, self.discretisation.time_step)
-        position = self.measured(values, sample(motion.position, commands), seen)
-        angle = self.driven(values, commands, self.discretisation.time_step)
+        position = self.measured(values, sample(motion.position, commands), observed_at(commands, time_step))
+        angle = self.driven(values, commands, time_step)
         return Observation(position, sample(motion.tension, commands), None, status, angle)
 
     def balance(self, parameters: Values, commands: Commands) -> Balance:
