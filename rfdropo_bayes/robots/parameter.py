@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from rfdropo_bayes.robots.table import Table
+from rfdropo_bayes.tables import nearest
 
 ARGUMENTS = {
     "Normal": ("loc", "scale"),
@@ -52,7 +53,7 @@ class Parameter(Table):
 def _check_prior(prior: dict[str, Any], low: float, high: float) -> None:
     family = prior.get("distribution")
     if family not in ARGUMENTS:
-        raise ValueError(f"unknown distribution {family!r}; known: {', '.join(ARGUMENTS)}")
+        raise ValueError(f"unknown distribution {family!r}; {nearest(str(family), ARGUMENTS)}")
     names = ARGUMENTS[family]
     if set(prior) - {"distribution"} != set(names):
         raise ValueError(f"{family} takes exactly {', '.join(names)}")

@@ -13,6 +13,7 @@ from rfdropo_bayes.robots.body import Body
 from rfdropo_bayes.robots.cable import Cable, Channels
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.table import Name, Positive, Table, Vector
+from rfdropo_bayes.tables import nearest
 
 REQUIRED = (
     "young_modulus",
@@ -119,7 +120,13 @@ class Robot(Table):
             raise ValueError("channels.radius_parameter is needed for commands in rad, and only for those")
         masses = [mass.parameter for mass in self.body.point_masses]
         radius = [self.channels.radius_parameter] if self.channels.radius_parameter else []
-        for name in (*REQUIRED, *masses, *radius):
+        used = {*REQUIRED, *masses, *radius}
+        for name, parameter in self.parameters.items():
+            if name not in used:
+                raise ValueError(f"nothing uses the table [parameters.{name}]; {nearest(name, used)}")
+            if (parameter.each == "cable") != (name == "initial_displacement"):
+                raise ValueError(f'each = "cable" belongs to initial_displacement alone; mend [parameters.{name}]')
+        for name in sorted(used):
             if name not in self.parameters:
                 raise ValueError(f"the parameter {name!r} has no table [parameters.{name}]")
         if self.parameters["poisson_ratio"].high > 0.499:
