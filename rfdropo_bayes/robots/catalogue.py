@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -68,7 +69,13 @@ def find_robot_file(name_or_path: str | Path) -> Path:
     path = Path(name_or_path)
     if path.suffix == ".toml" and path.is_file():
         return path
+    if path.suffix == ".toml":
+        raise InputError(
+            "no such robot file", where=str(path), remedy="correct the path; it counts from the experiment file"
+        )
+    close = difflib.get_close_matches(str(name_or_path), list(known), n=1)
     raise InputError(
         f"unknown robot {str(name_or_path)!r}",
-        remedy=f"known: {', '.join(sorted(known)) or 'none'}; or give the path of a .toml file",
+        remedy=(f"did you mean {close[0]!r}? " if close else "")
+        + f"known: {', '.join(sorted(known)) or 'none'}; or give the path of a .toml file",
     )
