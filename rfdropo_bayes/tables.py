@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
 from rfdropo_bayes.errors import InputError
 
 Parsed = TypeVar("Parsed", bound=BaseModel)
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A remedy for a mistyped name: the closest known one, or the list of all."""
+    known = sorted(known)
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
 
 
 def parse_table(schema: type[Parsed], table: Mapping[str, Any], *, where: str) -> Parsed:
@@ -28,28 +35,48 @@ def parse_table(schema: type[Parsed], table: Mapping[str, Any], *, where: str) -
         inner = first.get("ctx", {}).get("error")
         if isinstance(inner, InputError):
             raise inner from None
-        path = [str(part) for part in first["loc"]]
+        path, here = _follow(schema, first["loc"])
         if first["type"] == "extra_forbidden":
-            known = sorted(_fields_at(schema, path[:-1]))
-            close = difflib.get_close_matches(path[-1], known, n=1)
-            remedy = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
-            raise InputError(f"unknown key {'.'.join(path)!r}", where=where, remedy=remedy) from None
+            known = sorted({name for table in here for name in table.model_fields})
+            raise InputError(f"unknown key {'.'.join(path)!r}", where=where, remedy=nearest(path[-1], known)) from None
         if first["type"] == "missing":
             raise InputError(f"the key {'.'.join(path)!r} is missing", where=where, remedy="add it") from None
         message = first["msg"].removeprefix("Value error, ")
         # A whole table or list would fill the screen; its name says enough.
         given = f" = {first['input']!r}" if isinstance(first["input"], str | int | float | bool) else ""
-        raise InputError(f"{'.'.join(path)}{given}: {message}", where=where, remedy="mend the value") from None
+        # What a whole file says wrong has no key, and its message says what to mend.
+        what, remedy = (f"{'.'.join(path)}{given}: {message}", "mend the value") if path else (message, "")
+        raise InputError(what, where=where, remedy=remedy) from None
 
 
-def _fields_at(schema: type[BaseModel], path: list[str]) -> set[str]:
-    """Names of the fields of the model found by following ``path`` from ``schema``."""
-    for part in path:
-        field = schema.model_fields.get(part)
-        if field is None:
+def _follow(schema: type[BaseModel], location: Sequence[str | int]) -> tuple[list[str], list[type[BaseModel]]]:
+    """What a user would call a place that pydantic names, and the tables that may stand there.
+
+    Pydantic puts the tag of a union, such as a shape's name, between the keys; the file has none there.
+    """
+    path: list[str] = []
+    here: list[type[BaseModel]] = [schema]
+    for part in location:
+        tagged = [table for table in here if _tag(table) == part]
+        if len(here) > 1 and tagged:
+            here = tagged
             continue
-        candidates = [field.annotation, *getattr(field.annotation, "__args__", ())]
-        models = [item for item in candidates if isinstance(item, type) and issubclass(item, BaseModel)]
-        if models:
-            schema = models[0]
-    return set(schema.model_fields)
+        path.append(str(part))
+        fields = [table.model_fields[str(part)] for table in here if part in table.model_fields]
+        if fields:
+            here = [table for field in fields for table in _tables_in(field.annotation)] or here
+    return path, here
+
+
+def _tag(table: type[BaseModel]) -> Any:
+    """The one value that the first field of a table may have, if it is such a field."""
+    first = next(iter(table.model_fields.values()), None)
+    choices = get_args(first.annotation) if first is not None and get_origin(first.annotation) is Literal else ()
+    return choices[0] if len(choices) == 1 else None
+
+
+def _tables_in(annotation: Any) -> list[type[BaseModel]]:
+    """The tables that an annotation such as ``tuple[A | B, ...]`` mentions."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [table for part in get_args(annotation) for table in _tables_in(part)]

@@ -61,7 +61,7 @@ def _open(bound: float) -> float | None:
     return bound if math.isfinite(bound) else None
 
 
-_FAMILIES: dict[str, tuple[Callable[..., dist.Distribution], tuple[str, ...]]] = {
+FAMILIES: dict[str, tuple[Callable[..., dist.Distribution], tuple[str, ...]]] = {
     "Normal": (_normal, ("loc", "scale")),
     "TruncatedNormal": (_normal, ("loc", "scale")),
     "HalfNormal": (_half_normal, ("scale",)),
@@ -87,9 +87,9 @@ def prior_from_table(spec: ParameterSpec, table: Mapping[str, Any], *, where: st
     """
     arguments = dict(table)
     family = arguments.pop("distribution", None)
-    if family not in _FAMILIES:
-        raise InputError(f"unknown distribution {family!r}", where=where, remedy=nearest(str(family), _FAMILIES))
-    build, names = _FAMILIES[family]
+    if family not in FAMILIES:
+        raise InputError(f"unknown distribution {family!r}", where=where, remedy=nearest(str(family), FAMILIES))
+    build, names = FAMILIES[family]
     for name in arguments:
         if name not in names:
             raise InputError(f"{family} takes no argument {name!r}", where=where, remedy=nearest(name, names))

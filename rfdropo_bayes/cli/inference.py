@@ -30,7 +30,7 @@ def export(
 
 def check(path: Path, out: Path, name: str, datasets: int, overrides: list[str], resume: bool) -> None:
     """Run a check of an experiment's method and say what it found."""
-    from rfdropo_bayes.workflow.check import run_check
+    from rfdropo_bayes.workflow.method_check import run_check
 
     found = run_check(path, out, name, datasets=datasets, overrides=overrides, resume=resume)
     typer.echo(found["sentence"])

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from rfdropo_bayes import __version__
-from rfdropo_bayes.cli import audit, inference, pictures, prediction
+from rfdropo_bayes.cli import audit, inference, listings, pictures, prediction
 from rfdropo_bayes.cli.options import ExperimentFile, OutFolder, Overrides, Resume, folder_for
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.runtime import keep_compilations
@@ -97,6 +97,10 @@ app.command()(audit.design)
 app.command()(inference.export)
 app.command()(pictures.view)
 app.command()(prediction.predict)
+app.command()(listings.robots)
+app.command()(listings.mechanisms)
+app.command()(listings.formats)
+app.command()(listings.methods)
 
 benchmark = typer.Typer(help="Comparisons that take hours; each can be interrupted and resumed.", no_args_is_help=True)
 benchmark.command()(inference.table1)

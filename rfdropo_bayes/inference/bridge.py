@@ -41,7 +41,7 @@ SOUNDINGS = 0.1  # share of the budget that soundings may take, see `soundings`
 
 @dataclass(frozen=True)
 class BridgeConfig:
-    """Laplace-to-SMC bridge.
+    """Bridge: posterior and an evidence that scatters little, by SMC from the optima to the posterior.
 
     Attributes:
         climb: settings of the search for optima.

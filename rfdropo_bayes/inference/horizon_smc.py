@@ -44,7 +44,7 @@ NOT_REPRESENTABLE = "not_representable"
 
 @dataclass(frozen=True)
 class SmcConfig:
-    """Horizon SMC.
+    """Horizon SMC: posterior and evidence of every block of rows, by sampling ever longer prefixes.
 
     Attributes:
         rollouts: budget in full-length rollouts, of all replicates together; None for no limit.

@@ -53,7 +53,7 @@ FEWEST_STEPS = 4.0  # of a climb that is worth its start
 
 @dataclass(frozen=True)
 class LaplaceConfig:
-    """Levenberg-Marquardt and Laplace.
+    """Laplace: a normal posterior around the optima that Levenberg-Marquardt climbs reach.
 
     Attributes:
         starts: number of climbs at the first horizon; the better half of their summits go on to each longer one, and

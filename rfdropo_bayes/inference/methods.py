@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -18,6 +17,7 @@ from rfdropo_bayes.inference import bridge, horizon_smc, laplace, nested, nuts, 
 from rfdropo_bayes.inference.logbook import Logbook
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
+from rfdropo_bayes.tables import nearest
 
 
 class Method(NamedTuple):
@@ -52,7 +52,7 @@ def method_named(name: str) -> Method:
         InputError: no such method; the nearest name is offered.
     """
     if name not in METHODS:
-        raise InputError(f"unknown method {name!r}", where="[inference] method", remedy=_nearest(name, METHODS))
+        raise InputError(f"unknown method {name!r}", where="[inference] method", remedy=nearest(name, METHODS))
     return METHODS[name]
 
 
@@ -97,7 +97,7 @@ def _build(kind: type, options: Mapping[str, Any], where: str) -> Any:
     values = {}
     for name, value in options.items():
         if name not in names:
-            raise InputError(f"unknown option {name!r}", where=where, remedy=_nearest(name, names))
+            raise InputError(f"unknown option {name!r}", where=where, remedy=nearest(name, names))
         values[name] = _convert(hints[name], value, f"{where} {name}")
     return kind(**values)
 
@@ -136,8 +136,3 @@ def _pair(value: Any, where: str) -> tuple[float, float]:
         if all(isinstance(x, int | float) and not isinstance(x, bool) for x in (low, high)):
             return float(low), float(high)
     raise InputError(f"{value!r} is not a range", where=where, remedy="give [low, high]")
-
-
-def _nearest(name: str, known: Any) -> str:
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f"did you mean {close[0]!r}?" if close else f"one of {', '.join(known)}"

@@ -29,7 +29,7 @@ EVALUATIONS = 8  # of a slice, roughly: stepping out and shrinking
 
 @dataclass(frozen=True)
 class NestedConfig:
-    """Nested slice sampling.
+    """Nested slice sampling: posterior and evidence, where JAX can trace the likelihood.
 
     Attributes:
         live: points that are kept.

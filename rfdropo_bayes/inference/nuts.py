@@ -27,7 +27,7 @@ LOWEST = -1e10  # density of a rollout that failed: finite, so that a gradient t
 
 @dataclass(frozen=True)
 class NutsConfig:
-    """NUTS.
+    """NUTS: the posterior by Hamiltonian Monte Carlo, where JAX can differentiate the likelihood.
 
     Attributes:
         chains: run one after the other.

@@ -41,7 +41,7 @@ DRAWS = FINAL + 1
 
 @dataclass(frozen=True)
 class RfdropoConfig:
-    """RF-DROPO.
+    """RF-DROPO: phi, the distribution to randomise over, by a search along a growing horizon.
 
     Attributes:
         rollouts: budget in full-length rollouts, which then decides the number of generations.

@@ -37,7 +37,7 @@ FEWEST_ROLLOUTS = 50
 
 @dataclass(frozen=True)
 class BayesSimConfig:
-    """BayesSim; the defaults are those of its use in the RF-DROPO paper.
+    """BayesSim, a baseline of the paper with its settings there: a mixture density network.
 
     Attributes:
         rollouts: simulations drawn from the prior.
@@ -59,7 +59,7 @@ class BayesSimConfig:
 
 @dataclass(frozen=True)
 class NpdrConfig:
-    """NPDR; the defaults are those of its use in the RF-DROPO paper.
+    """NPDR, a baseline of the paper with its settings there: rounds of neural posterior estimation.
 
     Attributes:
         rollouts: simulations of all rounds together.
@@ -85,7 +85,11 @@ class NpdrConfig:
 
 @dataclass(frozen=True)
 class UdrConfig:
-    """Uniform domain randomisation: ranges drawn at random inside the central 99 % of the prior."""
+    """UDR, a baseline of the paper: uniform ranges drawn at random inside the central 99 % of the prior.
+
+    Attributes:
+        draws: from the ranges.
+    """
 
     draws: int = 1000
 

@@ -2,20 +2,27 @@
 
 from rfdropo_bayes.robots.body import Body, PointMass
 from rfdropo_bayes.robots.cable import Cable, Channels
-from rfdropo_bayes.robots.catalogue import known_robots, load_robot
+from rfdropo_bayes.robots.catalogue import find_robot_file, known_robots, load_robot
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.robot import Command, Marker, PushScene, Robot
+from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, section_profile
 
 __all__ = [
     "Body",
     "Cable",
     "Channels",
     "Command",
+    "Cone",
+    "Cylinder",
+    "Disks",
     "Marker",
     "Parameter",
     "PointMass",
     "PushScene",
     "Robot",
+    "Tube",
+    "find_robot_file",
     "known_robots",
     "load_robot",
+    "section_profile",
 ]

@@ -23,8 +23,8 @@ def poisson_terms(poisson_ratio: Any, reference: float) -> tuple[Any, Any, Any]:
 class PointMass(Table):
     """A rigid part fixed to the body: its mass [kg] is the parameter of that name; it sits at a station."""
 
-    parameter: Name
-    z_m: float
+    parameter: Name = Field(description="parameter that holds its mass [kg]")
+    z_m: float = Field(description="station at which it sits")
 
 
 class Body(Table):
@@ -33,36 +33,44 @@ class Body(Table):
     A layer's section is effective: the profile is what makes the layer's ends move as those of the real body do under
     unit moments, force and torque, whatever its true shape in between.
 
-    Attributes:
-        station_m: axial coordinates of the S stations; the first is clamped.
-        half_width_m: half widths in x and y at each station of the square that carries the nodes: the outer size of
-            the body, which encloses the cable guides.
-        nodes_across: nodes along a side of that square.
-        axial_area_m2: EA / E of the S - 1 layers.
-        bending_moment_area_m4: EI / E: [integral of x^2, integral of y^2]; the first resists bending in the x-z plane.
-        torsion_constant_m4: GJ / G.
-        mass_area_m2: volume per length.
-        mass_moment_area_m4: rotary inertia per density and length, ordered like ``bending_moment_area_m4``.
-        reference_poisson_ratio: Poisson ratio that the profile holds for.
-        poisson_stiffening: how the stiffness of each layer depends on Poisson's ratio: three coefficients per layer,
-            of `poisson_terms`. Wide vertebrae keep a neck from contracting, and linear tetrahedra lock. With these, the
-            layers themselves do not contract as they stretch. Empty: a solid of the profile's sections.
-        volume_m3: volume of the whole body, clamped part included: what the trunk mass is divided by.
-        point_masses: rigid parts on top of the body's own mass.
+    ``poisson_stiffening`` is there because wide vertebrae keep a neck from contracting, and linear tetrahedra lock.
+    With it, the layers themselves do not contract as they stretch.
     """
 
-    station_m: tuple[float, ...] = Field(min_length=2)
-    half_width_m: tuple[Pair, ...]
-    nodes_across: Literal[2, 3] = 2
-    axial_area_m2: tuple[Positive, ...]
-    bending_moment_area_m4: tuple[tuple[Positive, Positive], ...]
-    torsion_constant_m4: tuple[Positive, ...]
-    mass_area_m2: tuple[Positive, ...]
-    mass_moment_area_m4: tuple[tuple[Positive, Positive], ...]
-    reference_poisson_ratio: float = Field(default=0.45, ge=0.0, le=0.499)
-    poisson_stiffening: tuple[tuple[float, float, float], ...] = ()
-    volume_m3: Positive
-    point_masses: tuple[PointMass, ...] = ()
+    station_m: tuple[float, ...] = Field(
+        min_length=2,
+        description="axial coordinates of the S stations; the first is clamped",
+    )
+    half_width_m: tuple[Pair, ...] = Field(
+        description="half widths in x and y, at each station, of the square that carries the nodes: the outer size of"
+        " the body, which encloses the cable guides",
+    )
+    nodes_across: Literal[2, 3] = Field(default=2, description="nodes along a side of that square")
+    axial_area_m2: tuple[Positive, ...] = Field(description="EA / E of the S - 1 layers")
+    bending_moment_area_m4: tuple[tuple[Positive, Positive], ...] = Field(
+        description="EI / E of each layer: [integral of x^2, integral of y^2]; the first resists bending in the x-z "
+        "plane",
+    )
+    torsion_constant_m4: tuple[Positive, ...] = Field(description="GJ / G of each layer")
+    mass_area_m2: tuple[Positive, ...] = Field(description="volume per length of each layer")
+    mass_moment_area_m4: tuple[tuple[Positive, Positive], ...] = Field(
+        description="rotary inertia per density and length of each layer, ordered like bending_moment_area_m4",
+    )
+    reference_poisson_ratio: float = Field(
+        default=0.45,
+        ge=0.0,
+        le=0.499,
+        description="Poisson ratio that the profile holds for",
+    )
+    poisson_stiffening: tuple[tuple[float, float, float], ...] = Field(
+        default=(),
+        description="how the stiffness of each layer depends on Poisson's ratio: three coefficients per layer, of "
+        "robots.body.poisson_terms; empty for a solid of the profile's sections",
+    )
+    volume_m3: Positive = Field(
+        description="volume of the whole body, clamped part included: what the trunk mass is divided by",
+    )
+    point_masses: tuple[PointMass, ...] = Field(default=(), description="rigid parts on top of the body's own mass")
 
     @model_validator(mode="after")
     def _consistent(self) -> Body:

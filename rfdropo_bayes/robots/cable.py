@@ -13,25 +13,21 @@ class Cable(Table):
     """A cable that runs at one azimuth, parallel to the axis or tapering towards it.
 
     It starts at the anchor, a point fixed to the base, and passes the guides on to the last one, where it ends.
-
-    Attributes:
-        name: unique among the robot's cables.
-        azimuth_deg: from +x towards +y.
-        anchor_z_m, anchor_radius_m: axial coordinate of the anchor, and its distance from the axis.
-        guide_z_m: axial coordinates of the guides.
-        guide_radius_m: distance of each guide from the axis.
-        anchor_azimuth_deg: azimuth of the anchor, where it differs.
-        displacement_limit_m: least and greatest displacement, pull > 0; commands beyond are held at the limit.
     """
 
-    name: Name
-    azimuth_deg: float
-    anchor_z_m: float
-    anchor_radius_m: Positive
-    anchor_azimuth_deg: float | None = None
-    guide_z_m: tuple[float, ...] = Field(min_length=1)
-    guide_radius_m: tuple[Positive, ...]
-    displacement_limit_m: Pair
+    name: Name = Field(description="unique among the robot's cables")
+    azimuth_deg: float = Field(description="where it runs, from +x towards +y")
+    anchor_z_m: float = Field(description="axial coordinate of the anchor, a point fixed to the base")
+    anchor_radius_m: Positive = Field(description="distance of the anchor from the axis")
+    anchor_azimuth_deg: float | None = Field(default=None, description="azimuth of the anchor, where it differs")
+    guide_z_m: tuple[float, ...] = Field(
+        min_length=1,
+        description="axial coordinates of the guides in the undeformed body; the cable ends at the last",
+    )
+    guide_radius_m: tuple[Positive, ...] = Field(description="distance of each guide from the axis")
+    displacement_limit_m: Pair = Field(
+        description="least and greatest displacement, pull > 0; commands beyond are held at the limit",
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Cable:
@@ -61,17 +57,20 @@ def _points(azimuth: float, radius: float | tuple[float, ...], z: float | tuple[
 
 
 class Channels(Table):
-    """How commands become cable displacements: ``displacement = radius * gain @ command``.
+    """How commands become cable displacements: ``displacement = radius * gain @ command``."""
 
-    Attributes:
-        names: the channels, in the order of the columns of ``gain``.
-        gain: one row per cable, one column per channel; pull > 0.
-        radius_parameter: parameter [m] that turns an angle [rad] into a length; absent where commands are lengths.
-    """
-
-    names: tuple[Name, ...] = Field(min_length=1)
-    gain: tuple[tuple[float, ...], ...]
-    radius_parameter: Name | None = None
+    names: tuple[Name, ...] = Field(
+        min_length=1,
+        description="the command channels, in the order of the columns of gain",
+    )
+    gain: tuple[tuple[float, ...], ...] = Field(
+        description="one row per cable, one column per channel: displacement = gain @ command, times the radius where"
+        " commands are angles; pull > 0",
+    )
+    radius_parameter: Name | None = Field(
+        default=None,
+        description="parameter [m] that turns an angle [rad] into a length; absent where commands are lengths",
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Channels:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots.robot import Robot
+from rfdropo_bayes.robots.sections import body_tables
 from rfdropo_bayes.tables import parse_table
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -23,7 +25,8 @@ def known_robots() -> dict[str, Path]:
 def load_robot(name_or_path: str | Path) -> Robot:
     """Read and validate a robot description.
 
-    A file with a key ``base`` describes a variant of that robot: its tables replace the base's of the same name.
+    Its body is a section profile, or shapes that make one up (`sections`). A file with a key ``base`` describes a
+    variant of that robot: its tables replace the base's of the same name.
 
     Args:
         name_or_path: name of a robot that comes with the package, or path of a TOML file.
@@ -32,8 +35,11 @@ def load_robot(name_or_path: str | Path) -> Robot:
         InputError: an unknown robot (the known ones are listed), an unreadable file, or a description that does not
             hold together.
     """
-    path = _find(name_or_path)
-    return parse_table(Robot, _read(path), where=str(path))
+    path = find_robot_file(name_or_path)
+    tables = _read(path)
+    if isinstance(tables.get("body"), dict):
+        tables["body"] = body_tables(tables["body"], str(path))
+    return parse_table(Robot, tables, where=str(path))
 
 
 def _read(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
@@ -48,17 +54,28 @@ def _read(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:
         return table
     if path in derived:
         raise InputError("is its own base", where=str(path), remedy="name another robot as base, or none")
-    return _read(_find(str(table.pop("base"))), (*derived, path)) | table
+    return _read(find_robot_file(str(table.pop("base"))), (*derived, path)) | table
 
 
-def _find(name_or_path: str | Path) -> Path:
+def find_robot_file(name_or_path: str | Path) -> Path:
+    """The file of a robot that comes with the package, or the path itself.
+
+    Raises:
+        InputError: neither the name of a robot nor the path of a file.
+    """
     known = known_robots()
     if str(name_or_path) in known:
         return known[str(name_or_path)]
     path = Path(name_or_path)
     if path.suffix == ".toml" and path.is_file():
         return path
+    if path.suffix == ".toml":
+        raise InputError(
+            "no such robot file", where=str(path), remedy="correct the path; it counts from the experiment file"
+        )
+    close = difflib.get_close_matches(str(name_or_path), list(known), n=1)
     raise InputError(
         f"unknown robot {str(name_or_path)!r}",
-        remedy=f"known: {', '.join(sorted(known)) or 'none'}; or give the path of a .toml file",
+        remedy=(f"did you mean {close[0]!r}? " if close else "")
+        + f"known: {', '.join(sorted(known)) or 'none'}; or give the path of a .toml file",
     )

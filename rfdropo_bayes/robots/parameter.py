@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from rfdropo_bayes.robots.table import Table
+from rfdropo_bayes.tables import nearest
 
 ARGUMENTS = {
     "Normal": ("loc", "scale"),
@@ -20,24 +21,20 @@ ARGUMENTS = {
 
 
 class Parameter(Table):
-    """A physical parameter.
+    """A physical parameter."""
 
-    Attributes:
-        unit: SI unit, "-" if it has none.
-        nominal: value used where the parameter is not inferred.
-        low, high: hard bounds, outside which the model has no meaning.
-        prior: default prior, ``{distribution = "LogNormal", median = 4.5e6, sigma = 0.5}``.
-        description: one line on its physical meaning.
-        each: "cable" stands for one parameter per cable, named ``<name>_<cable>``.
-    """
-
-    unit: str
-    nominal: float
-    low: float
-    high: float
-    prior: dict[str, Any]
-    description: str = Field(min_length=1)
-    each: Literal["cable"] | None = None
+    unit: str = Field(description='SI unit, "-" if it has none')
+    nominal: float = Field(description="value used where the parameter is not inferred")
+    low: float = Field(description="lower hard bound, below which the model has no meaning")
+    high: float = Field(description="upper hard bound")
+    prior: dict[str, Any] = Field(
+        description='default prior, e.g. { distribution = "LogNormal", median = 4.5e6, sigma = 0.5 }',
+    )
+    description: str = Field(min_length=1, description="one line on its physical meaning")
+    each: Literal["cable"] | None = Field(
+        default=None,
+        description='"cable" stands for one parameter per cable, named NAME_CABLE',
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Parameter:
@@ -52,7 +49,7 @@ class Parameter(Table):
 def _check_prior(prior: dict[str, Any], low: float, high: float) -> None:
     family = prior.get("distribution")
     if family not in ARGUMENTS:
-        raise ValueError(f"unknown distribution {family!r}; known: {', '.join(ARGUMENTS)}")
+        raise ValueError(f"unknown distribution {family!r}; {nearest(str(family), ARGUMENTS)}")
     names = ARGUMENTS[family]
     if set(prior) - {"distribution"} != set(names):
         raise ValueError(f"{family} takes exactly {', '.join(names)}")

@@ -13,6 +13,7 @@ from rfdropo_bayes.robots.body import Body
 from rfdropo_bayes.robots.cable import Cable, Channels
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.table import Name, Positive, Table, Vector
+from rfdropo_bayes.tables import nearest
 
 REQUIRED = (
     "young_modulus",
@@ -29,24 +30,18 @@ REQUIRED = (
 
 
 class Command(Table):
-    """Timing of commands.
+    """Timing of commands."""
 
-    Attributes:
-        unit: of the recorded commands: "m" of cable, or "rad" of a motor.
-        ramp_s: a change of command is carried out linearly over this time.
-        dead_time_s: a command starts to act so much later than it was given.
-    """
-
-    unit: Literal["m", "rad"]
-    ramp_s: float = Field(ge=0.0)
-    dead_time_s: float = Field(ge=0.0)
+    unit: Literal["m", "rad"] = Field(description='of the recorded commands: "m" of cable, or "rad" of a motor')
+    ramp_s: float = Field(ge=0.0, description="a change of command is carried out linearly over this time")
+    dead_time_s: float = Field(ge=0.0, description="a command starts to act so much later than it was given")
 
 
 class Marker(Table):
     """A measured point of the body, given where it lies in the undeformed body."""
 
-    name: Name
-    point_m: Vector
+    name: Name = Field(description="name, as in the recordings")
+    point_m: Vector = Field(description="where it lies in the undeformed body: x, y, z")
 
 
 OBJECT = ("cube_mass", "friction", "cube_side", "cube_x", "cube_y", "cube_z", "cube_yaw")
@@ -54,18 +49,14 @@ OBJECT = ("cube_mass", "friction", "cube_side", "cube_x", "cube_y", "cube_z", "c
 
 
 class PushScene(Table):
-    """A cube on a plate across gravity, for pushing.
+    """A cube on a plate across gravity, for pushing."""
 
-    Attributes:
-        plate_height_m: coordinate of the plate's top against gravity.
-        contact_distance_m: distance that surfaces keep from each other.
-        parameters: mass [kg], Coulomb friction, edge [m], and the pose at the start: centre [m] and turn about the
-            vertical [rad] from where the edges are parallel to the axes.
-    """
-
-    plate_height_m: float
-    contact_distance_m: float = Field(ge=0.0)
-    parameters: dict[Name, Parameter]
+    plate_height_m: float = Field(description="coordinate of the plate's top against gravity")
+    contact_distance_m: float = Field(ge=0.0, description="distance that surfaces keep from each other")
+    parameters: dict[Name, Parameter] = Field(
+        description="of the cube: mass [kg], Coulomb friction, edge [m], and the pose at the start: centre [m], and "
+        "turn about the vertical [rad] from where the edges are parallel to the axes",
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> PushScene:
@@ -80,33 +71,22 @@ class PushScene(Table):
 
 
 class Robot(Table):
-    """A soft robot, in the frame of its base: z along the body, away from the clamp; SI units.
+    """A soft robot, in the frame of its base: z along the body, away from the clamp; SI units."""
 
-    Attributes:
-        name: name of the robot and of its file.
-        description: one line.
-        gravity_m_s2: in the frame of the base.
-        time_step_s: of the simulation.
-        initial_state: "rest" starts undeformed, "equilibrium" in the static equilibrium of the first command.
-        command, channels, cables: from recorded commands to cable displacements.
-        body: geometry and section profile.
-        markers: measured points.
-        push: object and plate, if the robot has one.
-        parameters: physical parameters with bounds and default priors.
-    """
-
-    name: Name
-    description: str
-    gravity_m_s2: Vector
-    time_step_s: Positive
-    initial_state: Literal["rest", "equilibrium"]
-    command: Command
-    channels: Channels
-    cables: tuple[Cable, ...] = Field(min_length=1)
-    body: Body
-    markers: tuple[Marker, ...] = Field(min_length=1)
-    push: PushScene | None = None
-    parameters: dict[Name, Parameter]
+    name: Name = Field(description="name of the robot")
+    description: str = Field(description="one line")
+    gravity_m_s2: Vector = Field(description="gravity in the frame of the base: x, y, z")
+    time_step_s: Positive = Field(description="time step of the simulation")
+    initial_state: Literal["rest", "equilibrium"] = Field(
+        description='"rest" starts undeformed, "equilibrium" in the static equilibrium of the first command',
+    )
+    command: Command = Field(description="unit and timing of commands")
+    channels: Channels = Field(description="from commands to cable displacements")
+    cables: tuple[Cable, ...] = Field(min_length=1, description="the cables")
+    body: Body = Field(description="geometry: a section profile, or shapes that make one up")
+    markers: tuple[Marker, ...] = Field(min_length=1, description="measured points of the body")
+    push: PushScene | None = Field(default=None, description="object on a plate, if the robot has one")
+    parameters: dict[Name, Parameter] = Field(description="physical parameters with bounds and default priors, by name")
 
     @model_validator(mode="after")
     def _consistent(self) -> Robot:
@@ -119,7 +99,13 @@ class Robot(Table):
             raise ValueError("channels.radius_parameter is needed for commands in rad, and only for those")
         masses = [mass.parameter for mass in self.body.point_masses]
         radius = [self.channels.radius_parameter] if self.channels.radius_parameter else []
-        for name in (*REQUIRED, *masses, *radius):
+        used = {*REQUIRED, *masses, *radius}
+        for name, parameter in self.parameters.items():
+            if name not in used:
+                raise ValueError(f"nothing uses the table [parameters.{name}]; {nearest(name, used)}")
+            if (parameter.each == "cable") != (name == "initial_displacement"):
+                raise ValueError(f'each = "cable" belongs to initial_displacement alone; mend [parameters.{name}]')
+        for name in sorted(used):
             if name not in self.parameters:
                 raise ValueError(f"the parameter {name!r} has no table [parameters.{name}]")
         if self.parameters["poisson_ratio"].high > 0.499:

@@ -21,31 +21,35 @@ SAME_HEIGHT = 1e-5
 
 
 class TetrahedraTable(BaseModel):
-    """[simulator.tetrahedra]: a mesh for the body, and how it is simulated.
-
-    Attributes:
-        mesh: mesh file (VTK, Gmsh), looked for as the recordings are.
-        unit: of its coordinates, which are in the frame of the robot's base.
-        clamp_height: nodes at or below this height are held [m].
-        frames: what turns with an element: the rotation nearest to its deformation, or axes along its edges (SOFA's
-            "large").
-        masses: the trunk's mass in equal parts on all nodes (SOFA's UniformMass), or with the elements' volumes.
-        drives: "robot" follows the robot's ramp, lag and end stops; "sofa" hands a command over in equal updates, as
-            an animation of SOFA's STLIB does, to cables that SOFA's CableConstraint limits.
-        drive_rate: how far the imposed displacement may be from the one last measured [m per step]; for "sofa".
-        marker_cables: a marker at the height of guides of these cables is their mean; empty: a point of the body.
-    """
+    """[simulator.tetrahedra]: a mesh for the body, and how it is simulated."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    mesh: str
-    unit: Literal["m", "cm", "mm"]
-    clamp_height: float
-    frames: Literal["polar", "edges"] = "polar"
-    masses: Literal["equal", "volume"] = "volume"
-    drives: Literal["robot", "sofa"] = "robot"
-    drive_rate: Annotated[float, Field(gt=0.0)] | None = None
-    marker_cables: tuple[str, ...] = ()
+    mesh: str = Field(description="mesh file (VTK, Gmsh), looked for as the recordings are")
+    unit: Literal["m", "cm", "mm"] = Field(description="of its coordinates, which are in the frame of the robot's base")
+    clamp_height: float = Field(description="nodes at or below this height are held [m]")
+    frames: Literal["polar", "edges"] = Field(
+        default="polar",
+        description="what turns with an element: the rotation nearest to its deformation, or axes along its edges "
+        '(SOFA\'s "large")',
+    )
+    masses: Literal["equal", "volume"] = Field(
+        default="volume",
+        description="the trunk's mass in equal parts on all nodes (SOFA's UniformMass), or with the elements' volumes",
+    )
+    drives: Literal["robot", "sofa"] = Field(
+        default="robot",
+        description='"robot" follows the robot\'s ramp, lag and end stops; "sofa" hands a command over in equal '
+        "updates, as an animation of SOFA's STLIB does, to cables that SOFA's CableConstraint limits",
+    )
+    drive_rate: Annotated[float, Field(gt=0.0)] | None = Field(
+        default=None,
+        description='how far the imposed displacement may be from the one last measured [m per step]; for "sofa"',
+    )
+    marker_cables: tuple[str, ...] = Field(
+        default=(),
+        description="a marker at the height of guides of these cables is their mean; empty: a point of the body",
+    )
 
 
 class MeshAssembly(NamedTuple):

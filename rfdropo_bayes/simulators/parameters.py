@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.tables import nearest as nearest
 
 
 class ParameterSpec(NamedTuple):
@@ -31,13 +31,6 @@ class ParameterSpec(NamedTuple):
     prior: Mapping[str, Any]
     description: str
     grid: tuple[float, ...] = ()
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """A remedy for a mistyped name: the closest known one, or the list of all."""
-    known = sorted(known)
-    close = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
 
 
 def check_names(names: Iterable[str], specs: Iterable[ParameterSpec], *, where: str) -> None:

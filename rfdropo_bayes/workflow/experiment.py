@@ -22,60 +22,90 @@ class Table(BaseModel):
 
 
 class WeighedTable(Table):
-    """[[model.weighed]]: the sum of ``parameters`` was measured as ``value`` +- ``sd``, in their unit."""
+    """[[model.weighed]]: parts that were weighed, or other sums of parameters that were measured."""
 
-    parameters: list[str] = Field(min_length=1)
-    value: float
-    sd: float = Field(gt=0.0)
+    parameters: list[str] = Field(min_length=1, description="parameters whose sum was measured")
+    value: float = Field(description="the sum, in their unit")
+    sd: float = Field(gt=0.0, description="standard deviation of the measurement")
 
 
 class ModelTable(Table):
-    """[model]: what is added to the robot's base simulator, and what is inferred.
+    """[model]: what is added to the robot's base simulator, and what is inferred."""
 
-    ``priors`` maps parameter names to prior tables (``{}`` asks for the default prior); ``fixed`` sets the values of
-    parameters that are not inferred; ``per_recording`` frees a parameter in the named recordings (``"all"``, or names
-    with wildcards) instead of sharing it. ``groups`` names recordings that have a set-up in common (a day, a robot), by
-    names or wildcards; a recording in none is a group of its own. ``per_group`` lets a parameter differ between groups
-    about the value they share, with the given standard deviation in its unit (partial pooling). ``tension`` uses the
-    recordings' cable tensions as data, with a relative noise ``tension_noise`` that is inferred and a ``tension_gain``
-    that is 1 unless it has a prior; ``motor_angle`` uses the motor angles that the robot measured, with a noise
-    ``motor_angle_noise`` that is inferred; ``object_pose`` uses the measured poses of the pushed body, which then
-    starts at the first of them, with ``object_noise``, ``object_turn_noise`` and ``object_correlation_time``;
-    ``weighed`` lists parameters, or sums of them, known from measurements of their own.
-    """
-
-    mechanisms: list[str] = Field(default_factory=list)
-    noise: Literal["auto", "white", "ar1", "student-t"] = "auto"
-    priors: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    fixed: dict[str, float] = Field(default_factory=dict)
-    per_recording: dict[str, str | list[str]] = Field(default_factory=dict)
-    groups: dict[str, str | list[str]] = Field(default_factory=dict)
-    per_group: dict[str, float] = Field(default_factory=dict)
-    tension: bool = False
-    motor_angle: bool = False
-    object_pose: bool = False
-    weighed: list[WeighedTable] = Field(default_factory=list)
+    mechanisms: list[str] = Field(
+        default_factory=list,
+        description="effects on top of the base simulator, by name, or file.py:ClassName of one's own",
+    )
+    noise: Literal["auto", "white", "ar1", "student-t"] = Field(
+        default="auto", description="noise of the positions; see docs/inference.md"
+    )
+    priors: dict[str, dict[str, Any]] = Field(
+        default_factory=dict,
+        description="what is inferred: parameter = prior; {} asks for the default prior",
+    )
+    fixed: dict[str, float] = Field(default_factory=dict, description="values of parameters that are not inferred")
+    per_recording: dict[str, str | list[str]] = Field(
+        default_factory=dict,
+        description='parameters that are free in each of the named recordings instead of shared: "all", or names with'
+        " wildcards",
+    )
+    groups: dict[str, str | list[str]] = Field(
+        default_factory=dict,
+        description="recordings that have a set-up in common (a day, a robot), by names or wildcards; one in no group"
+        " is a group of its own",
+    )
+    per_group: dict[str, float] = Field(
+        default_factory=dict,
+        description="parameters that differ between groups about the value they share, with their standard deviation "
+        "between groups, in their unit",
+    )
+    tension: bool = Field(
+        default=False,
+        description="the recordings' cable tensions are data, with a relative noise tension_noise that is inferred "
+        "and a tension_gain that is 1 unless it has a prior",
+    )
+    motor_angle: bool = Field(
+        default=False,
+        description="the recordings' motor angles are data, with a noise motor_angle_noise that is inferred",
+    )
+    object_pose: bool = Field(
+        default=False,
+        description="the recordings' poses of the pushed body are data, with object_noise, object_turn_noise and "
+        "object_correlation_time; it starts at the first of them",
+    )
+    weighed: list[WeighedTable] = Field(
+        default_factory=list,
+        description="parameters, or sums of them, known from measurements of their own",
+    )
 
 
 class SimulatorTable(Table):
-    """[simulator]: body, engine and discretisation; what is left out is the robot's own.
+    """[simulator]: body, engine and discretisation; what is left out is the robot's own."""
 
-    ``body`` is made of the layers of the robot's section profile (``nodes_across``, ``refine``) or of the mesh that
-    ``tetrahedra`` describes. An experiment may describe both; the body that is not chosen has no effect. ``push`` puts
-    the robot's cube and plate before the trunk. With ``drives = "direct"`` commands act at once, without the robot's
-    ramp and dead time: what the drives do is left to mechanisms such as `command_delay` and `actuator_lag`.
-    """
-
-    body: Literal["layered", "tetrahedra"] = "layered"
-    push: bool = False
-    drives: Literal["robot", "direct"] = "robot"
-    tetrahedra: TetrahedraTable | None = None
-    engine: Literal["auto", "jax", "numba"] = "auto"
-    precision: Literal["float64", "float32"] = "float64"
-    time_step: float | None = Field(default=None, gt=0.0, le=0.1)
-    nodes_across: Literal[2, 3] = 2
-    refine: int = Field(default=1, ge=1, le=16)
-    threads: int | None = Field(default=None, ge=1)
+    body: Literal["layered", "tetrahedra"] = Field(
+        default="layered",
+        description="layers of the robot's section profile, or the mesh under [simulator.tetrahedra]; a body that is "
+        "not chosen has no effect",
+    )
+    push: bool = Field(default=False, description="put the robot's cube and plate before the trunk")
+    drives: Literal["robot", "direct"] = Field(
+        default="robot",
+        description='"direct": commands act at once, without the robot\'s ramp and dead time; what drives do is left '
+        "to mechanisms such as command_delay",
+    )
+    tetrahedra: TetrahedraTable | None = Field(default=None, description="the mesh")
+    engine: Literal["auto", "jax", "numba"] = Field(
+        default="auto",
+        description='"auto" is the compiled one, or JAX where it has a GPU and the body is layered',
+    )
+    precision: Literal["float64", "float32"] = Field(
+        default="float64",
+        description="of the compiled engine; stiff bodies lose their answer in float32",
+    )
+    time_step: float | None = Field(default=None, gt=0.0, le=0.1, description="time step [s]; the robot's by default")
+    nodes_across: Literal[2, 3] = Field(default=2, description="nodes along a side of a layer")
+    refine: int = Field(default=1, ge=1, le=16, description="each layer is cut into so many")
+    threads: int | None = Field(default=None, ge=1, description="of the compiled engine; one per processor by default")
 
     @model_validator(mode="after")
     def _has_mesh(self) -> SimulatorTable:
@@ -93,8 +123,11 @@ class InferenceTable(BaseModel):
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
-    method: str = "smc"
-    rollouts: int = Field(default=20000, ge=1)
+    method: str = Field(
+        default="smc",
+        description="see docs/reference/methods.md; options of the method stand beside it",
+    )
+    rollouts: int = Field(default=20000, ge=1, description="budget in full-length rollouts")
 
     @property
     def options(self) -> dict[str, Any]:
@@ -103,46 +136,59 @@ class InferenceTable(BaseModel):
 
 
 class CommandsTable(Table):
-    """[commands]: a random command sequence to simulate, where no recording is replayed.
+    """[commands]: a random command sequence to simulate, where no recording is replayed."""
 
-    Every ``interval`` seconds one channel, chosen at random, moves by ``step`` (in the robot's command unit) up or
-    down, within ``[low, high]``; every ``sample_time`` seconds the named markers are observed (all, if none is named).
-    """
-
-    duration: float = Field(gt=0.0)
-    interval: float = Field(gt=0.0)
-    step: float = Field(gt=0.0)
-    low: float
-    high: float
-    sample_time: float = Field(gt=0.0)
-    recordings: list[str] = Field(min_length=1)
-    markers: list[str] = Field(default_factory=list)
+    duration: float = Field(gt=0.0, description="length of a recording [s]")
+    interval: float = Field(
+        gt=0.0,
+        description="time between changes [s]: one channel, chosen at random, moves up or down",
+    )
+    step: float = Field(gt=0.0, description="size of a change, in the robot's unit of commands")
+    low: float = Field(description="least command")
+    high: float = Field(description="greatest command")
+    sample_time: float = Field(gt=0.0, description="time between observations [s]")
+    recordings: list[str] = Field(min_length=1, description="a name for each recording")
+    markers: list[str] = Field(default_factory=list, description="markers that are observed; all by default")
 
 
 class NoiseTable(Table):
-    """[noise]: added to simulated marker positions; ``standard_deviation`` in metres per coordinate."""
+    """[noise]: noise of marker positions whose size is known."""
 
-    standard_deviation: float = Field(ge=0.0)
-    correlation_time: float | None = Field(default=None, gt=0.0)
+    standard_deviation: float = Field(ge=0.0, description="of one coordinate of one marker [m]")
+    correlation_time: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="over which the noise forgets its sign [s]; white by default",
+    )
 
 
 class AuditTable(Table):
-    """[audit]: ``candidates`` are tried beside the registry's mechanisms, e.g. ``"mine.py:MyMechanism"``; those in
-    ``exclude`` are not. ``bootstraps`` is how many simulated data sets its p-values rest on; ``minutes`` the processor
-    time that a candidate may take which only a slower engine knows."""
+    """[audit]: candidates and effort of ``rfdropo audit``."""
 
-    candidates: list[str] = Field(default_factory=list)
-    exclude: list[str] = Field(default_factory=list)
-    bootstraps: int = Field(default=999, ge=199)
-    minutes: float = Field(default=10.0, ge=0.0)
+    candidates: list[str] = Field(
+        default_factory=list,
+        description="mechanisms that are tried beside the registry's, e.g. mine.py:MyMechanism",
+    )
+    exclude: list[str] = Field(default_factory=list, description="mechanisms that are not tried")
+    bootstraps: int = Field(default=999, ge=199, description="simulated data sets that the p-values rest on")
+    minutes: float = Field(
+        default=10.0,
+        ge=0.0,
+        description="processor time that a candidate may take which only a slower engine knows",
+    )
 
 
 class SeparationTable(Table):
-    """[separation]: ``mechanisms`` that join the base model, to see which of them the recordings tell apart; ``groups``
-    names sets of them that are asked for together, such as all ways to be late."""
+    """[separation]: mechanisms that ``rfdropo separate`` compares."""
 
-    mechanisms: list[str] = Field(min_length=2)
-    groups: dict[str, list[str]] = Field(default_factory=dict)
+    mechanisms: list[str] = Field(
+        min_length=2,
+        description="that join the base model, to see which of them the recordings tell apart",
+    )
+    groups: dict[str, list[str]] = Field(
+        default_factory=dict,
+        description="sets of them that are asked for together, such as all ways to be late",
+    )
 
     @model_validator(mode="after")
     def _has_members(self) -> SeparationTable:
@@ -166,17 +212,31 @@ class SeparationTable(Table):
 class Experiment(Table):
     """An experiment as read from its file; see `load_experiment`."""
 
-    robot: str
-    seed: int = 0
-    title: str = ""
-    data: DataSpec | None = None
-    commands: CommandsTable | None = None
-    noise: NoiseTable | None = None
-    model: ModelTable = Field(default_factory=ModelTable)
-    simulator: SimulatorTable = Field(default_factory=SimulatorTable)
-    inference: InferenceTable = Field(default_factory=InferenceTable)
-    audit: AuditTable = Field(default_factory=AuditTable)
-    separation: SeparationTable | None = None
+    robot: str = Field(
+        description="name of a robot that comes with the package, or path of a robot file, relative to this file",
+    )
+    seed: int = Field(default=0, description="of all that is random")
+    title: str = Field(default="", description="heading of the report; the file's name by default")
+    data: DataSpec | None = Field(default=None, description="the recordings")
+    commands: CommandsTable | None = Field(
+        default=None,
+        description="random commands to simulate, where no recording is replayed",
+    )
+    noise: NoiseTable | None = Field(
+        default=None,
+        description="noise that simulate adds to positions, and what an audit without repeats takes for known",
+    )
+    model: ModelTable = Field(
+        default_factory=ModelTable,
+        description="what is added to the base simulator, and what is inferred",
+    )
+    simulator: SimulatorTable = Field(default_factory=SimulatorTable, description="body, engine and discretisation")
+    inference: InferenceTable = Field(
+        default_factory=InferenceTable,
+        description="method, budget and the method's options",
+    )
+    audit: AuditTable = Field(default_factory=AuditTable, description="candidates and effort of rfdropo audit")
+    separation: SeparationTable | None = Field(default=None, description="what rfdropo separate compares")
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experiment, dict[str, Any]]:

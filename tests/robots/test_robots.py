@@ -55,19 +55,22 @@ def test_unknown_robot_lists_the_known_ones():
         ('name = "long_1"', 'name = "long_0"', "cables share a name"),
         ('unit = "m"', 'unit = "rad"', "radius_parameter"),
         ("point_m = [0, 0, 0.184368]", "point_m = [0, 0, 0.2]", "marker p20 lies outside the body"),
-        ("[parameters.young_modulus]", "[parameters.youngs_modulus]", "'young_modulus' has no table"),
+        ("[parameters.young_modulus]", "[parameters.youngs_modulus]", "youngs_modulus].*did you mean 'young_modulus'"),
+        ("[parameters.young_modulus]", "[parameters.tip_mass]", r"nothing uses the table \[parameters.tip_mass\]"),
+        ('each = "cable"', "", r"mend \[parameters.initial_displacement\]"),
         ("nominal = 0.45", "nominal = 0.05", "outside its bounds"),
         ("high = 0.499", "high = 0.5", "0.499"),
         ("nominal = 0.42\nlow = 0.0001", "nominal = 0.42\nlow = 0.0", "massless"),
         ('"LogNormal", median = 4e+06', '"LogNormal", median = 4e+02', "prior lies outside the bounds"),
         ('"LogNormal", median = 4e+06', '"LogNormal", mean = 4e+06', "takes exactly median, sigma"),
-        ('distribution = "LogNormal"', 'distribution = "Lognormal"', "unknown distribution 'Lognormal'"),
+        ('distribution = "LogNormal"', 'distribution = "Lognormal"', "'Lognormal'; did you mean 'LogNormal'"),
     ],
 )
 def test_a_mistake_is_named(tmp_path, old, new, message):
     with pytest.raises(InputError, match=message) as caught:
         load_robot(edited(tmp_path, old, new))
     assert "edited.toml" in str(caught.value)
+    assert ": :" not in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.workflow.check import run_check
+from rfdropo_bayes.workflow.method_check import run_check
 
 EXPERIMENT = Path(__file__).resolve().parents[2] / "benchmarks" / "sbc.toml"
 
@@ -37,7 +37,7 @@ def test_the_layered_arm_is_calibrated(tmp_path):
 def test_simulated_data_fit_their_own_truth():
     """Whitened residuals of a data set at its truth are standard normal: mean square 1 to five standard errors."""
     from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
-    from rfdropo_bayes.workflow.check import simulate_data_set
+    from rfdropo_bayes.workflow.method_check import simulate_data_set
     from rfdropo_bayes.workflow.experiment import load_experiment
 
     experiment, _ = load_experiment(EXPERIMENT)

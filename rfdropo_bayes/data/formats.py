@@ -1,0 +1,11 @@
+"""What each format of recordings is, in one line: for whoever has files and asks what reads them."""
+
+from __future__ import annotations
+
+FORMATS: dict[str, str] = {
+    "csv": "any CSV, plain or gzipped, whose columns the table [data.columns] names: the way in for one's own robot",
+    "netcdf": "what `rfdropo simulate` and `Trajectory.save` write",
+    "asl-csv": "observations and control inputs of Stanford's hanging trunk (StanfordASL/trunk-stack), in two files",
+    "optitrack-csv": "motion capture of the paper's trunk and cube (vandaele/sim2real-trunk)",
+    "sofa-csv": "SOFA rollouts of the paper's scene (andreaprotopapa/sofa-dr-rl): action, x0, y0, z0, ... in mm",
+}

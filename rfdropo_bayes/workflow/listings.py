@@ -1,0 +1,52 @@
+"""Robots and formats of recordings to choose from, as rows of text; nothing here loads JAX."""
+
+from __future__ import annotations
+
+from rfdropo_bayes.data.formats import FORMATS
+from rfdropo_bayes.robots import find_robot_file, known_robots, load_robot
+
+Row = dict[str, str]
+
+
+def robot_rows() -> list[Row]:
+    """The robots that come with the package."""
+    rows = []
+    for name in known_robots():
+        robot = load_robot(name)
+        rows.append(
+            {
+                "robot": name,
+                "cables": str(len(robot.cables)),
+                "commands": f"{len(robot.channel_names)} in {robot.command_unit}",
+                "markers": str(len(robot.markers)),
+                "description": robot.description,
+            }
+        )
+    return rows
+
+
+def robot_facts(name: str) -> Row:
+    """What one robot is: of the package, or a file."""
+    path, robot = find_robot_file(name), load_robot(name)
+    body = robot.body
+    across = max(max(pair) for pair in body.half_width_m)
+    return {
+        "robot": robot.name,
+        "file": str(path),
+        "description": robot.description,
+        "body": f"{1e3 * (body.station_m[-1] - body.station_m[0]):.4g} mm long, up to {2e3 * across:.3g} mm wide, "
+        f"{len(body.station_m) - 1} layers, {robot.nominal()['trunk_mass']:.4g} kg, "
+        f"E = {robot.nominal()['young_modulus']:.4g} Pa",
+        "gravity": f"{', '.join(f'{g:g}' for g in robot.gravity_m_s2)} m/s2 along x, y, z; z runs along the body, away "
+        "from the clamp",
+        "starts": "undeformed" if robot.initial_state == "rest" else "in equilibrium with the first command",
+        "commands": f"{', '.join(robot.channel_names)} ({robot.command_unit})",
+        "cables": ", ".join(robot.cable_names),
+        "markers": ", ".join(f"{m.name} (z = {1e3 * m.point_m[2]:.4g} mm)" for m in robot.markers),
+        "parameters": ", ".join(robot.parameters),
+    }
+
+
+def format_rows() -> list[Row]:
+    """The formats of recordings."""
+    return [{"format": name, "description": text} for name, text in FORMATS.items()]
