@@ -31,11 +31,15 @@ def finish(out: Path, command: str = "calibrate", **options) -> None:
         (folder / "log.jsonl").write_text("a line\n")
 
 
+def press_control_c(folder: Path) -> None:
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "smc_0.npz").write_bytes(b"")
+    raise KeyboardInterrupt
+
+
 def interrupt(out: Path) -> None:
     with pytest.raises(Interrupted) as stopped, run_folder(out, "calibrate", **SETTINGS) as folder:
-        (folder / "checkpoints").mkdir()
-        (folder / "checkpoints" / "smc_0.npz").write_bytes(b"")
-        raise KeyboardInterrupt
+        press_control_c(folder)
     assert stopped.value.resumable
     assert stopped.value.folder == str(out)
 
@@ -154,7 +158,8 @@ def test_files_that_are_named_and_missing_are_found_out_at_once(tmp_path, monkey
 def test_nothing_heavy_is_imported_before_inputs_are_looked_at(arguments, tmp_path):
     program = (
         "import sys\nsys.argv = ['rfdropo', *sys.argv[1:]]\nfrom rfdropo_bayes.cli import main\n"
-        "try:\n    main()\nexcept SystemExit as done:\n    heavy = {'jax', 'pandas', 'xarray', 'scipy'} & set(sys.modules)\n"
+        "try:\n    main()\nexcept SystemExit as done:\n"
+        "    heavy = {'jax', 'pandas', 'xarray', 'scipy'} & set(sys.modules)\n"
         "    sys.exit(f'imports {heavy}' if heavy else done.code)\n"
     )
     environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
@@ -190,9 +195,13 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(kind, tmp_path):
 def test_a_file_is_replaced_whole_or_stays(tmp_path):
     path = tmp_path / "file"
     write_text(path, "before")
-    with pytest.raises(RuntimeError), whole(path) as partial:
+
+    def fail(partial: Path) -> None:
         partial.write_text("half")
         raise RuntimeError
+
+    with pytest.raises(RuntimeError), whole(path) as partial:
+        fail(partial)
     assert path.read_text() == "before"
     assert [found.name for found in tmp_path.iterdir()] == ["file"]
 
