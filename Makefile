@@ -23,7 +23,7 @@ help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-16s%s\n", $$1, $$2 }'
 
 demo: $(CORE) ## calibrate the bundled example and write its report (minutes)
-	$(BIN)/rfdropo calibrate experiments/demo.toml --out reports/demo
+	$(BIN)/rfdropo calibrate experiments/demo.toml --out reports/demo --overwrite
 	@echo "The report: reports/demo/report.html"
 
 test: $(DEV) ## the tests that are not slow
@@ -51,7 +51,7 @@ notebooks: $(DEV) ## run every notebook from top to bottom
 	$(PYTEST) -m notebook
 
 demo-data: $(CORE) ## make the recordings of the bundled example again
-	$(BIN)/rfdropo simulate experiments/demo_data.toml --out experiments/demo
+	$(BIN)/rfdropo simulate experiments/demo_data.toml --out experiments/demo --overwrite
 
 clean: ## remove the environment and what the tools cached; reports stay
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist

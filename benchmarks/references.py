@@ -28,7 +28,7 @@ from rfdropo_bayes.fem.rigid_body import (
     solid_gyration_radius,
 )
 from rfdropo_bayes.workflow.experiment import load_experiment
-from rfdropo_bayes.workflow.simulation import run_simulation
+from rfdropo_bayes.workflow.simulation import simulate_all
 
 EXPERIMENTS = Path(__file__).resolve().parents[1] / "experiments"
 BEFORE_CONTACT = "{observations='sofa_trunk/push_1.csv', rows=[0, 10]}"
@@ -260,7 +260,7 @@ def recordings() -> Iterator[Reference]:
         try:
             experiment, _ = load_experiment(EXPERIMENTS / file, overrides)
             with tempfile.TemporaryDirectory() as folder:
-                found = run_simulation(experiment, EXPERIMENTS, Path(folder))
+                found = simulate_all(experiment, EXPERIMENTS, Path(folder))
         except InputError as error:
             print(f"{name}: {error}")
             continue

@@ -24,3 +24,11 @@ class InputError(ValueError):
 
 class NoLikelihoodError(InputError):
     """No parameter set that was tried has a positive likelihood: the prior excludes the data, or more must be tried."""
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C in the middle of a run; ``folder`` is where the run writes, ``resumable`` whether it can go on."""
+
+    def __init__(self, folder: str, resumable: bool) -> None:
+        self.folder, self.resumable = folder, resumable
+        super().__init__(folder)

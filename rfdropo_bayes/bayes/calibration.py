@@ -48,6 +48,7 @@ class CalibrationProblem:
         self.earlier = {} if earlier is None else {name: np.asarray(draws) for name, draws in earlier.items()}
         self.measured = model.measured
         self.jacobian = "auto"
+        self.watch: Callable[[float], None] | None = None  # told of rollouts, in full-length ones, as they are done
         self.chunk = chunk
         self.names = model.space.names
         self.units = {p.name: p.spec.unit for p in model.space.parameters}
@@ -338,6 +339,8 @@ class CalibrationProblem:
             index = np.minimum(np.arange(start, start + size), n - 1)
             chunk = {name: column[index] for name, column in columns.items()}
             parts.append(jax.device_get(evaluate(chunk, steps, *rest)))
+            if self.watch is not None:
+                self.watch(min(n - start, self.chunk) * horizon / self.n_rows)
         return tuple(None if column[0] is None else np.concatenate(column)[:n] for column in zip(*parts, strict=True))
 
 

@@ -7,7 +7,20 @@ from typing import Annotated
 
 import typer
 
-from rfdropo_bayes.cli.options import ExperimentFile, OutFolder, Overrides, Resume, Seed, folder_for, say_progress
+from rfdropo_bayes.cli.options import (
+    AsJson,
+    ExperimentFile,
+    OutFolder,
+    Overrides,
+    Overwrite,
+    Quiet,
+    Resume,
+    Seed,
+    folder_for,
+    say_progress,
+    see_calibration,
+)
+from rfdropo_bayes.cli.results import show_audit
 
 
 def audit(
@@ -18,17 +31,27 @@ def audit(
     ] = None,
     seed: Seed = None,
     resume: Resume = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
     """Say what the simulator lacks, by name: writes audit.json, extended.toml and report.html."""
+    see_calibration(base, "--base")
+    folder = folder_for("audit", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.workflow.audit import run_audit
 
-    folder = folder_for(experiment, out)
     found = run_audit(
-        experiment, folder, overrides=overrides or [], base=base, seed=seed, resume=resume, report=say_progress()
+        experiment,
+        folder,
+        overrides=overrides or [],
+        base=base,
+        seed=seed,
+        resume=resume,
+        overwrite=overwrite,
+        report=say_progress(quiet),
     )
-    typer.echo(f"{found['verdict']}: {found['sentence']}")
-    typer.echo(f"report: {folder / 'report.html'}; extended model: {folder / 'extended.toml'}")
+    show_audit(found, folder, quiet=quiet, as_json=as_json)
 
 
 def separate(
@@ -38,23 +61,42 @@ def separate(
         Path | None, typer.Option("--base", help="folder of an earlier calibration, to start the base model from")
     ] = None,
     resume: Resume = False,
+    overwrite: Overwrite = False,
     overrides: Overrides = None,
 ) -> None:
     """Say which mechanisms the recordings tell apart: writes separation.json, separation.md and separation.png."""
+    see_calibration(base, "--base")
+    folder = folder_for("separate", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.workflow.separation import TABLE, run_separation
 
-    folder = folder_for(experiment, out)
-    run_separation(experiment, folder, overrides=overrides or [], base=base, resume=resume, report=say_progress())
+    run_separation(
+        experiment,
+        folder,
+        overrides=overrides or [],
+        base=base,
+        resume=resume,
+        overwrite=overwrite,
+        report=say_progress(),
+    )
     typer.echo((folder / TABLE).read_text(encoding="utf-8"))
 
 
-def design(experiment: ExperimentFile, out: OutFolder = None, seed: Seed = None, overrides: Overrides = None) -> None:
+def design(
+    experiment: ExperimentFile,
+    out: OutFolder = None,
+    seed: Seed = None,
+    overwrite: Overwrite = False,
+    overrides: Overrides = None,
+) -> None:
     """Propose the commands that best separate the leading explanations: writes next_commands.csv and design.json."""
-    from rfdropo_bayes.workflow.design import run_design
+    folder = folder_for("design", experiment, out, overrides, overwrite=overwrite)
+    from rfdropo_bayes.workflow.design import COMMANDS, run_design
 
-    folder = folder_for(experiment, out)
-    found = run_design(experiment, folder, overrides=overrides or [], seed=seed, report=say_progress())
+    found = run_design(
+        experiment, folder, overrides=overrides or [], seed=seed, overwrite=overwrite, report=say_progress()
+    )
     typer.echo(found["sentence"])
+    typer.echo(f"commands: {folder / COMMANDS}")
 
 
 def benchmark_audit(

@@ -9,7 +9,9 @@ from typing import Annotated
 
 import typer
 
+from rfdropo_bayes.cli.options import Overwrite, see_calibration
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.workflow.files import check_folder
 
 
 def export(
@@ -17,22 +19,26 @@ def export(
     phi: Annotated[bool, typer.Option("--phi", help="the distribution to randomise over")] = False,
     posterior: Annotated[bool, typer.Option("--posterior", help="a posterior.nc without its predictions")] = False,
     out: Annotated[Path | None, typer.Option("--out", help="folder to write to; DIR by default")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="replace what an earlier export wrote")] = False,
 ) -> None:
     """Write the distribution to randomise over as tables with units, or a posterior small enough to keep."""
-    from rfdropo_bayes.workflow.export import export_phi, export_posterior
-
     if not phi and not posterior:
         raise InputError("nothing to export was named", where="export", remedy="add --phi or --posterior")
-    paths = export_phi(folder, out) if phi else []
-    for path in [*paths, *([export_posterior(folder, out)] if posterior else [])]:
+    see_calibration(folder, "DIR")
+    from rfdropo_bayes.workflow.export import export_phi, export_posterior
+
+    paths = export_phi(folder, out, overwrite=overwrite) if phi else []
+    if posterior:
+        paths.append(export_posterior(folder, out, overwrite=overwrite))
+    for path in paths:
         typer.echo(str(path))
 
 
-def check(path: Path, out: Path, name: str, datasets: int, overrides: list[str], resume: bool) -> None:
+def check(path: Path, out: Path, name: str, datasets: int, overrides: list[str], resume: bool, overwrite: bool) -> None:
     """Run a check of an experiment's method and say what it found."""
     from rfdropo_bayes.workflow.method_check import run_check
 
-    found = run_check(path, out, name, datasets=datasets, overrides=overrides, resume=resume)
+    found = run_check(path, out, name, datasets=datasets, overrides=overrides, resume=resume, overwrite=overwrite)
     typer.echo(found["sentence"])
     typer.echo(f"details: {out / f'{name}.json'}")
 
@@ -49,9 +55,11 @@ def table1(
     tasks: Annotated[list[str] | None, typer.Option("--task", help="only this task; may be repeated")] = None,
     resume: Annotated[bool, typer.Option(help="keep the fits that an interrupted run has done")] = False,
     only_done: Annotated[bool, typer.Option(help="tables of the fits that an interrupted run has done")] = False,
+    overwrite: Overwrite = False,
     cluster: Annotated[str | None, typer.Option(help="local, or HOST:PORT of a Dask scheduler")] = None,
 ) -> None:
     """The paper's Table I, with baselines, rivals and off-centre truths: table1.json, table1.md, table1.png."""
+    check_folder(out, "benchmark table1", resume=resume or only_done, overwrite=overwrite)
     from rfdropo_bayes.workflow.table1 import ROWS, TASKS, Size, run_table1
 
     size = Size(truths, rival_truths, budget, actions, seed, repeats)
@@ -64,6 +72,7 @@ def table1(
         resume=resume,
         cluster=cluster,
         only_done=only_done,
+        overwrite=overwrite,
         command=words,
     )
     for claim in content["claims"]:

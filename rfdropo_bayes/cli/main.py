@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -11,11 +12,23 @@ import typer
 
 from rfdropo_bayes import __version__
 from rfdropo_bayes.cli import audit, inference, listings, pictures, prediction
-from rfdropo_bayes.cli.options import ExperimentFile, OutFolder, Overrides, Resume, folder_for
-from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.cli.options import (
+    AsJson,
+    ExperimentFile,
+    OutFolder,
+    Overrides,
+    Overwrite,
+    Quiet,
+    Resume,
+    folder_for,
+    see_calibration,
+)
+from rfdropo_bayes.cli.results import show_calibration
+from rfdropo_bayes.errors import InputError, Interrupted
+from rfdropo_bayes.interrupts import EXIT_STATUS, NOTHING_LOST, watch_interrupts
 from rfdropo_bayes.runtime import keep_compilations
 
-INPUT_ERROR, INTERRUPTED = 2, 3
+INPUT_ERROR = 2
 
 # Typer carries its own copy of click, or uses the installed one, depending on its version.
 USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
@@ -44,6 +57,9 @@ def calibrate(
     experiment: ExperimentFile,
     out: OutFolder = None,
     resume: Resume = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
     check: Annotated[
         str | None, typer.Option(help="sbc: instead of fitting, check the method on simulated data")
     ] = None,
@@ -55,16 +71,26 @@ def calibrate(
     overrides: Overrides = None,
 ) -> None:
     """Fit the simulator to recordings: writes posterior.nc, summary.json and report.html."""
+    if check is not None and start is not None:
+        raise InputError("a check has no start", where="--from", remedy="leave it out")
+    see_calibration(start, "--from")
+    command = "calibrate" if check is None else "check"
+    folder = folder_for(command, experiment, out, overrides, resume=resume, overwrite=overwrite)
+    if check is not None:
+        inference.check(experiment, folder, check, datasets, overrides or [], resume, overwrite)
+        return
     from rfdropo_bayes.workflow.calibration import run_calibration
 
-    folder = folder_for(experiment, out)
-    if check is not None:
-        if start is not None:
-            raise InputError("a check has no start", where="--from", remedy="leave it out")
-        inference.check(experiment, folder, check, datasets, overrides or [], resume)
-        return
-    report = run_calibration(experiment, folder, overrides=overrides or [], resume=resume, start=start)
-    typer.echo(f"report: {report}")
+    run_calibration(
+        experiment,
+        folder,
+        overrides=overrides or [],
+        resume=resume,
+        overwrite=overwrite,
+        start=start,
+        show=False if quiet else None,
+    )
+    show_calibration(folder, quiet=quiet, as_json=as_json)
 
 
 @app.command()
@@ -72,20 +98,21 @@ def simulate(
     experiment: ExperimentFile,
     out: OutFolder = None,
     balance: Annotated[bool, typer.Option(help="also write base reaction, energies and work to the NetCDF")] = False,
+    overwrite: Overwrite = False,
     overrides: Overrides = None,
 ) -> None:
     """Simulate the experiment's commands: writes NetCDF and CSV, prints the error against the recording as JSON."""
-    from rfdropo_bayes.workflow.experiment import load_experiment
+    folder = folder_for("simulate", experiment, out, overrides, overwrite=overwrite)
     from rfdropo_bayes.workflow.simulation import run_simulation
 
-    loaded, _ = load_experiment(experiment, overrides or [])
-    report = run_simulation(loaded, experiment.resolve().parent, folder_for(experiment, out), balance)
+    report = run_simulation(experiment, folder, overrides=overrides or [], balance=balance, overwrite=overwrite)
     typer.echo(json.dumps(report, indent=2))
 
 
 @app.command()
 def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a calibration has written")]) -> None:
     """Write report.html again from the files of a run."""
+    see_calibration(folder, "DIR")
     from rfdropo_bayes.report import rebuild_report
 
     typer.echo(f"report: {rebuild_report(folder)}")
@@ -111,13 +138,34 @@ app.add_typer(benchmark, name="benchmark")
 def main() -> None:
     """Run the command line; bad input ends with one line on stderr and status 2, an interrupted run with status 3."""
     try:
-        sys.exit(app(standalone_mode=False))
+        watch_interrupts()
+        # Not app(): Typer's own main keeps KeyboardInterrupt to itself.
+        command = typer.main.get_command(app)
+        with command.make_context("rfdropo", sys.argv[1:]) as context:
+            command.invoke(context)
+        sys.exit(0)
+    except typer.Exit as done:
+        sys.exit(done.exit_code)
     except InputError as error:
         print(f"rfdropo: {error}", file=sys.stderr)
         sys.exit(INPUT_ERROR)
     except USAGE_ERROR as error:
+        if len(sys.argv) == 1 or sys.argv[1:] == ["benchmark"]:  # no argument is a question for help
+            print(error)
+            sys.exit(0)
         print(f"rfdropo: {error}; see rfdropo --help", file=sys.stderr)
         sys.exit(INPUT_ERROR)
-    except (KeyboardInterrupt, typer.Abort):
-        print("rfdropo: interrupted; where the command takes --resume, it goes on from here", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+    except (KeyboardInterrupt, typer.Abort) as stop:
+        print(f"rfdropo: {_after(stop)}", file=sys.stderr)
+        sys.exit(EXIT_STATUS)
+
+
+def _after(stop: BaseException) -> str:
+    """What an interrupted user can do next."""
+    again = [argument for argument in sys.argv[1:] if argument not in ("--resume", "--overwrite")]
+    if isinstance(stop, Interrupted) and stop.resumable:
+        command = shlex.join(["rfdropo", *again, "--resume"])
+        return f"interrupted; what is done is kept in {stop.folder}; to go on: {command}"
+    if isinstance(stop, Interrupted):
+        return f"interrupted; {stop.folder} holds no result; to start again: {shlex.join(['rfdropo', *again])}"
+    return NOTHING_LOST

@@ -2,27 +2,79 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.interrupts import check_interrupt
+from rfdropo_bayes.workflow.experiment_file import look_through
+from rfdropo_bayes.workflow.files import check_folder
+
 ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file")]
-OutFolder = Annotated[Path | None, typer.Option("--out", help="folder to write to; reports/<experiment> by default")]
+OutFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        help="folder to write to; by default reports/<experiment>, and <experiment>_<command> for all but calibrate",
+    ),
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", help="name=value: a parameter's value, or table.key=value of the experiment file"),
 ]
 Seed = Annotated[int | None, typer.Option(help="seed; that of the experiment file by default")]
-Resume = Annotated[bool, typer.Option(help="go on from the checkpoint of an interrupted run")]
+Resume = Annotated[bool, typer.Option("--resume", help="go on from the checkpoint of an interrupted run")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="start anew, whatever the folder holds")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="print nothing but errors")]
+AsJson = Annotated[bool, typer.Option("--json", help="print the result as JSON, and nothing else")]
 
 
-def folder_for(experiment: Path, out: Path | None) -> Path:
-    """The folder that was asked for, or the one named after the experiment."""
-    return out or Path("reports") / experiment.stem
+def folder_for(
+    command: str,
+    experiment: Path,
+    out: Path | None,
+    overrides: Sequence[str] | None = None,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+) -> Path:
+    """The folder that was asked for, or one named after the experiment and, for all but calibrations, the command.
+
+    Whether the experiment's files are there and the folder is free is seen here, before anything heavy is imported.
+
+    Raises:
+        InputError: a file is missing, or the folder holds a run that is not to be replaced.
+    """
+    look_through(experiment, overrides or [])
+    name = experiment.stem if command == "calibrate" else f"{experiment.stem}_{command.split()[0]}"
+    folder = out or Path("reports") / name
+    check_folder(folder, command, resume=resume, overwrite=overwrite)
+    return folder
 
 
-def say_progress() -> Callable[[str], None]:
+def see_calibration(folder: Path | None, option: str) -> None:
+    """See that a folder holds a finished calibration, before anything heavy is imported.
+
+    Raises:
+        InputError: it does not.
+    """
+    if folder is not None and not (folder / "posterior.nc").is_file():
+        raise InputError(
+            f"{folder} holds no posterior.nc", where=option, remedy="name the folder of a finished rfdropo calibrate"
+        )
+
+
+def say_progress(quiet: bool = False) -> Callable[[str], None]:
     """Lines of progress on the standard error stream, so that results alone are on the standard output."""
-    return lambda line: typer.echo(f"  {line}", err=True)
+    began = time.monotonic()
+
+    def say(line: str) -> None:
+        check_interrupt()
+        if not quiet:
+            typer.echo(f"  {time.monotonic() - began:5.0f} s  {line}", err=True)
+
+    return say

@@ -8,7 +8,10 @@ from typing import Annotated
 
 import typer
 
+from rfdropo_bayes.cli.options import Overwrite, see_calibration
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.workflow.experiment_file import look_through
+from rfdropo_bayes.workflow.files import check_folder
 
 
 def predict(
@@ -21,9 +24,13 @@ def predict(
     ] = None,
     rows: Annotated[str | None, typer.Option("--rows", help="FIRST:LAST observation rows, both included")] = None,
     seed: Annotated[int | None, typer.Option(help="seed of the draws; that of the experiment by default")] = None,
+    overwrite: Overwrite = False,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="as in calibrate")] = None,
 ) -> None:
     """Predict commands that were never run: mean, 50 and 90 % bands as NetCDF and CSV (m, base frame)."""
+    see_calibration(posterior, "--posterior")
+    look_through(experiment, overrides or [])
+    check_folder(out, "predict", overwrite=overwrite)
     from rfdropo_bayes.workflow.unseen import run_prediction
 
     facts = run_prediction(
@@ -35,6 +42,7 @@ def predict(
         rows=_window(rows),
         overrides=overrides or [],
         seed=seed,
+        overwrite=overwrite,
     )
     typer.echo(json.dumps(facts, indent=2))
 

@@ -7,9 +7,10 @@ from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
 from rfdropo_bayes.data.registration import Registration, clock_offset, register, shift_commands, to_base_frame
 from rfdropo_bayes.data.repeats import PureError, group_repeats, noise_floor, pure_error
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
-from rfdropo_bayes.data.spec import DATA_VARIABLE, DataSpec, RecordingEntry, find_data_file, load_recordings
+from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, load_recordings
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.data.unseen import first_row_only, load_unseen, start_is_known
+from rfdropo_bayes.files import DATA_VARIABLE
 
 __all__ = [
     "DATA_VARIABLE",

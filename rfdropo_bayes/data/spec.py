@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -15,11 +14,10 @@ from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import find_files
 from rfdropo_bayes.tables import parse_table
 
-DATA_VARIABLE = "RFDROPO_DATA"
 Format = Literal["sofa-csv", "optitrack-csv", "asl-csv", "csv", "netcdf"]
-_GLOB = "*?["
 
 
 class RecordingEntry(BaseModel):
@@ -117,35 +115,15 @@ def find_data_file(name: str | Path, base: Path) -> Path:
     Raises:
         InputError: no such file.
     """
-    return _found(str(name), base)[0]
-
-
-def _found(pattern: str, base: Path) -> list[Path]:
-    """Files of a name or glob in the first folder that has any: RFDROPO_DATA, or else the experiment file's own."""
-    variable = os.environ.get(DATA_VARIABLE)
-    roots = [Path(variable), Path(base)] if variable else [Path(base)]
-    wanted = Path(pattern)
-    if wanted.is_absolute():
-        roots, wanted = [Path(wanted.anchor)], wanted.relative_to(wanted.anchor)
-    for root in roots:
-        files = sorted(root.glob(str(wanted))) if any(sign in pattern for sign in _GLOB) else [root / wanted]
-        files = [file for file in files if file.is_file()]
-        if files:
-            return files
-    looked = " and ".join(str(root) for root in roots)
-    raise InputError(
-        f"no such file; looked in {looked} ({DATA_VARIABLE} is {'set' if variable else 'not set'})",
-        where=pattern,
-        remedy=f"correct the path, or set {DATA_VARIABLE} to the folder that holds the data",
-    )
+    return find_files(str(name), base)[0]
 
 
 def _sources(entries: list[RecordingEntry], base: Path) -> Iterator[_Source]:
     for entry in entries:
         commands = None
         if entry.commands not in (None, NO_COMMANDS):
-            commands = _found(str(entry.commands), base)[0]
-        for match in _found(entry.observations, base):
+            commands = find_files(str(entry.commands), base)[0]
+        for match in find_files(entry.observations, base):
             yield _Source(match, commands, entry.commands == NO_COMMANDS, entry.rows)
 
 

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from rfdropo_bayes.data import checks
 from rfdropo_bayes.data.held_readings import new_readings
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import whole
 
 AXES = ("x", "y", "z")
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -284,12 +285,8 @@ class Trajectory:
         Raises:
             InputError: if the file cannot be written.
         """
-        try:
-            self.dataset.to_netcdf(path, engine="h5netcdf")
-        except OSError as error:
-            raise InputError(
-                f"cannot be written ({error.strerror or error})", where=str(path), remedy="choose a writable folder"
-            ) from None
+        with whole(path) as partial:
+            self.dataset.to_netcdf(partial, engine="h5netcdf")
 
     @classmethod
     def load(cls, path: Path) -> Trajectory:

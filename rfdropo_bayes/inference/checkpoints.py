@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tempfile
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import whole
 
 SCHEMA_VERSION = 5
 _META = "meta_json"
@@ -60,22 +60,12 @@ class Checkpoint:
             return
         text = json.dumps({"digest": self.digest, "schema_version": SCHEMA_VERSION, **meta})
         entries: dict[str, Any] = {_META: np.frombuffer(text.encode(), dtype=np.uint8), **arrays}
-        try:
+        with whole(self.path) as partial:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(dir=self.path.parent, prefix=f".{self.path.name}.")
-            try:
-                with os.fdopen(handle, "wb") as file:
-                    np.savez(file, allow_pickle=False, **entries)
-                    file.flush()
-                    os.fsync(file.fileno())
-                os.replace(temporary, self.path)
-            except BaseException:
-                Path(temporary).unlink(missing_ok=True)
-                raise
-        except OSError as error:
-            raise InputError(
-                f"cannot write a checkpoint ({error.strerror})", where=str(self.path), remedy="choose another folder"
-            ) from error
+            with partial.open("wb") as file:
+                np.savez(file, allow_pickle=False, **entries)
+                file.flush()
+                os.fsync(file.fileno())
 
     def load(self) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
         """Arrays and the rest of the last whole stage, or None where there is no checkpoint yet.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ import xarray as xr
 from jaxtyping import Float
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import whole
 
 with warnings.catch_warnings():  # 0.23 announces its successor on import; pyproject.toml keeps us on the old one
     warnings.simplefilter("ignore", FutureWarning)
@@ -110,16 +110,8 @@ def save_posterior(data: arviz.InferenceData, path: Path) -> None:
     Raises:
         InputError: if the file cannot be written.
     """
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.partial")
-    try:
+    with whole(path) as partial:
         data.to_netcdf(str(partial), engine="h5netcdf", compress=True)
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError(
-            f"cannot be written ({error.strerror or error})", where=str(path), remedy="choose a writable folder"
-        ) from None
 
 
 def load_posterior(path: Path) -> arviz.InferenceData:

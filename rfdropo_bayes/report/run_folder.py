@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import write_text
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.page import render_page
-from rfdropo_bayes.report.summary import build_summary, read_summary, write_summary, write_text
+from rfdropo_bayes.report.summary import build_summary, read_summary, write_summary
 
 POSTERIOR, SUMMARY, CONFIG, REPORT = "posterior.nc", "summary.json", "config.toml", "report.html"
 

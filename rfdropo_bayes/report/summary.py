@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import write_text
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.report.coverage import coverage
 from rfdropo_bayes.report.facts import RunFacts
@@ -163,22 +163,6 @@ def check_summary(summary: Mapping[str, Any], *, where: str) -> None:
             where=where,
             remedy="use the version of the program that wrote it",
         )
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all.
-
-    Raises:
-        InputError: if it cannot be written.
-    """
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        raise InputError(
-            f"cannot be written ({error.strerror or error})", where=str(path), remedy="choose a writable folder"
-        ) from None
 
 
 def write_summary(summary: Mapping[str, Any], path: Path) -> None:

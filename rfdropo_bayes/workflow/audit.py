@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,6 +24,7 @@ from rfdropo_bayes.bayes.model import gather_recordings
 from rfdropo_bayes.bayes.space import ParameterSpace, build_space
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import write_text
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.audit_page import render_audit
@@ -45,8 +45,9 @@ from rfdropo_bayes.workflow.assembly import (
     measurement_specs,
     pooling,
 )
-from rfdropo_bayes.workflow.experiment import Experiment, describe, load_experiment, matching
-from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.experiment import Experiment, load_experiment, matching
+from rfdropo_bayes.workflow.experiment_file import code_placed, describe, self_contained
+from rfdropo_bayes.workflow.files import hashes, run_folder
 
 Workshop = dict[str, Lanes]
 
@@ -62,6 +63,7 @@ def run_audit(
     base: Path | None = None,
     seed: int | None = None,
     resume: bool = False,
+    overwrite: bool = False,
     workshop: Workshop | None = None,
     report: Callable[[str], None] = lambda line: None,
     inspect: Callable[[Answer], None] = lambda answer: None,
@@ -76,6 +78,7 @@ def run_audit(
         base: folder of an earlier calibration, from whose optimum the base model starts.
         seed: of the audit; that of the file by default.
         resume: go on from what an interrupted audit has left in ``out``.
+        overwrite: start anew whatever ``out`` holds.
         workshop: see `build_question`.
         report: called with a line of words now and then.
         inspect: called with the answer.
@@ -91,19 +94,21 @@ def run_audit(
     fitted, tested = (load_data(experiment, folder, role) for role in ("fit", "test"))
     chosen = experiment.seed if seed is None else seed
     question = build_question(experiment, folder, fitted, tested, chosen, start=start_values(base), workshop=workshop)
-    out = output_folder(out)
-    answer = audit(question, report, Journal(out / JOURNAL, resume=resume))
-    inspect(answer)
-    content = record(
-        answer,
-        versions=software_versions(),
-        data_sha256=combined_hash([trajectory.sha256 for trajectory in [*fitted, *tested]]),
-        next_experiment=next_experiment(answer),
-    )
-    (out / AUDIT).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    (out / EXTENDED).write_text(describe(extended_tables(tables, answer, folder)), encoding="utf-8")
-    page = render_audit(answer, content, experiment.title or path.stem, describe(tables))
-    (out / REPORT).write_text(page, encoding="utf-8")
+    settings = {"tables": tables, "folder": folder, "data": hashes([*fitted, *tested])}
+    options = {"base": base, "seed": chosen}
+    with run_folder(out, "audit", **settings, options=options, resume=resume, overwrite=overwrite) as out:
+        answer = audit(question, report, Journal(out / JOURNAL, resume=resume))
+        inspect(answer)
+        content = record(
+            answer,
+            versions=software_versions(),
+            data_sha256=combined_hash([trajectory.sha256 for trajectory in [*fitted, *tested]]),
+            next_experiment=next_experiment(answer),
+        )
+        write_text(out / AUDIT, json.dumps(content, indent=2, allow_nan=False) + "\n")
+        write_text(out / EXTENDED, describe(extended_tables(tables, answer, folder, out)))
+        page = render_audit(answer, content, experiment.title or path.stem, describe(tables))
+        write_text(out / REPORT, page)
     return content
 
 
@@ -334,9 +339,12 @@ def start_values(base: Path | None) -> dict[str, float] | None:
         ) from None
 
 
-def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path) -> dict[str, Any]:
-    """The experiment file with the mechanisms that the model adopts, for ``rfdropo calibrate``."""
-    extended = copy.deepcopy(tables)
+def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path, out: Path | None = None) -> dict[str, Any]:
+    """The experiment file with the mechanisms that the model adopts, for ``rfdropo calibrate``.
+
+    ``out`` is the folder that it is written to, which gets copies of the user's own files.
+    """
+    extended = self_contained(tables, folder, out)
     model = extended.setdefault("model", {})
     simulator = extended.setdefault("simulator", {})
     for step in answer.adopted:
@@ -346,18 +354,13 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path) -> dic
             simulator["time_step"] = answer.question.finer[0].simulator.description["time_step_s"]
         else:
             candidate = next(c for c in answer.question.candidates if c.name == step.name)
-            model["mechanisms"] = [*model.get("mechanisms", []), _found_again(candidate.source, folder)]
+            model["mechanisms"] = [*model.get("mechanisms", []), code_placed(candidate.source, folder, out)]
             model.setdefault("priors", {}).update(sized_priors(answer, candidate))
     audit = extended.get("audit", {})
     if "candidates" in audit:
-        taken = {c.source for c in answer.question.candidates if c.name in {step.name for step in answer.adopted}}
-        audit["candidates"] = [_found_again(source, folder) for source in audit["candidates"] if source not in taken]
-    data = extended.get("data", {})
-    robot = folder / str(extended.get("robot", ""))
-    if robot.suffix == ".toml" and robot.is_file():
-        extended["robot"] = str(robot)
-    for role in ("fit", "test"):
-        data[role] = [_placed(entry, folder) for entry in data.get(role, [])]
+        adopted = {step.name for step in answer.adopted}
+        taken = {code_placed(c.source, folder, out) for c in answer.question.candidates if c.name in adopted}
+        audit["candidates"] = [source for source in audit["candidates"] if source not in taken]
     return extended
 
 
@@ -373,16 +376,3 @@ def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, An
             table["scale"] = float(f"{table['scale'] * factor[index]:.3g}")
         found[parameter.spec.name] = table
     return found
-
-
-def _found_again(source: str, folder: Path) -> str:
-    """A candidate's name such that it is found from another folder, too."""
-    return str(folder / source) if ".py:" in source else source
-
-
-def _placed(entry: Any, folder: Path) -> Any:
-    """A recording's path such that it is found from another folder, too."""
-    if isinstance(entry, dict):
-        return {k: _placed(v, folder) if k in ("observations", "commands") else v for k, v in entry.items()}
-    beside = folder / str(entry)
-    return str(beside) if list(folder.glob(str(entry))) or beside.is_file() else entry

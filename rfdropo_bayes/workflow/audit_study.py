@@ -19,6 +19,7 @@ from rfdropo_bayes.audit.pipeline import Answer, simulated
 from rfdropo_bayes.audit.record import STIFFNESS
 from rfdropo_bayes.audit.verdict import EQUIVALENT, EXPLAINED, NO_DISCREPANCY, PARTLY, UNEXPLAINED
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.workflow.audit import JOURNAL, Workshop, run_audit
@@ -116,8 +117,8 @@ def run_study(
             "conditions": {c.name: summarise(c, _rows_of(c, done)) for c in chosen},
             "schema_version": 1,
         }
-        (out / RESULT).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        (out / TABLE).write_text(as_table(content), encoding="utf-8")
+        write_text(out / RESULT, json.dumps(content, indent=2) + "\n")
+        write_text(out / TABLE, as_table(content))
     return content
 
 
@@ -156,7 +157,9 @@ def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path)
     hidden, names, unreached = _hidden(condition, turn, number, library, exclude, place, _WORKSHOP)
     answers: list[Answer] = []
     given = [] if condition.repeats else [ONCE]
-    content = run_audit(hidden.experiment, place / "audit", workshop=_WORKSHOP, overrides=given, inspect=answers.append)
+    content = run_audit(
+        hidden.experiment, place / "audit", workshop=_WORKSHOP, overrides=given, inspect=answers.append, overwrite=True
+    )
     prior = answers[0].question.coordinates.prior_deviations
     judged = {
         **judge(content, names, hidden, prior),

@@ -22,8 +22,8 @@ from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, soft
 from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
-from rfdropo_bayes.workflow.experiment import Experiment, describe, load_experiment
-from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
+from rfdropo_bayes.workflow.files import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.workflow.prediction import (
     FITTED,
     HELD,
@@ -43,7 +43,14 @@ CLIMBING = ("laplace", "bridge", "smc")  # smc where it starts at the optima
 
 
 def run_calibration(
-    path: Path, out: Path, *, overrides: Sequence[str] = (), resume: bool = False, start: Path | None = None
+    path: Path,
+    out: Path,
+    *,
+    overrides: Sequence[str] = (),
+    resume: bool = False,
+    overwrite: bool = False,
+    start: Path | None = None,
+    show: bool | None = None,
 ) -> Path:
     """Fit an experiment and write what it found.
 
@@ -52,8 +59,10 @@ def run_calibration(
         out: folder to write to; checkpoints go to its folder ``checkpoints``.
         overrides: assignments that replace entries of the file.
         resume: go on from the checkpoint of an interrupted run of the same experiment.
+        overwrite: start anew whatever ``out`` holds.
         start: folder of an earlier calibration of the same robot, perhaps with fewer mechanisms or other recordings:
             climbs start from its posterior. What is inferred, and from which data, does not change.
+        show: whether to show progress, see `Progress`.
 
     Returns:
         path of report.html.
@@ -69,15 +78,19 @@ def run_calibration(
     method = experiment.inference.method
     problem = build_problem(build_model(experiment, simulator, fitted), earlier_draws(start, method))
     config = make_config(method, inference_options(experiment))
-    out = output_folder(out)
+    recordings = [*fitted, *tested]
     key, predicting = jax.random.split(jax.random.key(experiment.seed))
-    with Progress(method, show=None, log=out / "log.jsonl") as progress:
-        result = run(problem, method, config, key, checkpoint_dir=out / "checkpoints", resume=resume, progress=progress)
-    problem = problem.holding(result.held)
-    attributes = _attributes(experiment, [*fitted, *tested])
-    record = record_posterior(problem, result, tested, predicting, attributes, experiment.model.groups)
-    facts = gather_facts(experiment, path.stem, problem, result, fitted, tested, record.recordings)
-    return write_run(out, record, facts, describe(tables))
+    settings = {"tables": tables, "folder": folder, "data": hashes(recordings), "options": {"from": start}}
+    with run_folder(out, "calibrate", **settings, resume=resume, overwrite=overwrite) as out:
+        with Progress(method, show=show, log=out / LOG, budget=getattr(config, "rollouts", None)) as progress:
+            problem.watch = progress.spend
+            kept = out / CHECKPOINTS
+            result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
+        problem = problem.holding(result.held)
+        attributes = _attributes(experiment, recordings)
+        record = record_posterior(problem, result, tested, predicting, attributes, experiment.model.groups)
+        facts = gather_facts(experiment, path.stem, problem, result, fitted, tested, record.recordings)
+        return write_run(out, record, facts, (out / CONFIG).read_text(encoding="utf-8"))
 
 
 def earlier_draws(folder: Path | None, method: str) -> Batch | None:

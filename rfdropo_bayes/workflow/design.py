@@ -33,6 +33,7 @@ def run_design(
     *,
     overrides: Sequence[str] = (),
     seed: int | None = None,
+    overwrite: bool = False,
     report: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Propose the commands that best separate the leading explanations of an experiment's recordings.

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +12,7 @@ from rfdropo_bayes.data import DataSpec
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable
 from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.workflow.experiment_file import override, read_tables
 
 
 class Table(BaseModel):
@@ -253,46 +253,10 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experime
     Raises:
         InputError: no such file, not TOML, an unknown key or a value of the wrong type.
     """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not text"
-        raise InputError(
-            f"cannot read the experiment file: {reason}", where=str(path), remedy="check the path"
-        ) from None
-    try:
-        tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"not valid TOML: {error}", where=str(path), remedy="mend the syntax there") from None
+    tables = read_tables(path)
     for assignment in overrides:
-        override(tables, assignment)
+        override(tables, assignment, Experiment.model_fields)
     return parse_table(Experiment, tables, where=str(path)), tables
-
-
-def override(tables: dict[str, Any], assignment: str) -> None:
-    """Apply one assignment to nested tables in place."""
-    name, equals, text = assignment.partition("=")
-    keys = [key.strip() for key in name.split(".")]
-    if not equals or not all(keys):
-        raise InputError(f"{assignment!r} is not of the form name=value", where="--set", remedy="e.g. --set seed=1")
-    if len(keys) == 1 and keys[0] not in Experiment.model_fields:
-        tables.get("model", {}).get("priors", {}).pop(keys[0], None)
-        keys = ["model", "fixed", keys[0]]
-    table: Any = tables
-    for key in keys[:-1]:
-        table = table.setdefault(key, {})
-        if not isinstance(table, dict):
-            raise InputError(f"{key!r} in {name!r} is not a table", where="--set", remedy="check the key")
-    table[keys[-1]] = _toml_value(text.strip())
-
-
-def _toml_value(text: str) -> Any:
-    """A value in TOML syntax; a bare word is taken as a string, so that names need no quotes on a command line."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
 
 
 def matching(names: Sequence[str], patterns: str | Sequence[str], *, where: str) -> list[str]:
@@ -308,10 +272,3 @@ def matching(names: Sequence[str], patterns: str | Sequence[str], *, where: str)
             raise InputError(f"no recording matches {pattern!r}", where=where, remedy=f"recordings: {', '.join(names)}")
         chosen += [name for name in found if name not in chosen]
     return chosen
-
-
-def describe(tables: Mapping[str, Any]) -> str:
-    """The tables as TOML text, for config.toml in the run folder."""
-    import tomli_w
-
-    return tomli_w.dumps(dict(tables))

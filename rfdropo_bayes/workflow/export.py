@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.report.run_folder import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import read_summary
@@ -37,7 +38,7 @@ def millimetre_factor(unit: str) -> float:
     return 1000.0**power
 
 
-def export_phi(folder: Path, out: Path | None = None) -> list[Path]:
+def export_phi(folder: Path, out: Path | None = None, *, overwrite: bool = False) -> list[Path]:
     """Write phi of a run: a table (CSV and JSON) with units, and joint draws.
 
     RF-DROPO's phi is written as found: independent normals before truncation, with their limits. Of any other method
@@ -53,6 +54,7 @@ def export_phi(folder: Path, out: Path | None = None) -> list[Path]:
     summary = read_summary(folder / SUMMARY)
     record = PosteriorRecord.load(folder / POSTERIOR)
     out = output_folder(out or folder)
+    _check_absent([out / TABLE, out / TABLE_JSON, out / DRAWS], overwrite)
     names = [info.name for info in record.free]
     stack = np.stack([record.flat(name) for name in names])
     rows = _rows(record, summary)
@@ -69,18 +71,15 @@ def export_phi(folder: Path, out: Path | None = None) -> list[Path]:
         "draws": {"file": DRAWS, "number": drawn.shape[1], "units": "SI"},
     }
     paths = [out / TABLE, out / TABLE_JSON, out / DRAWS]
-    try:
-        pd.DataFrame(rows).to_csv(paths[0], index=False)
-        paths[1].write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        pd.DataFrame(drawn.T, columns=names).to_csv(paths[2], index=False)
-    except OSError as error:
-        raise InputError(
-            f"cannot be written ({error.strerror})", where=str(out), remedy="choose another with --out"
-        ) from None
+    with whole(paths[0]) as partial:
+        pd.DataFrame(rows).to_csv(partial, index=False)
+    write_text(paths[1], json.dumps(content, indent=2, allow_nan=False) + "\n")
+    with whole(paths[2]) as partial:
+        pd.DataFrame(drawn.T, columns=names).to_csv(partial, index=False)
     return paths
 
 
-def export_posterior(folder: Path, out: Path | None) -> Path:
+def export_posterior(folder: Path, out: Path | None, *, overwrite: bool = False) -> Path:
     """Write posterior.nc with `KEPT_DRAWS` draws and no predictions: enough to predict with, or to start climbs from.
 
     Returns:
@@ -98,8 +97,20 @@ def export_posterior(folder: Path, out: Path | None) -> Path:
     kept = np.linspace(0, size - 1, min(KEPT_DRAWS, size)).round().astype(int)
     draws = {name: values[:, kept] for name, values in record.posterior.items()}
     path = output_folder(out) / POSTERIOR
+    _check_absent([path], overwrite)
     PosteriorRecord(record.parameters, draws, derived=record.derived, attrs=record.attrs).save(path)
     return path
+
+
+def _check_absent(paths: Sequence[Path], overwrite: bool) -> None:
+    """Raise InputError where an earlier export would be replaced."""
+    there = [path for path in paths if path.exists()]
+    if there and not overwrite:
+        raise InputError(
+            "is there already",
+            where=str(there[0]),
+            remedy="choose another folder with --out, or replace it with --overwrite",
+        )
 
 
 def _rows(record: PosteriorRecord, summary: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -29,7 +29,8 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot
 from rfdropo_bayes.workflow.audit import Workshop, build_question
 from rfdropo_bayes.workflow.commands import random_walk
-from rfdropo_bayes.workflow.experiment import AuditTable, CommandsTable, Experiment, describe
+from rfdropo_bayes.workflow.experiment import AuditTable, CommandsTable, Experiment
+from rfdropo_bayes.workflow.experiment_file import describe
 from rfdropo_bayes.workflow.files import output_folder
 
 NOISE, MEMORY = 5e-4, 0.6  # standard deviation [m] and correlation from row to row

@@ -14,13 +14,14 @@ from jaxtyping import PRNGKeyArray
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import write_text
 from rfdropo_bayes.inference import sbc
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
 from rfdropo_bayes.workflow.calibration import inference_options
 from rfdropo_bayes.workflow.experiment import load_experiment
-from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.files import LOG, hashes, run_folder
 
 CHECKS = ("sbc",)
 MOST_FAILURES = 100
@@ -34,6 +35,7 @@ def run_check(
     datasets: int = 200,
     overrides: Sequence[str] = (),
     resume: bool = False,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
     """Check the experiment's method on data simulated from its own prior at its own commands and times.
 
@@ -47,34 +49,36 @@ def run_check(
     """
     if check not in CHECKS:
         raise InputError(f"unknown check {check!r}", where="--check", remedy=f"one of {', '.join(CHECKS)}")
-    experiment, _ = load_experiment(path, overrides)
+    experiment, tables = load_experiment(path, overrides)
     folder = Path(path).resolve().parent
     simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
-    problem = build_problem(build_model(experiment, simulator, load_data(experiment, folder, "fit")))
+    fitted = load_data(experiment, folder, "fit")
+    problem = build_problem(build_model(experiment, simulator, fitted))
     options = inference_options(experiment)
     make_config(experiment.inference.method, options)
-    out = output_folder(out)
-    with Progress("sbc", show=None, log=out / "log.jsonl") as progress:
-        found = sbc.calibrate(
-            problem,
-            lambda key: simulate_data_set(problem, key),
-            experiment.inference.method,
-            options,
-            jax.random.key(experiment.seed),
-            datasets,
-            log=out / "sbc.jsonl",
-            resume=resume,
-            progress=progress,
-        )
-    content = {
-        **found.as_dict(),
-        "method": experiment.inference.method,
-        "options": options,
-        "seed": experiment.seed,
-        "robot": experiment.robot,
-        "simulator": simulator.description,
-    }
-    (out / "sbc.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    settings = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": {"check": check}}
+    with run_folder(out, "check", **settings, resume=resume, overwrite=overwrite) as out:
+        with Progress("sbc", show=None, log=out / LOG) as progress:
+            found = sbc.calibrate(
+                problem,
+                lambda key: simulate_data_set(problem, key),
+                experiment.inference.method,
+                options,
+                jax.random.key(experiment.seed),
+                datasets,
+                log=out / "sbc.jsonl",
+                resume=resume,
+                progress=progress,
+            )
+        content = {
+            **found.as_dict(),
+            "method": experiment.inference.method,
+            "options": options,
+            "seed": experiment.seed,
+            "robot": experiment.robot,
+            "simulator": simulator.description,
+        }
+        write_text(out / "sbc.json", json.dumps(content, indent=1) + "\n")
     return content
 
 

@@ -16,13 +16,14 @@ from rfdropo_bayes.audit.noise import RESIDUALS, NoiseModel
 from rfdropo_bayes.audit.pipeline import FIRST_GUESS, Question, simulated
 from rfdropo_bayes.audit.separation import Separation, separate
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import write_text
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.separation_table import separation_figure, separation_markdown
 from rfdropo_bayes.report.summary import combined_hash
 from rfdropo_bayes.workflow.assembly import load_data
 from rfdropo_bayes.workflow.audit import build_question, start_values
 from rfdropo_bayes.workflow.experiment import load_experiment
-from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.files import hashes, run_folder
 
 RESULT, TABLE, FIGURE, JOURNAL = "separation.json", "separation.md", "separation.png", "checkpoints/separation"
 DRAWS = 1000
@@ -36,6 +37,7 @@ def run_separation(
     overrides: Sequence[str] = (),
     base: Path | None = None,
     resume: bool = False,
+    overwrite: bool = False,
     report: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Fit the experiment's base model with and without the mechanisms of its table [separation].
@@ -46,6 +48,7 @@ def run_separation(
         overrides: assignments that replace entries of the file.
         base: folder of an earlier calibration, from whose posterior means the model without mechanisms starts.
         resume: go on from what an interrupted run has left in ``out``.
+        overwrite: start anew whatever ``out`` holds.
         report: called with a line of words now and then.
 
     Returns:
@@ -54,7 +57,7 @@ def run_separation(
     Raises:
         InputError: bad input, before anything long has started.
     """
-    experiment, _ = load_experiment(path, overrides)
+    experiment, tables = load_experiment(path, overrides)
     folder = Path(path).resolve().parent
     table = experiment.separation
     if table is None:
@@ -67,24 +70,25 @@ def run_separation(
     fitted = load_data(experiment, folder, "fit")
     start = start_values(base)
     question = build_question(experiment, folder, fitted, [], experiment.seed, start=start, names=table.mechanisms)
-    out = output_folder(out)
-    coordinates = question.coordinates
-    found = separate(
-        _target(question, Journal(out / JOURNAL, resume=resume)),
-        question.candidates,
-        table.groups,
-        coordinates.null if start is None else coordinates.encode(start),
-        report,
-    )
-    content = {
-        **record_separation(found, question),
-        "seed": experiment.seed,
-        "versions": software_versions(),
-        "data_sha256": combined_hash([trajectory.sha256 for trajectory in fitted]),
-    }
-    (out / RESULT).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    (out / TABLE).write_text(separation_markdown(content), encoding="utf-8")
-    separation_figure(content).savefig(out / FIGURE)
+    settings = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": {"base": base}}
+    with run_folder(out, "separate", **settings, resume=resume, overwrite=overwrite) as out:
+        coordinates = question.coordinates
+        found = separate(
+            _target(question, Journal(out / JOURNAL, resume=resume)),
+            question.candidates,
+            table.groups,
+            coordinates.null if start is None else coordinates.encode(start),
+            report,
+        )
+        content = {
+            **record_separation(found, question),
+            "seed": experiment.seed,
+            "versions": software_versions(),
+            "data_sha256": combined_hash([trajectory.sha256 for trajectory in fitted]),
+        }
+        write_text(out / RESULT, json.dumps(content, indent=2, allow_nan=False) + "\n")
+        write_text(out / TABLE, separation_markdown(content))
+        separation_figure(content).savefig(out / FIGURE)
     return content
 
 

@@ -15,14 +15,15 @@ from jaxtyping import Float, PRNGKeyArray
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values, load_data
 from rfdropo_bayes.workflow.balance import append_balance
 from rfdropo_bayes.workflow.commands import random_walk
-from rfdropo_bayes.workflow.experiment import CommandsTable, Experiment, NoiseTable
-from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.experiment import CommandsTable, Experiment, NoiseTable, load_experiment
+from rfdropo_bayes.workflow.files import output_folder, run_folder
 
 # Number that the first marker's column carries in each source.
 FIRST_COLUMN = {"sofa-csv": 0, "optitrack-csv": 1, "asl-csv": 1}
@@ -30,7 +31,22 @@ CUBE_COLUMNS = tuple(f"cube_{name}" for name in ("x", "y", "z", "qx", "qy", "qz"
 """Of the cube's pose, as in SOFA's and OptiTrack's recordings."""
 
 
-def run_simulation(experiment: Experiment, folder: Path, out: Path, balance: bool = False) -> dict[str, Any]:
+def run_simulation(
+    path: Path, out: Path, *, overrides: Sequence[str] = (), balance: bool = False, overwrite: bool = False
+) -> dict[str, Any]:
+    """Simulate the recordings or commands of an experiment file into a folder of its own; see `simulate_all`.
+
+    Raises:
+        InputError: bad input, a folder that holds a run, or a rollout that did not end well.
+    """
+    experiment, tables = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    settings = {"tables": tables, "folder": folder, "options": {"balance": balance}}
+    with run_folder(out, "simulate", **settings, overwrite=overwrite) as out:
+        return simulate_all(experiment, folder, out, balance)
+
+
+def simulate_all(experiment: Experiment, folder: Path, out: Path, balance: bool = False) -> dict[str, Any]:
     """Simulate every recording of the experiment, or the command sequences of its [commands] table.
 
     Writes, per recording, ``<name>.nc`` (`Trajectory`) and ``<name>.csv`` (time in s, markers in mm, in the source's
@@ -66,7 +82,8 @@ def run_simulation(experiment: Experiment, folder: Path, out: Path, balance: boo
         pose = None if observation.object_pose is None else np.asarray(observation.object_pose)
         simulated = _as_trajectory(source, position, pose, markers, simulator, experiment, values, index)
         simulated.save(out / f"{stem}.nc")
-        _table(source, simulated).to_csv(out / f"{stem}.csv", index=False, float_format="%.6f")
+        with whole(out / f"{stem}.csv") as partial:
+            _table(source, simulated).to_csv(partial, index=False, float_format="%.6f")
         distances.append(_distance(source, position, markers))
         report["recordings"][source.name] = {
             "status": result.name.lower(),
@@ -79,7 +96,7 @@ def run_simulation(experiment: Experiment, folder: Path, out: Path, balance: boo
         if pose is not None and source.object_pose is not None:
             report["recordings"][source.name]["object_error"] = _object_errors(pose, source.object_pose)
     report["error_mm"] = _errors(distances) if experiment.data else None
-    (out / "simulation.json").write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    write_text(out / "simulation.json", json.dumps(report, indent=2) + "\n")
     return report
 
 

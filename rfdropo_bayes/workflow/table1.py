@@ -13,12 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.rivals import import_sbi
 from rfdropo_bayes.report.facts import software_versions
 from rfdropo_bayes.report.randomisation import unfinished
 from rfdropo_bayes.workflow.comparison import RIVALS, ROWS, fit, misleads
-from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.files import LOG, run_folder
 from rfdropo_bayes.workflow.fits import finished, run_fits
 from rfdropo_bayes.workflow.table1_figure import draw_figure
 from rfdropo_bayes.workflow.tasks import TASKS
@@ -81,6 +82,7 @@ def run_table1(
     resume: bool = False,
     cluster: str | None = None,
     only_done: bool = False,
+    overwrite: bool = False,
     command: str = "",
 ) -> dict[str, Any]:
     """Do all fits and write ``table1.json``, ``table1.md`` and ``table1.png``; fits.jsonl keeps each fit as it ends.
@@ -94,34 +96,37 @@ def run_table1(
         for name in given:
             if name not in known:
                 raise InputError(f"unknown {kind} {name!r}", where=f"--{kind}", remedy=f"some of {', '.join(known)}")
-    out = output_folder(out)
-    left_out = _without_sbi(rows)
-    jobs = list_jobs(size, [row for row in rows if row not in left_out], tasks)
-    ledger = out / "fits.jsonl"
-    if only_done:
-        done = finished(jobs, ledger)
-    else:
-        with Progress("table1", show=None, log=out / "log.jsonl") as progress:
-            done = run_fits(jobs, fit, ledger, resume=resume, cluster=cluster, progress=progress)
-    # Ledgers older than this figure have no cube: their motion tells of all parameters.
-    found = [{"mse_excited": result.get("mse"), **result} for result in done]
-    content = {
-        "schema_version": 1,
-        "command": command,
-        "size": asdict(size),
-        "left_out": left_out,
-        "not_done": len(jobs) - len(done),
-        "paper": PAPER,
-        "cells": summarise(found),
-        "claims": claims(found),
-        "ahead_of_ours": ahead_of_ours(found),
-        "misleading": misleading(found),
-        "by_warning": by_warning(found),
-        "versions": software_versions(),
-    }
-    (out / "table1.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    (out / "table1.md").write_text(as_markdown(content), encoding="utf-8")
-    draw_figure(content, out / "table1.png")
+    # A study may grow: more truths, rows and tasks go on with the fits that are there.
+    options = {"budget": size.budget, "actions": size.actions, "seed": size.seed}
+    going_on = resume or only_done
+    with run_folder(out, "benchmark table1", options=options, resume=going_on, overwrite=overwrite) as out:
+        left_out = _without_sbi(rows)
+        jobs = list_jobs(size, [row for row in rows if row not in left_out], tasks)
+        ledger = out / "fits.jsonl"
+        if only_done:
+            done = finished(jobs, ledger)
+        else:
+            with Progress("table1", show=None, log=out / LOG) as progress:
+                done = run_fits(jobs, fit, ledger, resume=resume, cluster=cluster, progress=progress)
+        # Ledgers older than this figure have no cube: their motion tells of all parameters.
+        found = [{"mse_excited": result.get("mse"), **result} for result in done]
+        content = {
+            "schema_version": 1,
+            "command": command,
+            "size": asdict(size),
+            "left_out": left_out,
+            "not_done": len(jobs) - len(done),
+            "paper": PAPER,
+            "cells": summarise(found),
+            "claims": claims(found),
+            "ahead_of_ours": ahead_of_ours(found),
+            "misleading": misleading(found),
+            "by_warning": by_warning(found),
+            "versions": software_versions(),
+        }
+        write_text(out / "table1.json", json.dumps(content, indent=1) + "\n")
+        write_text(out / "table1.md", as_markdown(content))
+        draw_figure(content, out / "table1.png")
     return content
 
 

@@ -18,12 +18,13 @@ from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
 from rfdropo_bayes.data import load_unseen, start_is_known
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values, measurement_specs
 from rfdropo_bayes.workflow.experiment import load_experiment
-from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.prediction import FITTED, HELD, MARKER_ERRORS, predict_new, thin
 
 DRAWS = 200
@@ -42,6 +43,7 @@ def run_prediction(
     rows: tuple[int, int] | None = None,
     overrides: Sequence[str] = (),
     seed: int | None = None,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
     """Predict what the markers will do under given commands, from at most the start pose.
 
@@ -57,11 +59,12 @@ def run_prediction(
         rows: predict observation rows first to last only; the pose of the first is then that of row ``first``.
         overrides: assignments that replace entries of the experiment file.
         seed: of the draws; that of the experiment by default.
+        overwrite: write whatever ``out`` holds.
 
     Raises:
         InputError: bad input, or a posterior that does not belong to the experiment.
     """
-    experiment, _ = load_experiment(path, overrides)
+    experiment, tables = load_experiment(path, overrides)
     folder = Path(path).resolve().parent
     if experiment.data is None:
         raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format the commands are")
@@ -80,25 +83,29 @@ def run_prediction(
     predicted = predict_new(
         model, [unseen], values, key, chunk=simulator.lanes, fitted=fitted, errors=errors, groups=groups
     )[0]
-    out = output_folder(out)
     table = summarise(predicted)
     table.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": simulator.robot.name, "recording": unseen.name}
-    table.to_netcdf(out / "prediction.nc", engine="h5netcdf")
-    _columns(table).to_csv(out / "prediction.csv", index=False, float_format="%.6f")
-    facts = {
-        "schema_version": SCHEMA_VERSION,
-        "experiment": str(path),
-        "posterior": str(posterior),
-        "commands": commands,
-        "start_pose_known": start_is_known(unseen),
-        "rows": len(predicted.time),
-        "draws": int(predicted.predicted.shape[0]),
-        "unit": "m",
-        "frame": unseen.dataset.attrs["frame"],
-        "simulator": simulator.description,
-        "files": [str(out / "prediction.nc"), str(out / "prediction.csv")],
-    }
-    (out / "prediction.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    options = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
+    settings = {"tables": tables, "folder": folder, "options": options, "data": hashes([unseen])}
+    with run_folder(out, "predict", **settings, overwrite=overwrite) as out:
+        facts = {
+            "schema_version": SCHEMA_VERSION,
+            "experiment": str(path),
+            "posterior": str(posterior),
+            "commands": commands,
+            "start_pose_known": start_is_known(unseen),
+            "rows": len(predicted.time),
+            "draws": int(predicted.predicted.shape[0]),
+            "unit": "m",
+            "frame": unseen.dataset.attrs["frame"],
+            "simulator": simulator.description,
+            "files": [str(out / "prediction.nc"), str(out / "prediction.csv")],
+        }
+        with whole(out / "prediction.nc") as partial:
+            table.to_netcdf(partial, engine="h5netcdf")
+        with whole(out / "prediction.csv") as partial:
+            _columns(table).to_csv(partial, index=False, float_format="%.6f")
+        write_text(out / "prediction.json", json.dumps(facts, indent=2) + "\n")
     return facts
 
 

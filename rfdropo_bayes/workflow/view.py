@@ -15,7 +15,7 @@ from rfdropo_bayes.report.motion_figures import save_animation, save_still
 from rfdropo_bayes.robots import Robot, load_robot
 from rfdropo_bayes.workflow.assembly import find_robot, load_data
 from rfdropo_bayes.workflow.experiment import load_experiment
-from rfdropo_bayes.workflow.simulation import run_simulation
+from rfdropo_bayes.workflow.simulation import simulate_all
 
 STILLS, ANIMATIONS = (".png", ".svg", ".pdf"), (".gif", ".mp4")
 
@@ -62,7 +62,7 @@ def _from_experiment(path: Path, overrides: list[str], recording: str | None) ->
     experiment, _ = load_experiment(path, overrides)
     folder = path.resolve().parent
     with tempfile.TemporaryDirectory() as scratch:
-        found = run_simulation(experiment, folder, Path(scratch))
+        found = simulate_all(experiment, folder, Path(scratch))
         names = list(found["recordings"])
         if recording is not None and recording not in names:
             raise InputError(f"no recording {recording!r}", where="view", remedy=f"recordings: {', '.join(names)}")

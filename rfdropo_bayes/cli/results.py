@@ -1,0 +1,90 @@
+"""What a calibration or an audit found, on the terminal: the verdict, a table of parameters, where the report is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+GOOD, FAIR, BAD = "green", "yellow", "red"
+COLOURS = {
+    "safe": GOOD,
+    "with care": FAIR,
+    "unsafe": BAD,
+    "no_discrepancy": GOOD,
+    "explained": GOOD,
+    "equivalent": FAIR,
+    "partly_explained": FAIR,
+    "unexplained": BAD,
+}
+CALIBRATED = ("title", "status", "headline", "randomisation", "parameters", "rmse", "log_evidence", "warnings")
+AUDITED = ("verdict", "sentence", "findings", "gain", "next_experiment")
+MOST_ROWS = 20
+
+
+def show_calibration(folder: Path, *, quiet: bool, as_json: bool) -> None:
+    """Print the result of a finished calibration."""
+    if quiet and not as_json:
+        return
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    report = folder / "report.html"
+    if as_json:
+        chosen = {key: summary[key] for key in CALIBRATED if key in summary}
+        typer.echo(json.dumps({**chosen, "folder": str(folder), "report": str(report)}, indent=2))
+        return
+    console = Console(highlight=False)
+    judged = summary.get("randomisation", {})
+    for sentence in summary["headline"]:
+        own = sentence == judged.get("sentence")
+        console.print(Text(sentence, style=COLOURS.get(judged.get("verdict", ""), "") if own else ""), soft_wrap=True)
+    rows = [(name, row, "derived" if row.get("derived") else "") for name, row in summary["parameters"].items()]
+    console.print(_parameters(rows[:MOST_ROWS]))
+    if len(rows) > MOST_ROWS:
+        console.print(f"and {len(rows) - MOST_ROWS} more in {folder / 'summary.json'}", soft_wrap=True)
+    for sentence in summary["warnings"]:
+        console.print(Text(f"warning: {sentence}", style=FAIR), soft_wrap=True)
+    console.print(f"report: {report}", soft_wrap=True)
+
+
+def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: bool) -> None:
+    """Print the result of an audit; ``found`` is the content of audit.json."""
+    files = {"folder": str(folder), "report": str(folder / "report.html"), "extended": str(folder / "extended.toml")}
+    if as_json:
+        typer.echo(json.dumps({**{key: found[key] for key in AUDITED if key in found}, **files}, indent=2))
+        return
+    if quiet:
+        return
+    console = Console(highlight=False)
+    verdict = Text(found["verdict"], style=f"bold {COLOURS.get(found['verdict'], '')}")
+    console.print(verdict + Text(f": {found['sentence']}", style="not bold"), soft_wrap=True)
+    rows = [
+        (name, row, finding["mechanism"].replace("_", " "))
+        for finding in found["findings"]
+        for name, row in finding["parameters"].items()
+    ]
+    if rows:
+        console.print(_parameters(rows[:MOST_ROWS]))
+    console.print(f"report: {files['report']}; extended model: {files['extended']}", soft_wrap=True)
+
+
+def _parameters(rows: Iterable[tuple[str, Mapping[str, Any], str]]) -> Table:
+    """Name, unit, mean, 5 and 95 % quantiles, and a remark."""
+    from rfdropo_bayes.report.units import display_unit
+
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for title in ("parameter", "unit"):
+        table.add_column(title)
+    for title in ("mean", "5 %", "95 %"):
+        table.add_column(title, justify="right")
+    table.add_column("")
+    for name, row, remark in rows:
+        factor, unit = display_unit(row["unit"], max(abs(row["q05"]), abs(row["q95"])))
+        bound = Text("at a bound", style=BAD) if row.get("at_bound") else Text(remark, style="dim")
+        table.add_row(Text(name), Text(unit), *(f"{row[key] / factor:.4g}" for key in ("mean", "q05", "q95")), bound)
+    return table

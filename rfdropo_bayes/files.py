@@ -1,0 +1,91 @@
+"""Files: found where recordings lie, and written whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from rfdropo_bayes.errors import InputError
+
+DATA_VARIABLE = "RFDROPO_DATA"
+_GLOB = "*?["
+
+
+def find_files(pattern: str, base: Path) -> list[Path]:
+    """Files of a name or glob in the first folder that has any: RFDROPO_DATA, or else ``base``.
+
+    Raises:
+        InputError: no such file.
+    """
+    variable = os.environ.get(DATA_VARIABLE)
+    roots = [Path(variable), Path(base)] if variable else [Path(base)]
+    wanted = Path(pattern)
+    if wanted.is_absolute():
+        roots, wanted = [Path(wanted.anchor)], wanted.relative_to(wanted.anchor)
+    for root in roots:
+        files = sorted(root.glob(str(wanted))) if any(sign in pattern for sign in _GLOB) else [root / wanted]
+        files = [file for file in files if file.is_file()]
+        if files:
+            return files
+    looked = " and ".join(str(root) for root in roots)
+    raise InputError(
+        f"no such file; looked in {looked} ({DATA_VARIABLE} is {'set' if variable else 'not set'})",
+        where=pattern,
+        remedy=f"correct the path, or set {DATA_VARIABLE} to the folder that holds the data",
+    )
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A name to write to, which becomes ``path`` once the block has ended well; else nothing is left of it.
+
+    Raises:
+        InputError: the file cannot be written, e.g. because the disk is full.
+    """
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        yield partial
+        os.replace(partial, path)
+    except OSError as error:
+        raise unwritten(error, path) from None
+    finally:
+        with suppress(OSError):
+            partial.unlink()
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    with whole(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def append_line(path: Path, line: str) -> None:
+    """Add a line to a text file, whose folder is made.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+    except OSError as error:
+        raise unwritten(error, path) from None
+
+
+def unwritten(error: OSError, path: Path) -> InputError:
+    """The error of the operating system as one that says what to do."""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    return InputError(
+        f"cannot be written ({error.strerror or error})",
+        where=str(path),
+        remedy="make room on the disk" if full else "choose a writable folder",
+    )

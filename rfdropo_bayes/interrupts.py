@@ -1,0 +1,61 @@
+"""Ctrl-C: a run stops where it can go on, without a traceback.
+
+An exception raised at any place is not enough: modules that are being imported swallow it or crash, and JAX makes
+another of one that is raised while compiled code calls back.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Literal
+
+EXIT_STATUS = 3
+NOTHING_LOST = "interrupted before anything was computed; nothing is lost"
+STOPPING = "stopping at the end of this step; Ctrl-C again stops at once"
+
+_pressed = 0
+_answer: Literal["exit", "raise", "note"] = "exit"
+
+
+def watch_interrupts() -> None:
+    """Answer Ctrl-C from now on: outside of `running`, the program ends at once."""
+    global _pressed
+    _pressed = 0
+    signal.signal(signal.SIGINT, _note)
+
+
+@contextmanager
+def running(*, checks: bool) -> Iterator[None]:
+    """A part in which Ctrl-C raises KeyboardInterrupt; with ``checks``, the first one does so in `check_interrupt`."""
+    global _answer
+    _answer = "note" if checks else "raise"
+    try:
+        yield
+    finally:
+        _answer = "exit"
+
+
+def interrupted() -> bool:
+    """Whether Ctrl-C was pressed since `watch_interrupts`."""
+    return _pressed > 0
+
+
+def check_interrupt() -> None:
+    """Raise KeyboardInterrupt if Ctrl-C was pressed."""
+    if interrupted():
+        raise KeyboardInterrupt
+
+
+def _note(number: int, frame: FrameType | None) -> None:
+    global _pressed
+    _pressed += 1
+    if _answer == "exit":
+        os.write(2, f"rfdropo: {NOTHING_LOST}\n".encode())
+        os._exit(EXIT_STATUS)
+    if _answer == "raise" or _pressed > 1:
+        raise KeyboardInterrupt
+    os.write(2, f"\nrfdropo: {STOPPING}\n".encode())

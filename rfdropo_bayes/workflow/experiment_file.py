@@ -1,0 +1,168 @@
+"""The experiment file as text and tables: read, overridden, looked through, and made to work from another folder.
+
+Nothing heavy is imported here: a mistyped path is answered before JAX and the engines are loaded.
+"""
+
+from __future__ import annotations
+
+import copy
+import shutil
+import tomllib
+from collections.abc import Container, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import find_files, unwritten
+
+ROBOT_COPY = "robot.toml"
+FILE_KEYS = ("observations", "commands")
+NO_COMMANDS = "none"  # stands for zero commands where a file of them could be named
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """Tables of a TOML file.
+
+    Raises:
+        InputError: no such file, or not TOML.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not text"
+        raise InputError(
+            f"cannot read the experiment file: {reason}", where=str(path), remedy="check the path"
+        ) from None
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"not valid TOML: {error}", where=str(path), remedy="mend the syntax there") from None
+
+
+def override(tables: dict[str, Any], assignment: str, fields: Container[str]) -> None:
+    """Apply one assignment to nested tables in place; a bare name that is none of ``fields`` is a parameter."""
+    name, equals, text = assignment.partition("=")
+    keys = [key.strip() for key in name.split(".")]
+    if not equals or not all(keys):
+        raise InputError(f"{assignment!r} is not of the form name=value", where="--set", remedy="e.g. --set seed=1")
+    if len(keys) == 1 and keys[0] not in fields:
+        tables.get("model", {}).get("priors", {}).pop(keys[0], None)
+        keys = ["model", "fixed", keys[0]]
+    table: Any = tables
+    for key in keys[:-1]:
+        table = table.setdefault(key, {})
+        if not isinstance(table, dict):
+            raise InputError(f"{key!r} in {name!r} is not a table", where="--set", remedy="check the key")
+    table[keys[-1]] = _toml_value(text.strip())
+
+
+def _toml_value(text: str) -> Any:
+    """A value in TOML syntax; a bare word is taken as a string, so that names need no quotes on a command line."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def describe(tables: Mapping[str, Any]) -> str:
+    """The tables as TOML text, for config.toml in the run folder."""
+    import tomli_w
+
+    return tomli_w.dumps(dict(tables))
+
+
+def look_through(path: Path, overrides: Sequence[str] = ()) -> None:
+    """See that the files which an experiment names are there, at once.
+
+    What else may be wrong with it is said by `load_experiment` and by the rooms that read its tables.
+
+    Raises:
+        InputError: the experiment file cannot be read, or a recording or a robot file is missing.
+    """
+    tables = read_tables(path)
+    folder = Path(path).resolve().parent
+    for assignment in overrides:
+        if assignment.split("=")[0].strip().startswith(("data.", "robot")):
+            override(tables, assignment, {"robot"})
+    robot = tables.get("robot")
+    if isinstance(robot, str) and robot.endswith(".toml") and not _robot_file(robot, folder).is_file():
+        raise InputError(
+            "no such robot file", where=str(folder / robot), remedy="correct robot = ... in the experiment"
+        )
+    for name in _recordings(tables):
+        find_files(name, folder)
+
+
+def _recordings(tables: Mapping[str, Any]) -> Iterator[str]:
+    data = tables.get("data")
+    for role in ("fit", "test"):
+        entries = data.get(role) if isinstance(data, dict) else None
+        for entry in entries if isinstance(entries, list) else []:
+            named = [entry.get(key) for key in FILE_KEYS] if isinstance(entry, dict) else [entry]
+            yield from (name for name in named if isinstance(name, str) and name != NO_COMMANDS)
+
+
+def _robot_file(robot: str, folder: Path) -> Path:
+    """Beside the experiment, or else from where the program was started."""
+    beside = folder / robot
+    return beside if beside.is_file() else Path(robot)
+
+
+def self_contained(tables: Mapping[str, Any], folder: Path, out: Path | None = None) -> dict[str, Any]:
+    """The tables such that they mean the same in another folder.
+
+    Args:
+        tables: of an experiment.
+        folder: that of the experiment file.
+        out: folder that gets copies of the robot's file and of mechanisms' code; without one, their paths are given.
+
+    Raises:
+        InputError: a file cannot be copied.
+    """
+    placed = copy.deepcopy(dict(tables))
+    robot = _robot_file(str(placed.get("robot", "")), folder)
+    if robot.suffix == ".toml" and robot.is_file():
+        placed["robot"] = _brought(robot, out, ROBOT_COPY)
+    for table, key in (("model", "mechanisms"), ("audit", "candidates"), ("separation", "mechanisms")):
+        if key in placed.get(table, {}):
+            placed[table][key] = [code_placed(name, folder, out) for name in placed[table][key]]
+    mesh = placed.get("simulator", {}).get("tetrahedra", {})
+    if "mesh" in mesh:
+        mesh["mesh"] = _placed(mesh["mesh"], folder)
+    for role in ("fit", "test"):
+        if role in placed.get("data", {}):
+            placed["data"][role] = [_placed(entry, folder) for entry in placed["data"][role]]
+    return placed
+
+
+def _placed(entry: Any, folder: Path) -> Any:
+    """A recording's path such that it is found from another folder, too."""
+    if isinstance(entry, dict):
+        return {k: _placed(v, folder) if k in FILE_KEYS else v for k, v in entry.items()}
+    try:
+        beside = find_files(str(entry), folder)[0].is_relative_to(folder)
+    except InputError:
+        return entry
+    return str(folder / str(entry)) if beside else entry
+
+
+def code_placed(source: str, folder: Path, out: Path | None = None) -> str:
+    """``"mine.py:Mechanism"`` such that it is found from another folder, too; names of the registry stay."""
+    file, colon, name = source.partition(".py:")
+    if not colon:
+        return source
+    code = folder / f"{file}.py"
+    return f"{_brought(code, out, code.name)}:{name}" if code.is_file() else source
+
+
+def _brought(file: Path, out: Path | None, name: str) -> str:
+    """Where a file is found: in the folder it is copied to, under ``name``, or where it is."""
+    if out is None:
+        return str(file.resolve())
+    try:
+        if not (out / name).exists() or not (out / name).samefile(file):
+            shutil.copyfile(file, out / name)
+    except OSError as error:
+        raise unwritten(error, out / name) from None
+    return name
