@@ -94,7 +94,7 @@ def run_audit(
     fitted, tested = (load_data(experiment, folder, role) for role in ("fit", "test"))
     chosen = experiment.seed if seed is None else seed
     question = build_question(experiment, folder, fitted, tested, chosen, start=start_values(base), workshop=workshop)
-    settings = {"tables": tables, "folder": folder, "data": hashes([*fitted, *tested])}
+    settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes([*fitted, *tested])}
     options = {"base": base, "seed": chosen}
     with run_folder(out, "audit", **settings, options=options, resume=resume, overwrite=overwrite) as out:
         answer = audit(question, report, Journal(out / JOURNAL, resume=resume))

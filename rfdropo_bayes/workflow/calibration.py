@@ -80,7 +80,8 @@ def run_calibration(
     config = make_config(method, inference_options(experiment))
     recordings = [*fitted, *tested]
     key, predicting = jax.random.split(jax.random.key(experiment.seed))
-    settings = {"tables": tables, "folder": folder, "data": hashes(recordings), "options": {"from": start}}
+    settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes(recordings)}
+    settings["options"] = {"from": start}
     with run_folder(out, "calibrate", **settings, resume=resume, overwrite=overwrite) as out:
         with Progress(method, show=show, log=out / LOG, budget=getattr(config, "rollouts", None)) as progress:
             problem.watch = progress.spend

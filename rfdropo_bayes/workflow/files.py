@@ -91,7 +91,7 @@ def run_folder(
     """
     out = output_folder(out)
     earlier = _read(out / RUN)
-    settings = {"experiment": {}, "options": dict(options or {}), "data": dict(data or {})}
+    settings: dict[str, Any] = {"experiment": {}, "options": dict(options or {}), "data": dict(data or {})}
     check_folder(out, command, resume=resume, overwrite=overwrite)
     if tables is not None:
         contained = self_contained(tables, folder, out)

@@ -56,7 +56,7 @@ def run_check(
     problem = build_problem(build_model(experiment, simulator, fitted))
     options = inference_options(experiment)
     make_config(experiment.inference.method, options)
-    settings = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": {"check": check}}
+    settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": {"check": check}}
     with run_folder(out, "check", **settings, resume=resume, overwrite=overwrite) as out:
         with Progress("sbc", show=None, log=out / LOG) as progress:
             found = sbc.calibrate(

@@ -70,7 +70,7 @@ def run_separation(
     fitted = load_data(experiment, folder, "fit")
     start = start_values(base)
     question = build_question(experiment, folder, fitted, [], experiment.seed, start=start, names=table.mechanisms)
-    settings = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": {"base": base}}
+    settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": {"base": base}}
     with run_folder(out, "separate", **settings, resume=resume, overwrite=overwrite) as out:
         coordinates = question.coordinates
         found = separate(

@@ -41,7 +41,7 @@ def run_simulation(
     """
     experiment, tables = load_experiment(path, overrides)
     folder = Path(path).resolve().parent
-    settings = {"tables": tables, "folder": folder, "options": {"balance": balance}}
+    settings: dict[str, Any] = {"tables": tables, "folder": folder, "options": {"balance": balance}}
     with run_folder(out, "simulate", **settings, overwrite=overwrite) as out:
         return simulate_all(experiment, folder, out, balance)
 

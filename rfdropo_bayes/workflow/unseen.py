@@ -86,7 +86,7 @@ def run_prediction(
     table = summarise(predicted)
     table.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": simulator.robot.name, "recording": unseen.name}
     options = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
-    settings = {"tables": tables, "folder": folder, "options": options, "data": hashes([unseen])}
+    settings: dict[str, Any] = {"tables": tables, "folder": folder, "options": options, "data": hashes([unseen])}
     with run_folder(out, "predict", **settings, overwrite=overwrite) as out:
         facts = {
             "schema_version": SCHEMA_VERSION,
