@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import count as counting
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, has_friction, law_rows
 from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
 from rfdropo_bayes.fem.native.layered_friction import compile_rollout as compile_friction_rollout
+from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
 from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, Storage, compile_rollout, storage
 from rfdropo_bayes.fem.native.section_modes import layered_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
@@ -45,6 +47,12 @@ class NativeRollout(NamedTuple):
     diverged: Bool[np.ndarray, " batch"]
     cables_converged: Bool[np.ndarray, " batch"]
     residual: Float[np.ndarray, " batch"]  # relative force out of balance in the initial equilibrium; 0 without one
+
+    @classmethod
+    def of(cls, output: Output) -> NativeRollout:
+        """What the kernels have written."""
+        codes = output.diverged.view(bool), output.cables_converged.view(bool)
+        return cls(output.position, output.tension, *codes, output.residual)
 
 
 @cache
@@ -98,7 +106,7 @@ class NativeLayered:
         self.threads = threads or available_threads()
         self.lanes = lanes or native_lanes(self.dtype)
         self.points = len(points.node)
-        self._tables = layered_tables(system, points, self.dtype.type)
+        self.tables = layered_tables(system, points, self.dtype.type)
         self._runs = runs_of(system.cables)
         self._token = lane_token(self.lanes)
         self._local = threading.local()
@@ -131,19 +139,28 @@ class NativeLayered:
             InputError: shapes that do not fit.
         """
         state = {"start": start, "position": position, "tension": tension}
-        batch, schedule, output = self._inputs(material, displacement, state, steps, stride)
+        batch, schedule, output = self.inputs(material, displacement, state, steps, stride)
         rubs = has_friction(material.effects)
-        kernel, tables, token = _friction_kernel() if rubs else _kernel(), self._tables, self._token
 
         def block(first: int) -> None:
-            friction = (self._runs, self._friction()) if rubs else ()
-            kernel(tables, batch, *self._storage(), *friction, schedule, output, first, token)
+            self.run_block(batch, self.records(rubs), schedule, output, first)
 
         in_blocks(block, batch.count, self.lanes, self.threads)
-        codes = output.diverged.view(bool), output.cables_converged.view(bool)
-        return NativeRollout(output.position, output.tension, *codes, output.residual)
+        return NativeRollout.of(output)
 
-    def _inputs(
+    def records(self, rubs: bool) -> tuple[Samples, Factors, Work] | tuple[Samples, Factors, Work, Friction]:
+        """What a block works on in the calling thread; ``rubs``: with friction of the cables."""
+        return (*self._storage(), self._friction()) if rubs else self._storage()
+
+    def run_block(
+        self, batch: Batch, records: tuple[NamedTuple, ...], schedule: Schedule, output: Output, first: int
+    ) -> None:
+        """Run one lane block, whose first rollout is ``first``, on `records`."""
+        friction = (self._runs, *records[3:]) if len(records) > 3 else ()
+        kernel = _friction_kernel() if friction else _kernel()
+        kernel(self.tables, batch, *records[:3], *friction, schedule, output, first, self._token)
+
+    def inputs(
         self,
         material: Material,
         displacement: np.ndarray,
@@ -153,7 +170,7 @@ class NativeLayered:
     ) -> tuple[Batch, Schedule, Output]:
         """What the kernels read and write; ``given`` holds the states that `rollout` takes, by name."""
         displacement = np.asarray(displacement, dtype=float)
-        cables = self._tables.cables
+        cables = self.tables.cables
         if displacement.ndim not in (2, 3) or displacement.shape[-1] != cables:
             raise InputError(f"displacement has shape {displacement.shape} for {cables} cables", where="rollout")
         state = {
@@ -164,21 +181,24 @@ class NativeLayered:
         }
         batch = self._batch(material, state)
         steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
-        settling = 0 if given["start"] is None else ITERATIONS
-        schedule = Schedule(self.time_step, steps, int(stride), settling, *_NUMERICS[self.precision])
-        return batch, schedule, _empty_output(batch.count, 1 + steps // stride, self.points, cables)
+        schedule = self.schedule(steps, stride)._replace(static_iterations=0 if given["start"] is None else ITERATIONS)
+        return batch, schedule, empty_output(batch.count, 1 + steps // stride, self.points, cables)
+
+    def schedule(self, steps: int, stride: int) -> Schedule:
+        """How so many steps run, from the undeformed body."""
+        return Schedule(self.time_step, steps, int(stride), 0, *_NUMERICS[self.precision])
 
     def _modes(self, position: np.ndarray | None) -> np.ndarray:
         """Node positions as section modes, one row a rollout."""
         if position is None:
-            return self._tables.rest[None]
-        shape = self._tables.shape
+            return self.tables.rest[None]
+        shape = self.tables.shape
         nodes = np.asarray(position, dtype=float).reshape(-1, len(self.system.body.station), len(shape), 3)
-        return np.einsum("mn,bsni->bsmi", self._tables.inverse, nodes).reshape(len(nodes), -1)
+        return np.einsum("mn,bsni->bsmi", self.tables.inverse, nodes).reshape(len(nodes), -1)
 
     def _batch(self, material: Material, state: dict[str, np.ndarray]) -> Batch:
         """Parameters, initial states and commands in the precision of the kernels."""
-        layers = self._tables.stations - 1
+        layers = self.tables.stations - 1
         width = {"gravity": (3,), "stiffness_scale": (layers,), "point_mass": (layers + 1,)}
         given, effects = material._asdict(), material.effects
         del given["effects"]
@@ -216,25 +236,35 @@ class NativeLayered:
     def _storage(self) -> Storage:
         """Storage of the calling thread."""
         if not hasattr(self._local, "storage"):
-            self._local.storage = storage(self._tables, self.lanes, self.dtype.type)
+            self._local.storage = storage(self.tables, self.lanes, self.dtype.type)
         return self._local.storage
 
     def _friction(self) -> Friction:
         """Friction of the calling thread."""
         if not hasattr(self._local, "friction"):
-            self._local.friction = friction_storage(self._tables, self._runs, self.lanes, self.dtype.type)
+            self._local.friction = friction_storage(self.tables, self._runs, self.lanes, self.dtype.type)
         return self._local.friction
+
+
+@cache
+def _workers(threads: int, process: int) -> ThreadPoolExecutor:
+    """Threads that wait for lane blocks; a forked ``process`` has none of its parent's."""
+    return ThreadPoolExecutor(threads, f"lanes_{process}")
 
 
 def in_blocks(block: Callable[[int], None], count: int, lanes: int, threads: int) -> None:
     """Call for the first rollout of every lane block, in this thread or in several."""
-    firsts = range(0, count, lanes)
-    if min(threads, len(firsts)) < 2:
-        for first in firsts:
+    threads = min(threads, -(-count // lanes))
+    following = counting(0, lanes)
+
+    def work() -> None:
+        while (first := next(following)) < count:
             block(first)
-        return
-    with ThreadPoolExecutor(min(threads, len(firsts))) as pool:
-        list(pool.map(block, firsts))
+
+    waiting = [_workers(threads - 1, os.getpid()).submit(work) for _ in range(threads - 1)]
+    work()
+    for other in waiting:
+        other.result()
 
 
 def _cable_rows(values: np.ndarray | None, cables: int, name: str) -> Float[np.ndarray, "rows cables"]:
@@ -245,7 +275,7 @@ def _cable_rows(values: np.ndarray | None, cables: int, name: str) -> Float[np.n
     return rows.reshape(-1, cables)
 
 
-def _empty_output(count: int, records: int, points: int, cables: int) -> Output:
+def empty_output(count: int, records: int, points: int, cables: int) -> Output:
     return Output(
         np.zeros((count, records, points, 3)),
         np.zeros((count, records, cables)),

@@ -115,7 +115,8 @@ def compile_rollout(sources: str) -> Callable:
         friction = addresses(friction)
         rate = 1.0 / schedule.time_step
         settle(tables, batch, samples, factors, work, schedule, first, token)
-        _start_slip(tables, runs, friction, work, token)
+        if not schedule.resumed:
+            _start_slip(tables, runs, friction, work, token)
         step = 0
         while begin_step(tables, batch, samples, factors, work, schedule, output, step, first, token):
             condense_increment(tables, samples, factors, work, rate, schedule, token)

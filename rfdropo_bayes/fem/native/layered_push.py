@@ -113,7 +113,7 @@ class NativeLayeredPush(NativeLayered):
     ) -> None:
         super().__init__(system, points, time_step, precision=precision, threads=threads, lanes=lanes)
         rest = rest_positions(system.body)
-        shape = np.asarray(self._tables.shape, dtype=float)
+        shape = np.asarray(self.tables.shape, dtype=float)
         self._scene: Scene = scene_tables(scene, shape, np.arange(len(rest)), rest, self.dtype.type)
 
     def push(
@@ -137,7 +137,7 @@ class NativeLayeredPush(NativeLayered):
         """
         check_effects(material.effects)
         given = {"start": start, "position": None, "tension": None}
-        batch, schedule, output = self._inputs(material, displacement, given, steps, 1)
+        batch, schedule, output = self.inputs(material, displacement, given, steps, 1)
         cubes = cube_rows(state, values, batch.count, self.dtype)
         poses = PushOutput(np.zeros((batch.count, output.records, 7)), np.zeros(batch.count, dtype=np.uint8))
         kernel, settled, missed = _kernel(), SETTLED[self.precision], MISSED[self.precision]
@@ -145,7 +145,7 @@ class NativeLayeredPush(NativeLayered):
         def block(first: int) -> None:
             samples, factors, work = self._storage()
             kernel(
-                self._tables, self._scene, batch, cubes, samples, factors, work, self._touch(), schedule, settled,
+                self.tables, self._scene, batch, cubes, samples, factors, work, self._touch(), schedule, settled,
                 missed, output, poses, first, self._token,
             )  # fmt: skip
 
@@ -157,7 +157,7 @@ class NativeLayeredPush(NativeLayered):
     def _touch(self) -> Touch:
         """Contacts of the calling thread."""
         if not hasattr(self._local, "touch"):
-            tables, panels = self._tables, border_panels(self._tables.cables)
+            tables, panels = self.tables, border_panels(self.tables.cables)
             border = 9 * tables.stations * TRUNK_MOST * tables.modes
             self._local.touch = touch_storage(border, panels, tables.cables, self.lanes, self.dtype.type)
         return self._local.touch

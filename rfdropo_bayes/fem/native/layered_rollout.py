@@ -1,4 +1,4 @@
-"""Rollouts of a layered body: one lane block from its parameters to the recorded motion."""
+"""Rollouts of a layered body: one lane block from its parameters to the recorded motion, or on from where it stands."""
 
 from __future__ import annotations
 
@@ -8,8 +8,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from rfdropo_bayes.fem.native.layered_assembly import clear
-from rfdropo_bayes.fem.native.layered_effects import DECAY, EFFECTS, FLAGS, GAIN, GIVE, LAW, SHARE
+from rfdropo_bayes.fem.native.layered_assembly import clear, layer_frame
+from rfdropo_bayes.fem.native.layered_effects import (
+    BRANCH,
+    DECAY,
+    EFFECTS,
+    FLAGS,
+    GAIN,
+    GIVE,
+    LAW,
+    SHARE,
+    add_branch,
+)
 from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
 from rfdropo_bayes.fem.native.layered_step import point, refine_increment, solve_increment, take_step
@@ -62,6 +72,7 @@ class Schedule(NamedTuple):
     tolerance: float  # relative, of the tension problem
     regularisation: float  # relative compliance of every cable
     refinements: int  # of every step's linear solution
+    resumed: int = 0  # 1 goes on from the state in ``Work`` instead of starting anew
 
 
 class Storage(NamedTuple):
@@ -190,8 +201,19 @@ def start_rollouts(tables, batch, samples, work, first, token):
 
 
 @kernel
-def step_factors(samples, factors, work, length, first, token):
-    """Factors of an implicit Euler step; ``first``: the dashpots of the Prony branches start without tension."""
+def _relax_branches(tables, samples, factors, work, token):
+    """Let the dashpots of the Prony branches follow all the strain of the initial shape."""
+    if samples.present[BRANCH]:
+        store(factors.share, 0, fill(1.0, factors.share, token))
+        store(factors.branch, 0, fill(0.0, factors.branch, token))
+        for layer in range(tables.stations - 1):
+            layer_frame(tables, layer, work, token)
+            add_branch(tables, factors, layer, work, token)
+
+
+@kernel
+def step_factors(samples, factors, work, length, token):
+    """Factors of an implicit Euler step."""
     time_step, drag = fill(length, samples.damping, token), load(samples.damping, 0, token)
     one, gain = fill(1.0, drag, token), load(samples.effects, GAIN, token)
     softness = load(work.softness, 0, token) * load(samples.effects, DECAY, token)
@@ -205,7 +227,7 @@ def step_factors(samples, factors, work, length, first, token):
     store(factors.drag, 0, time_step * drag)
     store(factors.fluid, 0, time_step)
     store(factors.branch, 0, time_step * softness * gain)
-    store(factors.share, 0, one if first else load(samples.effects, SHARE, token))
+    store(factors.share, 0, load(samples.effects, SHARE, token))
     store(factors.give, 0, load(samples.effects, GIVE, token) / (time_step * time_step))
 
 
@@ -237,16 +259,18 @@ def finish_rollouts(work, output, first, count, token):
 
 @kernel
 def settle(tables, batch, samples, factors, work, schedule, first, token):
-    """Parameters and initial state of a block's rollouts: as given, or in equilibrium."""
-    start_rollouts(tables, batch, samples, work, first, token)
-    if schedule.static_iterations == 0:
+    """Parameters and initial state of a block's rollouts: as given, or in equilibrium; none where they go on."""
+    if schedule.resumed:
         return
-    start_settling(tables, samples, factors, work, token)
-    fill_lanes(batch.start, batch.start_pitch, 0, tables.cables, first, batch.count, work.commanded, token)
-    for _ in range(schedule.static_iterations):
-        solve_increment(tables, samples, factors, work, 1.0, schedule, token)
-        take_increment(tables, work, token)
-    finish_settling(tables, samples, factors, work, token)
+    start_rollouts(tables, batch, samples, work, first, token)
+    if schedule.static_iterations > 0:
+        start_settling(tables, samples, factors, work, token)
+        fill_lanes(batch.start, batch.start_pitch, 0, tables.cables, first, batch.count, work.commanded, token)
+        for _ in range(schedule.static_iterations):
+            solve_increment(tables, samples, factors, work, 1.0, schedule, token)
+            take_increment(tables, work, token)
+        finish_settling(tables, samples, factors, work, token)
+    _relax_branches(tables, samples, factors, work, token)
 
 
 @kernel
@@ -256,7 +280,7 @@ def begin_step(tables, batch, samples, factors, work, schedule, output, step, fi
         record_body(tables, work, output, step // schedule.stride, first, batch.count, token)
     if step == schedule.steps:
         return False
-    step_factors(samples, factors, work, schedule.time_step, step == 0, token)
+    step_factors(samples, factors, work, schedule.time_step, token)
     pitch, offset = batch.displacement_pitch, step * tables.cables
     fill_lanes(batch.displacement, pitch, offset, tables.cables, first, batch.count, work.commanded, token)
     return True
