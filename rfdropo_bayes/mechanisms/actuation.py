@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import math
+from collections.abc import Callable
 
-from rfdropo_bayes.simulators.mechanisms import Values
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
@@ -35,15 +37,39 @@ class CommandDelay:
     ) -> Float[Array, "step channel"]:
         """Read the command ``command_delay`` earlier, linearly between steps."""
         history = jnp.concatenate([initial[None], command])
-        at = jnp.arange(1, len(history)) - values["command_delay"] / time_step
-        # Interpolating towards the past keeps the derivative right at zero delay, where only later times count.
-        after = jnp.clip(jnp.ceil(at), 0, len(command)).astype(int)
-        before = jnp.maximum(after - 1, 0)
-        weight = jnp.where(at > 0, after - at, 0.0)[:, None]
-        return history[after] - weight * (history[after] - history[before])
+        late = values["command_delay"] / time_step
+        return _read_late(jnp.arange(1, len(history)), late, lambda step: history[step])
+
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
+        """Commands of the last steps, as far back as a delay may reach, and the number of steps."""
+        steps = math.ceil(self.parameters[0].high / interval) + 2
+        return jnp.broadcast_to(first, (steps, *first.shape)), jnp.zeros((), int)
+
+    def advance(
+        self, values: Values, memory: tuple[Array, Array], given: Float[Array, " channel"], now: float
+    ) -> tuple[tuple[Array, Array], Float[Array, " channel"]]:
+        """Read the command ``command_delay`` earlier; the oldest one is overwritten."""
+        last, step = memory[0], memory[1] + 1
+        last = last.at[step % len(last)].set(given)
+        reached = _read_late(step, values["command_delay"] / now, lambda at: last[at % len(last)])
+        return (last, step), reached
 
 
-class ActuatorLag:
+def _read_late(
+    step: Int[Array, "*step"],
+    late: Float[Array, ""],
+    read: Callable[[Int[Array, "*step"]], Float[Array, "*step channel"]],
+) -> Float[Array, "*step channel"]:
+    """What ``read`` gives so many steps earlier, 0 at the earliest, linearly between steps."""
+    at = step - late
+    # Interpolating towards the past keeps the derivative right at zero delay, where only later times count.
+    after = jnp.maximum(jnp.ceil(at), 0).astype(int)
+    weight = jnp.where(at > 0, after - at, 0.0)[..., None]
+    newer = read(after)
+    return newer - weight * (newer - read(jnp.maximum(after - 1, 0)))
+
+
+class ActuatorLag(SteppedActuation):
     """First-order lag of the drives, ``tau y' = u - y`` with u held over each step; tau = 0 is the base simulator.
 
     A lag much shorter than a time step changes nothing that can be seen: the derivative at tau = 0 is zero.
@@ -60,20 +86,19 @@ class ActuatorLag:
         ),
     )
 
-    def actuate(
-        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
-    ) -> Float[Array, "step channel"]:
-        """Filter the command, starting from rest at its initial value."""
-        kept = kept_over(time_step, values["actuator_lag"])
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Float[Array, " channel"]:
+        """Where the drives stand."""
+        return first
 
-        def advance(last: Array, sent: Array) -> tuple[Array, Array]:
-            reached = sent + kept * (last - sent)
-            return reached, reached
+    def advance(
+        self, values: Values, memory: Float[Array, " channel"], given: Float[Array, " channel"], now: float
+    ) -> tuple[Float[Array, " channel"], Float[Array, " channel"]]:
+        """Follow the command, starting from rest at its initial value."""
+        reached = given + kept_over(now, values["actuator_lag"]) * (memory - given)
+        return reached, reached
 
-        return jax.lax.scan(advance, jnp.asarray(initial, command.dtype), command)[1]
 
-
-class CommandGain:
+class CommandGain(MemorylessActuation):
     """All commands scaled by ``1 + command_gain_error``; zero is the base simulator."""
 
     name = "command_gain"
@@ -93,8 +118,8 @@ class CommandGain:
         ),
     )
 
-    def actuate(
-        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
-    ) -> Float[Array, "step channel"]:
+    def reach(
+        self, values: Values, sent: Float[Array, "*step channel"], initial: Float[Array, " channel"]
+    ) -> Float[Array, "*step channel"]:
         """Scale the displacement from the initial command, to which the initial state belongs."""
-        return initial + (1.0 + values["command_gain_error"]) * (command - initial)
+        return initial + (1.0 + values["command_gain_error"]) * (sent - initial)

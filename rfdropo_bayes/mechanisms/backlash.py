@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
-from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.mechanisms import SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 REST = 1e-9  # m or rad per step: less is the rounding of a command that is held
 
 
-class Backlash(InCommandUnit):
+class Backlash(InCommandUnit, SteppedActuation):
     """At each reversal a drive moves by twice ``backlash`` before the cable follows (play operator); none at null."""
 
     name = "backlash"
@@ -33,19 +32,17 @@ class Backlash(InCommandUnit):
         ),
     )
 
-    def actuate(
-        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
-    ) -> Float[Array, "step channel"]:
-        """Drag the cable's end along with the drive, from the middle of the play at first."""
-        half = values["backlash"]
-        sent = jnp.concatenate([jnp.asarray(initial, command.dtype)[None], command])
-        moves = jnp.diff(sent, axis=0)
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
+        """How far the drive leads the cable, and what it was sent last: the middle of the play at first."""
+        return jnp.zeros_like(first), first
 
-        def drag(lead: Array, move: Array) -> tuple[Array, Array]:
-            # Written with strict comparisons, so that without play the derivative stays that of the last move.
-            ahead = lead + move
-            lead = jnp.where(ahead > half, half, jnp.where(ahead < -half, -half, ahead))
-            return lead, lead
-
-        moves = jnp.where(jnp.abs(moves) > REST, moves, 0.0)
-        return command - jax.lax.scan(drag, jnp.zeros_like(sent[0]), moves)[1]
+    def advance(
+        self, values: Values, memory: tuple[Array, Array], given: Float[Array, " channel"], now: float
+    ) -> tuple[tuple[Array, Array], Float[Array, " channel"]]:
+        """Drag the cable's end along with the drive."""
+        half, (lead, last) = values["backlash"], memory
+        move = given - last
+        # Written with strict comparisons, so that without play the derivative stays that of the last move.
+        ahead = lead + jnp.where(jnp.abs(move) > REST, move, 0.0)
+        lead = jnp.where(ahead > half, half, jnp.where(ahead < -half, -half, ahead))
+        return (lead, given), given - lead

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 NUMBERED = tuple(str(k + 1) for k in range(8))
 
 
-class CableGain:
+class CableGain(MemorylessActuation):
     """Each command scaled by its own ``1 + error``; zero at null. Equal errors of all are `command_gain`'s.
 
     Args:
@@ -46,10 +46,10 @@ class CableGain:
         """One error for every command channel of a robot."""
         return cls(robot.channel_names)
 
-    def actuate(
-        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
-    ) -> Float[Array, "step channel"]:
+    def reach(
+        self, values: Values, sent: Float[Array, "*step channel"], initial: Float[Array, " channel"]
+    ) -> Float[Array, "*step channel"]:
         """Scale the displacements from the initial command."""
-        count = command.shape[-1]
+        count = sent.shape[-1]
         error = jnp.stack([values[spec.name] for spec in self.parameters[:count]])
-        return initial + (1.0 + error) * (command - initial)
+        return initial + (1.0 + error) * (sent - initial)

@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
-from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
-class CableSlack(InCommandUnit):
+class CableSlack(InCommandUnit, MemorylessActuation):
     """The first part of every pull only takes up slack (a dead zone around zero); none at null."""
 
     name = "cable_slack"
@@ -30,9 +30,9 @@ class CableSlack(InCommandUnit):
         ),
     )
 
-    def actuate(
-        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
-    ) -> Float[Array, "step channel"]:
+    def reach(
+        self, values: Values, sent: Float[Array, "*step channel"], initial: Float[Array, " channel"]
+    ) -> Float[Array, "*step channel"]:
         """Shrink the command towards zero by the slack."""
         slack = values["cable_slack"]
-        return jnp.where(command > slack, command - slack, jnp.where(command < -slack, command + slack, 0.0))
+        return jnp.where(sent > slack, sent - slack, jnp.where(sent < -slack, sent + slack, 0.0))

@@ -33,5 +33,17 @@ class CameraDrift:
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
         """Shift the positions in proportion to time."""
-        velocity = jnp.stack([values[spec.name] for spec in self.parameters])
-        return position + (time - time[0])[:, None, None] * velocity
+        return position + self._shift(values, (time - time[0])[:, None, None])
+
+    def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> tuple[()]:
+        """Nothing to remember."""
+        return ()
+
+    def advance(
+        self, values: Values, memory: tuple[()], given: Float[Array, "marker 3"], now: Float[Array, ""]
+    ) -> tuple[tuple[()], Float[Array, "marker 3"]]:
+        """Shift the positions in proportion to time."""
+        return memory, given + self._shift(values, now)
+
+    def _shift(self, values: Values, elapsed: Float[Array, "..."]) -> Float[Array, "..."]:
+        return elapsed * jnp.stack([values[spec.name] for spec in self.parameters])

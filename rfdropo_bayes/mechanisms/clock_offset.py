@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -32,10 +34,30 @@ class ClockOffset:
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
         """Read the positions at other times, linearly between observations; beyond the ends they stand still."""
-        at = time - values["clock_offset"]
-        # Not a clip, whose derivative at the first and last row would be halved.
-        at = jnp.where(at <= time[0], time[0], jnp.where(at > time[-1], time[-1], at))
-        after = jnp.clip(jnp.searchsorted(time, at), 1, len(time) - 1)
-        gap = jnp.maximum(time[after] - time[after - 1], 1e-9)
-        weight = ((time[after] - at) / gap)[:, None, None]
-        return position[after] - weight * (position[after] - position[after - 1])
+        return _read(position, time, time - values["clock_offset"])
+
+    def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> tuple[Array, Array]:
+        """The last observations and their times, as far back as an offset may reach; none before the first."""
+        rows = math.ceil(self.parameters[0].high / interval) + 2
+        return jnp.broadcast_to(first, (rows, *first.shape)), jnp.zeros(rows)
+
+    def advance(
+        self, values: Values, memory: tuple[Array, Array], given: Float[Array, "marker 3"], now: Float[Array, ""]
+    ) -> tuple[tuple[Array, Array], Float[Array, "marker 3"]]:
+        """Read the positions earlier. A clock that is ahead would show the future: what is there now stands for it."""
+        position = jnp.concatenate([memory[0][1:], given[None]])
+        time = jnp.concatenate([memory[1][1:], jnp.asarray(now, float)[None]])
+        return (position, time), _read(position, time, now - values["clock_offset"])
+
+
+def _read(
+    position: Float[Array, "time marker 3"], time: Float[Array, " time"], at: Float[Array, "*when"]
+) -> Float[Array, "*when marker 3"]:
+    """Positions at other times, linearly between those given; beyond the ends they stand still."""
+    # Not a clip, whose derivative at the first and last row would be halved.
+    until = jnp.where(at > time[-1], time[-1], at)
+    after = jnp.clip(jnp.searchsorted(time, until), 1, len(time) - 1)
+    gap = jnp.maximum(time[after] - time[after - 1], 1e-9)
+    weight = ((time[after] - until) / gap)[..., None, None]
+    read = position[after] - weight * (position[after] - position[after - 1])
+    return jnp.where((at > time[0])[..., None, None], read, position[0])

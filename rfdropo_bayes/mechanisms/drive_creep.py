@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.mechanisms.actuation import kept_over
-from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.mechanisms import SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
-class DriveCreep:
+class DriveCreep(SteppedActuation):
     """A share of every displacement is given back with a time constant, as by a creeping cable; no share at null."""
 
     name = "drive_creep"
@@ -41,16 +39,15 @@ class DriveCreep:
         ),
     )
 
-    def actuate(
-        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
-    ) -> Float[Array, "step channel"]:
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
+        """The slowly following command, and where it started."""
+        return first, first
+
+    def advance(
+        self, values: Values, memory: tuple[Array, Array], given: Float[Array, " channel"], now: float
+    ) -> tuple[tuple[Array, Array], Float[Array, " channel"]]:
         """Take away a share of the slowly following command."""
-        kept = kept_over(time_step, values["drive_creep_time"])
-
-        def relax(last: Array, sent: Array) -> tuple[Array, Array]:
-            slow = sent + kept * (last - sent)
-            return slow, slow
-
-        start = jnp.asarray(initial, command.dtype)
-        slow = jax.lax.scan(relax, start, command)[1]
-        return command - values["drive_creep"] * (slow - start)
+        slow, start = memory
+        kept = kept_over(now, values["drive_creep_time"])
+        slow = given + kept * (slow - given)
+        return (slow, start), given - values["drive_creep"] * (slow - start)

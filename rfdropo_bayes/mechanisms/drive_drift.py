@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
-from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.mechanisms import SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
-class DriveDrift(InCommandUnit):
+class DriveDrift(InCommandUnit, SteppedActuation):
     """The zero of all drives moves at a steady rate from the start of the recording; no rate at null."""
 
     name = "drive_drift"
@@ -30,8 +30,12 @@ class DriveDrift(InCommandUnit):
         ),
     )
 
-    def actuate(
-        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
-    ) -> Float[Array, "step channel"]:
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Int[Array, ""]:
+        """Number of steps."""
+        return jnp.zeros((), int)
+
+    def advance(
+        self, values: Values, memory: Int[Array, ""], given: Float[Array, " channel"], now: float
+    ) -> tuple[Int[Array, ""], Float[Array, " channel"]]:
         """Add the drift to every channel."""
-        return command + values["drive_drift"] * time_step * jnp.arange(1, len(command) + 1)[:, None]
+        return memory + 1, given + values["drive_drift"] * now * (memory + 1)

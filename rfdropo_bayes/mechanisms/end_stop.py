@@ -6,11 +6,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
-from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
-class EndStop(InCommandUnit):
+class EndStop(InCommandUnit, MemorylessActuation):
     """Commands beyond a limit are cut off on either side; the limit is infinite, its inverse zero, at null."""
 
     name = "end_stop"
@@ -31,10 +31,10 @@ class EndStop(InCommandUnit):
         ),
     )
 
-    def actuate(
-        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
-    ) -> Float[Array, "step channel"]:
+    def reach(
+        self, values: Values, sent: Float[Array, "*step channel"], initial: Float[Array, " channel"]
+    ) -> Float[Array, "*step channel"]:
         """Cut the command off at the limit."""
         inverse = values["inverse_travel_limit"]
-        limit = jnp.sign(command) / jnp.maximum(inverse, 1e-12)
-        return jnp.where(jnp.abs(command) * inverse > 1.0, limit, command)
+        limit = jnp.sign(sent) / jnp.maximum(inverse, 1e-12)
+        return jnp.where(jnp.abs(sent) * inverse > 1.0, limit, sent)

@@ -53,20 +53,33 @@ class MarkerOffset:
 
     def sense(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
         """Add the arms, turned."""
+        return self._moved(values, position[:1], position)
+
+    def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> Float[Array, "marker 3"]:
+        """The first positions, at which the arms are given."""
+        return first
+
+    def advance(
+        self, values: Values, memory: Float[Array, "marker 3"], given: Float[Array, "marker 3"], now: Float[Array, ""]
+    ) -> tuple[Float[Array, "marker 3"], Float[Array, "marker 3"]]:
+        """Add the arms, turned."""
+        return memory, self._moved(values, memory[None], given[None])[0]
+
+    def _moved(
+        self, values: Values, first: Float[Array, "1 marker 3"], position: Float[Array, "time marker 3"]
+    ) -> Float[Array, "time marker 3"]:
         count = position.shape[1]
         arm = jnp.stack([values[spec.name] for spec in self.parameters[: 3 * count]]).reshape(count, 3)
         if count == 1:
             return position + arm
-        chord = jnp.concatenate(
-            [
-                position[:, 1:2] - position[:, :1],
-                position[:, 2:] - position[:, :-2],
-                position[:, -1:] - position[:, -2:-1],
-            ],
-            axis=1,
-        )
-        direction = chord / jnp.sqrt(jnp.sum(chord**2, axis=-1, keepdims=True) + ROUNDING)
-        return position + _turned(direction[:1], direction, arm)
+        return position + _turned(_direction(first), _direction(position), arm)
+
+
+def _direction(position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
+    """Direction of the body at every marker: the chord of its neighbours."""
+    ends = position[:, 1:2] - position[:, :1], position[:, -1:] - position[:, -2:-1]
+    chord = jnp.concatenate([ends[0], position[:, 2:] - position[:, :-2], ends[1]], axis=1)
+    return chord / jnp.sqrt(jnp.sum(chord**2, axis=-1, keepdims=True) + ROUNDING)
 
 
 def _turned(

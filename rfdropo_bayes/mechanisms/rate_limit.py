@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
-from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.mechanisms import SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
-class RateLimit(InCommandUnit):
+class RateLimit(InCommandUnit, SteppedActuation):
     """Drives follow at a limited speed; the speed is infinite, its inverse zero, at null."""
 
     name = "rate_limit"
@@ -32,16 +31,16 @@ class RateLimit(InCommandUnit):
         ),
     )
 
-    def actuate(
-        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
-    ) -> Float[Array, "step channel"]:
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Float[Array, " channel"]:
+        """Where the drives stand."""
+        return first
+
+    def advance(
+        self, values: Values, memory: Float[Array, " channel"], given: Float[Array, " channel"], now: float
+    ) -> tuple[Float[Array, " channel"], Float[Array, " channel"]]:
         """Follow the command as fast as the limit allows."""
         inverse = values["inverse_speed_limit"]
-        longest = time_step / jnp.maximum(inverse, 1e-12)
-
-        def follow(last: Array, sent: Array) -> tuple[Array, Array]:
-            move = sent - last
-            reached = jnp.where(jnp.abs(move) * inverse > time_step, last + jnp.sign(move) * longest, sent)
-            return reached, reached
-
-        return jax.lax.scan(follow, jnp.asarray(initial, command.dtype), command)[1]
+        longest = now / jnp.maximum(inverse, 1e-12)
+        move = given - memory
+        reached = jnp.where(jnp.abs(move) * inverse > now, memory + jnp.sign(move) * longest, given)
+        return reached, reached

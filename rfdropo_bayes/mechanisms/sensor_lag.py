@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -33,18 +35,26 @@ class SensorLag:
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
         """Exact response to positions that run straight from one observation to the next."""
+
+        def follow(memory: tuple[Array, Array, Array], row: tuple[Array, Array]) -> tuple[Any, Array]:
+            return self.advance(values, memory, *row)
+
+        return jax.lax.scan(follow, self.begin(values, position[0], 0.0), (position, time - time[0]))[1]
+
+    def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> tuple[Array, Array, Array]:
+        """The last position as it was seen and as it was, and its time: the first one at zero."""
+        return first, first, jnp.zeros(())
+
+    def advance(
+        self, values: Values, memory: tuple[Array, Array, Array], given: Float[Array, "marker 3"], now: Float[Array, ""]
+    ) -> tuple[tuple[Array, Array, Array], Float[Array, "marker 3"]]:
+        """Exact response to a position that ran straight from the last one to this."""
+        last, before, then = memory
         tau = values["sensor_lag"]
         on = tau > 0.0
         safe = jnp.where(on, tau, 1.0)
-
-        def follow(state: tuple[Array, Array], row: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
-            last, before = state
-            gap, now = row
-            slope = (now - before) / gap
-            kept = jnp.where(on, jnp.exp(-gap / safe), 0.0)
-            seen = now - tau * slope + kept * (last - before + tau * slope)
-            return (seen, now), seen
-
-        rows = (jnp.maximum(jnp.diff(time), 1e-9), position[1:])
-        seen = jax.lax.scan(follow, (position[0], position[0]), rows)[1]
-        return jnp.concatenate([position[:1], seen])
+        gap = jnp.maximum(now - then, 1e-9)
+        slope = (given - before) / gap
+        kept = jnp.where(on, jnp.exp(-gap / safe), 0.0)
+        seen = given - tau * slope + kept * (last - before + tau * slope)
+        return (seen, given, jnp.asarray(now, float)), seen

@@ -5,11 +5,11 @@ from __future__ import annotations
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
-from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
-class SpoolGrowth(InCommandUnit):
+class SpoolGrowth(InCommandUnit, MemorylessActuation):
     """Displacement grows with the square of the command, ``u (1 + k u)``; k is zero at null."""
 
     name = "spool_growth"
@@ -29,8 +29,8 @@ class SpoolGrowth(InCommandUnit):
         ),
     )
 
-    def actuate(
-        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
-    ) -> Float[Array, "step channel"]:
+    def reach(
+        self, values: Values, sent: Float[Array, "*step channel"], initial: Float[Array, " channel"]
+    ) -> Float[Array, "*step channel"]:
         """Add the square of the command, from zero command on."""
-        return command + values["spool_growth"] * (command**2 - initial**2)
+        return sent + values["spool_growth"] * (sent**2 - initial**2)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.mechanisms.command_unit import InCommandUnit
-from rfdropo_bayes.simulators.mechanisms import Values
+from rfdropo_bayes.simulators.mechanisms import SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 GRID = (5.0, 15.0, 30.0, 60.0, 85.0, 110.0, 150.0, 250.0, 500.0, 1000.0)
 
 
-class TravelStop(InCommandUnit):
+class TravelStop(InCommandUnit, SteppedActuation):
     """Commands beyond a stop are lost, not remembered: a drive at its stop moves with the next command away from it.
 
     In contrast to `EndStop`, which cuts off the accumulated command and has to be commanded all the way back. Travel is
@@ -48,17 +47,18 @@ class TravelStop(InCommandUnit):
         ),
     )
 
-    def actuate(
-        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
-    ) -> Float[Array, "step channel"]:
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
+        """What was lost at the stops, and the command that travel is counted from."""
+        return jnp.zeros_like(first), first
+
+    def advance(
+        self, values: Values, memory: tuple[Array, Array], given: Float[Array, " channel"], now: float
+    ) -> tuple[tuple[Array, Array], Float[Array, " channel"]]:
         """Follow the command, less all that was lost at the stops."""
         release, pull = values["inverse_release_travel"], values["inverse_pull_travel"]
-
-        def advance(lost: Array, sent: Array) -> tuple[Array, Array]:
-            travel = sent - initial - lost
-            over = jnp.where(travel * pull > 1.0, travel - 1.0 / jnp.maximum(pull, 1e-12), 0.0)
-            under = jnp.where(-travel * release > 1.0, travel + 1.0 / jnp.maximum(release, 1e-12), 0.0)
-            lost = lost + over + under
-            return lost, sent - lost
-
-        return jax.lax.scan(advance, jnp.zeros_like(initial), command)[1]
+        lost, start = memory
+        travel = given - start - lost
+        over = jnp.where(travel * pull > 1.0, travel - 1.0 / jnp.maximum(pull, 1e-12), 0.0)
+        under = jnp.where(-travel * release > 1.0, travel + 1.0 / jnp.maximum(release, 1e-12), 0.0)
+        lost = lost + over + under
+        return (lost, start), given - lost

@@ -111,22 +111,40 @@ def _ramped(
     ramp: float,
 ) -> Float[np.ndarray, "step channel"]:
     """The piecewise-constant command averaged over the last ``ramp`` seconds before each of ``at``."""
-    if len(time) == 0:
-        return np.broadcast_to(np.asarray(initial, float), (len(at), len(initial))).copy()
-    if ramp <= 0.0:
-        # A command given at the start of a step acts during it; rounding must not postpone it to the next.
-        index = np.searchsorted(time, at - 1e-9 * max(1.0, float(np.abs(at).max(initial=0.0))), side="left") - 1
-        padded = np.vstack([initial, value])
-        return padded[index + 1]
-    first = min(time[0], float(np.min(at, initial=time[0])) - ramp) - 1.0
-    knots = np.concatenate([[first], time, [max(time[-1], float(np.max(at, initial=time[-1]))) + 1.0]])
+    given = np.concatenate([[-np.inf], time])
     held = np.vstack([initial, value])
-    integral = np.concatenate([np.zeros((1, held.shape[1])), np.cumsum(held * np.diff(knots)[:, None], axis=0)])
-    columns = [
-        (np.interp(at, knots, integral[:, j]) - np.interp(at - ramp, knots, integral[:, j])) / ramp
-        for j in range(held.shape[1])
-    ]
-    return np.stack(columns, axis=1)
+    # Commands older than the first one in force count as carried out, so one more or less makes no difference.
+    first = np.maximum(np.searchsorted(given, at - ramp, side="right") - 2, 0)
+    last = np.searchsorted(given, at, side="right")
+    window = np.minimum(first[:, None] + np.arange(np.max(last - first, initial=0) + 1), len(given) - 1)
+    return carried_out(given[window], held[window], at, ramp)
+
+
+def carried_out(
+    given: Float[np.ndarray, "*step command"],
+    value: Float[np.ndarray, "*step command channel"],
+    at: Float[np.ndarray, "*step"],
+    ramp: float,
+) -> Float[np.ndarray, "*step channel"]:
+    """Where a drive stands that carries out every change linearly over ``ramp`` seconds.
+
+    Args:
+        given: when the last commands before each of ``at`` were given [s], in order; a command may stand twice, and
+            later ones do not count. The first one must have been carried out.
+        value: of these commands, cumulative [m or rad].
+        at: times [s].
+        ramp: 0 carries a command out at once: one given at the start of a step acts during it.
+    """
+    reached = value[..., 0, :]
+    for k in range(1, given.shape[-1]):
+        elapsed = at - given[..., k]
+        if ramp > 0.0:
+            share = np.clip(elapsed / ramp, 0.0, 1.0)
+        else:  # rounding must not postpone a command to the next step
+            share = np.where(elapsed > 1e-9 * np.maximum(1.0, np.abs(at)), 1.0, 0.0)
+        share = share[..., None]
+        reached = np.where(share < 1.0, reached + share * (value[..., k, :] - value[..., k - 1, :]), value[..., k, :])
+    return reached
 
 
 def stack_commands(sequences: Sequence[Commands]) -> Commands:

@@ -11,6 +11,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.errors import InputError
@@ -83,6 +85,69 @@ class TimedSensingMechanism(Mechanism, Protocol):
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
         """Return the measured marker positions [m], given the true ones and when they are seen [s]."""
+
+
+@runtime_checkable
+class SteppedMechanism(Mechanism, Protocol):
+    """A mechanism of actuation or sensing that can also act step by step, as a session needs it.
+
+    For a mechanism of actuation a step is one of time, ``now`` is the time step [s], and ``first`` the command before
+    the first step. For one of sensing a step is one observation, ``now`` its time [s], and ``first`` the first
+    observation of the markers [m]; it is shown too. Its steps give what its form for whole rollouts gives.
+    """
+
+    def begin(self, values: Values, first: Array, interval: float) -> Any:
+        """Memory before the first step; ``interval`` [s] is the time between steps."""
+
+    def advance(self, values: Values, memory: Any, given: Array, now: Any) -> tuple[Any, Array]:
+        """Memory after a step, and what the mechanism makes of what it is given."""
+
+
+class SteppedActuation:
+    """Base of mechanisms of actuation that are written as a step; a rollout scans it."""
+
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Any:
+        """See `SteppedMechanism`."""
+        raise NotImplementedError
+
+    def advance(
+        self, values: Values, memory: Any, given: Float[Array, " channel"], now: float
+    ) -> tuple[Any, Float[Array, " channel"]]:
+        """See `SteppedMechanism`."""
+        raise NotImplementedError
+
+    def actuate(
+        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
+    ) -> Float[Array, "step channel"]:
+        """Return the command that reaches the cables at the end of each step, given the one that was sent."""
+        memory = self.begin(values, jnp.asarray(initial, command.dtype), time_step)
+        return jax.lax.scan(lambda kept, sent: self.advance(values, kept, sent, time_step), memory, command)[1]
+
+
+class MemorylessActuation:
+    """Base of mechanisms of actuation that look at nothing but the command and the one before the first step."""
+
+    def reach(
+        self, values: Values, sent: Float[Array, "*step channel"], initial: Float[Array, " channel"]
+    ) -> Float[Array, "*step channel"]:
+        """Return the command that reaches the cables, given the one that was sent."""
+        raise NotImplementedError
+
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Float[Array, " channel"]:
+        """See `SteppedMechanism`."""
+        return first
+
+    def advance(
+        self, values: Values, memory: Float[Array, " channel"], given: Float[Array, " channel"], now: float
+    ) -> tuple[Float[Array, " channel"], Float[Array, " channel"]]:
+        """See `SteppedMechanism`."""
+        return memory, self.reach(values, given, memory)
+
+    def actuate(
+        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
+    ) -> Float[Array, "step channel"]:
+        """Return the command that reaches the cables at the end of each step, given the one that was sent."""
+        return self.reach(values, command, initial)
 
 
 def inside_drive(mechanism: Mechanism) -> bool:

@@ -78,7 +78,9 @@ def test_an_equilibrium_is_found_once(monkeypatch):
     session = LayeredSession(engine, BATCH)
     first = session.reset(np.arange(BATCH), material, start=displacement[:, 0])
     monkeypatch.setattr(engine, "run_block", lambda *_: pytest.fail("computed again"))
-    again = session.reset(np.arange(BATCH)[::-1], rows_of(material, np.arange(BATCH)[::-1]), start=displacement[::-1, 0])
+    again = session.reset(
+        np.arange(BATCH)[::-1], rows_of(material, np.arange(BATCH)[::-1]), start=displacement[::-1, 0]
+    )
     np.testing.assert_array_equal(again.position, first.position[::-1])
 
 

@@ -231,9 +231,7 @@ def _row(values: np.ndarray, row: int) -> np.ndarray:
 def _taken(batch: Batch, rows: list[int]) -> Batch:
     """Rows of a batch; fields of which one row serves all stay."""
     fields = {
-        name: value[rows]
-        for name, value in batch._asdict().items()
-        if name in GIVEN and len(value) == batch.count
+        name: value[rows] for name, value in batch._asdict().items() if name in GIVEN and len(value) == batch.count
     }
     pitch = batch.start.shape[1] if len(fields.get("start", ())) > 1 else 0
     return batch._replace(**fields, start_pitch=pitch, count=len(rows))
