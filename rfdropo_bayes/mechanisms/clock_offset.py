@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -41,10 +44,19 @@ class ClockOffset:
         rows = math.ceil(self.parameters[0].high / interval) + 2
         return jnp.broadcast_to(first, (rows, *first.shape)), jnp.zeros(rows)
 
+    def check_steps(self, values: Mapping[str, Float[np.ndarray, " lane"]]) -> None:
+        """Raise InputError where a session would have to show what has not happened yet."""
+        if np.any(values["clock_offset"] < 0.0):
+            raise InputError(
+                f"clock_offset = {np.min(values['clock_offset']):g} s would show the future",
+                where="a session",
+                remedy="leave clock_offset out: it belongs to a recording, and a policy sees one clock",
+            )
+
     def advance(
         self, values: Values, memory: tuple[Array, Array], given: Float[Array, "marker 3"], now: Float[Array, ""]
     ) -> tuple[tuple[Array, Array], Float[Array, "marker 3"]]:
-        """Read the positions earlier. A clock that is ahead would show the future: what is there now stands for it."""
+        """Read the positions earlier."""
         position = jnp.concatenate([memory[0][1:], given[None]])
         time = jnp.concatenate([memory[1][1:], jnp.asarray(now, float)[None]])
         return (position, time), _read(position, time, now - values["clock_offset"])

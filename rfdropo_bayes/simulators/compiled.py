@@ -15,7 +15,8 @@ from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.fem import BendingLaw, BodyEffects, Material, PointMap, Viscoelasticity, Wall
 from rfdropo_bayes.fem.native.effect_rows import COMPILED_EFFECTS
-from rfdropo_bayes.fem.native.layered import NativeLayered
+from rfdropo_bayes.fem.native.layered import NativeLayered, NativeRollout
+from rfdropo_bayes.fem.native.layered_session import LayeredSession
 from rfdropo_bayes.simulators.differences import (
     ACCELERATION,
     LENGTH,
@@ -26,6 +27,7 @@ from rfdropo_bayes.simulators.differences import (
     with_differences,
 )
 from rfdropo_bayes.simulators.reference import ReferenceEngine
+from rfdropo_bayes.simulators.session import LaneMotion
 from rfdropo_bayes.simulators.trunk import Assembly, Motion
 
 Inputs = tuple[Material, Float[Array, " cable"], Float[Array, "step cable"]]
@@ -120,6 +122,10 @@ class CompiledEngine:
         """See `Engine.recording`."""
         return replace(self, assembly=self.assembly._replace(markers=points), precision="float64")
 
+    def body_lanes(self, count: int) -> CompiledLanes:
+        """See `Engine.body_lanes`."""
+        return CompiledLanes(LayeredSession(self._native, count), self.from_equilibrium)
+
     def motion(
         self,
         material: Material,
@@ -182,6 +188,36 @@ class CompiledEngine:
             found.residual.reshape(batch),
             found.cables_converged.reshape(batch),
         )
+
+
+class CompiledLanes:
+    """Bodies of a session in the compiled engine: see `BodyLanes`."""
+
+    def __init__(self, session: LayeredSession, from_equilibrium: bool) -> None:
+        self._session, self._from_equilibrium = session, from_equilibrium
+        self.save, self.restore = session.save, session.restore
+
+    @property
+    def nbytes(self) -> int:
+        """See `BodyLanes`."""
+        return self._session.nbytes
+
+    def reset(
+        self, rows: Int[np.ndarray, " row"], material: Material, start: Float[np.ndarray, "row cable"]
+    ) -> LaneMotion:
+        """See `BodyLanes`."""
+        return _last(self._session.reset(rows, material, start=start if self._from_equilibrium else None))
+
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> LaneMotion:
+        """See `BodyLanes`."""
+        return _last(self._session.advance(displacement, stride=displacement.shape[1]))
+
+
+def _last(found: NativeRollout) -> LaneMotion:
+    """The last recorded row."""
+    return LaneMotion(
+        found.position[:, -1], found.tension[:, -1], found.diverged, found.residual, found.cables_converged
+    )
 
 
 def distinct(arrays: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

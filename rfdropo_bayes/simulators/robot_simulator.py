@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,9 @@ from rfdropo_bayes.simulators.protocol import Observation
 
 Values = Mapping[str, Float[Array, ""]]
 
+EQUILIBRIUM_TOLERANCE = 1e-3
+"""A static equilibrium counts as found when the unbalanced force is below this share of the largest force."""
+
 
 def every_node(count: int) -> PointMap:
     """All nodes of a body as recorded points."""
@@ -37,6 +41,13 @@ def every_node(count: int) -> PointMap:
 def sampled(balance: Balance, commands: Commands) -> Balance:
     """The rows of the observation times."""
     return Balance(*(sample(series, commands) for series in balance))
+
+
+class Wound(NamedTuple):
+    """Drives between two steps."""
+
+    level: Float[Array, " cable"]  # displacement of the cables at their drives, without pretension [m]
+    sent: Float[Array, " channel"]  # last command that reached them [m or rad]
 
 
 class RobotSimulator:
@@ -155,19 +166,25 @@ class RobotSimulator:
     ) -> tuple[Float[Array, " cable"], Float[Array, "step cable"]]:
         """Cable displacements [m] before the first step and at the end of every step, by drives with end stops."""
         command = self.actuated(values, commands, time_step)
-        matrix = jnp.asarray(self.robot.channel_matrix(values))
+        start = self.unwound(values, commands.initial)
+        levels = jax.lax.scan(lambda drives, sent: self.wind(values, drives, sent), start, command)[1]
+        return start.level + self.pretension(values), levels
+
+    def unwound(self, values: Values, initial: Float[Array, " channel"]) -> Wound:
+        """The drives before the first step, at this command [m or rad]."""
+        limits = self.robot.displacement_limits()
+        level = self.robot.channel_matrix(values) @ initial
+        return Wound(jnp.clip(level, limits[:, 0], limits[:, 1]), jnp.asarray(initial, float))
+
+    def wind(
+        self, values: Values, drives: Wound, sent: Float[Array, " channel"]
+    ) -> tuple[Wound, Float[Array, " cable"]]:
+        """The drives at the end of a step, and the cables' displacements [m], given the command that reached them."""
         limits = jnp.asarray(self.robot.displacement_limits())
-        initial = jnp.clip(matrix @ commands.initial, limits[:, 0], limits[:, 1])
-        moves = jnp.diff(jnp.concatenate([commands.initial[None], command]), axis=0) @ matrix.T
-
-        def wind(level: Array, move: Array) -> tuple[Array, Array]:
-            # A drive at its limit ignores further pulls, and answers the first release at once.
-            level = jnp.clip(level + move, limits[:, 0], limits[:, 1])
-            return level, level
-
-        levels = jax.lax.scan(wind, initial, moves)[1]
-        pretension = self.pretension(values)
-        return initial + pretension, levels + pretension
+        move = jnp.asarray(self.robot.channel_matrix(values)) @ (sent - drives.sent)
+        # A drive at its limit ignores further pulls, and answers the first release at once.
+        level = jnp.clip(drives.level + move, limits[:, 0], limits[:, 1])
+        return Wound(level, sent), level + self.pretension(values)
 
     def steps_seen(
         self, values: Values, commands: Commands, time_step: float, steps: Int[Array, ""] | None

@@ -16,10 +16,8 @@ from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms
 from rfdropo_bayes.simulators.protocol import Observation, Result
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values, every_node, sampled
-
-# Static equilibrium counts as found when the unbalanced force is below this share of the largest force.
-EQUILIBRIUM_TOLERANCE = 1e-3
+from rfdropo_bayes.simulators.robot_simulator import EQUILIBRIUM_TOLERANCE, RobotSimulator, Values, every_node, sampled
+from rfdropo_bayes.simulators.session import BodyLanes, Session
 
 
 class Motion(NamedTuple):
@@ -55,6 +53,9 @@ class Engine(Protocol):
 
     def recording(self, points: PointMap) -> Engine:
         """The same engine in double precision, recording these points of the body in place of the markers."""
+
+    def body_lanes(self, count: int) -> BodyLanes:
+        """Bodies that go on from one control period to the next."""
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,19 @@ class TrunkSimulator(RobotSimulator):
             ramp=self.robot.command.ramp_s,
             dead_time=self.robot.command.dead_time_s,
         )
+
+    @property
+    def time_step(self) -> float:
+        """Of the simulation [s]."""
+        return self.discretisation.time_step
+
+    def session(self, lanes: int, period: float) -> Session:
+        """So many trunks that are commanded one control period [s] at a time; see `Session`."""
+        return Session(self, lanes, period)
+
+    def body_lanes(self, count: int) -> BodyLanes:
+        """See `SteppedSimulator`."""
+        return self.engine.body_lanes(count)
 
     def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
         """Simulate from the initial state to the last observation.

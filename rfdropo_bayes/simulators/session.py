@@ -1,0 +1,418 @@
+"""Sessions: many robots that go on from one control period to the next, each with its own parameters and its own time.
+
+A session is a simulator's rollout taken apart: the same drives, mechanisms, body and cameras, whose state stands still
+between two calls. Its state is plain arrays with one row a lane.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem import Material
+from rfdropo_bayes.simulators.commands import carried_out
+from rfdropo_bayes.simulators.mechanisms import (
+    ActuationMechanism,
+    Mechanism,
+    SensingMechanism,
+    SteppedMechanism,
+    TimedSensingMechanism,
+    inside_drive,
+)
+from rfdropo_bayes.simulators.parameters import check_names, check_value
+from rfdropo_bayes.simulators.protocol import Observation, Result
+from rfdropo_bayes.simulators.robot_simulator import EQUILIBRIUM_TOLERANCE, Values, Wound
+
+WHOLE = 1e-6
+"""How far a control period may be from a whole number of time steps, in time steps."""
+
+
+class LaneMotion(NamedTuple):
+    """Where the bodies of some lanes are."""
+
+    position: Float[np.ndarray, "lane marker 3"]
+    tension: Float[np.ndarray, "lane cable"]
+    diverged: Bool[np.ndarray, " lane"]  # since the lane was started
+    imbalance: Float[np.ndarray, " lane"]  # relative unbalanced force of its initial equilibrium
+    cables_converged: Bool[np.ndarray, " lane"]  # since the lane was started
+
+
+class BodyLanes(Protocol):
+    """The bodies of a session's lanes."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of their parameters and state."""
+
+    def reset(
+        self, rows: Int[np.ndarray, " row"], material: Material, start: Float[np.ndarray, "row cable"]
+    ) -> LaneMotion:
+        """Start some lanes anew; the material has one entry per row. Returns the motion of these rows."""
+
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> LaneMotion:
+        """Take steps to the cable displacements [m] at their ends."""
+
+    def save(self) -> Float[np.ndarray, "lane values"]:
+        """A copy of the state, one row a lane."""
+
+    def restore(self, rows: Int[np.ndarray, " row"], state: Float[np.ndarray, "row values"]) -> None:
+        """Set lanes to rows of a saved state."""
+
+
+class SteppedSimulator(Protocol):
+    """A simulator that sessions can be made of."""
+
+    @property
+    def time_step(self) -> float:
+        """Of the simulation [s]."""
+
+    def body_lanes(self, count: int) -> BodyLanes:
+        """Bodies for so many lanes."""
+
+    def material(self, values: Values) -> Material:
+        """Material of the body for these values."""
+
+
+class _Drives(NamedTuple):
+    """State of the drives of a lane between two steps."""
+
+    cables: tuple[Any, ...]  # memory of every mechanism between command and cables
+    encoders: tuple[Any, ...]  # and of those that an encoder shows, again: other mechanisms may stand between them
+    wound: Wound
+
+
+class _Past(NamedTuple):
+    """The last commands of every lane, as far as drives still carry them out."""
+
+    given: Float[np.ndarray, "lane command"]  # [s] since the lane was started
+    value: Float[np.ndarray, "lane command channel"]
+    periods: Int[np.ndarray, " lane"]
+
+
+class Session:
+    """Lanes of one robot that are commanded one control period at a time.
+
+    Args:
+        simulator: whose rollouts the lanes are.
+        lanes: how many.
+        period: control period [s], a whole number of time steps.
+
+    Raises:
+        InputError: a period that is none, or a mechanism that is not written by steps.
+    """
+
+    def __init__(self, simulator: Any, lanes: int, period: float) -> None:
+        self.simulator, self.lanes, self.period = simulator, lanes, float(period)
+        self.robot = simulator.robot
+        self.steps = round(period / simulator.time_step)
+        if self.steps < 1 or abs(self.steps - period / simulator.time_step) > WHOLE:
+            raise InputError(
+                f"a control period of {period:g} s is no whole number of time steps",
+                remedy=f"give a multiple of {simulator.time_step:g} s",
+            )
+        self._check_mechanisms(simulator.mechanisms)
+        self.bodies: BodyLanes = simulator.body_lanes(lanes)
+        self._specs = {spec.name: spec for spec in simulator.parameters}
+        self._values = {name: jnp.full(lanes, spec.nominal) for name, spec in self._specs.items()}
+        command = self.robot.command
+        kept = math.ceil((command.ramp_s + command.dead_time_s) / self.period + WHOLE) + 2
+        channels = len(self.robot.channel_names)
+        self._past = _Past(np.full((lanes, kept), -np.inf), np.zeros((lanes, kept, channels)), np.zeros(lanes, int))
+        self._started = np.zeros(lanes, bool)
+        self._drives = self._first_drives(self._values, np.zeros((lanes, channels)))
+        self._cameras = self._first_cameras(self._values, np.zeros((lanes, len(self.robot.marker_names), 3)))[0]
+
+    @property
+    def time(self) -> Float[np.ndarray, " lane"]:
+        """Since every lane was started [s]."""
+        return self.period * self._past.periods
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the state of all lanes; scratch of the engine is not counted."""
+        return sum(part.nbytes for part in self.save().values())
+
+    @property
+    def parameters(self) -> dict[str, Float[np.ndarray, " lane"]]:
+        """Values of all parameters in every lane."""
+        return {name: np.array(value) for name, value in self._values.items()}
+
+    def reset(
+        self,
+        rows: Int[np.ndarray, " row"],
+        parameters: Mapping[str, Float[np.ndarray, " row"] | float],
+        *,
+        command: Float[np.ndarray, "row channel"] | None = None,
+    ) -> Observation:
+        """Start some lanes anew; the others stay where they are.
+
+        Args:
+            rows: lanes.
+            parameters: values by name, one per row or one for all of them; those left out are nominal.
+            command: in force before the start, to which the initial state belongs [m or rad]; zero by default.
+
+        Returns:
+            The first observation of these rows.
+
+        Raises:
+            InputError: no such lane or parameter, a value outside its hard bounds, or one that a mechanism cannot
+                carry out by steps.
+        """
+        rows = np.atleast_1d(np.asarray(rows, dtype=np.intp))
+        if rows.size == 0 or rows.min() < 0 or rows.max() >= self.lanes or len(set(rows.tolist())) < len(rows):
+            raise InputError(f"rows {rows.tolist()} of {self.lanes} lanes", where="reset", remedy="name each lane once")
+        self._take_values(rows, parameters)
+        first = np.zeros((len(rows), len(self.robot.channel_names))) if command is None else np.asarray(command, float)
+        past = self._past
+        past.given[rows], past.value[rows], past.periods[rows] = -np.inf, first[:, None], 0
+        fresh = self._first_drives(self._values, past.value[:, -1])
+        chosen = np.zeros(self.lanes, bool)
+        chosen[rows] = True
+        self._drives = _chosen(chosen, fresh, self._drives)
+        material, start = self._bodies_of(self._values, fresh.wound)
+        found = self.bodies.reset(
+            rows, jax.tree.map(lambda part: np.asarray(part)[rows], material), np.asarray(start)[rows]
+        )
+        position = np.zeros((self.lanes, *found.position.shape[1:]))
+        position[rows] = found.position
+        cameras, seen = self._first_cameras(self._values, position)
+        self._cameras = _chosen(chosen, cameras, self._cameras)
+        self._started |= chosen
+        return Observation(np.asarray(seen)[rows], found.tension, None, status_of(found), first.copy())
+
+    def act(self, commands: Float[np.ndarray, "lane channel"]) -> Observation:
+        """Let all lanes run for one control period with these commands [m or rad], in force from its start.
+
+        Returns:
+            What is observed at the end of the period.
+
+        Raises:
+            InputError: lanes that were never reset, or commands of another shape or that are not finite.
+        """
+        if not self._started.all():
+            raise InputError(f"lane {int(np.argmin(self._started))} was not started", remedy="reset all lanes first")
+        commands = np.asarray(commands, float)
+        expected = self.lanes, len(self.robot.channel_names)
+        if commands.shape != expected or not np.isfinite(commands).all():
+            raise InputError(
+                f"commands of shape {commands.shape}, {int(np.sum(~np.isfinite(commands)))} of them not finite",
+                where="act",
+                remedy=f"give finite numbers of shape {expected}",
+            )
+        self._drives, displacement, angle = self._move_drives(self._values, self._drives, self._sent(commands))
+        found = self.bodies.advance(np.asarray(displacement))
+        now = self.simulator.time_step * (self.steps * self._past.periods)
+        self._cameras, seen = self._look(self._values, self._cameras, found.position, now)
+        return Observation(np.asarray(seen), found.tension, None, status_of(found), np.asarray(angle))
+
+    def save(self) -> dict[str, np.ndarray]:
+        """A copy of the state: arrays by name, one row a lane."""
+        values = np.stack([np.asarray(value) for value in self._values.values()], axis=1)
+        return {
+            "started": self._started.copy(),
+            "parameters": values,
+            "command_time": self._past.given.copy(),
+            "command": self._past.value.copy(),
+            "periods": self._past.periods.copy(),
+            "drives": flat_lanes(self._drives, self.lanes),
+            "cameras": flat_lanes(self._cameras, self.lanes),
+            "bodies": self.bodies.save(),
+        }
+
+    def restore(self, state: Mapping[str, np.ndarray], rows: Int[np.ndarray, " row"] | None = None) -> None:
+        """Set lanes to the rows of a state that `save` returned.
+
+        Args:
+            state: of a session of the same robot, engine and mechanisms, with one row for each of ``rows``.
+            rows: lanes; all by default.
+
+        Raises:
+            InputError: a state of something else.
+        """
+        chosen = np.arange(self.lanes) if rows is None else np.asarray(rows, dtype=np.intp)
+        mine = self.save()
+        for name, part in mine.items():
+            if name not in state or state[name].shape != (len(chosen), *part.shape[1:]):
+                raise InputError(f"the state's {name!r} does not fit this session", where="restore")
+            if name != "bodies":
+                part[chosen] = state[name]
+        self.bodies.restore(chosen, state["bodies"])
+        self._started = mine["started"]
+        self._values = {name: jnp.asarray(mine["parameters"][:, i]) for i, name in enumerate(self._values)}
+        self._past = _Past(mine["command_time"], mine["command"], mine["periods"])
+        self._drives, self._cameras = (
+            lanes_like(self._drives, mine["drives"]),
+            lanes_like(self._cameras, mine["cameras"]),
+        )
+
+    def _check_mechanisms(self, mechanisms: tuple[Mechanism, ...]) -> None:
+        for mechanism in mechanisms:
+            remembers = isinstance(mechanism, ActuationMechanism | TimedSensingMechanism)
+            if remembers and not isinstance(mechanism, SteppedMechanism):
+                raise InputError(
+                    f"mechanism {mechanism.name!r} is written for whole rollouts only",
+                    where="a session",
+                    remedy="give it begin and advance, see docs/mechanisms.md",
+                )
+
+    def _take_values(self, rows: np.ndarray, parameters: Mapping[str, Float[np.ndarray, " row"] | float]) -> None:
+        """Set the parameters of some lanes."""
+        check_names(parameters, self._specs.values(), where="reset")
+        given: dict[str, np.ndarray] = {}
+        for name, spec in self._specs.items():
+            value = np.asarray(parameters.get(name, spec.nominal), float)
+            if value.shape not in ((), rows.shape):
+                raise InputError(f"{name} has shape {value.shape} for {len(rows)} lanes", where="reset")
+            for extreme in (np.min(value), np.max(value)):
+                check_value(spec, float(extreme), where="reset")
+            given[name] = np.broadcast_to(value, rows.shape)
+        for mechanism in self.simulator.mechanisms:
+            if hasattr(mechanism, "check_steps"):
+                mechanism.check_steps({spec.name: given[spec.name] for spec in mechanism.parameters})
+        for name, value in given.items():
+            whole = np.array(self._values[name])
+            whole[rows] = value
+            self._values[name] = jnp.asarray(whole)
+
+    def _sent(self, commands: Float[np.ndarray, "lane channel"]) -> Float[np.ndarray, "lane step channel"]:
+        """What the drives carry out in every step of the period, ramps and dead time included."""
+        past, timing, time_step = self._past, self.robot.command, self.simulator.time_step
+        past.given[:, :-1], past.value[:, :-1] = past.given[:, 1:].copy(), past.value[:, 1:].copy()
+        past.given[:, -1], past.value[:, -1] = self.time, commands
+        step = self.steps * past.periods[:, None] + np.arange(1, self.steps + 1)
+        past.periods[:] += 1
+        end = time_step * step - timing.dead_time_s
+        return carried_out(past.given[:, None], past.value[:, None], end, timing.ramp_s)
+
+    @property
+    def _drive_chains(self) -> tuple[list[Any], list[Any]]:
+        """Mechanisms between command and cables, and those of them that an encoder shows."""
+        chain = [m for m in self.simulator.mechanisms if isinstance(m, ActuationMechanism)]
+        return chain, [m for m in chain if inside_drive(m)]
+
+    @cached_property
+    def _first_drives(self) -> Any:
+        """Drives of all lanes before the first step, given the command before it."""
+        chains, interval = self._drive_chains, self.simulator.time_step
+
+        def first(values: Values, command: Float[Array, " channel"]) -> _Drives:
+            cables, encoders = (tuple(m.begin(values, command, interval) for m in chain) for chain in chains)
+            return _Drives(cables, encoders, self.simulator.unwound(values, command))
+
+        return jax.jit(jax.vmap(first))
+
+    @cached_property
+    def _move_drives(self) -> Any:
+        """Drives of all lanes after a period, cable displacements [m] in its steps, and where encoders stand."""
+        chains, time_step = self._drive_chains, self.simulator.time_step
+
+        def through(chain: list[Any], values: Values, memory: tuple[Any, ...], sent: Array) -> tuple[tuple, Array]:
+            after = []
+            for mechanism, kept in zip(chain, memory, strict=True):
+                kept, sent = mechanism.advance(values, kept, sent, time_step)
+                after.append(kept)
+            return tuple(after), sent
+
+        def move(values: Values, drives: _Drives, commands: Float[Array, "step channel"]) -> tuple[_Drives, Any, Any]:
+            def one(before: _Drives, command: Float[Array, " channel"]) -> tuple[_Drives, tuple[Array, Array]]:
+                cables, reached = through(chains[0], values, before.cables, command)
+                encoders, angle = through(chains[1], values, before.encoders, command)
+                wound, displacement = self.simulator.wind(values, before.wound, reached)
+                return _Drives(cables, encoders, wound), (displacement, angle)
+
+            after, (displacement, angle) = jax.lax.scan(one, drives, commands)
+            return after, displacement, angle[-1]
+
+        return jax.jit(jax.vmap(move))
+
+    @cached_property
+    def _bodies_of(self) -> Any:
+        """Material of all lanes, and the displacements [m] that their initial states belong to."""
+
+        def of(values: Values, wound: Wound) -> tuple[Material, Float[Array, " cable"]]:
+            return self.simulator.material(values), wound.level + self.simulator.pretension(values)
+
+        return jax.jit(jax.vmap(of))
+
+    @property
+    def _camera_chain(self) -> list[Any]:
+        return [m for m in self.simulator.mechanisms if isinstance(m, SensingMechanism | TimedSensingMechanism)]
+
+    @cached_property
+    def _look(self) -> Any:
+        """Cameras of all lanes after an observation, and the marker positions [m] that they see."""
+        chain = self._camera_chain
+
+        def look(
+            values: Values, memories: tuple[Any, ...], position: Float[Array, "marker 3"], now: Float[Array, ""]
+        ) -> tuple[tuple[Any, ...], Float[Array, "marker 3"]]:
+            after = []
+            for mechanism, memory in zip(chain, memories, strict=True):
+                if isinstance(mechanism, SteppedMechanism):
+                    memory, position = mechanism.advance(values, memory, position, now)
+                else:
+                    position = mechanism.sense(values, position[None])[0]
+                after.append(memory)
+            offset = jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])
+            return tuple(after), position + offset
+
+        return jax.jit(jax.vmap(look))
+
+    @cached_property
+    def _first_cameras(self) -> Any:
+        """Cameras of all lanes after the first observation, and what they see of it."""
+        chain = self._camera_chain
+
+        def first(values: Values, position: Float[Array, "marker 3"]) -> tuple[Any, ...]:
+            memories = []
+            for mechanism in chain:
+                stepped = isinstance(mechanism, SteppedMechanism)
+                memories.append(mechanism.begin(values, position, self.period) if stepped else ())
+                if stepped:
+                    position = mechanism.advance(values, memories[-1], position, jnp.zeros(()))[1]
+                else:
+                    position = mechanism.sense(values, position[None])[0]
+            return tuple(memories)
+
+        def shown(values: Values, position: Float[Array, "lane marker 3"]) -> tuple[Any, Float[Array, "lane marker 3"]]:
+            memories = jax.vmap(first)(values, position)
+            return self._look(values, memories, position, jnp.zeros(self.lanes))
+
+        return jax.jit(shown)
+
+
+def status_of(found: LaneMotion) -> Int[np.ndarray, " lane"]:
+    """How the rollouts of some lanes stand: a `Result` value each."""
+    cases = found.diverged, found.imbalance > EQUILIBRIUM_TOLERANCE, ~found.cables_converged
+    codes = Result.DIVERGED, Result.NOT_IN_EQUILIBRIUM, Result.CABLE_LIMIT
+    return np.select(cases, [int(code) for code in codes], int(Result.OK))
+
+
+@jax.jit
+def _chosen(rows: Bool[Array, " lane"], new: Any, old: Any) -> Any:
+    """Some lanes of one tree of arrays, the others of another."""
+    return jax.tree.map(lambda n, o: jnp.where(rows.reshape(-1, *(1,) * (n.ndim - 1)), n, o), new, old)
+
+
+def flat_lanes(tree: Any, count: int) -> Float[np.ndarray, "lane values"]:
+    """All leaves of a tree, one row a lane; whole numbers as floats."""
+    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(tree)]
+    rows = [leaf.reshape(len(leaf), -1) for leaf in leaves]
+    return np.concatenate([np.zeros((count, 0)), *rows], axis=1)
+
+
+def lanes_like(tree: Any, flat: Float[np.ndarray, "lane values"]) -> Any:
+    """The inverse of `flat_lanes`, with the shapes and types of a tree."""
+    leaves, structure = jax.tree.flatten(tree)
+    ends = np.cumsum([leaf[0].size for leaf in leaves])[:-1]
+    parts = np.split(flat, ends, axis=1)[: len(leaves)]
+    like = [jnp.asarray(p.reshape(leaf.shape), leaf.dtype) for p, leaf in zip(parts, leaves, strict=True)]
+    return jax.tree.unflatten(structure, like)

@@ -1,0 +1,198 @@
+"""Sessions behind the simulator: periods with partial resets are whole rollouts, and state is plain arrays."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms import mechanisms_named
+from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.simulators.compiled import CompiledEngine
+from rfdropo_bayes.simulators.protocol import Result
+from rfdropo_bayes.simulators.reference import ReferenceEngine
+from rfdropo_bayes.simulators.session import Session
+from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
+
+PERIOD, PERIODS, LANES = 0.05, 8, 5
+MECHANISMS = ("command_delay", "actuator_lag", "backlash", "viscoelasticity", "sensor_lag", "marker_offset")
+VALUES = {
+    "command_delay": 0.023,
+    "actuator_lag": 0.04,
+    "backlash": 5e-4,
+    "prony_fraction": 0.4,
+    "prony_time": 0.3,
+    "sensor_lag": 0.06,
+}
+
+
+@functools.cache
+def simulator(engine: str, precision: str = "float64", mechanisms: tuple[str, ...] = (), state: str = "rest"):
+    """The paper's trunk; its drives ramp every command over two periods, and here answer late, too."""
+    robot = load_robot("trunk_sofa")
+    timing = robot.command.model_copy(update={"dead_time_s": 0.013})
+    robot = robot.model_copy(update={"command": timing, "initial_state": state})
+    discretisation = Discretisation(robot.time_step_s)
+    assembly = assemble(robot, discretisation)
+    settled = state == "equilibrium"
+    if engine == "jax":
+        computed = ReferenceEngine(assembly, robot.time_step_s, settled)
+    else:
+        computed = CompiledEngine(assembly, robot.time_step_s, settled, precision)
+    return TrunkSimulator(robot, computed, assembly, discretisation, mechanisms_named(mechanisms, robot))
+
+
+def drawn(values: dict[str, float], seed: int = 0):
+    """Parameters of every lane, and what it is commanded in every period [m]."""
+    random = np.random.default_rng(seed)
+    parameters = {
+        "young_modulus": 4.5e6 * random.uniform(0.7, 1.3, LANES),
+        "trunk_mass": random.uniform(0.2, 0.6, LANES),
+    }
+    parameters |= {name: value * random.uniform(0.5, 1.5, LANES) for name, value in values.items()}
+    steps = 0.005 * random.integers(-1, 3, (LANES, PERIODS, 8))
+    return parameters, np.cumsum(steps, axis=1)
+
+
+def rollouts(model, parameters, commands):
+    """Whole rollouts of the same commands."""
+    grid = [
+        model.commands(PERIOD * np.arange(PERIODS), rows, np.zeros(8), PERIOD * np.arange(PERIODS + 1))
+        for rows in commands
+    ]
+    stacked = type(grid[0])(*(np.stack(parts) for parts in zip(*grid, strict=True)))
+    return jax.jit(jax.vmap(lambda p, *c: model.rollout(p, type(grid[0])(*c))))(parameters, *stacked)
+
+
+def run(model, parameters, commands, late=(1, 3)):
+    """In a session, some lanes of which start anew later than the others."""
+    session = Session(model, LANES, PERIOD)
+    everyone = np.arange(LANES)
+    session.reset(everyone, {"young_modulus": 3e6})
+    for _ in range(2):
+        session.act(np.full((LANES, 8), 0.01))
+    others = np.setdiff1d(everyone, late)
+    session.reset(others, {name: value[others] for name, value in parameters.items()})
+    session.act(np.where(np.isin(everyone, late)[:, None], 0.02, commands[:, 0]))
+    seen = [None] * LANES
+    session.reset(np.array(late), {name: value[list(late)] for name, value in parameters.items()})
+    for period in range(PERIODS):
+        age = np.where(np.isin(everyone, late), period, period + 1) % PERIODS
+        now = session.act(commands[everyone, age])
+        for lane in everyone:
+            if age[lane] == period or period < PERIODS - 1:
+                seen[lane] = (age[lane] + 1, jax.tree.map(lambda part, lane=lane: part[lane], now))
+        yield session, seen
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("state", ["rest", "equilibrium"])
+def test_a_session_is_a_rollout_bit_for_bit(precision, state):
+    model = simulator("numba", precision, (), state)
+    parameters, commands = drawn({})
+    whole = rollouts(model, parameters, commands)
+    compared = 0
+    for _, seen in run(model, parameters, commands):
+        for lane, (row, now) in enumerate(seen):
+            np.testing.assert_array_equal(now.position, whole.position[lane, row])
+            np.testing.assert_array_equal(now.tension, whole.tension[lane, row])
+            np.testing.assert_array_equal(now.motor_angle, whole.motor_angle[lane, row])
+            assert now.status == whole.status[lane] == 0
+            compared += 1
+    assert compared == LANES * PERIODS
+    assert np.ptp(whole.position, axis=1).max() > 0.02
+
+
+@pytest.mark.parametrize(("engine", "tolerance"), [("numba", 1e-13), pytest.param("jax", 1e-9, marks=pytest.mark.slow)])
+def test_mechanisms_carry_their_state(engine, tolerance):
+    """To rounding, as XLA rounds the same expressions differently in different programs."""
+    model = simulator(engine, mechanisms=MECHANISMS)
+    parameters, commands = drawn(VALUES)
+    base = rollouts(simulator("numba"), {name: parameters[name] for name in ("young_modulus", "trunk_mass")}, commands)
+    whole = rollouts(simulator("numba", mechanisms=MECHANISMS), parameters, commands)
+    assert np.abs(whole.position - base.position).max() > 1e-3, "they do nothing"
+    for _, seen in run(model, parameters, commands):
+        for lane, (row, now) in enumerate(seen):
+            np.testing.assert_allclose(now.position, whole.position[lane, row], rtol=0.0, atol=tolerance)
+            np.testing.assert_allclose(now.motor_angle, whole.motor_angle[lane, row], rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("engine", ["numba", pytest.param("jax", marks=pytest.mark.slow)])
+def test_a_state_is_saved_restored_and_copied(engine, tmp_path):
+    model = simulator(engine, mechanisms=MECHANISMS)
+    parameters, commands = drawn(VALUES)
+    session = Session(model, LANES, PERIOD)
+    session.reset(np.arange(LANES), parameters)
+    for period in range(3):
+        session.act(commands[:, period])
+    np.savez(tmp_path / "state.npz", **session.save())
+    state = dict(np.load(tmp_path / "state.npz"))
+    expected = [session.act(commands[:, period]) for period in range(3, 6)]
+    other = Session(model, LANES, PERIOD)
+    other.reset(np.arange(LANES), {name: value[::-1] for name, value in parameters.items()})
+    other.act(commands[:, 7])
+    other.restore({name: part[[2, 4]] for name, part in state.items()}, np.array([4, 0]))
+    for period, seen in enumerate(expected, start=3):
+        found = other.act(commands[[4, 1, 2, 3, 2], period])
+        np.testing.assert_array_equal(found.position[[4, 0]], seen.position[[2, 4]])
+        np.testing.assert_array_equal(found.motor_angle[[4, 0]], seen.motor_angle[[2, 4]])
+    np.testing.assert_array_equal(other.parameters["backlash"][[4, 0]], parameters["backlash"][[2, 4]])
+    np.testing.assert_allclose(other.time, PERIOD * np.array([6, 4, 4, 4, 6]))
+    assert other.nbytes < 100_000 * LANES * (1 if engine == "numba" else 10)
+
+
+def test_what_a_session_cannot_do_is_said():
+    model = simulator("numba")
+    with pytest.raises(InputError, match="whole number of time steps"):
+        Session(model, 2, 0.025)
+    session = Session(model, 2, PERIOD)
+    with pytest.raises(InputError, match="lane 0 was not started"):
+        session.act(np.zeros((2, 8)))
+    session.reset(np.array([0]), {})
+    with pytest.raises(InputError, match="lane 1 was not started"):
+        session.act(np.zeros((2, 8)))
+    session.reset(np.array([1]), {})
+    with pytest.raises(InputError, match="8 of them not finite"):
+        session.act(np.array([np.zeros(8), np.full(8, np.nan)]))
+    with pytest.raises(InputError, match="of shape"):
+        session.act(np.zeros(8))
+    with pytest.raises(InputError, match="did you mean 'young_modulus'"):
+        session.reset(np.array([0]), {"young_module": 1e6})
+    with pytest.raises(InputError, match="outside its hard bounds"):
+        session.reset(np.array([0]), {"young_modulus": -1.0})
+    with pytest.raises(InputError, match="name each lane once"):
+        session.reset(np.array([0, 0]), {})
+    with pytest.raises(InputError, match="does not fit"):
+        session.restore({"bodies": np.zeros((2, 3))})
+
+
+def test_a_mechanism_for_whole_rollouts_only_is_refused():
+    class Own:
+        name, stage, cause, remedy, parameters = "own", "actuation", "a", "b", ()
+
+        def actuate(self, values, command, initial, time_step):
+            return command
+
+    base = simulator("numba")
+    model = TrunkSimulator(base.robot, base.engine, base.assembly, base.discretisation, (Own(),))
+    with pytest.raises(InputError, match="written for whole rollouts only"):
+        model.session(1, PERIOD)
+
+
+def test_a_lane_that_is_lost_says_so_and_leaves_the_others_alone():
+    model = simulator("numba", "float32")
+    session, alone = Session(model, 2, PERIOD), Session(model, 1, PERIOD)
+    session.reset(np.arange(2), {})
+    alone.reset(np.arange(1), {})
+    state = session.save()
+    state["bodies"][1] = np.nan
+    session.restore(state)
+    for _ in range(3):
+        seen, one = session.act(np.full((2, 8), 0.01)), alone.act(np.full((1, 8), 0.01))
+        np.testing.assert_array_equal(seen.position[0], one.position[0])
+        assert list(seen.status) == [Result.OK, Result.DIVERGED]
+    assert session.reset(np.array([1]), {}).status == [Result.OK]
+    np.testing.assert_array_equal(session.act(np.zeros((2, 8))).status, Result.OK)
