@@ -27,7 +27,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "inference": {"posteriors", "bayes"},
     "audit": {"data", "posteriors", "simulators", "mechanisms", "bayes", "inference"},
     "report": {"data", "posteriors", "bayes", "inference", "audit"},
-    "envs": {"posteriors", "robots", "simulators", "mechanisms"},
+    "envs": {"posteriors", "robots", "simulators", "mechanisms", "report"},
     "training": {"posteriors", "robots", "inference", "envs"},
     "deployment": {"data", "robots"},
 }

@@ -1,0 +1,1 @@
+"""The paper's tasks as environments that simulate many trunks at once, their parameters drawn at every reset."""

@@ -1,0 +1,218 @@
+"""Where the parameters of an episode come from: a posterior, RF-DROPO's phi, uniform ranges, or one point."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import truncnorm
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
+
+POSTERIOR, PHI = "posterior.nc", "summary.json"
+
+
+class Randomisation(Protocol):
+    """A distribution over a simulator's parameters."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters that it varies or sets."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """ "posterior", "phi", "uniform" or "point"."""
+        ...
+
+    @property
+    def sha256(self) -> str:
+        """Digest of what it was made from."""
+        ...
+
+    def draw(self, rng: np.random.Generator) -> dict[str, float]:
+        """Values for one episode."""
+        ...
+
+
+def _digest(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=float).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Point:
+    """The same values in every episode; an empty mapping is the nominal simulator."""
+
+    values: Mapping[str, float]
+    kind: str = "point"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters that are set."""
+        return tuple(self.values)
+
+    @property
+    def sha256(self) -> str:
+        """Of the values."""
+        return _digest(dict(self.values))
+
+    def draw(self, rng: np.random.Generator) -> dict[str, float]:
+        """The values."""
+        return dict(self.values)
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """Independent uniform ranges: uniform domain randomisation."""
+
+    ranges: Mapping[str, tuple[float, float]]
+    kind: str = "uniform"
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in self.ranges.items():
+            if not low <= high:
+                raise InputError(f"{name} from {low:g} to {high:g}", where="ranges", remedy="give the lower end first")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters that vary."""
+        return tuple(self.ranges)
+
+    @property
+    def sha256(self) -> str:
+        """Of the ranges."""
+        return _digest({name: list(ends) for name, ends in self.ranges.items()})
+
+    def draw(self, rng: np.random.Generator) -> dict[str, float]:
+        """A point of the box."""
+        return {name: float(rng.uniform(low, high)) for name, (low, high) in self.ranges.items()}
+
+
+@dataclass(frozen=True)
+class Phi:
+    """RF-DROPO's distribution: independent normals, cut off at ``low`` and ``high`` [parameter units]."""
+
+    normals: Mapping[str, Mapping[str, float]]
+    kind: str = "phi"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters that vary."""
+        return tuple(self.normals)
+
+    @property
+    def sha256(self) -> str:
+        """Of the normals."""
+        return _digest({name: dict(normal) for name, normal in self.normals.items()})
+
+    def draw(self, rng: np.random.Generator) -> dict[str, float]:
+        """Independent draws."""
+        found = {}
+        for name, normal in self.normals.items():
+            mean, std = normal["mean"], max(normal["std"], 1e-300)
+            low, high = (normal["low"] - mean) / std, (normal["high"] - mean) / std
+            found[name] = float(truncnorm.rvs(low, high, loc=mean, scale=std, random_state=rng))
+        return found
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Rows of a posterior: whole rows, so that correlations between parameters stay."""
+
+    names: tuple[str, ...]
+    rows: Float[np.ndarray, "draw parameter"]
+    sha256: str
+    kind: str = "posterior"
+
+    def draw(self, rng: np.random.Generator) -> dict[str, float]:
+        """One row."""
+        row = self.rows[rng.integers(len(self.rows))]
+        return dict(zip(self.names, map(float, row), strict=True))
+
+
+def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Randomisation:
+    """The randomisation, if every value that it can give lies within the hard bounds of a parameter of the simulator.
+
+    Raises:
+        InputError: an unknown parameter, or values outside its bounds; of a posterior the number of such draws is said.
+    """
+    where = f"randomisation ({randomisation.kind})"
+    check_names(randomisation.names, specs, where=where)
+    known = {spec.name: spec for spec in specs}
+    if isinstance(randomisation, Draws):
+        for index, name in enumerate(randomisation.names):
+            column, spec = randomisation.rows[:, index], known[name]
+            bad = ~((column >= spec.low) & (column <= spec.high))
+            if bad.any():
+                raise InputError(
+                    f"{int(bad.sum())} of {len(column)} draws of {name} are outside its hard bounds "
+                    f"[{spec.low:g}, {spec.high:g}] {spec.unit}, or not finite",
+                    where=where,
+                    remedy="calibrate with this robot",
+                )
+        return randomisation
+    ends: dict[str, tuple[float, ...]] = {}
+    if isinstance(randomisation, Point):
+        ends = {name: (float(value),) for name, value in randomisation.values.items()}
+    elif isinstance(randomisation, Uniform):
+        ends = {name: tuple(map(float, pair)) for name, pair in randomisation.ranges.items()}
+    elif isinstance(randomisation, Phi):
+        ends = {name: (n["low"], n["high"]) for name, n in randomisation.normals.items()}
+    for name, values in ends.items():
+        for value in values:
+            check_value(known[name], value, where=where)
+    return randomisation
+
+
+def read_posterior(path: Path, specs: Sequence[ParameterSpec]) -> tuple[Draws, tuple[str, ...]]:
+    """Draws of a saved posterior, and the names in it that are no parameters of the simulator (such as its noise).
+
+    Args:
+        path: posterior.nc, or the run folder that holds it.
+        specs: parameters of the simulator.
+
+    Raises:
+        InputError: no such file, no posterior of ours, or one that shares no parameter with the simulator.
+    """
+    path = Path(path)
+    file = path / POSTERIOR if path.is_dir() else path
+    record = PosteriorRecord.load(file)
+    known = {spec.name for spec in specs}
+    names = tuple(info.name for info in record.free if info.name in known)
+    if not names:
+        raise InputError(
+            "the posterior shares no parameter with the simulator", where=str(file), remedy="use one of this robot"
+        )
+    rows = np.stack([record.flat(name) for name in names], axis=1)
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    return Draws(names, rows, digest), tuple(info.name for info in record.free if info.name not in known)
+
+
+def read_phi(path: Path, specs: Sequence[ParameterSpec]) -> Phi:
+    """RF-DROPO's distribution from a run folder.
+
+    Raises:
+        InputError: no summary there, or one of a method that has no phi.
+    """
+    path = Path(path)
+    file = path / PHI if path.is_dir() else path
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise InputError("cannot read the summary of a run", where=str(file), remedy="name a run folder") from None
+    if not found.get("phi"):
+        raise InputError(
+            f"the method {found.get('method')!r} has no phi",
+            where=str(file),
+            remedy='calibrate with method = "rfdropo", or randomise over the posterior',
+        )
+    known = {spec.name for spec in specs}
+    return Phi({name: normal for name, normal in found["phi"].items() if name in known})

@@ -1,0 +1,19 @@
+"""Gymnasium's spaces of a policy layout."""
+
+from __future__ import annotations
+
+import numpy as np
+from gymnasium import spaces
+
+from rfdropo_bayes.robots.policy_layout import PolicyLayout
+
+FAR = 1e3
+"""Beyond anything that is observed, in SI units: Gymnasium wants bounds."""
+
+
+def spaces_of(layout: PolicyLayout) -> tuple[spaces.Box, spaces.Space]:
+    """Observation and action space."""
+    observed = spaces.Box(-FAR, FAR, (layout.size,), np.float32)
+    if layout.kind == "discrete":
+        return observed, spaces.Discrete(len(layout.moves))
+    return observed, spaces.Box(-1.0, 1.0, (len(layout.channels),), np.float32)

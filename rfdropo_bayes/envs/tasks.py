@@ -1,0 +1,194 @@
+"""The tasks of the paper: goals, reward, what is observed and what an action does. No JAX, no simulator.
+
+Facts of the scene and of the reward are those of the authors' SOFA environments (RF-DROPO, section IV, and their code).
+Differences, each with its reason: an episode does not end near the goal unless asked to, as that forfeits the positive
+reward of staying there; and the cube starts at rest on its plate, where SOFA's falls 23 mm first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots.policy_layout import ObservationPart, PolicyLayout
+
+Actions = Literal["discrete", "continuous"]
+Observed = Literal["full", "paper", "markers"]
+
+EPISODE = 100
+"""Actions of an episode."""
+PERIOD = 0.05
+"""Control period [s]: five steps of SOFA's 10 ms. The authors' robot was driven at 10 Hz, a period of 0.1 s."""
+STEP = 0.005
+"""Most that an action moves a cable [m]."""
+TRACKED_HEIGHTS = (0.0363, 0.0792, 0.1292, 0.179)
+"""Where motion capture sees the physical trunk [m along the axis]."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A goal for the tip, or for a cube that the trunk pushes.
+
+    Attributes:
+        name: of the environment.
+        robot: the robot it is made for.
+        push: whether a cube stands before the trunk; its centre is then what must reach the goal.
+        goal_low, goal_high: corners of the box that goals are drawn from [m], in the frame of the base.
+        axes: coordinates in which the distance to the goal is measured.
+        gamma: discount factor of one action with which the task is learnt well.
+    """
+
+    name: str
+    robot: str
+    push: bool
+    goal_low: tuple[float, float, float]
+    goal_high: tuple[float, float, float]
+    axes: tuple[int, ...]
+    gamma: float
+
+
+TASKS = {
+    "TrunkReach-v0": Task(
+        "TrunkReach-v0", "trunk_sofa", False, (-0.030, -0.050, 0.115), (0.030, 0.020, 0.150), (0, 1, 2), 0.95
+    ),
+    "TrunkPush-v0": Task(
+        "TrunkPush-v0", "trunk_sofa", True, (0.100, -0.100, 0.050), (0.100, -0.100, 0.050), (0, 2), 0.98
+    ),
+}
+
+
+def task_named(name: str) -> Task:
+    """A task by the name of its environment; InputError if there is none."""
+    if name not in TASKS:
+        raise InputError(f"unknown task {name!r}", where="task", remedy=f"use {' or '.join(TASKS)}")
+    return TASKS[name]
+
+
+def potential(distance: Float[np.ndarray, " lane"]) -> Float[np.ndarray, " lane"]:
+    """The potential of the authors' reward, for a distance in metres: it grows towards the goal."""
+    millimetres = 1e3 * np.asarray(distance)
+    return -0.006 * millimetres**2 - 500.0 * np.log(millimetres**2 + 1e-3)
+
+
+def reward(
+    distance: Float[np.ndarray, " lane"], first_distance: Float[np.ndarray, " lane"]
+) -> Float[np.ndarray, " lane"]:
+    """Reward of ending an action at a distance [m], in an episode that began at ``first_distance`` [m].
+
+    It is -0.05 at the first distance and near 0.95 within a millimetre of the goal.
+    """
+    beginning = potential(first_distance)
+    return (beginning - potential(distance)) / beginning - 0.05
+
+
+FLOOR = -1.05
+"""Reward for each action that a failed simulation leaves undone: that of being about twice as far off as at first."""
+
+
+def distance_to(
+    task: Task, place: Float[np.ndarray, "lane 3"], goal: Float[np.ndarray, "lane 3"]
+) -> Float[np.ndarray, " lane"]:
+    """Distance of the tip or of the cube's centre to the goal [m]."""
+    axes = list(task.axes)
+    return np.linalg.norm(place[:, axes] - goal[:, axes], axis=1)
+
+
+def resting_height(robot: Robot, side: Float[np.ndarray, " lane"]) -> Float[np.ndarray, " lane"]:
+    """Coordinate against gravity [m] of the centre of a cube that rests on the robot's plate.
+
+    Raises:
+        InputError: a robot without a plate.
+    """
+    if robot.push is None:
+        raise InputError(f"robot {robot.name!r} has no cube to push", where="task", remedy="use a reaching task")
+    return robot.push.plate_height_m + robot.push.contact_distance_m + 0.5 * np.asarray(side)
+
+
+def tracked_markers(robot: Robot) -> tuple[int, ...]:
+    """Indices of the markers nearest to where motion capture sees the physical trunk."""
+    height = robot.marker_points()[:, 2]
+    chosen = [int(np.argmin(np.abs(height - wanted))) for wanted in TRACKED_HEIGHTS]
+    return tuple(dict.fromkeys(chosen))
+
+
+def layout_of(
+    task: Task, robot: Robot, actions: Actions, observed: Observed, period: float = PERIOD, step: float = STEP
+) -> PolicyLayout:
+    """Observation and action of a task on a robot.
+
+    Args:
+        actions: "discrete", one channel pulled or released by ``step``, as in the paper; or "continuous", every channel
+            moved by up to ``step``.
+        observed: "paper", markers and goal, and the cube's pose; "full", also the commands in force and how far each
+            marker has moved since the last action; "markers", the same with the markers that motion capture sees.
+        period: from one action to the next [s].
+        step: most that an action moves a channel [m or rad].
+    """
+    channels = robot.channel_names
+    shown = len(tracked_markers(robot)) if observed == "markers" else len(robot.marker_names)
+    parts = [ObservationPart("markers", 3 * shown, "m"), ObservationPart("goal", 3, "m")]
+    parts += [ObservationPart("object", 7, "m, quaternion")] if task.push else []
+    if observed != "paper":
+        parts += [
+            ObservationPart("commands", len(channels), robot.command_unit),
+            ObservationPart("moved", 3 * shown, "m"),
+        ]
+    one = step * np.eye(len(channels))
+    moves = np.full((1, len(channels)), step) if actions == "continuous" else np.concatenate([one, -one])
+    low, high = command_limits(robot)
+    return PolicyLayout(
+        task=task.name,
+        period_s=period,
+        observation=tuple(parts),
+        channels=channels,
+        unit=robot.command.unit,
+        kind=actions,
+        moves=tuple(tuple(map(float, row)) for row in moves),
+        low=tuple(map(float, low)),
+        high=tuple(map(float, high)),
+    )
+
+
+def command_limits(robot: Robot) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
+    """Least and greatest command of each channel [m or rad] at nominal parameters.
+
+    A cable may be released as far as it may be pulled, or to its own limit where that is nearer: a policy could
+    otherwise pay out slack that takes hundreds of actions to wind up again.
+    """
+    limits = robot.displacement_limits()
+    pull, release = limits[:, 1], np.maximum(limits[:, 0], -limits[:, 1])
+    matrix = np.asarray(robot.channel_matrix(robot.nominal()), dtype=float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = np.stack([release[:, None] / matrix, pull[:, None] / matrix])
+    ends = np.where(matrix == 0.0, np.stack([np.full_like(matrix, -np.inf), np.full_like(matrix, np.inf)]), ends)
+    low, high = np.min(ends, axis=0), np.max(ends, axis=0)
+    return low.max(axis=0), high.min(axis=0)
+
+
+def parts_seen(
+    layout: PolicyLayout,
+    robot: Robot,
+    marker: Float[np.ndarray, "lane marker 3"],
+    before: Float[np.ndarray, "lane marker 3"],
+    goal: Float[np.ndarray, "lane 3"],
+    commands: Float[np.ndarray, "lane channel"],
+    pose: Float[np.ndarray, "lane 7"] | None,
+) -> Mapping[str, np.ndarray]:
+    """All pieces of an observation that a layout may ask for, from what is measured now and one action ago."""
+    markers = next(part for part in layout.observation if part.name == "markers")
+    chosen = list(tracked_markers(robot)) if markers.size != 3 * len(robot.marker_names) else slice(None)
+    seen, moved = marker[:, chosen], (marker - before)[:, chosen]
+    lanes = len(goal)
+    found = {
+        "markers": seen.reshape(lanes, -1),
+        "goal": goal,
+        "commands": commands,
+        "moved": moved.reshape(lanes, -1),
+    }
+    return found if pose is None else {**found, "object": pose}
