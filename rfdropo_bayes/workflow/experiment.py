@@ -128,13 +128,13 @@ class NoiseTable(Table):
 
 class AuditTable(Table):
     """[audit]: ``candidates`` are tried beside the registry's mechanisms, e.g. ``"mine.py:MyMechanism"``; those in
-    ``exclude`` are not. ``bootstraps`` is how many simulated data sets its p-values rest on; ``minutes`` the processor
-    time that a candidate may take which only a slower engine knows."""
+    ``exclude`` are not. ``bootstraps`` is how many simulated data sets its p-values rest on. ``minutes`` bound the
+    whole run: when they are up, it finishes with what it knows."""
 
     candidates: list[str] = Field(default_factory=list)
     exclude: list[str] = Field(default_factory=list)
     bootstraps: int = Field(default=999, ge=199)
-    minutes: float = Field(default=10.0, ge=0.0)
+    minutes: float = Field(default=30.0, gt=0.0)
 
 
 class SeparationTable(Table):
