@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import Candidate, Probe, discretisation_probe, fixed_drop, lead, probe_all
+from rfdropo_bayes.audit.deadline import OutOfTime
 from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.score import likeness, span
@@ -32,8 +34,8 @@ class Rules:
         evidence: log Bayes factor a mechanism must bring to be added; one after the first must bring the logarithm of
             the number of candidates more, since with so many to choose from a few together imitate most things.
         bootstraps: simulated data sets behind every p-value.
-        minutes: of processor time for a candidate that only a slower simulator knows; one that needs more is not
-            examined.
+        minutes, slowest: for the whole audit; when they are up it finishes with what it knows. A candidate that only
+            a slower simulator knows and that would need more than the share ``slowest`` of them is not examined.
         base_passes, extended_passes: p-values of the joint test from which a model is let pass.
         explained, significant: shares of the discrepancy for "explained" and for "partly explained".
     """
@@ -45,7 +47,8 @@ class Rules:
     effects: int = 3
     evidence: float = 3.0
     bootstraps: int = 999
-    minutes: float = 10.0
+    minutes: float = 30.0
+    slowest: float = 0.3
     base_passes: float = 0.01
     extended_passes: float = 0.05
     explained: float = 0.8
@@ -114,22 +117,33 @@ class Inquiry:
         return found, probes
 
     def name_causes(self, base: Fit) -> tuple[list[Step], Look]:
-        """Forward-stepwise extension: the steps taken, and the look at the final model."""
+        """Forward-stepwise extension: the steps taken, and the look at the final model.
+
+        When the time is up, the steps so far, and a look without candidates.
+        """
         steps: list[Step] = []
+        try:
+            return steps, self._name_causes(base, steps)
+        except OutOfTime:
+            fit = steps[-1].fit if steps else base
+            return steps, look(self.target, fit, [], [], [self.seed, len(steps)], self.rules.bootstraps)
+
+    def _name_causes(self, base: Fit, steps: list[Step]) -> Look:
+        """Append steps until no more are called for; the look at the final model."""
         fit = base
         renewed = 0  # number of steps at which the model was climbed again: once at each
         while True:
             named = [step.name for step in steps]
             found, _ = self.look_at(fit, named)
             if not steps and found.omnibus.p > self.rules.base_passes:
-                return steps, found
+                return found
             p = p_in_words(found.omnibus.p, self.rules.bootstraps)
             self.report(f"joint test p {p}; first: {found.rows[0].name if found.rows else 'none'}")
             if len(steps) >= self.rules.effects or found.omnibus.p > self.rules.extended_passes:
-                return steps, found
+                return found
             step = self._extend(found, named)
             if step is None:
-                return steps, found
+                return found
             if len(steps) > renewed and (better := self._climbed_again(step, named)) is not None:
                 renewed = len(steps)
                 self.report(f"without {step.name}, a better optimum than before: {steps[-1].name} once more")
@@ -140,7 +154,7 @@ class Inquiry:
             steps.append(step)
             fit = step.fit
             if len(steps) > 1:
-                steps = self._reconsider(base, steps)
+                steps[:] = self._reconsider(base, steps)
                 fit = steps[-1].fit
 
     def _extend(self, found: Look, named: Sequence[str]) -> Step | None:
@@ -149,13 +163,15 @@ class Inquiry:
         refits: dict[str, float] = {}
         fits: dict[str, Fit] = {}
         leads = {row.name: self._lead(found.fit, row) for row in significant}
-        for row in self._leading(significant, {name: drop for name, (drop, _) in leads.items()}, found.fit):
-            fits[row.name] = self._refit(found.fit, row, leads[row.name][1])
-            refits[row.name] = fits[row.name].log_evidence - found.fit.log_evidence
-            self.report(f"refit with {row.name}: log Bayes factor {refits[row.name]:.1f}")
-        for name in sorted(refits, key=lambda name: -refits[name])[: self.rules.classes]:
-            fits[name] = self._from_afar(name, fits[name])
-            refits[name] = fits[name].log_evidence - found.fit.log_evidence
+        # When the time is up, the refits that are done decide.
+        with suppress(OutOfTime):
+            for row in self._leading(significant, {name: drop for name, (drop, _) in leads.items()}, found.fit):
+                fits[row.name] = self._refit(found.fit, row, leads[row.name][1])
+                refits[row.name] = fits[row.name].log_evidence - found.fit.log_evidence
+                self.report(f"refit with {row.name}: log Bayes factor {refits[row.name]:.1f}")
+            for name in sorted(refits, key=lambda name: -refits[name])[: self.rules.classes]:
+                fits[name] = self._from_afar(name, fits[name])
+                refits[name] = fits[name].log_evidence - found.fit.log_evidence
         further = np.log(len(self.candidates)) if named else 0.0
         if not refits or max(refits.values()) < self.rules.evidence + further:
             return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
@@ -17,8 +17,8 @@ from rfdropo_bayes.audit.journal import Arrays, Journal, digest
 from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.noise import NoiseModel
 
-STARTS, SCREENED = 3, 48
-FIRST, ALL = 8, 40  # evaluations of a climb from each start, and of the one that goes on from the best of them
+FIRST, ALL = 8, 40  # evaluations of a short climb, and of one to its end
+CLOSE = 1e-3  # of the squared misfit: climbs end where steps bring less than a thousandth of that
 FAILED = 1e6  # whitened residual of a rollout that did not end well: no step is ever taken there
 
 
@@ -33,6 +33,7 @@ class Fit:
         jacobian: of the whitened prediction with respect to the free coordinates.
         covariance: of the free coordinates, prior included.
         log_evidence: Laplace's, up to the noise's normaliser, which all models under one noise share.
+        promise: what a Gauss-Newton step from here still promises [nat]; see `converged`.
     """
 
     x: Float[np.ndarray, " d"]
@@ -41,6 +42,12 @@ class Fit:
     jacobian: Float[np.ndarray, "n free"]
     covariance: Float[np.ndarray, "free free"]
     log_evidence: float
+    promise: float
+
+    @property
+    def converged(self) -> bool:
+        """Whether no step promises more than a nat, or more than what the accuracy of a large misfit allows."""
+        return self.promise < 1.0 + CLOSE * float(self.residual @ self.residual)
 
     def draws(self, rng: np.random.Generator, count: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Draws of all coordinates, folded back at the bounds."""
@@ -102,7 +109,8 @@ def climb(
         return {part.name: np.asarray(getattr(found, part.name)) for part in fields(Fit)}
 
     found = target.recall("climb", [start, free, np.array(evaluations)], compute)
-    return Fit(**{**found, "log_evidence": float(found["log_evidence"])})  # type: ignore[arg-type]
+    numbers = {name: float(found[name]) for name in ("log_evidence", "promise")}
+    return Fit(**{**found, **numbers})  # type: ignore[arg-type]
 
 
 def _climb(target: Target, start: np.ndarray, free: np.ndarray, evaluations: int) -> Fit:
@@ -144,7 +152,13 @@ def _around(target: Target, x: np.ndarray, free: np.ndarray, residual: np.ndarra
     beyond = np.log(norm.cdf((high - mean) / sd) - norm.cdf((low - mean) / sd))
     inside = np.log(np.maximum(norm.cdf((high - x[free]) / spread) - norm.cdf((low - x[free]) / spread), 1e-12))
     evidence = -0.5 * float(residual @ residual) + log_prior + 0.5 * float(np.linalg.slogdet(covariance)[1])
-    return Fit(x, free, residual, jacobian, covariance, evidence + float(np.sum(inside - beyond)))
+    slope = jacobian.T @ residual - (x[free] - mean) / sd**2
+    # At a bound a step leads nowhere.
+    slope = np.where(
+        ((x[free] <= low + 1e-6 * sd) & (slope < 0)) | ((x[free] >= high - 1e-6 * sd) & (slope > 0)), 0.0, slope
+    )
+    promise = 0.5 * float(slope @ covariance @ slope)
+    return Fit(x, free, residual, jacobian, covariance, evidence + float(np.sum(inside - beyond)), promise)
 
 
 def best_between(
@@ -186,25 +200,3 @@ def widening(fit: Fit, coordinates: Coordinates) -> Float[np.ndarray, " d"]:
     """By how much the scale of each prior is widened for a fit's sizes; 1 where it stays as it is."""
     free = np.isin(np.arange(len(fit.x)), fit.free) & coordinates.affine
     return np.where(free, np.maximum(np.abs(fit.x / coordinates.prior_sd), 1.0), 1.0)
-
-
-def fit_base(
-    target: Target,
-    free: Int[np.ndarray, " free"],
-    rng: np.random.Generator,
-    start: np.ndarray | None = None,
-    report: Callable[[str], None] = lambda line: None,
-) -> Fit:
-    """Posterior mode of the base model: climbs from a given start, or from the best of some prior draws."""
-    coordinates = target.forward.coordinates
-    if start is not None:
-        return climb(target, start, free)
-    points = np.repeat(coordinates.null[None], SCREENED, axis=0)
-    points[1:, free] += coordinates.prior_sd[free] * rng.standard_normal((SCREENED - 1, len(free)))
-    points = np.clip(points, *coordinates.bounds)
-    cost = target.recall("screen", [points], lambda: {"cost": np.sum(target.residual(points) ** 2, axis=1)})["cost"]
-    best = []
-    for index in np.argsort(cost, kind="stable")[:STARTS]:
-        best.append(climb(target, points[index], free, evaluations=FIRST))
-        report(f"base model, start {len(best)} of {STARTS}: sum of squares {best[-1].residual @ best[-1].residual:.0f}")
-    return climb(target, max(best, key=lambda fit: fit.log_evidence).x, free)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.coordinates import Coordinates
+from rfdropo_bayes.audit.deadline import Deadline
 from rfdropo_bayes.audit.journal import digest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
@@ -25,6 +26,10 @@ WIDTH = max(8, 4 * (os.cpu_count() or 1))
 Thetas = Float[np.ndarray, "lane physical"]
 Points = Float[np.ndarray, "n d"]
 Series = Float[np.ndarray, "... recording time channel"]
+
+
+def _no_limit() -> None:
+    """No check of the time."""
 
 
 class Lanes:
@@ -46,12 +51,12 @@ class Lanes:
         self.slope_rollouts = slope_rollouts
         self.physical = tuple(spec.name for spec in simulator.parameters)
 
-    def _observe(self, theta: jax.Array, commands: Commands) -> tuple[jax.Array, jax.Array]:
+    def _observe(self, theta: jax.Array, commands: Commands) -> tuple[jax.Array, jax.Array, jax.Array]:
         values = dict(zip(self.physical, theta, strict=True))
         steps = jnp.asarray(commands.step.shape[0])
         observation = self.simulator.rollout(values, commands, steps)
         position = observation.position[:, self.marker_index]
-        return position.reshape(position.shape[0], -1), observation.status
+        return position.reshape(position.shape[0], -1), observation.status, observation.tension
 
     @cached_property
     def _rolled(self) -> Any:
@@ -64,25 +69,39 @@ class Lanes:
 
         return jax.jit(jax.vmap(one))
 
-    def roll(self, theta: Thetas, commands: Commands, lane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Marker coordinates of each set of parameters under the commands of its lane, and result codes."""
-        parts = self._chunks(self._rolled, commands, lane, theta)
+    def roll(
+        self, theta: Thetas, commands: Commands, lane: np.ndarray, check: Callable[[], None] = _no_limit
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Marker coordinates of each set of parameters under the commands of its lane, and result codes.
+
+        ``check`` is called before every batch, and may raise.
+        """
+        parts = self._chunks(self._rolled, commands, lane, check, theta)
         position, status = (np.concatenate([part[i] for part in parts])[: len(lane)] for i in range(2))
         return position, status
 
-    def tension(self, theta: Float[np.ndarray, " physical"], commands: Commands, lane: int) -> np.ndarray:
-        """Cable tensions [N] of one rollout."""
-        values = dict(zip(self.physical, jnp.asarray(theta), strict=True))
-        own = Commands(*(np.asarray(part)[lane] for part in commands))
-        return np.asarray(self.simulator.rollout(values, own, jnp.asarray(own.step.shape[0])).tension)
+    def tension(self, theta: Thetas, commands: Commands, lane: np.ndarray) -> np.ndarray:
+        """Cable tensions [N] of each set of parameters."""
+        parts = self._chunks(self._rolled, commands, lane, _no_limit, theta)
+        return np.concatenate([part[2] for part in parts])[: len(lane)]
 
-    def differentiate(self, theta: Thetas, tangent: Thetas, commands: Commands, lane: np.ndarray) -> np.ndarray:
+    def differentiate(
+        self,
+        theta: Thetas,
+        tangent: Thetas,
+        commands: Commands,
+        lane: np.ndarray,
+        check: Callable[[], None] = _no_limit,
+    ) -> np.ndarray:
         """Derivatives of the marker coordinates along tangents."""
-        return np.concatenate(self._chunks(self._derived, commands, lane, theta, tangent))[: len(lane)]
+        return np.concatenate(self._chunks(self._derived, commands, lane, check, theta, tangent))[: len(lane)]
 
-    def _chunks(self, function: Any, commands: Commands, lane: np.ndarray, *arrays: np.ndarray) -> list[Any]:
+    def _chunks(
+        self, function: Any, commands: Commands, lane: np.ndarray, check: Callable[[], None], *arrays: np.ndarray
+    ) -> list[Any]:
         parts = []
         for start in range(0, len(lane), self.width):
+            check()
             index = np.minimum(np.arange(start, start + self.width), len(lane) - 1)
             chosen = Commands(*(np.asarray(part)[lane[index]] for part in commands))
             parts.append(jax.device_get(function(*(a[index] for a in arrays), chosen)))
@@ -108,33 +127,42 @@ class RoutedLanes(Lanes):
     def _needs_slow(self, theta: np.ndarray) -> np.ndarray:
         return ~np.isclose(theta[:, self._further], self._null, rtol=1e-6, atol=1e-12).all(axis=1)
 
-    def roll(self, theta: Thetas, commands: Commands, lane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def roll(
+        self, theta: Thetas, commands: Commands, lane: np.ndarray, check: Callable[[], None] = _no_limit
+    ) -> tuple[np.ndarray, np.ndarray]:
         """See `Lanes.roll`."""
         slow = self._needs_slow(theta)
         parts = [
             (~slow, self.fast, theta[:, self._kept]),
             (slow, self.slow, theta),
         ]
-        found = [(mask, *lanes.roll(t[mask], commands, lane[mask])) for mask, lanes, t in parts if mask.any()]
+        found = [(mask, *lanes.roll(t[mask], commands, lane[mask], check)) for mask, lanes, t in parts if mask.any()]
         position = np.zeros((len(lane), *found[0][1].shape[1:]))
         status = np.zeros(len(lane), dtype=int)
         for mask, own, codes in found:
             position[mask], status[mask] = own, codes
         return position, status
 
-    def tension(self, theta: Float[np.ndarray, " physical"], commands: Commands, lane: int) -> np.ndarray:
+    def tension(self, theta: Thetas, commands: Commands, lane: np.ndarray) -> np.ndarray:
         """See `Lanes.tension`."""
-        if self._needs_slow(theta[None])[0]:
+        if self._needs_slow(theta).any():
             return self.slow.tension(theta, commands, lane)
-        return self.fast.tension(theta[self._kept], commands, lane)
+        return self.fast.tension(theta[:, self._kept], commands, lane)
 
-    def differentiate(self, theta: Thetas, tangent: Thetas, commands: Commands, lane: np.ndarray) -> np.ndarray:
+    def differentiate(
+        self,
+        theta: Thetas,
+        tangent: Thetas,
+        commands: Commands,
+        lane: np.ndarray,
+        check: Callable[[], None] = _no_limit,
+    ) -> np.ndarray:
         """See `Lanes.differentiate`."""
         slow = self._needs_slow(theta) | np.any(tangent[:, self._further] != 0.0, axis=1)
         found = []
         for mask, lanes, kept in ((~slow, self.fast, self._kept), (slow, self.slow, slice(None))):
             if mask.any():
-                own = lanes.differentiate(theta[mask][:, kept], tangent[mask][:, kept], commands, lane[mask])
+                own = lanes.differentiate(theta[mask][:, kept], tangent[mask][:, kept], commands, lane[mask], check)
                 found.append((mask, own))
         derivative = np.zeros((len(lane), *found[0][1].shape[1:]))
         for mask, own in found:
@@ -151,6 +179,7 @@ class Forward:
         commands: of the recordings, stacked.
         chosen: which of these are simulated, by name.
         rows: observations that are wanted of each; all by default.
+        deadline: of the rollouts; none by default.
     """
 
     def __init__(
@@ -160,7 +189,9 @@ class Forward:
         commands: Commands,
         chosen: Mapping[str, int],
         rows: int | None = None,
+        deadline: Deadline | None = None,
     ) -> None:
+        self.deadline = deadline or Deadline()
         self.lanes = lanes
         self.coordinates = coordinates
         self.commands = _cut(Commands(*(np.asarray(part)[list(chosen.values())] for part in commands)), rows)
@@ -181,7 +212,7 @@ class Forward:
         """Marker coordinates [m] of every recording, and True where all its rollouts ended well."""
         points = np.atleast_2d(points)
         theta, lane = self._lanes_of(points)
-        position, status = self.lanes.roll(theta, self.commands, lane)
+        position, status = self.lanes.roll(theta, self.commands, lane, self.deadline.check)
         self.rollouts += len(lane)
         fine = (status == Result.OK) & np.isfinite(position).all(axis=(1, 2))
         return position.reshape(len(points), self.count, *position.shape[1:]), fine.reshape(len(points), -1).all(axis=1)
@@ -200,9 +231,7 @@ class Forward:
     def tension(self, point: Float[np.ndarray, " d"]) -> Float[np.ndarray, "recording time cable"]:
         """Cable tensions at one point [N]."""
         theta, lane = self._lanes_of(point[None])
-        return np.stack(
-            [self.lanes.tension(values, self.commands, int(r)) for values, r in zip(theta, lane, strict=True)]
-        )
+        return self.lanes.tension(theta, self.commands, lane)
 
     def derivatives(self, point: Float[np.ndarray, " d"], directions: Points) -> Series:
         """Derivative of the marker coordinates along each direction; one-sided where a mechanism is so at null."""
@@ -214,7 +243,7 @@ class Forward:
             return np.zeros((0, self.count, self.commands.sample_step.shape[1], 3 * len(self.lanes.marker_index)))
         theta, lane = self._lanes_of(points)
         tangent = self.coordinates.physical_tangents(points, directions, self.slots).reshape(theta.shape)
-        found = self.lanes.differentiate(theta, tangent, self.commands, lane)
+        found = self.lanes.differentiate(theta, tangent, self.commands, lane, self.deadline.check)
         self.rollouts += self.lanes.slope_rollouts * len(lane)
         return np.nan_to_num(found).reshape(len(points), self.count, *found.shape[1:])
 

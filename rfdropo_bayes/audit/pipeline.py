@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -13,21 +15,25 @@ from rfdropo_bayes.audit.affordable import unaffordable
 from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
+from rfdropo_bayes.audit.deadline import Deadline, OutOfTime
 from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step
-from rfdropo_bayes.audit.fit import Fit, Target, climb, fit_base, widened
+from rfdropo_bayes.audit.fit import Fit, Target, climb, widened
 from rfdropo_bayes.audit.forward import Forward, Lanes
 from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
 from rfdropo_bayes.audit.noise import RESIDUALS, STATED, NoiseModel
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
-from rfdropo_bayes.audit.screen import Look
-from rfdropo_bayes.audit.verdict import PARTLY, UNEXPLAINED, decide
+from rfdropo_bayes.audit.screen import Look, look
+from rfdropo_bayes.audit.search import better_nearby, search
+from rfdropo_bayes.audit.verdict import NO_VERDICT, PARTLY, UNEXPLAINED, decide
 from rfdropo_bayes.bayes.model import RecordingSet
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
 
 DRAWS = 60
+AGAIN = 3  # times that a base fit is climbed on from a better point beside it, before it counts as not converged
 FIRST_GUESS = 1e-3  # [m] of white noise, until something better is known
 HELD_OUT_ROWS = 0.6  # of a single recording, which is all that is fitted of it when the rest is to be predicted
 
@@ -71,7 +77,7 @@ class Answer:
     after each step; ``stages`` the explained fraction after each step; ``sizes`` is the last model's fit under priors
     that do not pull, and ``draws`` are from it; ``suspected`` is a noise under which the base model would pass, where a
     stated one leaves a discrepancy that is not explained; ``shift`` is the distance by which constants tell repeats
-    apart [m].
+    apart [m]; ``stopped`` says that the time was up before all was done.
     """
 
     verdict: str
@@ -92,6 +98,7 @@ class Answer:
     draws: Float[np.ndarray, "draw d"]
     suspected: NoiseModel | None
     shift: float | None
+    stopped: bool
     rollouts: int
     seconds: float
 
@@ -120,24 +127,29 @@ def audit(
     Raises:
         InputError: rollouts at the optimum do not end well.
     """
-    began = time.monotonic()
-    rng = np.random.default_rng(question.seed)
-    target, base = base_model(question, rng, journal, report)
+    began, deadline = time.monotonic(), Deadline(question.rules.minutes)
+    target, base = base_model(question, question.seed, journal, report, deadline)
     shared = "" if target.noise.correlation is None else ", shared between channels"
     report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.order}){shared}")
     finer = None
     if question.finer is not None:
-        finer = _forward(question, True, target.measurements)
-    unexamined = unaffordable(question.candidates, target, base, question.rules.minutes)
+        finer = _forward(question, True, target.measurements, deadline)
+    unexamined = unaffordable(question.candidates, target, base, question.rules.slowest * question.rules.minutes)
     for name, minutes in unexamined.items():
         report(f"{name} is not examined: on the slower engine it would take {minutes:.0f} minutes")
     examined = [c for c in question.candidates if c.name not in unexamined]
     inquiry = Inquiry(target, examined, question.rules, question.seed, finer, report)
-    steps, last = inquiry.name_causes(base)
+    if base.converged:
+        steps, last = inquiry.name_causes(base)
+    else:
+        steps, last = [], look(target, base, [], [], [question.seed, 0], question.rules.bootstraps)
     if steps and target.noise.source == RESIDUALS:
-        inquiry, base = _asked_again(inquiry, base, steps[-1].fit)
-        target, (steps, last) = inquiry.target, inquiry.name_causes(base)
-    held_out = _held_out(question, target, inquiry, base, steps)
+        with suppress(OutOfTime):
+            inquiry, base = _asked_again(inquiry, base, steps[-1].fit)
+            target, (steps, last) = inquiry.target, inquiry.name_causes(base)
+    held_out = None
+    with suppress(OutOfTime):
+        held_out = _held_out(question, target, inquiry, base, steps)
     kept = held_out.supported() if held_out else 0
     unsupported = [step.name for step in steps[kept:]] if kept else []
     if unsupported:
@@ -145,7 +157,8 @@ def audit(
         steps, last = steps[:kept], steps[kept].before
     extended = steps[-1].fit if steps else base
     if steps and target.noise.source == RESIDUALS:
-        last = _final_look(inquiry, extended, steps)
+        with suppress(OutOfTime):
+            last = _final_look(inquiry, extended, steps)
     looks = [*(step.before for step in steps), last]
     stages = [held_out.gain(0, k) for k in range(1, len(steps) + 1)] if held_out else []
     gain = stages[-1] if stages else None
@@ -153,7 +166,14 @@ def audit(
     verdict = decide(
         question.rules, looks[0].omnibus.p, last.omnibus.p if steps else None, members, gain, target.noise.doubtful
     )
-    unexplained = verdict in (PARTLY, UNEXPLAINED) and last.omnibus.p <= question.rules.extended_passes
+    if not base.converged or (verdict == UNEXPLAINED and deadline.reached):
+        verdict = NO_VERDICT
+    suspected = None
+    if verdict in (PARTLY, UNEXPLAINED) and last.omnibus.p <= question.rules.extended_passes:
+        with suppress(OutOfTime):
+            suspected = _suspected(inquiry, base)
+    stopped = deadline.reached
+    deadline.lift()  # what is left are single rollouts, for the report
     sizes = widened(extended, question.coordinates)
     low, high = question.coordinates.bounds
     return Answer(
@@ -173,60 +193,85 @@ def audit(
         held_out.unseen if held_out else None,
         sizes,
         sizes.draws(np.random.default_rng([question.seed, 5]), 1000, low, high),
-        _suspected(inquiry, base) if unexplained else None,
+        suspected,
         target.measurements.shift,
+        stopped,
         target.forward.rollouts + (finer.rollouts if finer else 0),
         time.monotonic() - began,
     )
 
 
-def _forward(question: Question, finer: bool, measurements: Measurements) -> Forward:
+def _forward(question: Question, finer: bool, measurements: Measurements, deadline: Deadline | None) -> Forward:
     chosen = {name: group[0] for name, group in zip(measurements.names, measurements.members, strict=True)}
-    return simulated(question, finer, chosen)
+    return simulated(question, finer, chosen, deadline)
 
 
-def simulated(question: Question, finer: bool, chosen: dict[str, int]) -> Forward:
+def simulated(question: Question, finer: bool, chosen: dict[str, int], deadline: Deadline | None = None) -> Forward:
     """Some of the recordings, on the simulator itself or on the finer one."""
     lanes, commands = question.lanes, question.recordings.commands
     if finer and question.finer is not None:
         lanes, commands = question.finer
     rows = int(question.recordings.rows[list(chosen.values())].max())
-    return Forward(lanes, question.coordinates, commands, chosen, rows)
+    return Forward(lanes, question.coordinates, commands, chosen, rows, deadline)
 
 
 def base_model(
     question: Question,
-    rng: np.random.Generator,
+    seed: int,
     journal: Journal | None = None,
     report: Callable[[str], None] = lambda line: None,
+    deadline: Deadline | None = None,
 ) -> tuple[Target, Fit]:
-    """Noise and base fit; where the noise is estimated from residuals, the two in turn."""
+    """Noise and base fit; where the noise is estimated from residuals, the two in turn.
+
+    Raises:
+        InputError: the time was up before the base model was fitted.
+    """
     journal = journal or Journal()
-    coordinates = question.coordinates
-    per_recording = any(p.recording for p in coordinates.space.parameters)
+    per_recording = any(p.recording for p in question.coordinates.space.parameters)
     count = len(question.trajectories)
     fitted = _subset(question.recordings, range(count))
     measurements = gather_measurements(fitted, question.trajectories, join=not per_recording)
-    forward = _forward(question, False, measurements)
+    forward = _forward(question, False, measurements, deadline)
+    noise = question.stated_noise
+    if measurements.has_repeats:
+        noise = measurements.noise(measurements.single, 0)
+    known = noise or NoiseModel(np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf)
+    target = Target(forward, measurements, known, journal)
+    try:
+        fit = _base_fit(target, question.start, seed, report)
+        return (target, fit) if noise is not None else _under_residual_noise(target, fit)
+    except OutOfTime:
+        raise InputError(
+            "the time was up before the base model was fitted",
+            where="[audit] minutes",
+            remedy="raise it and go on with --resume, or start from a calibration by --base",
+        ) from None
+
+
+def _base_fit(target: Target, start: dict[str, float] | None, seed: int, report: Callable[[str], None]) -> Fit:
+    """Posterior mode of the base model, from a given start or from where `calibrate`'s search leads; climbed on while
+    rollouts beside it are better."""
+    coordinates = target.forward.coordinates
     free = np.arange(coordinates.base)
-    start = None if question.start is None else coordinates.encode(question.start)
-    if measurements.has_repeats or question.stated_noise is not None:
-        noise = question.stated_noise
-        if noise is None or measurements.has_repeats:
-            noise = measurements.noise(measurements.single, 0)
-        target = Target(forward, measurements, noise, journal)
-        return target, fit_base(target, free, rng, start, report)
-    white = NoiseModel(np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf)
-    target = Target(forward, measurements, white, journal)
-    return _under_residual_noise(target, fit_base(target, free, rng, start, report))
+    first = search(target, jax.random.key(seed)) if start is None else coordinates.encode(start)
+    fit = climb(target, first, free)
+    for _ in range(AGAIN):
+        better = better_nearby(target, fit)
+        if better is None:
+            return fit
+        report(f"base model: sum of squares {fit.residual @ fit.residual:.0f}, and better beside it")
+        fit = climb(target, better, free)
+    return fit if better_nearby(target, fit) is None else replace(fit, promise=np.inf)
 
 
 def _under_residual_noise(target: Target, fit: Fit) -> tuple[Target, Fit]:
     """Noise and fit in turn."""
+    converged = fit.converged
     for _ in range(2):
         target = replace(target, noise=residual_noise(target, fit))
         fit = climb(target, fit.x, fit.free)
-    return target, fit
+    return target, fit if converged else replace(fit, promise=np.inf)
 
 
 def residual_noise(target: Target, fit: Fit) -> NoiseModel:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.extension import DISCRETISATION, TOLD_APART
 from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.noise import REPEATS, STATED
 from rfdropo_bayes.audit.pipeline import Answer
-from rfdropo_bayes.audit.verdict import EXPLAINED, NO_DISCREPANCY, UNEXPLAINED, unclear
+from rfdropo_bayes.audit.verdict import EXPLAINED, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED, unclear
 
 MOST_EXCLUDED = 3
 MOST_SIZES = 4
@@ -18,7 +20,7 @@ MOST_SIZES = 4
 
 def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     """What was found, how much of the discrepancy it explains, what is excluded, what remains."""
-    words = _words(answer, findings) + _suspicion(answer) + _shifted(answer) + _unexamined(answer)
+    words = _words(answer, findings) + _suspicion(answer) + _shifted(answer) + _unexamined(answer) + _stopped(answer)
     return words[0].upper() + words[1:]
 
 
@@ -28,6 +30,16 @@ def _unexamined(answer: Answer) -> str:
     count = len(answer.question.left_out)
     does = "candidate does" if count == 1 else "candidates do"
     return slow + (f" Left out: {count} {does} not run on this body or engine." if count else "")
+
+
+def _stopped(answer: Answer) -> str:
+    if not answer.stopped:
+        return ""
+    minutes = answer.question.rules.minutes
+    return (
+        f" The time was up after {minutes:g} minutes ([audit] minutes), before every question was asked: raise it and "
+        "go on with --resume."
+    )
 
 
 def _suspicion(answer: Answer) -> str:
@@ -52,6 +64,13 @@ def _shifted(answer: Answer) -> str:
 
 
 def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
+    if not answer.base.converged:
+        left = answer.base.residual
+        return (
+            f"No verdict: the fit of the base model has not converged (sum of squares {left @ left:.3g} for "
+            f"{np.count_nonzero(left)} values, and better points beside it). Start from a calibration with --base, "
+            "narrow the priors, or shorten [simulator] time_step."
+        )
     if answer.verdict == NO_DISCREPANCY:
         return (
             f"No discrepancy: what the base model leaves is noise as far as these data can tell "
@@ -64,6 +83,8 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
             f"without repeats it cannot be told from noise, and no candidate stands out of it "
             f"(joint test p {_p(answer)})."
         )
+    if not findings and answer.verdict == NO_VERDICT:
+        return f"Something is wrong with the base model (joint test p {_p(answer)}); no candidate was tried to the end."
     if not findings:
         tail = f"what remains has a standard deviation of {1e3 * answer.remainder.amplitude:.2g} mm"
         return f"Something is wrong with the base model, and no candidate of the library says what: {tail}."

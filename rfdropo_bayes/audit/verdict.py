@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.gain import Gain
 
+NO_VERDICT = "no_verdict"  # the base fit has not converged, or the time was up before anything was found
 NO_DISCREPANCY, EXPLAINED, EQUIVALENT, PARTLY, UNEXPLAINED = (
     "no_discrepancy",
     "explained",

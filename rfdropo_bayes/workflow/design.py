@@ -54,7 +54,7 @@ def run_design(
     question = build_question(experiment, folder, fitted, [], experiment.seed if seed is None else seed)
     out = output_folder(out)
     rng = np.random.default_rng(question.seed)
-    target, base = base_model(question, rng)
+    target, base = base_model(question, question.seed)
     inquiry = Inquiry(target, question.candidates, question.rules, question.seed)
     found, _ = inquiry.look_at(base)
     hypotheses = _hypotheses(inquiry, found, report)

@@ -172,9 +172,9 @@ class AuditTable(Table):
     exclude: list[str] = Field(default_factory=list, description="mechanisms that are not tried")
     bootstraps: int = Field(default=999, ge=199, description="simulated data sets that the p-values rest on")
     minutes: float = Field(
-        default=10.0,
-        ge=0.0,
-        description="processor time that a candidate may take which only a slower engine knows",
+        default=30.0,
+        gt=0.0,
+        description="bound of the whole run: when they are up, it finishes with what it knows",
     )
 
 

@@ -11,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rfdropo_bayes.audit import pipeline
 from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import lead
+from rfdropo_bayes.audit.deadline import Deadline
 from rfdropo_bayes.audit.experiment_design import Hypothesis, at_hand, outlooks
 from rfdropo_bayes.audit.extension import Inquiry, Rules, Step
 from rfdropo_bayes.audit.fit import climb
@@ -27,6 +29,7 @@ from rfdropo_bayes.audit.sentence import _named
 from rfdropo_bayes.audit.verdict import decide
 from rfdropo_bayes.bayes.model import gather_recordings
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.audit_page import p_value
 from rfdropo_bayes.simulators.commands import Commands
 
@@ -158,7 +161,7 @@ def test_a_killed_audit_goes_on_where_it_was_and_says_the_same(tmp_path, monkeyp
 def test_commands_that_excite_only_one_of_two_effects_separate_them():
     """Hypotheses play (first cable) and delay (second): a recording that moves both separates, one at rest does not."""
     asked = question({**TRUTH, "play": 1.0}, 1)
-    target, base = base_model(asked, np.random.default_rng(0))
+    target, base = base_model(asked, 0)
     inquiry = Inquiry(target, asked.candidates, asked.rules, 0)
     look, _ = inquiry.look_at(base)
     hypotheses = [Hypothesis(name, inquiry.refit(base, look.row(name))) for name in ("play", "delay")]
@@ -178,12 +181,72 @@ def test_a_candidate_that_would_take_too_long_is_named_and_not_examined():
 
     asked = question({**TRUTH, "play": 1.0}, 1)
     routed = RoutedLanes(Lanes(Without(), np.arange(4)), asked.lanes, {"play": 0.0})
-    answer = audit(replace(asked, lanes=routed, rules=replace(asked.rules, minutes=0.0)))
+    answer = audit(replace(asked, lanes=routed, rules=replace(asked.rules, slowest=0.0)))
     assert list(answer.unexamined) == ["play"]
     assert answer.verdict in ("unexplained", "partly_explained")
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
     assert "play" not in {c["mechanism"] for c in content["candidates"]}
     assert content["sentence"].endswith("Not examined, as it would have taken too long: play.")
+
+
+class Hurried(Deadline):
+    """A deadline after a number of looks at the clock, each before a batch of rollouts."""
+
+    def __init__(self, looks: int) -> None:
+        super().__init__(minutes=1e9)
+        self.looks = looks
+
+    @property
+    def left(self) -> float:
+        return 1.0 if np.isinf(self.minutes) else float(self.looks)
+
+    def check(self) -> None:
+        self.looks -= 1
+        super().check()
+
+
+@pytest.mark.parametrize("share", [0.5, 0.65, 0.8, 0.95])
+def test_an_audit_whose_time_is_up_finishes_with_what_it_knows(monkeypatch, share):
+    """Play of ten times the size that is sure, and the time is up between the base fit and the end."""
+    asked = question({**TRUTH, "play": 1.0}, 1)
+    clock = Hurried(10**9)
+    monkeypatch.setattr(pipeline, "Deadline", lambda minutes: clock)
+    whole = audit(asked)
+    assert not whole.stopped
+    used = 10**9 - clock.looks
+    clock = Hurried(int(share * used))
+    answer = audit(asked)
+    content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
+    assert content["out_of_time"]
+    assert "The time was up" in content["sentence"]
+    assert "--resume" in content["sentence"]
+    named = [finding["mechanism"] for finding in content["findings"]]
+    assert named in ([], ["play"])
+    assert content["verdict"] == ("no_verdict" if not named else whole.verdict)
+
+
+def test_an_audit_without_the_time_for_a_base_fit_says_so():
+    asked = question(TRUTH, 1)
+    with pytest.raises(InputError, match=r"\[audit\] minutes: the time was up before the base model was fitted"):
+        audit(replace(asked, rules=replace(asked.rules, minutes=1e-6)))
+
+
+class Rough(Toy):
+    """Motion that jumps by several deviations of the noise where the gain changes by a thousandth."""
+
+    def rollout(self, parameters, commands, steps=None):
+        observed = super().rollout(parameters, commands, steps)
+        jump = jnp.sin(1e5 * parameters["gain"]) * jnp.sin(3e4 * parameters["bend"])
+        return observed._replace(position=observed.position + 20.0 * NOISE * jump)
+
+
+def test_a_base_fit_that_has_not_converged_is_said_and_gives_no_verdict():
+    answer = audit(replace(question({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Rough(), np.arange(4))))
+    assert answer.verdict == "no_verdict"
+    content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
+    assert not content["base_fit_converged"]
+    assert content["findings"] == []
+    assert "the fit of the base model has not converged" in content["sentence"]
 
 
 def test_rollouts_go_to_the_simulator_that_knows_their_candidates():
@@ -217,7 +280,7 @@ def test_a_refit_finds_back_from_an_extrapolation_at_which_rollouts_fail(monkeyp
             return observed._replace(status=jnp.where(jnp.abs(parameters["play"]) > 4.0, 1, 0))
 
     asked = replace(question({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Brittle(), np.arange(4)))
-    target, base = base_model(asked, np.random.default_rng(0))
+    target, base = base_model(asked, 0)
     inquiry = Inquiry(target, asked.candidates, asked.rules, 0)
     look, _ = inquiry.look_at(base)
     index = asked.coordinates.space.names.index("play")
@@ -240,7 +303,7 @@ class Turning(Toy):
 
 def test_a_large_effect_is_found_though_its_slope_at_null_points_elsewhere():
     asked = replace(question({**TRUTH, "delay": 1.0}, 2), lanes=Lanes(Turning(), np.arange(4)))
-    target, base = base_model(asked, np.random.default_rng(0))
+    target, base = base_model(asked, 0)
     look, _ = Inquiry(target, asked.candidates, asked.rules, 0).look_at(base)
     row = look.row("lag")
     drop, start = lead(target, base, row.probe, row.lm)
@@ -251,7 +314,7 @@ def test_a_large_effect_is_found_though_its_slope_at_null_points_elsewhere():
 
 def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it():
     asked = question({**TRUTH, "play": 1.0}, 1)
-    target, base = base_model(asked, np.random.default_rng(0))
+    target, base = base_model(asked, 0)
     inquiry = Inquiry(target, asked.candidates, asked.rules, 0)
     look, _ = inquiry.look_at(base)
     play, creep = (next(c for c in asked.candidates if c.name == name) for name in ("play", "creep"))
@@ -290,7 +353,7 @@ def test_without_repeats_the_noise_is_what_the_extended_model_leaves():
     """The noise is within 10 % (160 rows, 12 channels, half of them for memory: five standard errors), where the base
     model leaves several times as much."""
     asked = unrepeated({"play": 3.0}, 5)
-    before, _ = base_model(asked, np.random.default_rng(0))
+    before, _ = base_model(asked, 0)
     assert np.mean(before.noise.scale) > 2.0 * NOISE
     answer = audit(asked)
     assert [step.name for step in answer.steps] == ["play"]

@@ -20,7 +20,7 @@ def asked(residual: np.ndarray, jacobian: np.ndarray, x: np.ndarray, valid: np.n
     coordinates = SimpleNamespace(prior_mean=np.ones(PARAMETERS), prior_sd=np.full(PARAMETERS, 2.0))
     target = SimpleNamespace(measurements=measurements, forward=SimpleNamespace(coordinates=coordinates))
     free = np.arange(PARAMETERS)
-    return target, Fit(x, free, residual, jacobian, np.eye(PARAMETERS), 0.0)
+    return target, Fit(x, free, residual, jacobian, np.eye(PARAMETERS), 0.0, 0.0)
 
 
 def drawn(rng: np.random.Generator):

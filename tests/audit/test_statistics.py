@@ -283,7 +283,7 @@ def test_a_size_far_outside_its_prior_is_not_drawn_back_and_a_usual_one_is_left(
         return covariance @ jacobian.T @ data, covariance
 
     x, covariance = posterior(np.ones(3))
-    fit = Fit(x, np.arange(3), data - jacobian @ x, jacobian, covariance, 0.0)
+    fit = Fit(x, np.arange(3), data - jacobian @ x, jacobian, covariance, 0.0, 0.0)
     found = widened(fit, coordinates)
     expected = posterior(np.maximum(np.abs(x), 1.0) ** np.array([0, 1, 0]))
     assert abs(x[2]) < 1.0

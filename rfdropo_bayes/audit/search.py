@@ -1,0 +1,156 @@
+"""The base model's optimum, looked for as `calibrate` looks for it: climbs from screened draws over growing horizons.
+
+Under a long recording the likelihood has many small summits, on which climbs of the whole end. `BaseProblem` shows the
+base model's posterior to `inference.laplace`, whose climbs begin at short prefixes; `better_nearby` then asks rollouts,
+not derivatives, whether the summit that was found is one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int, PRNGKeyArray
+
+from rfdropo_bayes.audit.fit import CLOSE, Fit, Target
+from rfdropo_bayes.inference.laplace import LaplaceConfig, find_modes
+
+CLIMBED = 0.1  # nats that a step of these climbs promises at their end; the audit's own climb goes on from there
+POLLED = (0.3, 0.03, 0.003)  # prior deviations to each side of a summit that are tried
+
+
+@dataclass(frozen=True)
+class BaseProblem:
+    """The base model's posterior as inference methods see it; see `bayes.problem.ResidualProblem`.
+
+    A row is one row of every group of repeats, whitened given those before it. The noise is known.
+    """
+
+    target: Target
+    jacobian: str = "central"
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Base parameters."""
+        own = self.target.forward.coordinates
+        return own.names[: own.base]
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Of the parameters."""
+        return {p.name: p.spec.unit for p in self._parameters}
+
+    @property
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Hard bounds."""
+        return {p.name: (p.spec.low, p.spec.high) for p in self._parameters}
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of the longest recording."""
+        return int(self.target.measurements.position.shape[1])
+
+    @property
+    def _parameters(self) -> Any:
+        own = self.target.forward.coordinates
+        return own.space.parameters[: own.base]
+
+    @cached_property
+    def _prior(self) -> tuple[np.ndarray, np.ndarray]:
+        own = self.target.forward.coordinates
+        return own.prior_mean[: own.base], own.prior_sd[: own.base]
+
+    def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
+        """Draws from the normal approximation of the prior, in the coordinates that climbs move in."""
+        mean, sd = self._prior
+        return self.from_unconstrained(mean + sd * np.asarray(jax.random.normal(key, (n, len(mean)))))
+
+    def to_unconstrained(self, values: Mapping[str, Any]) -> Float[Any, "n d"]:
+        """Coordinates of values."""
+        own = self.target.forward.coordinates
+        return np.stack([own.encode_one(i, np.asarray(values[name])) for i, name in enumerate(self.names)], axis=1)
+
+    def from_unconstrained(self, u: Float[Any, "n d"]) -> dict[str, Float[Any, " n"]]:
+        """Values of coordinates."""
+        values = self.target.forward.coordinates.values(self._points(u))
+        return {name: values[:, i] for i, name in enumerate(self.names)}
+
+    def log_prior(self, u: Float[Any, "n d"]) -> Float[Any, " n"]:
+        """The prior's normal approximation."""
+        mean, sd = self._prior
+        return -0.5 * np.sum(((np.asarray(u) - mean) / sd) ** 2 + np.log(2.0 * np.pi * sd**2), axis=-1)
+
+    @cached_property
+    def prior_derivatives(self) -> tuple[Any, Any]:
+        """Gradient and Hessian of the log prior."""
+        mean, sd = self._prior
+        return (lambda u: -(np.asarray(u) - mean) / sd**2), (lambda u: np.diag(-(sd**-2.0)))
+
+    def row_log_likelihood(
+        self, values: Mapping[str, Any], horizon: int
+    ) -> tuple[Float[Any, "n horizon"], Int[Any, " n"]]:
+        """Of each row given those before it, up to the noise's normaliser; status 1 for a rollout that was lost."""
+        white, fine = self._rows(values, horizon)
+        return np.where(fine[:, None], -0.5 * np.sum(white**2, axis=(1, 3)), -np.inf), np.where(fine, 0, 1)
+
+    def residual_batch(self, values: Mapping[str, Any], horizon: int) -> Float[Any, "n m"]:
+        """Whitened residuals of a prefix."""
+        white, fine = self._rows(values, horizon)
+        return np.where(fine[:, None], white.reshape(len(white), -1), np.inf)
+
+    def residuals(self, values: Mapping[str, Any], horizon: int) -> Float[Any, " m"]:
+        """The same of one set of values."""
+        return self.residual_batch({name: np.atleast_1d(value) for name, value in values.items()}, horizon)[0]
+
+    def _points(self, u: Any) -> np.ndarray:
+        own = self.target.forward.coordinates
+        points = np.repeat(own.null[None], len(u), axis=0)
+        points[:, : own.base] = np.asarray(u)
+        return np.clip(points, *own.bounds)
+
+    def _rows(self, values: Mapping[str, Any], horizon: int) -> tuple[np.ndarray, np.ndarray]:
+        position, fine = self.target.forward.positions(self._points(self.to_unconstrained(values)))
+        white = self.target.measurements.whiten(self.target.measurements.position - position, self.target.noise)
+        shape = self.target.measurements.position.shape
+        return np.where(fine[:, None], white, 0.0).reshape(len(white), *shape)[:, :, :horizon], fine
+
+
+def search(target: Target, key: PRNGKeyArray) -> Float[np.ndarray, " d"]:
+    """Where the best of `calibrate`'s climbs ends.
+
+    Raises:
+        NoLikelihoodError: all prior draws are lost.
+    """
+
+    def compute() -> dict[str, np.ndarray]:
+        problem = BaseProblem(target)
+        # Its normal approximation is not used: the coarse differences of short climbs suffice.
+        mode = find_modes(problem, LaplaceConfig(tolerance=CLIMBED), key).modes[0]
+        return {"x": problem._points(mode.mean[None])[0]}
+
+    return target.recall("search", [np.asarray(jax.random.key_data(key))], compute)["x"]
+
+
+def better_nearby(target: Target, fit: Fit) -> Float[np.ndarray, " d"] | None:
+    """A point beside a fit that is clearly better; None where rollouts confirm that it is a summit.
+
+    Derivatives cannot tell: of a motion that is rough on the scale of their steps they are noise, and promise nothing.
+    """
+    coordinates = target.forward.coordinates
+    points = []
+    for index in fit.free:
+        for step in POLLED:
+            for sign in (-1.0, 1.0):
+                point = fit.x.copy()
+                point[index] += sign * step * coordinates.prior_sd[index]
+                points.append(point)
+    tried = np.clip(np.stack([fit.x, *points]), *coordinates.bounds)
+    residual = target.recall("poll", [tried], lambda: {"residual": target.residual(tried)})["residual"]
+    z = ((tried - coordinates.prior_mean) / coordinates.prior_sd)[:, fit.free]
+    height = -0.5 * (np.sum(residual**2, axis=1) + np.sum(z**2, axis=1))
+    best = int(np.argmax(height))
+    return tried[best] if height[best] > height[0] + 1.0 + CLOSE * float(fit.residual @ fit.residual) else None
