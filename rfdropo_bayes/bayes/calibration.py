@@ -236,6 +236,12 @@ class CalibrationProblem:
         white = self._chunked(self._white, values, horizon, self.measured)
         return np.concatenate(_flat(white, horizon), axis=1)
 
+    def white_positions(self, values: Mapping[str, float]) -> Float[np.ndarray, "recording time marker 3"]:
+        """Whitened residuals of the markers at one set of values, NaN where masked."""
+        single = {name: np.array([values[name]]) for name in self.names}
+        white = self._chunked(self._white, single, self.n_rows, self.measured)[0][0]
+        return np.where(self.model.recordings.line.valid[..., None], white, np.nan)
+
     def with_measured(self, measured: Measured) -> CalibrationProblem:
         """The same problem with other data, which shares all that has been compiled.
 

@@ -38,6 +38,8 @@ from rfdropo_bayes.inference.tempering import Population, StageInfo, Tuning, pro
 PARTICLES_WITHOUT_BUDGET = 1000
 ROLLOUTS_PER_PARTICLE = 20.0
 FEWEST_PARTICLES = 50
+WORTH_A_REPLICATE = 100  # particles
+MOST_REPLICATES = 4
 STARTS = ("auto", "prior", "optimum")
 NOT_REPRESENTABLE = "not_representable"
 
@@ -49,7 +51,8 @@ class SmcConfig:
     Attributes:
         rollouts: budget in full-length rollouts, of all replicates together; None for no limit.
         particles: per replicate; None takes as many as the budget serves, or 1000 without one.
-        replicates: independent repetitions; they become chains, and their scatter is the evidence's deviation.
+        replicates: independent repetitions; they become chains, and their scatter is the evidence's deviation. None
+            takes as many as the budget serves, up to four, and one without a budget: see `decided`.
         blocks: number of times the horizon is lengthened.
         spacing: of the blocks: "geometric", "linear" or "every" (row).
         target_ess: share of effective particles kept from one target to the next; closer to 1 is slower and more exact.
@@ -65,7 +68,7 @@ class SmcConfig:
 
     rollouts: float | None = None
     particles: int | None = None
-    replicates: int = 1
+    replicates: int | None = None
     blocks: int = 6
     spacing: str = "geometric"
     target_ess: float = 0.5
@@ -89,12 +92,18 @@ class SmcConfig:
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InputError(f"{name} = {getattr(self, name)} is not between 0 and 1", where=where)
         for name in ("replicates", "blocks", "max_moves", "draws"):
-            if getattr(self, name) < 1:
+            value = getattr(self, name)
+            if value is not None and value < 1:
                 raise InputError(f"{name} = {getattr(self, name)} is less than 1", where=where)
         if self.particles is not None and self.particles < 10:
             raise InputError(f"particles = {self.particles} is less than 10", where=where)
         if self.degrees <= 0.0 or (self.rollouts is not None and self.rollouts <= 0.0):
             raise InputError("degrees and rollouts must be positive", where=where)
+
+    @property
+    def chains(self) -> int:
+        """Replicates that were asked for, or one."""
+        return self.replicates or 1
 
     @property
     def tuning(self) -> Tuning:
@@ -144,6 +153,15 @@ class SmcState(NamedTuple):
     finished: bool
 
 
+def decided(n_rows: int, config: SmcConfig) -> SmcConfig:
+    """The settings with a number of replicates: as many as the budget serves with enough particles each."""
+    if config.replicates is not None or config.rollouts is None:
+        return config
+    looks = sum(block_boundaries(n_rows, config.blocks, config.spacing)) / n_rows
+    one = (config.particles or WORTH_A_REPLICATE) * max(ROLLOUTS_PER_PARTICLE, 2.0 * looks)
+    return replace(config, replicates=int(np.clip(config.rollouts / one, 1, MOST_REPLICATES)))
+
+
 def make_plan(problem: Problem, config: SmcConfig) -> Plan:
     """Fix particles and blocks so that the budget can be kept.
 
@@ -151,7 +169,7 @@ def make_plan(problem: Problem, config: SmcConfig) -> Plan:
         InputError: the budget does not even allow every particle one look at every block and one last move.
     """
     horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
-    budget = np.inf if config.rollouts is None else config.rollouts / config.replicates
+    budget = np.inf if config.rollouts is None else config.rollouts / config.chains
     looks = sum(horizons) / problem.n_rows
     if config.particles is not None:
         particles = config.particles
@@ -164,7 +182,7 @@ def make_plan(problem: Problem, config: SmcConfig) -> Plan:
         raise InputError(
             f"{config.rollouts:g} rollouts are too few for {least} particles over {len(horizons)} blocks",
             where="[inference] rollouts",
-            remedy=f"allow at least {config.replicates * least * (looks + 1.0):.0f}, or use fewer particles",
+            remedy=f"allow at least {config.chains * least * (looks + 1.0):.0f}, or use fewer particles",
         )
     return Plan(least, horizons, budget, flow_of(problem) if config.kernel == "hamiltonian" else None)
 
@@ -228,7 +246,7 @@ def step(
         last_key = jax.random.fold_in(key, 1)
         population, done = refresh(last_key, population, info, evaluate, tuning, moves)
         left = _affordable_moves(state, plan, horizon, problem.n_rows, last=True) if np.isfinite(plan.budget) else 0
-        rounds = min(left // done.moves, -(-config.draws // (plan.particles * config.replicates)) - 1)
+        rounds = min(left // done.moves, -(-config.draws // (plan.particles * config.chains)) - 1)
         population = prolong(last_key, population, evaluate, tuning, done.moves, rounds)
         state.trace.append(facts | _facts(done) | {"rollouts": state.ledger.rollouts, "final": True})
     state = state._replace(
@@ -287,20 +305,20 @@ def run(
     key: PRNGKeyArray,
     logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
-    """Sample a problem's posterior with ``config.replicates`` independent replicates.
+    """Sample a problem's posterior with independent replicates.
 
     Raises:
         InputError: a budget that is too small, a prior that excludes the data, a checkpoint of another run.
     """
     digest = run_digest(problem, "smc", config, key)
-    config = replace(config, kernel=chosen_kernel(config.kernel, problem, config.rollouts))
+    config = replace(decided(problem.n_rows, config), kernel=chosen_kernel(config.kernel, problem, config.rollouts))
     plan = make_plan(problem, config)
     states = []
-    for replicate in range(config.replicates):
+    for replicate in range(config.chains):
         checkpoint = logbook.checkpoint(f"smc_{replicate}", digest)
 
         def report(state: SmcState, replicate: int = replicate) -> None:
-            done = (replicate + state.population.progress / problem.n_rows) / config.replicates
+            done = (replicate + state.population.progress / problem.n_rows) / config.chains
             logbook.stage(done, method="smc", replicate=replicate, stage=state.stage, **state.trace[-1])
 
         states.append(_replicate(problem, config, plan, jax.random.fold_in(key, replicate), checkpoint, report))

@@ -26,22 +26,24 @@ class Method(NamedTuple):
     Attributes:
         config: its configuration, a frozen dataclass.
         run: ``run(problem, config, key, logbook) -> InferenceResult``.
+        posterior: its draws are of a posterior, and not of a distribution to randomise over.
     """
 
     config: type
     run: Callable[..., InferenceResult]
+    posterior: bool = True
 
 
 METHODS: dict[str, Method] = {
     "smc": Method(horizon_smc.SmcConfig, starts.run),
-    "rfdropo": Method(rfdropo.RfdropoConfig, rfdropo.run),
+    "rfdropo": Method(rfdropo.RfdropoConfig, rfdropo.run, posterior=False),
     "laplace": Method(laplace.LaplaceConfig, laplace.run),
     "bridge": Method(bridge.BridgeConfig, bridge.run),
     "nuts": Method(nuts.NutsConfig, nuts.run),
     "nested": Method(nested.NestedConfig, nested.run),
     "bayessim": Method(rivals.BayesSimConfig, rivals.run_bayessim),
     "npdr": Method(rivals.NpdrConfig, rivals.run_npdr),
-    "udr": Method(rivals.UdrConfig, rivals.run_udr),
+    "udr": Method(rivals.UdrConfig, rivals.run_udr, posterior=False),
 }
 
 

@@ -110,7 +110,7 @@ def run(
     """Sample a plain model's posterior in two passes, see above; the evidence of prefixes is the first pass's,
     corrected by what the second says of the whole."""
     first_key, second_key = jax.random.split(key)
-    config = replace(config, replicates=REPLICATES if config.replicates == 1 else config.replicates)
+    config = replace(config, replicates=config.replicates or REPLICATES)
     large = chosen_kernel(config.kernel, problem, None) == "hamiltonian"
     whole = large or problem.n_rows > MOST_ROWS
     first = horizon_smc.run(WholeProblem(problem) if whole else problem, config, first_key, logbook.part(0.0, 0.5))

@@ -22,7 +22,7 @@ from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference import bridge, horizon_smc, refinement
 from rfdropo_bayes.inference.checkpoints import run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES, ROLLOUTS_PER_PARTICLE, SmcConfig
+from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES, MOST_REPLICATES, SmcConfig
 from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.numpyro_problem import NumpyroProblem
@@ -43,7 +43,6 @@ SURVEYED_STARTS = 8  # at most
 CLIMBED = 0.6  # share of the work that is done when climbs have ended, for a progress bar
 SCORING = 0.1  # and the evidence of the blocks
 MARGIN = 3.0  # what real posteriors cost over the estimate, which takes them to be normal and data to be even
-WORTH_A_REPLICATE = 100  # particles
 ENOUGH = 200  # particles per replicate that a start at the prior must allow
 
 
@@ -85,8 +84,8 @@ def run(
     horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
     way = way_from_prior(problem, found.modes[0], horizons, config.target_ess, way_key)
     left = None if config.rollouts is None else config.rollouts - found.climbs.ledger.rollouts
-    if config.start == "auto" and _affordable(way, config, left):
-        result = horizon_smc.run(problem, replace(config, rollouts=left), sample_key, logbook)
+    if config.start == "auto" and (replicates := _affordable(way, config, left)):
+        result = horizon_smc.run(problem, replace(config, rollouts=left, replicates=replicates), sample_key, logbook)
         return _with_climbs(result, found, way)
     return _from_optima(problem, config, found, way, sample_key, logbook)
 
@@ -117,14 +116,17 @@ def _worth_climbing(problem: Problem, config: SmcConfig) -> bool:
     """Without a budget a start at the prior never leaps; a small one is better spent on particles than on climbs."""
     if not isinstance(problem, ResidualProblem) or config.rollouts is None:
         return False
-    return config.rollouts >= 40.0 * config.replicates * max(FEWEST_PARTICLES, len(problem.names))
+    return config.rollouts >= 40.0 * config.chains * max(FEWEST_PARTICLES, len(problem.names))
 
 
-def _affordable(way: Way, config: SmcConfig, left: float | None) -> bool:
+def _affordable(way: Way, config: SmcConfig, left: float | None) -> int:
+    """Replicates whose way from the prior the budget covers: those asked for or none, else up to four."""
     if left is None:
-        return True
-    particles = max(config.particles or ENOUGH, FEWEST_PARTICLES)
-    return MARGIN * particles * config.replicates * way.rollouts <= left
+        return config.chains
+    one = MARGIN * max(config.particles or ENOUGH, FEWEST_PARTICLES) * way.rollouts
+    if config.replicates is not None:
+        return config.replicates if config.replicates * one <= left else 0
+    return min(int(left / one), MOST_REPLICATES)
 
 
 def _with_climbs(result: InferenceResult, found: Modes, way: Way) -> InferenceResult:
@@ -161,7 +163,7 @@ def _from_optima(
     settings = bridge.BridgeConfig(
         rollouts=sampling,
         particles=config.particles,
-        replicates=_replicates(config, sampling),
+        replicates=horizon_smc.decided(1, replace(config, rollouts=sampling, blocks=1)).chains,
         target_ess=config.target_ess,
         draws=config.draws,
     )
@@ -187,13 +189,6 @@ def _from_optima(
             "prefix_ess": [prefix.ess for prefix in prefixes],
         },
     )
-
-
-def _replicates(config: SmcConfig, budget: float | None) -> int:
-    """Those asked for; instead of a single one as many as the budget serves well, up to four, whose scatter tells."""
-    if config.replicates > 1 or budget is None:
-        return config.replicates
-    return int(np.clip(budget / (ROLLOUTS_PER_PARTICLE * (config.particles or WORTH_A_REPLICATE)), 1, 4))
 
 
 def _prefixes(

@@ -11,6 +11,7 @@ from typing import Any
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.report.baselines import BaselineErrors
 from rfdropo_bayes.report.object_scores import ObjectScore
+from rfdropo_bayes.report.residuals import ResidualCheck
 
 PACKAGES = ("rfdropo_bayes", "jax", "numpyro", "blackjax", "arviz", "numpy", "scipy", "numba")
 
@@ -72,6 +73,7 @@ class RunFacts:
         warnings: sentences.
         recordings: fit first, then test.
         model: label -> words, e.g. mechanisms, noise, fixed values, time step.
+        residuals: from `check_residuals`; empty where the method has no likelihood.
         baselines: from `baseline_errors`; empty if not computed.
         noise_floor: noise between repeats of each marker [m]; None without repeats.
         phi: distribution to randomise over, {name: {mean, std, low, high, unit}}; None without.
@@ -96,6 +98,7 @@ class RunFacts:
     warnings: Sequence[str] = ()
     recordings: Sequence[RecordingFacts] = ()
     model: Mapping[str, str] = field(default_factory=dict)
+    residuals: Mapping[str, ResidualCheck] = field(default_factory=dict)
     baselines: Mapping[str, BaselineErrors] = field(default_factory=dict)
     noise_floor: Mapping[str, float] | None = None
     phi: Mapping[str, Mapping[str, Any]] | None = None

@@ -50,13 +50,15 @@ def _errors(summary: Mapping[str, Any]) -> str:
     return f"In root mean square over time, its last marker ({marker}) is off by {', and by '.join(parts)}.{tail}"
 
 
-def best_baseline(summary: Mapping[str, Any], role: str) -> tuple[str, float] | None:
-    """Title and error of the best predictor that knows nothing of the robot; None if none was scored."""
+def best_baseline(summary: Mapping[str, Any], role: str, marker: str | None = None) -> tuple[str, float] | None:
+    """Title and error of the best predictor that knows nothing of the robot, of one marker, or of the last one; None if
+    none was scored."""
     scored = []
     for row in summary["baselines"].values():
-        values = list((row[role] or {"over_time": {}})["over_time"].values())
-        if values and values[-1] is not None:
-            scored.append((row["title"], values[-1]))
+        errors = (row[role] or {"over_time": {}})["over_time"]
+        value = errors.get(marker) if marker else next(reversed(list(errors.values())), None)
+        if value is not None:
+            scored.append((row["title"], value))
     return min(scored, key=lambda pair: pair[1]) if scored else None
 
 

@@ -15,6 +15,7 @@ BAND = "0.9"
 OVERCONFIDENT, VAGUE = 0.8, 0.97  # share of measurements in the 90 % band
 FEW_DRAWS = 100.0  # effective ones
 UNMIXED = 1.1  # R-hat
+HALF = 0.5  # of a variance: beyond it, most of an error is systematic
 LOST = 0.05  # share of rollouts without weight
 # In the warnings of samplers and climbs that a budget cut off, of particles that did not move, and of RF-DROPO.
 UNFINISHED = ("ran out", "left the particles", "sits on its smallest value")
@@ -49,24 +50,87 @@ class Safety:
 
 def judge(record: PosteriorRecord, summary: Mapping[str, Any]) -> Safety:
     """Judge a posterior by the numbers of its summary (without its key "randomisation")."""
-    grave = [*_prediction(summary), *_sampling(summary), *_conflicts(record)]
-    slight = _reservations(summary)
+    grave = [*_bands(summary), *_against_baselines(summary), *_sampling(summary), *_conflicts(record)]
+    slight = [*_systematic(summary), *_reservations(summary)]
     verdict = "unsafe" if grave else "with care" if slight else "safe"
     reasons = grave + slight
-    why = f": {'; '.join(reasons)}." if reasons else ": bands, sampler, bounds and prior give no reason against it."
+    nothing = "bands, residuals, errors, sampler, bounds and prior give no reason against it"
+    why = f": {'; '.join(reasons) or nothing}."
     return Safety(verdict, WORDS[verdict] + why, reasons, _advice(summary))
 
 
-def _prediction(summary: Mapping[str, Any]) -> list[str]:
-    """Bands that are too narrow, or a simulator that predicts no better than something without one."""
+def _bands(summary: Mapping[str, Any]) -> list[str]:
+    """Bands that are too narrow, over all or at a marker; residuals that the noise model takes for independent."""
     found = []
     share = summary["coverage"].get(BAND)
     if share is not None and share < OVERCONFIDENT:
         found.append(f"its 90 % bands hold only {100 * share:.0f} % of the measurements, so it is over-confident")
+    role = _role(summary)
+    rows = summary["coverage_by_role"][role]
+    shares = {marker: row.get(BAND) for marker, row in rows.items()}
+    narrow = {marker: share for marker, share in shares.items() if share is not None and share < OVERCONFIDENT}
+    if narrow:
+        places = ", ".join(f"{100 * share:.0f} % at {_place(marker, shares)}" for marker, share in narrow.items())
+        found.append(f"its 90 % bands of the {role} recordings hold only {places}")
+    checks = summary["residuals"]
+    correlated = {name: row for name, row in checks.items() if row["correlated"]}
+    if correlated:
+        worst = max(row["narrowing"] for row in correlated.values())
+        found.append(
+            f"its noise model leaves residuals correlated, and intervals too narrow by up to {worst:.2g} times"
+        )
+    return found
+
+
+def _against_baselines(summary: Mapping[str, Any]) -> list[str]:
+    """A simulator that predicts the last marker no better than something without one."""
     own, best = list(summary["rmse"]["test"].values()), best_baseline(summary, "test")
     if own and own[-1] is not None and best is not None and own[-1] >= best[1]:
-        found.append(f"the simulator predicts no better than one without physics ({best[0]}: {best[1]:.3g} mm)")
-    return found
+        return [f"the simulator predicts no better than one without physics ({best[0]}: {best[1]:.3g} mm)"]
+    return []
+
+
+def _role(summary: Mapping[str, Any]) -> str:
+    return "test" if summary["rmse"]["test"] else "fit"
+
+
+def _place(marker: str, markers: Mapping[str, Any]) -> str:
+    return f"the tip ({marker})" if marker == list(markers)[-1] else marker
+
+
+def _systematic(summary: Mapping[str, Any]) -> list[str]:
+    """Errors that no noise explains: beside the noise floor and the best baseline, and from row to row."""
+    found, role = [], _role(summary)
+    errors = {marker: error for marker, error in summary["rmse"][role].items() if error}
+    floor = summary["noise_floor_mm"] or {}
+    above = {m: error for m, error in errors.items() if floor.get(m) and HALF * error**2 > floor[m] ** 2}
+    if above:
+        worst = max(above, key=lambda marker: above[marker] / floor[marker])
+        found.append(
+            f"the simulator is off by {above[worst]:.3g} mm at {_place(worst, errors)}, where repeats differ by "
+            f"{floor[worst]:.3g} mm: most of the error is the simulator's"
+        )
+    lasting = {m: r for m, r in summary["error_correlation"][role].items() if r is not None and r > HALF}
+    if lasting:
+        places = ", ".join(f"{r:.2f} at {_place(m, summary['error_correlation'][role])}" for m, r in lasting.items())
+        found.append(
+            f"errors of the {role} recordings last from row to row (correlation {places}): something systematic is "
+            "missing from the simulator, and randomising its parameters does not put it there"
+        )
+    return [*found, *_near_baselines(summary, errors)] if role == "test" else found
+
+
+def _near_baselines(summary: Mapping[str, Any], errors: Mapping[str, float]) -> list[str]:
+    """Markers whose error, without its noise, is most of the best baseline's. Noise is what repeats differ by, or,
+    without repeats, the share of the squared error that does not last from row to row."""
+    floor, correlation, places = summary["noise_floor_mm"] or {}, summary["error_correlation"]["test"], []
+    for marker, error in errors.items():
+        best = best_baseline(summary, "test", marker)
+        noise = floor[marker] ** 2 if floor.get(marker) else error**2 * (1.0 - max(correlation[marker] or 0.0, 0.0))
+        if best is not None and error**2 - noise > HALF * max(best[1] ** 2 - noise, 0.0):
+            places.append(f"{error:.3g} against {best[1]:.3g} mm at {_place(marker, errors)}")
+    what = "beside its noise, the error is more than half of the squared error of a predictor without physics"
+    return [f"{what} ({', '.join(places)})"] if places else []
 
 
 def _sampling(summary: Mapping[str, Any]) -> list[str]:

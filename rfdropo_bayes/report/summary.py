@@ -16,11 +16,12 @@ from pydantic import BaseModel, ConfigDict
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_text
 from rfdropo_bayes.posteriors import PosteriorRecord
-from rfdropo_bayes.report.coverage import coverage
+from rfdropo_bayes.report.coverage import Coverage, coverage
 from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.headline import headline
 from rfdropo_bayes.report.identifiability import identify
 from rfdropo_bayes.report.randomisation import judge
+from rfdropo_bayes.report.residuals import error_correlations
 from rfdropo_bayes.report.scores import MILLIMETRES, ErrorFigures, MeasuredPath, score
 from rfdropo_bayes.report.tables import posterior_table
 from rfdropo_bayes.tables import parse_table
@@ -87,8 +88,13 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
         "errors": {role: asdict(errors) if errors else None for role, errors in figures.items()},
         "baselines": {name: asdict(errors) for name, errors in facts.baselines.items()},
         "noise_floor_mm": facts.noise_floor and {m: MILLIMETRES * s for m, s in facts.noise_floor.items()},
+        "residuals": {name: dict(check._asdict()) for name, check in facts.residuals.items()},
+        "error_correlation": {role: error_correlations(record.recordings, role) for role in ("fit", "test")},
         "coverage": {str(p): share for p, share in shares.over_all.items()},
-        "coverage_by_marker": {m: {str(p): s for p, s in row.items()} for m, row in shares.markers.items()},
+        "coverage_by_marker": _by_marker(shares),
+        "coverage_by_role": {
+            role: _by_marker(coverage([r for r in record.recordings if r.split == role])) for role in ("fit", "test")
+        },
         "identifiability": [{**asdict(c), "contraction": c.contraction} for c in identify(record)],
         "recordings": [asdict(recording) for recording in facts.recordings],
         "data_sha256": combined_hash([recording.sha256 for recording in facts.recordings]),
@@ -110,6 +116,10 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
     plain["headline"] = [*headline(plain), plain["randomisation"]["sentence"]]
     check_summary(plain, where="summary.json")
     return plain
+
+
+def _by_marker(shares: Coverage) -> dict[str, dict[str, float | None]]:
+    return {marker: {str(p): share for p, share in row.items()} for marker, row in shares.markers.items()}
 
 
 def model_errors(record: PosteriorRecord) -> dict[str, ErrorFigures | None]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.pooling import Patterns
@@ -20,6 +21,7 @@ from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
 from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, software_versions, write_run
 from rfdropo_bayes.report.object_scores import score_objects
+from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_warnings
 from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
@@ -90,7 +92,7 @@ def run_calibration(
         problem = problem.holding(result.held)
         attributes = _attributes(experiment, recordings)
         record = record_posterior(problem, result, tested, predicting, attributes, experiment.model.groups)
-        facts = gather_facts(experiment, path.stem, problem, result, fitted, tested, record.recordings)
+        facts = gather_facts(experiment, path.stem, problem, result, fitted, tested, record)
         return write_run(out, record, facts, (out / CONFIG).read_text(encoding="utf-8"))
 
 
@@ -129,6 +131,7 @@ def record_posterior(
 ) -> PosteriorRecord:
     """Draws, prior draws and predictions of every recording, with the combinations of parameters that rollouts see."""
     prior_key, fit_key, test_key = jax.random.split(key, 3)
+    rows = row_log_likelihood(problem, result)
     prior = {name: np.asarray(v) for name, v in problem.sample_prior(prior_key, PRIOR_DRAWS).items()}
     values = thin(result.draws, PREDICTIVE_DRAWS)
     before = {name: column[:PRIOR_PREDICTIVE_DRAWS] for name, column in prior.items()}
@@ -148,10 +151,33 @@ def record_posterior(
         tuple(predictions),
         trace=result.trace,
         block_scores=result.block_scores,
-        log_likelihood=result.log_likelihood,
+        log_likelihood=rows,
         attrs={**attributes, FITTED: fitted, MARKER_ERRORS: errors, HELD: result.held},
     )
     return record.with_derived(scale_free_ratios(problem.names))
+
+
+def row_log_likelihood(
+    problem: CalibrationProblem, result: InferenceResult
+) -> Float[np.ndarray, "chain draw row"] | None:
+    """Log density of each row given the rows before it, at every draw; None where the draws are no posterior.
+
+    Draws that the method kept without their rows are simulated once more, as predictions are: outside the budget.
+    """
+    if not method_named(result.method).posterior or result.log_likelihood is not None:
+        return result.log_likelihood
+    flat = {name: np.ravel(values) for name, values in result.draws.items()}
+    rows, _ = problem.row_log_likelihood(flat, problem.n_rows)
+    return rows.reshape(*next(iter(result.draws.values())).shape, -1)
+
+
+def check_fit(problem: CalibrationProblem, record: PosteriorRecord) -> dict[str, ResidualCheck]:
+    """Whether the residuals at the most likely draw are what the noise model says; empty without a likelihood."""
+    if record.log_likelihood is None:
+        return {}
+    best = int(np.argmax(record.log_likelihood.sum(axis=-1).ravel()))
+    white = problem.white_positions({name: float(record.flat(name)[best]) for name in problem.names})
+    return check_residuals(list(white), problem.model.recordings.markers)
 
 
 def scale_free_ratios(names: Sequence[str]) -> list[ProductOfPowers]:
@@ -176,11 +202,12 @@ def gather_facts(
     result: InferenceResult,
     fitted: Sequence[Trajectory],
     tested: Sequence[Trajectory],
-    predictions: Sequence[RecordingPrediction],
+    record: PosteriorRecord,
 ) -> RunFacts:
     """What the report says beside the posterior."""
-    unseen = [prediction for prediction in predictions if prediction.split == "test"]
+    unseen = [prediction for prediction in record.recordings if prediction.split == "test"]
     description = problem.model.simulator.description
+    checks = check_fit(problem, record)
     floor = noise_floor([*fitted, *tested])
     return RunFacts(
         title=experiment.title or name,
@@ -194,7 +221,8 @@ def gather_facts(
         evaluations=result.evaluations,
         log_evidence=result.log_evidence,
         excluded=result.excluded,
-        warnings=result.warnings,
+        warnings=[*result.warnings, *residual_warnings(checks, problem.model.noise)],
+        residuals=checks,
         recordings=[
             *(RecordingFacts.of_trajectory(t, "fit") for t in fitted),
             *(RecordingFacts.of_trajectory(t, "test") for t in tested),

@@ -1,0 +1,133 @@
+"""Are the residuals of a fit what its noise model says: independent from row to row, and without far outliers?
+
+Intervals are as wide as the noise model makes them. Where whitened residuals still go together for a while, a row says
+less than the model counts it for: intervals are too narrow by ``sqrt(1 + 2 sum of the autocorrelations)``, the factor
+for the mean of a stationary series. For a first-order process of correlation 0.2 it is 1.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from rfdropo_bayes.posteriors import RecordingPrediction
+
+TOO_NARROW = 1.2  # a fifth: as much as a correlation of 0.2 from row to row
+FAR = 4.0  # deviations; normal noise is farther off in 1 of 16,000 values
+MORE_THAN_CHANCE = 1e-3  # false alarm of either warning
+REMEDIES = {
+    "white": 'use noise = "auto", which finds how long the noise lasts',
+    "student-t": 'use noise = "auto", which finds how long the noise lasts',
+}
+NO_REMEDY = "rfdropo audit can tell what the simulator misses"
+
+
+class ResidualCheck(NamedTuple):
+    """What the residuals of one marker, or of all, look like after whitening by the noise model.
+
+    Attributes:
+        correlation: of whitened residuals with those of the row before.
+        narrowing: factor by which intervals are too narrow.
+        correlated: this is more than chance and `TOO_NARROW`.
+        far: share of the whitened residuals beyond `FAR` deviations.
+        heavy: this is more than chance.
+        values: number of residuals.
+    """
+
+    correlation: float
+    narrowing: float
+    correlated: bool
+    far: float
+    heavy: bool
+    values: int
+
+
+def check_residuals(
+    white: Sequence[Float[np.ndarray, "time marker 3"]], markers: Sequence[str]
+) -> dict[str, ResidualCheck]:
+    """Check of each marker, and of all under the key ``all``.
+
+    Args:
+        white: whitened residuals of each recording, NaN where masked.
+        markers: names of the markers.
+    """
+    own = {name: check([part[:, index] for part in white]) for index, name in enumerate(markers)}
+    return {**own, "all": check([part.reshape(len(part), -1) for part in white])}
+
+
+def check(white: Sequence[Float[np.ndarray, "time series"]]) -> ResidualCheck:
+    """Check of series that may have gaps (NaN); a lag counts rows that are there."""
+    series = [column[np.isfinite(column)] for part in white for column in part.T]
+    series = [column for column in series if len(column) > 1]
+    values = np.concatenate(series) if series else np.zeros(0)
+    if not np.any(values):
+        return ResidualCheck(0.0, 1.0, False, 0.0, False, len(values))
+    correlation = autocorrelations(series)
+    ends = np.flatnonzero(correlation <= 0.0)
+    lags = int(ends[0]) if len(ends) else len(correlation)
+    total = float(correlation[:lags].sum())
+    narrowing = float(np.sqrt(1.0 + 2.0 * total))
+    chance = stats.norm.isf(MORE_THAN_CHANCE) * np.sqrt(max(lags, 1) / len(values))
+    far = int(np.sum(np.abs(values) > FAR))
+    expected = 2.0 * stats.norm.sf(FAR) * len(values)
+    heavy = far > 1 and stats.poisson.sf(far - 1, expected) < MORE_THAN_CHANCE
+    return ResidualCheck(
+        float(correlation[0]),
+        narrowing,
+        bool(narrowing > TOO_NARROW and total > chance),
+        far / len(values),
+        bool(heavy),
+        len(values),
+    )
+
+
+def autocorrelations(series: Sequence[Float[np.ndarray, " time"]]) -> Float[np.ndarray, " lag"]:
+    """Autocorrelation about zero at the lags 1, 2, ... up to half of the longest series, pooled over series."""
+    most = max(1, max(len(column) for column in series) // 2)
+    power = sum(float(column @ column) for column in series)
+    return (
+        np.array([sum(float(column[lag:] @ column[:-lag]) for column in series) for lag in range(1, most + 1)]) / power
+    )
+
+
+def residual_warnings(checks: Mapping[str, ResidualCheck], noise: str) -> list[str]:
+    """A sentence where residuals are correlated beyond the noise model, and one where many are far off.
+
+    Args:
+        checks: from `check_residuals`.
+        noise: name of the noise model.
+    """
+    sentences = []
+    correlated = _names(checks, "correlated")
+    if correlated:
+        worst = max(check.narrowing for check in checks.values() if check.correlated)
+        sentences.append(
+            f"residuals are correlated beyond the noise model {noise!r} ({correlated}): intervals are too narrow, by "
+            f"up to {worst:.2g} times; {REMEDIES.get(noise, NO_REMEDY)}"
+        )
+    if noise != "student-t" and (heavy := _names(checks, "heavy")):
+        share = max(check.far for check in checks.values() if check.heavy)
+        sentences.append(
+            f"up to {share:.1%} of the residuals are more than {FAR:g} deviations off ({heavy}) and inflate the noise: "
+            'mask recording faults, or use noise = "student-t"'
+        )
+    return sentences
+
+
+def _names(checks: Mapping[str, ResidualCheck], flag: str) -> str:
+    own = [name for name, found in checks.items() if name != "all" and getattr(found, flag)]
+    return ", ".join(own) or ("all markers together" if getattr(checks.get("all"), flag, False) else "")
+
+
+def error_correlations(recordings: Sequence[RecordingPrediction], split: str) -> dict[str, float]:
+    """Correlation of each marker's prediction error with that of the row before, as it is, about zero."""
+    chosen = [r for r in recordings if r.split == split]
+    found = {}
+    for index, name in enumerate(chosen[0].marker_names if chosen else ()):
+        parts = [np.where(r.mask[:, index, None], (r.observed - r.central)[:, index], np.nan) for r in chosen]
+        found[name] = check(parts).correlation
+    return found
