@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from rfdropo_bayes.data.asl_csv import NO_COMMANDS, read_asl_csv
+from rfdropo_bayes.data.first_command import begun_from
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
 from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
@@ -24,7 +25,8 @@ class RecordingEntry(BaseModel):
     """One entry of ``fit`` or ``test``; a bare string is its ``observations``.
 
     ``observations`` may be a glob. ``commands`` is the file of commands where the format keeps them apart ("none": zero
-    commands). ``rows`` keeps the observation rows first to last, both included, counted from 0.
+    commands). ``rows`` keeps the observation rows first to last, both included, counted from 0. ``initial_command`` is
+    that of `DataSpec`, for this entry.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -32,6 +34,7 @@ class RecordingEntry(BaseModel):
     observations: str
     commands: str | None = None
     rows: tuple[int, int] | None = None
+    initial_command: Literal["first", "zero"] | list[float] | None = None
 
 
 class DataSpec(BaseModel):
@@ -44,6 +47,10 @@ class DataSpec(BaseModel):
         columns: what the columns are, for format "csv".
         resample: sample time [s] to bring every recording to; as recorded by default.
         missing: whether a lost marker position is an error or is masked.
+        initial_command: in force before the first row of a file: "first" (its first command was already), "zero", or
+            one value per channel [m or rad]; recognised from the first rows by default, where the file does not say.
+        lead_in: for so long [s] before the first of ``rows`` commands are simulated, too, so that a piece that starts
+            in motion is in motion. A piece starts at rest under the command in force by default.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -54,6 +61,8 @@ class DataSpec(BaseModel):
     columns: CsvColumns | None = None
     resample: Annotated[float, Field(gt=0)] | None = None
     missing: Literal["error", "mask"] = "error"
+    initial_command: Literal["first", "zero"] | list[float] | None = None
+    lead_in: Annotated[float, Field(ge=0)] = 0.0
 
     @field_validator("fit", "test", mode="before")
     @classmethod
@@ -83,6 +92,7 @@ class _Source(NamedTuple):
     commands: Path | None
     zero_command: bool
     rows: tuple[int, int] | None
+    initial_command: Literal["first", "zero"] | list[float] | None
 
 
 def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "fit") -> list[Trajectory]:
@@ -98,13 +108,14 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
     """
     sources = list(_sources(spec.fit if role == "fit" else spec.test, base))
     _check_split(list(_sources(spec.fit, base)), list(_sources(spec.test, base)))
-    loaded: dict[tuple[Path, Path | None], Trajectory] = {}
+    loaded: dict[tuple[Path, Path | None, str], Trajectory] = {}
     recordings = []
     for source in sources:
-        key = (source.observations, source.commands)
+        rule = spec.initial_command if source.initial_command is None else source.initial_command
+        key = (source.observations, source.commands, str(rule))
         if key not in loaded:
-            loaded[key] = _read(spec, source)
-        recording = loaded[key] if source.rows is None else loaded[key].slice_rows(*source.rows)
+            loaded[key] = begun_from(_read(spec, source), rule)
+        recording = loaded[key] if source.rows is None else loaded[key].slice_rows(*source.rows, spec.lead_in)
         recordings.append(recording if spec.resample is None else recording.resample(spec.resample))
     return _distinct_names(recordings, sources)
 
@@ -124,7 +135,8 @@ def _sources(entries: list[RecordingEntry], base: Path) -> Iterator[_Source]:
         if entry.commands not in (None, NO_COMMANDS):
             commands = find_files(str(entry.commands), base)[0]
         for match in find_files(entry.observations, base):
-            yield _Source(match, commands, entry.commands == NO_COMMANDS, entry.rows)
+            zero = entry.commands == NO_COMMANDS
+            yield _Source(match, commands, zero, entry.rows, entry.initial_command)
 
 
 def _read(spec: DataSpec, source: _Source) -> Trajectory:

@@ -22,6 +22,7 @@ from rfdropo_bayes.files import whole
 AXES = ("x", "y", "z")
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 SCHEMA = "rfdropo_bayes.trajectory/1"
+FIRST_COMMAND = "first_command"  # among the settings: which command was in force before the first row
 _HASHED = ("time", "command_time", "position", "position_mask", "command", "initial_command")
 _OPTIONAL = ("tension", "motor_angle", "motor_angle_mask", "object_pose")
 
@@ -199,6 +200,15 @@ class Trajectory:
         """Facts about the recording, as the importer knew them."""
         return dict(json.loads(str(self.dataset.attrs["settings"])))
 
+    @property
+    def first_command(self) -> str:
+        """Which command was in force before the first row, and how that is known."""
+        known = self.settings.get(FIRST_COMMAND, {"why": "as the file has it"})
+        if not np.any(self.initial_command):
+            return f"zero ({known['why']})"
+        shown = ", ".join(f"{value:.3g}" for value in self.initial_command)
+        return f"{shown} {self.command_unit} ({known['why']})"
+
     def _array(self, name: str) -> np.ndarray:
         values = self.dataset[name].values.view()
         values.flags.writeable = False
@@ -214,11 +224,16 @@ class Trajectory:
         settings = self.settings | attributes.pop("settings", {})
         return Trajectory(self.dataset.assign_attrs(settings=json.dumps(settings, sort_keys=True), **attributes))
 
-    def slice_rows(self, first: int, last: int) -> Trajectory:
+    def with_initial_command(self, initial: Float[np.ndarray, " cable"], beginning: Mapping[str, str]) -> Trajectory:
+        """Same content with another command before ``command_time[0]``, and how that is known (`first_command`)."""
+        dataset = self.dataset.assign(initial_command=(checks.DIMS["initial_command"], np.array(initial, dtype=float)))
+        return Trajectory(dataset).with_attributes(settings={FIRST_COMMAND: dict(beginning)})
+
+    def slice_rows(self, first: int, last: int, lead_in: float = 0.0) -> Trajectory:
         """Observation rows ``first`` to ``last``, both included, with the clock set back to 0 at ``first``.
 
-        The commands kept are those that begin in [time[first], time[last]); ``initial_command`` becomes the one in
-        force just before ``first``.
+        The commands kept begin before time[last], and at most ``lead_in`` seconds before time[first]: what drives and
+        body still do in the first row began earlier. ``initial_command`` becomes the one before these.
 
         Raises:
             InputError: if there are no such rows.
@@ -231,7 +246,7 @@ class Trajectory:
                 remedy=f"choose 0 <= first < last <= {rows - 1} (rows of the observations, both included)",
             )
         start, end = self.time[first], self.time[last]
-        before = self.command_time < start - _INSTANT
+        before = self.command_time < start - lead_in - _INSTANT
         kept = ~before & (self.command_time < end - _INSTANT)
         history = np.concatenate([self.initial_command[None], self.command[before]])
         dataset = self.dataset.isel(time=slice(first, last + 1))
@@ -243,7 +258,10 @@ class Trajectory:
             dataset = dataset.assign_coords(command_time=[start])
         dataset["initial_command"] = dataset["initial_command"].copy(data=history[-1])
         dataset = dataset.assign_coords(time=dataset.time - start, command_time=dataset.command_time - start)
-        return Trajectory(dataset.assign_attrs(name=f"{self.name}[{first}:{last}]"))
+        piece = Trajectory(dataset.assign_attrs(name=f"{self.name}[{first}:{last}]"))
+        if not before.any():
+            return piece
+        return piece.with_attributes(settings={FIRST_COMMAND: {"rule": "given", "why": f"in force before row {first}"}})
 
     def resample(self, sample_time: float) -> Trajectory:
         """Observations on the grid 0, sample_time, 2 sample_time, ... [s] by linear interpolation (quaternions: slerp).

@@ -6,11 +6,13 @@ Whatever else a file holds is masked here, so that no prediction can have seen i
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from rfdropo_bayes.data.asl_csv import read_asl_start
+from rfdropo_bayes.data.first_command import UNTOLD, begun_from
 from rfdropo_bayes.data.plain_csv import holds_commands_alone, read_csv_start
 from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, load_recordings
 from rfdropo_bayes.data.trajectory import Trajectory
@@ -38,15 +40,15 @@ def load_unseen(
     if spec.format == "asl-csv":
         observations = None if start is None else find_data_file(start, base)
         whole = read_asl_start(find_data_file(commands, base), observations, rows[0] if rows else 0)
-        return whole if rows is None else whole.slice_rows(*rows)
+        return _piece(_begun(whole, spec), spec, rows)
     if spec.format == "csv" and spec.columns is not None:
         path = find_data_file(commands, base)
         if holds_commands_alone(path, spec.columns):
             observations = None if start is None else find_data_file(start, base)
             whole = read_csv_start(path, spec.columns, observations, rows[0] if rows else 0)
-            return whole if rows is None else whole.slice_rows(*rows)
+            return _piece(_begun(whole, spec), spec, rows)
     if spec.format == "csv" and start is not None:
-        entry = RecordingEntry(observations=start, commands=commands, rows=rows)
+        entry = RecordingEntry(observations=start, commands=commands)
     elif start is not None:
         raise InputError(
             f"format {spec.format!r} keeps commands and observations in one file",
@@ -54,12 +56,26 @@ def load_unseen(
             remedy="leave --start out: the first row of the command file is the start",
         )
     else:
-        entry = RecordingEntry(observations=commands, rows=rows)
-    changes = {"fit": [entry], "test": [], "resample": None, "missing": "mask"}
+        entry = RecordingEntry(observations=commands)
+    changes: dict[str, Any] = {"fit": [entry], "test": [], "resample": None, "missing": "mask"}
+    if spec.initial_command is None and spec.format in UNTOLD:
+        changes["initial_command"] = "first"  # not recognised: later rows would have a say
     recordings = load_recordings(spec.model_copy(update=changes), base)
     if len(recordings) > 1:
         raise InputError(f"names {len(recordings)} files", where=commands, remedy="predict one at a time")
-    return first_row_only(recordings[0])
+    return first_row_only(_piece(_begun(recordings[0], spec), spec, rows))
+
+
+def _begun(whole: Trajectory, spec: DataSpec) -> Trajectory:
+    """With the command before the first row as [data] has it; the first one where neither it nor the file tells."""
+    if spec.initial_command is not None or spec.format not in UNTOLD:
+        return begun_from(whole, spec.initial_command)
+    why = "assumed; set data.initial_command where it was another"
+    return whole.with_initial_command(whole.command[0], {"rule": "first", "why": why})
+
+
+def _piece(whole: Trajectory, spec: DataSpec, rows: tuple[int, int] | None) -> Trajectory:
+    return whole if rows is None else whole.slice_rows(*rows, spec.lead_in)
 
 
 def first_row_only(trajectory: Trajectory) -> Trajectory:

@@ -20,7 +20,8 @@ PACKAGES = ("rfdropo_bayes", "jax", "numpyro", "blackjax", "arviz", "numpy", "sc
 class RecordingFacts:
     """One recording as the data section lists it.
 
-    ``masked`` counts marker positions that are left out as faults, of ``positions`` in all; ``seconds`` is its length.
+    ``masked`` counts marker positions that are left out as faults, of ``positions`` in all; ``seconds`` is its length;
+    ``first_command`` says which command was in force before the first row, and how that is known.
     """
 
     name: str
@@ -34,6 +35,7 @@ class RecordingFacts:
     positions: int
     synthetic: bool
     provenance: str = ""
+    first_command: str = ""
 
     @classmethod
     def of_trajectory(cls, trajectory: Trajectory, split: str) -> RecordingFacts:
@@ -52,6 +54,7 @@ class RecordingFacts:
             int(mask.size),
             trajectory.synthetic,
             str(attributes["provenance"]),
+            trajectory.first_command,
         )
 
 

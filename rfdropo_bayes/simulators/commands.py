@@ -18,7 +18,8 @@ class Commands(NamedTuple):
     Attributes:
         initial: command in force before the first step, to which the initial state belongs [m or rad].
         step: command reached at the end of each time step [m or rad].
-        sample_step: last step that ends at or before each observation; 0 is the initial state.
+        sample_step: last step that ends at or before each observation; 0 is the initial state. The first observation
+            comes later where commands from before it are known.
         sample_fraction: how far into the following step the observation lies, in [0, 1).
     """
 
@@ -42,13 +43,13 @@ def commands_on_grid(
 
     ``value[k]`` is in force from ``time[k]`` on; a change is carried out linearly over ``ramp`` seconds (a moving
     average of the piecewise-constant signal, so that overlapping changes add up), ``dead_time`` seconds late. The clock
-    starts at the first observation.
+    starts at the first observation, or as many whole steps before it as it takes to begin with the first command.
 
     Args:
         time: when each command was given [s], increasing.
         value: commands, cumulative [m or rad].
         initial: command in force before ``time[0]``.
-        observation_time: when the state was observed [s], increasing; the first is the initial state.
+        observation_time: when the state was observed [s], increasing.
 
     Raises:
         InputError: times do not increase, or shapes do not fit.
@@ -60,13 +61,14 @@ def commands_on_grid(
     for name, clock in (("command", time), ("observation", observation_time)):
         if np.any(np.diff(clock) < 0):
             raise InputError(f"{name} times decrease at row {int(np.argmax(np.diff(clock) < 0)) + 1}")
-    elapsed = (observation_time - observation_time[0]) / time_step
+    before = _steps_before(time, observation_time, time_step)
+    elapsed = before + (observation_time - observation_time[0]) / time_step
     # Observation clocks jitter by microseconds: an observation within 1e-6 of a step's end belongs to that step.
     sample_step = np.floor(elapsed + 1e-6).astype(np.int32)
     fraction = np.clip(elapsed - sample_step, 0.0, None)
     fraction[fraction < 1e-6] = 0.0
     n_steps = int(sample_step[-1]) + int(fraction[-1] > 0)
-    end = observation_time[0] + time_step * np.arange(1, n_steps + 1) - dead_time
+    end = observation_time[0] + time_step * (np.arange(1, n_steps + 1) - before) - dead_time
     return Commands(np.asarray(initial, float), _ramped(time, value, initial, end, ramp), sample_step, fraction)
 
 
@@ -87,7 +89,8 @@ def animated_on_grid(
             first observation on.
     """
     grid = commands_on_grid(time, value, initial, observation_time, time_step=time_step)
-    clock = (np.asarray(time, float) - observation_time[0]) / time_step
+    before = _steps_before(time, observation_time, time_step)
+    clock = before + (np.asarray(time, float) - observation_time[0]) / time_step
     start = np.round(clock).astype(int)
     every = int(start[1] - start[0]) if len(start) > 1 else len(grid.step)
     even = np.array_equal(start, every * np.arange(len(start))) and np.allclose(clock, start, atol=0.1)
@@ -101,6 +104,12 @@ def animated_on_grid(
     length = len(grid.step)
     held = _pad(steps, max(length, len(steps)))[:length]
     return grid._replace(step=grid.initial + held)
+
+
+def _steps_before(time: Float[np.ndarray, " command"], observation_time: np.ndarray, time_step: float) -> int:
+    """Steps from the first command to the first observation, where that comes later."""
+    earlier = observation_time[0] - time[0] if len(time) else 0.0
+    return max(0, int(np.ceil(earlier / time_step - 1e-6)))
 
 
 def _ramped(

@@ -94,6 +94,7 @@ def run_prediction(
             "posterior": str(posterior),
             "commands": commands,
             "start_pose_known": start_is_known(unseen),
+            "first_command": unseen.first_command,
             "rows": len(predicted.time),
             "draws": int(predicted.predicted.shape[0]),
             "unit": "m",

@@ -96,6 +96,14 @@ def test_a_slice_keeps_the_commands_in_force_within_it(recording):
     np.testing.assert_array_equal(part.position, recording.position[4:8])
 
 
+def test_a_slice_with_a_lead_in_keeps_earlier_commands(recording):
+    part = recording.slice_rows(4, 7, lead_in=0.2)
+    np.testing.assert_allclose(part.command_time, [-0.2, -0.1, 0.0, 0.1, 0.2], atol=1e-12)
+    np.testing.assert_array_equal(part.command, recording.command[2:7])
+    np.testing.assert_array_equal(part.initial_command, recording.command[1])
+    np.testing.assert_array_equal(recording.slice_rows(4, 7, lead_in=9.0).initial_command, recording.initial_command)
+
+
 def test_a_slice_without_commands_holds_the_last_one(build):
     sparse = build(command_time=np.array([0.05]), command=np.array([[0.01, -0.01]]))
     part = sparse.slice_rows(5, 9)

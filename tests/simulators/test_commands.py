@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.commands import commands_on_grid, sample, stack_commands
+from rfdropo_bayes.simulators.commands import commands_on_grid, observed_at, sample, stack_commands
 
 
 def grid(time, value, observed, **options):
@@ -69,3 +69,19 @@ def test_stacking_pads_with_the_last_command():
 def test_decreasing_times_are_refused():
     with pytest.raises(InputError, match="command times decrease at row 1"):
         grid([0.1, 0.0], [1.0, 2.0], [0.0, 0.1], time_step=0.01)
+
+
+def test_commands_from_before_the_first_observation_are_simulated_from_the_first_of_them():
+    """A piece that knows all commands before it takes the steps of the whole, and is observed in the same ones."""
+    rng = np.random.default_rng(4)
+    time = np.arange(0.0, 2.0, 0.05)
+    value, observed = rng.normal(size=(len(time), 2)), np.arange(0.0, 2.0, 0.03)
+    whole = commands_on_grid(time, value, np.ones(2), observed, time_step=0.02, ramp=0.1, dead_time=0.03)
+    first = 20
+    start = observed[first]
+    piece = commands_on_grid(
+        time - start, value, np.ones(2), observed[first:] - start, time_step=0.02, ramp=0.1, dead_time=0.03
+    )
+    np.testing.assert_array_equal(piece.initial, whole.initial)
+    np.testing.assert_allclose(piece.step, whole.step, atol=1e-9)
+    np.testing.assert_allclose(observed_at(piece, 0.02), observed_at(whole, 0.02)[first:], atol=1e-9)

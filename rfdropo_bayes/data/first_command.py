@@ -1,0 +1,159 @@
+"""The command in force before the first row, which many files do not hold.
+
+It is given, or recognised from how the recording begins. Either the first command was in force already, so that the
+robot stays where it is until commands change; or no command was, and the robot sets out from its rest. Each says what
+a linear robot with a dead time and a lag would do, and the one that meets the first rows better is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.data.trajectory import Trajectory
+from rfdropo_bayes.errors import InputError
+
+Rule = Literal["first", "zero"] | Sequence[float]
+
+DEAD_TIMES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)  # [s]
+LAGS = (0.01, 0.05, 0.1, 0.2, 0.4, 0.8)  # [s]
+LOOKED_AT = 20.0  # [s] of a recording, at most
+FEWEST_ROWS = 4  # at the beginning, to compare on
+RANK = 1e-9  # singular values below this share of the largest are rounding: channels that move together
+CLEARLY = 0.7  # ratio of two errors below which the smaller decides; of 160 starts none fell on the wrong side
+
+
+UNTOLD = ("asl-csv", "csv")
+"""Formats whose files do not tell what was in force before their first command."""
+
+
+def begun_from(trajectory: Trajectory, rule: Rule | None) -> Trajectory:
+    """The recording with the command before its first row as a rule has it, or else its file, or else as recognised.
+
+    Args:
+        trajectory: a whole recording.
+        rule: "first", "zero", or one value per channel [m or rad].
+
+    Raises:
+        InputError: another number of values than channels, or a rule where every row is a pose at rest.
+    """
+    settled = bool(trajectory.settings.get("settled_poses"))
+    if rule is None:
+        if settled or trajectory.dataset.attrs["format"] not in UNTOLD:
+            return trajectory
+        rule, why = recognised(trajectory)
+    elif settled:
+        raise InputError(
+            "every row is the pose at rest under its own command",
+            where=f"[data] initial_command, {trajectory.name}",
+            remedy="leave initial_command out for it",
+        )
+    else:
+        why = "initial_command in [data]"
+    if not isinstance(rule, str):
+        channels = trajectory.cable_names
+        if len(rule) != len(channels):
+            raise InputError(
+                f"initial_command has {len(rule)} values for {len(channels)} command channels",
+                where=f"[data], {trajectory.name}",
+                remedy=f"give one for each of {', '.join(channels)}",
+            )
+        return trajectory.with_initial_command(np.asarray(rule, dtype=float), {"rule": "given", "why": why})
+    first = trajectory.command[0]
+    return trajectory.with_initial_command(first if rule == "first" else 0.0 * first, {"rule": rule, "why": why})
+
+
+class Beginning(NamedTuple):
+    """Which command was in force before the first row, "first" or "zero", and how that is known."""
+
+    rule: Literal["first", "zero"]
+    why: str
+
+
+def recognised(trajectory: Trajectory) -> Beginning:
+    """Which command was in force before the first row, by how the first rows move; "first" where they do not tell."""
+    if not np.any(trajectory.command[0]):
+        return Beginning("first", "the first command is zero")
+    errors = beginning_errors(trajectory)
+    if errors is None:
+        return Beginning("first", "assumed: the first rows do not tell")
+    first, zero = 1e3 * errors["first"], 1e3 * errors["zero"]
+    said = (
+        f"the first rows differ by {first:.2g} mm from a start at the first command, by {zero:.2g} mm from one at zero"
+    )
+    if zero < CLEARLY * first:
+        return Beginning("zero", f"recognised: {said}")
+    if first < CLEARLY * zero:
+        return Beginning("first", f"recognised: {said}")
+    return Beginning("first", f"assumed: {said}, which does not decide")
+
+
+def beginning_errors(trajectory: Trajectory) -> dict[str, float] | None:
+    """Root mean square error [m] in the first rows of a linear robot that starts at the first command, and at zero.
+
+    For each start, the dead time and lag are the ones with which a regression meets all rows looked at best. None where
+    there are fewer rows than the regression has unknowns, or neither commands nor rows tell one from the other.
+    """
+    time = trajectory.time[trajectory.time <= LOOKED_AT]
+    mask = trajectory.position_mask[: len(time)]
+    seen = mask[:, mask.mean(axis=0) > 0.5]
+    rows = np.flatnonzero(seen.all(axis=1)) if seen.shape[1] else np.zeros(0, int)
+    channels = trajectory.command.shape[1]
+    if len(rows) < channels + 1 + FEWEST_ROWS:
+        return None
+    position = trajectory.position[rows][:, mask.mean(axis=0) > 0.5].reshape(len(rows), -1)
+    time = time[rows]
+    if not _changes(trajectory) and not _sets_out(position):
+        return None  # a motion that dies away under one command may have begun anywhere
+    scale = np.abs(trajectory.command).max()
+    best: dict[str, tuple[float, float, np.ndarray]] = {}
+    for lag in LAGS:
+        state = _states(trajectory, lag)
+        for dead_time in DEAD_TIMES:
+            followed, left = _followed(trajectory, time - dead_time, lag, state)
+            for rule, drive in (("first", followed), ("zero", followed - left[:, None] * trajectory.command[0])):
+                design = np.column_stack([np.ones(len(time)), drive / scale])
+                weights = np.linalg.pinv(design.T @ design, RANK, hermitian=True) @ (design.T @ position)
+                square = ((position - design @ weights) ** 2).sum(axis=1)
+                if rule not in best or square.sum() < best[rule][0]:
+                    best[rule] = (float(square.sum()), dead_time + 3.0 * lag, square)
+    end = max(max(found[1] for found in best.values()), time[FEWEST_ROWS - 1])
+    early = time <= end
+    points = position.shape[1] / 3.0
+    return {rule: float(np.sqrt(square[early].mean() / points)) for rule, (_, _, square) in best.items()}
+
+
+def _changes(trajectory: Trajectory) -> bool:
+    """Whether any command that is looked at differs from the first."""
+    return bool(np.any(trajectory.command[trajectory.command_time <= LOOKED_AT] != trajectory.command[0]))
+
+
+def _sets_out(position: Float[np.ndarray, "rows coordinate"]) -> bool:
+    """Whether a motion gathers speed after the first row, as one from rest does."""
+    speed = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    return bool(speed[0] < CLEARLY * speed.max())
+
+
+def _states(trajectory: Trajectory, lag: float) -> Float[np.ndarray, "command channel"]:
+    """Where a first-order lag stands when each command comes, after the first command for ever."""
+    command = trajectory.command
+    kept = np.exp(-np.diff(trajectory.command_time) / lag)
+    state = np.empty_like(command)
+    state[0] = command[0]
+    for row in range(1, int(np.searchsorted(trajectory.command_time, LOOKED_AT))):
+        state[row] = command[row - 1] + kept[row - 1] * (state[row - 1] - command[row - 1])
+    return state
+
+
+def _followed(
+    trajectory: Trajectory, time: Float[np.ndarray, " n"], lag: float, state: Float[np.ndarray, "command channel"]
+) -> tuple[Float[np.ndarray, "n channel"], Float[np.ndarray, " n"]]:
+    """Commands after the lag at these times, and the share that is left of what was there before the first command."""
+    row = np.maximum(np.searchsorted(trajectory.command_time, time + 1e-9, side="right") - 1, 0)
+    elapsed = np.maximum(time - trajectory.command_time[row], 0.0)
+    kept = np.exp(-elapsed / lag)[:, None]
+    followed = trajectory.command[row] + kept * (state[row] - trajectory.command[row])
+    return followed, np.exp(-np.maximum(time - trajectory.command_time[0], 0.0) / lag)
