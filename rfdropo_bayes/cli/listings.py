@@ -14,13 +14,13 @@ ROBOT_HELP = "name of a robot, or path of a robot file: say more of it"
 
 def robots(name: Annotated[str | None, typer.Argument(metavar="[ROBOT]", help=ROBOT_HELP)] = None) -> None:
     """List the robots that come with the package, or say what one is: geometry, cables, markers, parameters."""
-    from rfdropo_bayes.workflow.listings import robot_facts, robot_rows
+    from rfdropo_bayes.workflow.listings import named_robot_facts, robot_rows
 
     if name is None:
         _show(robot_rows())
         typer.echo("\nrfdropo robots NAME says more, and where its file is; rfdropo init writes one for your own.")
     else:
-        _say(robot_facts(name))
+        _say(named_robot_facts(name))
 
 
 def mechanisms(

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from rfdropo_bayes import __version__
-from rfdropo_bayes.cli import audit, inference, listings, pictures, prediction
+from rfdropo_bayes.cli import audit, check, inference, init, listings, pictures, prediction
 from rfdropo_bayes.cli.options import (
     AsJson,
     ExperimentFile,
@@ -118,6 +118,8 @@ def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a ca
     typer.echo(f"report: {rebuild_report(folder)}")
 
 
+app.command("init")(init.init)
+app.command("check")(check.check)
 app.command()(audit.audit)
 app.command()(audit.separate)
 app.command()(audit.design)

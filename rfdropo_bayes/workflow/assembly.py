@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -10,13 +10,14 @@ from rfdropo_bayes.bayes.angles import angle_specs, gather_angles
 from rfdropo_bayes.bayes.calibration import Batch, CalibrationProblem
 from rfdropo_bayes.bayes.forces import TENSION_GAIN, Weighed, check_weighed, gather_tension, tension_specs
 from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
-from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.noise import NOISE_MODELS, noise_specs
 from rfdropo_bayes.bayes.objects import gather_objects, object_specs
 from rfdropo_bayes.bayes.pooling import Pooled, gather_groups
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory, find_data_file, load_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
+from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.robots import Robot, load_robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.mesh_body import assemble_mesh
@@ -69,9 +70,28 @@ def fixed_values(experiment: Experiment, simulator: RobotSimulator) -> dict[str,
     """Values of [model.fixed], checked against names and hard bounds."""
     table = experiment.model
     specs = simulator.parameters + measurement_specs(table)
-    check_names(table.fixed, specs, where="[model.fixed]")
+    check_used(table.fixed, experiment, simulator, where="[model.fixed]")
     by_name = {spec.name: spec for spec in specs}
     return {name: check_value(by_name[name], v, where="[model.fixed]") for name, v in table.fixed.items()}
+
+
+def check_used(names: Iterable[str], experiment: Experiment, simulator: RobotSimulator, *, where: str) -> None:
+    """Raise InputError for a parameter that the model does not have, and say what would bring it in."""
+    table = experiment.model
+    specs = simulator.parameters + measurement_specs(table)
+    known = [spec.name for spec in specs]
+    switches = {"tension": tension_specs(True), "motor_angle": angle_specs(True), "object_pose": object_specs(True)}
+    further = {f"set [model] {key} = true": found for key, found in switches.items()}
+    further |= {f'set [model] noise = "{model}"': noise_specs(model) for model in NOISE_MODELS}
+    for mechanism in mechanisms_named(REGISTRY, simulator.robot):
+        further[f"add {mechanism.name!r} to [model] mechanisms"] = mechanism.parameters
+    for name in names:
+        if name in known or any(each.startswith(f"{name}_") for each in known):
+            continue
+        for remedy, absent in further.items():
+            if name in [spec.name for spec in absent]:
+                raise InputError(f"the model has no parameter {name!r}", where=where, remedy=f"{remedy}, or remove it")
+        check_names([name], specs, where=where)
 
 
 def load_data(experiment: Experiment, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
@@ -119,6 +139,8 @@ def build_model(
     table = experiment.model
     measurement = measurement_specs(table)
     fixed = fixed_values(experiment, simulator)
+    check_used(table.priors, experiment, simulator, where="[model.priors]")
+    check_used(table.per_recording, experiment, simulator, where="[model.per_recording]")
     both = sorted(set(fixed) & set(table.priors))
     if both:
         raise InputError(f"{both[0]!r} has a prior and a fixed value", where="[model]", remedy="remove one of them")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rfdropo_bayes.data.formats import FORMATS
-from rfdropo_bayes.robots import find_robot_file, known_robots, load_robot
+from rfdropo_bayes.robots import Robot, find_robot_file, known_robots, load_robot
 
 Row = dict[str, str]
 
@@ -25,15 +25,17 @@ def robot_rows() -> list[Row]:
     return rows
 
 
-def robot_facts(name: str) -> Row:
-    """What one robot is: of the package, or a file."""
-    path, robot = find_robot_file(name), load_robot(name)
+def named_robot_facts(name: str) -> Row:
+    """What one robot is, and where its file is: of the package, or a path."""
+    return {"file": str(find_robot_file(name)), **robot_facts(load_robot(name))}
+
+
+def robot_facts(robot: Robot) -> Row:
+    """What a robot is."""
     body = robot.body
     across = max(max(pair) for pair in body.half_width_m)
     return {
-        "robot": robot.name,
-        "file": str(path),
-        "description": robot.description,
+        "robot": f"{robot.name}: {robot.description}",
         "body": f"{1e3 * (body.station_m[-1] - body.station_m[0]):.4g} mm long, up to {2e3 * across:.3g} mm wide, "
         f"{len(body.station_m) - 1} layers, {robot.nominal()['trunk_mass']:.4g} kg, "
         f"E = {robot.nominal()['young_modulus']:.4g} Pa",

@@ -5,18 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
-
-from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem import BodyEffects, LayeredBody, Material
-from rfdropo_bayes.fem.layered_pushing import check_effects
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.mechanisms.registry import REGISTRY
-from rfdropo_bayes.robots import Robot, load_robot
-from rfdropo_bayes.simulators.compiled import effects_lacking
-from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism
-from rfdropo_bayes.simulators.trunk import refined_body
+from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.simulators.mechanisms import BODIES, ENGINES, Mechanism, bodies_of, engines_of
 
 Row = dict[str, str]
 EXAMPLE_ROBOT = "smooth_arm"
@@ -27,7 +20,7 @@ def mechanism_rows() -> list[Row]:
     """The mechanisms of the library, in the order of the physics."""
     robot = load_robot(EXAMPLE_ROBOT)
     return [
-        {"mechanism": m.name, "stage": m.stage, "runs on": where_it_runs(m, robot), "cause": m.cause}
+        {"mechanism": m.name, "stage": m.stage, "runs on": where_it_runs(m), "cause": m.cause}
         for m in mechanisms_named(REGISTRY, robot)
     ]
 
@@ -46,7 +39,7 @@ def mechanism_facts(name: str, robot: str = EXAMPLE_ROBOT) -> tuple[Row, list[Ro
         "stage": mechanism.stage,
         "cause": mechanism.cause,
         "remedy": mechanism.remedy,
-        "runs on": where_it_runs(mechanism, made_for),
+        "runs on": where_it_runs(mechanism),
     }
     return facts, [
         {
@@ -70,17 +63,12 @@ def method_rows() -> list[Row]:
     return [{"method": name, "description": first_paragraph(method.config.__doc__)} for name, method in METHODS.items()]
 
 
-def where_it_runs(mechanism: Mechanism, robot: Robot) -> str:
+def where_it_runs(mechanism: Mechanism) -> str:
     """Bodies and engines that simulate a mechanism, in words."""
-    effects = _effects(mechanism, robot)
-    if not effects.present:
-        return "layers and meshes, every engine"
-    words = "layers" if not effects_lacking(effects) else "layers, JAX engine"
-    try:
-        check_effects(effects)
-    except InputError:
-        return f"{words}, without a cube"
-    return words
+    bodies, engines = bodies_of(mechanism), engines_of(mechanism)
+    words = "every body" if set(bodies) == set(BODIES) else f"{' and '.join(bodies)} bodies"
+    words += ", every engine" if set(engines) == set(ENGINES) else f", engine {' or '.join(engines)}"
+    return words if getattr(mechanism, "beside_cube", True) else f"{words}, without a cube"
 
 
 def prior_text(prior: Mapping[str, Any]) -> str:
@@ -92,24 +80,3 @@ def prior_text(prior: Mapping[str, Any]) -> str:
 def first_paragraph(text: str | None) -> str:
     """The first paragraph of a docstring, in one line."""
     return " ".join((text or "").strip().split("\n\n")[0].split())
-
-
-def _effects(mechanism: Mechanism, robot: Robot) -> BodyEffects:
-    """Effects of the body that a mechanism switches on at its null value."""
-    if not isinstance(mechanism, BodyMechanism):
-        return BodyEffects()
-    layers: LayeredBody = refined_body(robot.layered_arrays(), 1, 2)
-    count = len(layers.station)
-    nominal = robot.nominal()
-    material = Material(
-        young_modulus=jnp.asarray(nominal["young_modulus"]),
-        poisson_ratio=jnp.asarray(nominal["poisson_ratio"]),
-        density=jnp.asarray(robot.density(nominal["trunk_mass"])),
-        rayleigh_mass=jnp.asarray(nominal["rayleigh_mass"]),
-        rayleigh_stiffness=jnp.asarray(nominal["rayleigh_stiffness"]),
-        gravity=jnp.asarray(robot.gravity),
-        stiffness_scale=jnp.ones(count - 1),
-        point_mass=jnp.zeros(count),
-    )
-    values = {spec.name: jnp.asarray(spec.nominal) for spec in mechanism.parameters}
-    return mechanism.embody(values, material, layers).effects

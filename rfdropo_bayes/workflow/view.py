@@ -4,31 +4,41 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import xarray as xr
+from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.motion import Motion, cube_corners, smooth_line, upright
 from rfdropo_bayes.report.motion_export import save_frames, save_vtk
 from rfdropo_bayes.report.motion_figures import save_animation, save_still
-from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.robots import Robot, known_robots, load_robot
 from rfdropo_bayes.workflow.assembly import find_robot, load_data
 from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.workflow.experiment_file import ROBOT_COPY
 from rfdropo_bayes.workflow.simulation import simulate_all
+from rfdropo_bayes.workflow.unseen import OBJECT
 
+PREDICTED = "mean"  # variable of a prediction's file
 STILLS, ANIMATIONS = (".png", ".svg", ".pdf"), (".gif", ".mp4")
 
 
-def run_view(source: Path, out: Path, overrides: list[str], recording: str | None, rate: int) -> list[Path]:
+def run_view(
+    source: Path, out: Path, overrides: list[str], recording: str | None, rate: int, robot: Path | None = None
+) -> list[Path]:
     """Draw a motion.
 
     Args:
-        source: an experiment to simulate, or a trajectory that ``rfdropo simulate`` wrote (NetCDF).
+        source: an experiment to simulate, or what ``rfdropo simulate`` or ``rfdropo predict`` wrote (NetCDF), of which
+            the mean prediction is drawn.
         out: .png, .svg or .pdf for several instants in one picture, .gif or .mp4 for an animation, a name that ends in
             .vtk for a folder of surfaces, any other name for a folder of frames.
         recording: which recording of the experiment, where it has several.
         rate: frames per second, in real time.
+        robot: file of the robot, where a NetCDF file has none beside it and the package does not know its name.
 
     Returns:
         the files written, the first to open first.
@@ -36,7 +46,7 @@ def run_view(source: Path, out: Path, overrides: list[str], recording: str | Non
     Raises:
         InputError: bad input, or a format that needs what is not installed.
     """
-    motion = _from_file(source) if source.suffix == ".nc" else _from_experiment(source, overrides, recording)
+    motion = _from_file(source, robot) if source.suffix == ".nc" else _from_experiment(source, overrides, recording)
     if out.suffix == ".vtk":
         return save_vtk(motion, out)
     if out.suffix == "":
@@ -52,9 +62,49 @@ def run_view(source: Path, out: Path, overrides: list[str], recording: str | Non
     return [out]
 
 
-def _from_file(path: Path) -> Motion:
+def _from_file(path: Path, robot: Path | None) -> Motion:
+    dataset = _open(path)
+    own = _robot_of(path, str(dataset.attrs.get("robot", "")), robot)
+    if PREDICTED in dataset:
+        return _predicted(dataset, own)
     trajectory = Trajectory.load(path)
-    return _motion(trajectory, load_robot(trajectory.dataset.attrs["robot"]), None, None)
+    return _motion(_shown(trajectory), own, None, None)
+
+
+def _open(path: Path) -> xr.Dataset:
+    if not path.is_file():
+        raise InputError("no such file", where=str(path), remedy="correct the path")
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as opened:
+            return opened.load()
+    except Exception as error:  # the HDF5 stack raises many types on damaged files, none of them ours
+        raise InputError(
+            f"is not a readable NetCDF file ({type(error).__name__})", where=str(path), remedy="make it again"
+        ) from None
+
+
+def _robot_of(path: Path, name: str, given: Path | None) -> Robot:
+    """The robot of a NetCDF file: the one that is given, the one in its run's folder, or the package's of that name."""
+    beside = path.resolve().parent / ROBOT_COPY
+    if given is None and name not in known_robots() and not beside.is_file():
+        raise InputError(
+            f"its robot, {name!r}, does not come with the package",
+            where=str(path),
+            remedy="give the robot's file with --robot",
+        )
+    return load_robot(given or (beside if beside.is_file() else name))
+
+
+def _predicted(dataset: xr.Dataset, robot: Robot) -> Motion:
+    """Mean of a prediction; an object is drawn as it moves in the draw that is nearest to the mean."""
+    pose = None
+    if OBJECT in dataset:
+        centre = dataset[OBJECT].values[:, :, :3]
+        nearest = int(np.argmin(np.sum((centre - centre.mean(axis=0)) ** 2, axis=(1, 2))))
+        pose = dataset[OBJECT].values[nearest].astype(float)
+    title = f"{dataset.attrs.get('recording', 'prediction')}, mean prediction"
+    names = tuple(str(name) for name in dataset["marker"].values)
+    return _motion(_Shown(title, dataset["time"].values, names, dataset[PREDICTED].values, pose), robot, None, None)
 
 
 def _from_experiment(path: Path, overrides: list[str], recording: str | None) -> Motion:
@@ -73,15 +123,41 @@ def _from_experiment(path: Path, overrides: list[str], recording: str | None) ->
         sources = [*load_data(experiment, folder, "fit"), *load_data(experiment, folder, "test")]
         measured = next(entry for entry in sources if entry.name == name)
     side = found["parameters"].get("cube_side")
-    return _motion(simulated, find_robot(experiment, folder), measured, side)
+    return _motion(_shown(simulated), find_robot(experiment, folder), measured, side)
 
 
-def _motion(trajectory: Trajectory, robot: Robot, measured: Trajectory | None, side: float | None) -> Motion:
-    """Geometry of a trajectory of a robot; the tube has the robot's outer width."""
+class _Shown(NamedTuple):
+    """What moves: markers [m] and, if there is one, an object's pose."""
+
+    title: str
+    time: Float[np.ndarray, " time"]
+    marker_names: tuple[str, ...]
+    position: Float[np.ndarray, "time marker 3"]
+    object_pose: Float[np.ndarray, "time 7"] | None
+
+
+def _shown(trajectory: Trajectory) -> _Shown:
+    return _Shown(
+        trajectory.name, trajectory.time, trajectory.marker_names, trajectory.position, trajectory.object_pose
+    )
+
+
+def _motion(shown: _Shown, robot: Robot, measured: Trajectory | None, side: float | None) -> Motion:
+    """Geometry of a robot's motion; the tube has the robot's outer width, and passes through the markers' means where
+    several have the same height."""
     rest = {name: point[2] for name, point in zip(robot.marker_names, robot.marker_points(), strict=True)}
-    order = sorted(trajectory.marker_names, key=lambda name: rest[name])
-    chosen = [trajectory.marker_names.index(name) for name in order]
-    position, heights = trajectory.position[:, chosen], np.array([rest[name] for name in order])
+    known = [index for index, name in enumerate(shown.marker_names) if name in rest]
+    if not known:
+        raise InputError(
+            f"none of its markers ({', '.join(shown.marker_names)}) is the robot's ({', '.join(rest)})",
+            where=shown.title,
+            remedy="give the robot that was recorded",
+        )
+    heights, group = np.unique([rest[shown.marker_names[index]] for index in known], return_inverse=True)
+    position = np.stack(
+        [shown.position[:, [known[i] for i in np.flatnonzero(group == g)]].mean(axis=1) for g in range(len(heights))],
+        axis=1,
+    )
     base = float(robot.body.station_m[0])
     if heights[0] > base + 1e-6:  # the clamped section does not move
         clamp = np.broadcast_to([0.0, 0.0, base], (len(position), 1, 3))
@@ -89,7 +165,7 @@ def _motion(trajectory: Trajectory, robot: Robot, measured: Trajectory | None, s
     line, at = smooth_line(position, heights)
     width = np.mean(robot.body.half_width_m, axis=1)
     turn = upright(robot.gravity)
-    pose, push = trajectory.object_pose, robot.push
+    pose, push = shown.object_pose, robot.push
     cube = None
     if pose is not None and push is not None:
         cube = cube_corners(pose, side or push.parameters["cube_side"].nominal) @ turn.T
@@ -97,8 +173,8 @@ def _motion(trajectory: Trajectory, robot: Robot, measured: Trajectory | None, s
     if measured is not None:
         dots = np.where(measured.position_mask[..., None], measured.position, np.nan) @ turn.T
     return Motion(
-        trajectory.name,
-        trajectory.time,
+        shown.title,
+        shown.time,
         line @ turn.T,
         np.interp(at, robot.body.station_m, width),
         dots,

@@ -47,6 +47,8 @@ def experiment(tmp_path: Path, *changes: tuple[str, str]) -> str:
         ('"smooth_arm"', '"smooth_harm"', "unknown robot 'smooth_harm'"),
         ("[model.priors]", '[model]\nmechanisms = ["paylod"]\n[model.priors]', "did you mean 'payload'"),
         ("young_modulus", "youngs_modulus", "did you mean 'young_modulus'"),
+        ("young_modulus", "payload_mass", "add 'payload' to [model] mechanisms, or remove it"),
+        ("young_modulus", "tension_noise", "set [model] tension = true, or remove it"),
         ("{}", '{ distribution = "Uniform", low = 1.0, high = 2.0 }', "outside the bounds"),
         ("{}", '{ distribution = "Normall", loc = 1.0, scale = 2.0 }', "did you mean 'Normal'"),
         (

@@ -8,13 +8,14 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
+import xarray as xr
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.motion import AROUND, cube_corners, silhouette, smooth_line, tube, tube_faces, upright
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import known_robots, load_robot
 from rfdropo_bayes.workflow.view import run_view
 
 ROWS = 6
@@ -131,3 +132,42 @@ def test_what_cannot_be_drawn_is_refused(recording, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.raises(InputError, match="MP4 needs ffmpeg"):
         run_view(recording, tmp_path / "motion.mp4", [], None, 20)
+
+
+def own_robot(folder: Path) -> Path:
+    """The bundled arm as one's own: another name, and two markers beside the axis at the tip."""
+    text = known_robots()["smooth_arm"].read_text(encoding="utf-8").replace("smooth_arm", "my_arm")
+    text = text.replace("point_m = [0.0, 0.0, 0.15]", "point_m = [0.005, 0.0, 0.2]")
+    text = text.replace("point_m = [0.0, 0.0, 0.2]", "point_m = [-0.005, 0.0, 0.2]")
+    path = folder / "my_arm.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def prediction(folder: Path) -> Path:
+    """What predict writes of the bundled arm, as far as it is drawn."""
+    position = np.tile(load_robot("smooth_arm").marker_points(), (ROWS, 1, 1))
+    position[:, 2:, 0] += [0.005, -0.005]
+    data = dict.fromkeys(("mean", "q05", "q95"), (("time", "marker", "axis"), position))
+    coords = {"time": 0.05 * np.arange(ROWS), "marker": ["m1", "m2", "m3", "m4"], "axis": list("xyz")}
+    path = folder / "prediction.nc"
+    xr.Dataset(data, coords, {"robot": "my_arm", "recording": "next"}).to_netcdf(path, engine="h5netcdf")
+    return path
+
+
+def test_own_robots_are_found_beside_the_file_or_given(tmp_path):
+    robot, file = own_robot(tmp_path), prediction(tmp_path)
+    with pytest.raises(InputError, match=r"'my_arm', does not come with the package.*--robot"):
+        run_view(file, tmp_path / "still.png", [], None, 20)
+    (given,) = run_view(file, tmp_path / "given.png", [], None, 20, robot)
+    shutil.copy(robot, tmp_path / "robot.toml")
+    (beside,) = run_view(file, tmp_path / "beside.png", [], None, 20)
+    pixels = [np.asarray(Image.open(path).convert("RGB")) for path in (given, beside)]
+    assert np.array_equal(*pixels)
+    assert pixels[0].std() > 10.0
+
+
+def test_a_robot_with_other_markers_is_refused(tmp_path):
+    file = prediction(tmp_path)
+    with pytest.raises(InputError, match=r"none of its markers \(m1, m2, m3, m4\) is the robot's"):
+        run_view(file, tmp_path / "still.png", [], None, 20, known_robots()["asl_trunk"])

@@ -1,0 +1,268 @@
+"""A robot from a few answers: shape, cables, markers, mass; written as a commented robot file to go on from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, section_profile
+
+SILICONE = 1070.0
+"""Density [kg/m3] where no mass is given: that of most silicone rubbers."""
+GRAVITY = 9.81
+DIRECTIONS = {f"{sign}{axis}": (sign, "xyz".index(axis)) for sign in "+-" for axis in "xyz"}
+SHAPES = ("cylinder", "cone", "tube", "disks")
+LEAST_LAYERS, LAYERS_PER_SEGMENT = 8, 4
+KNOWN, ASSUMED = 0.3, 1.0
+"""Standard deviation of the logarithm in the prior of what was given, and of what was taken as a default."""
+
+
+@dataclass(frozen=True)
+class RobotOutline:
+    """Answers that make a robot; lengths in m, in the frame of the base: z along the body, away from the clamp.
+
+    Attributes:
+        name: of the robot and of its file.
+        length, radius: of the body, the latter at its base.
+        markers: heights along the axis by name.
+        shape: "cylinder", "cone" (with ``tip_radius``), "tube" (with ``inner_radius``), or "disks" on a backbone.
+        segments: each has cables of its own, which end where it ends.
+        cables: of each segment, evenly around it.
+        cable_radius: distance of the cables from the axis at the base; they follow the taper.
+        pairs: opposite cables share a motor: what one pulls in, the other lets out.
+        command_unit: "m" of cable or "rad" of a motor, whose spool then has ``spool_radius``.
+        gravity: direction in which things fall, such as "+z" for a robot that hangs.
+        mass: [kg]; None for silicone of that volume.
+        young_modulus: [Pa].
+        assumed: names of those above that were not given but taken as defaults.
+    """
+
+    name: str
+    length: float
+    radius: float
+    markers: Mapping[str, float]
+    shape: Literal["cylinder", "cone", "tube", "disks"] = "cylinder"
+    tip_radius: float | None = None
+    inner_radius: float | None = None
+    disks: int = 10
+    disk_thickness: float = 0.003
+    segments: int = 1
+    cables: int = 4
+    cable_radius: float | None = None
+    pairs: bool = False
+    command_unit: Literal["m", "rad"] = "m"
+    spool_radius: float = 0.01
+    gravity: str = "+z"
+    mass: float | None = None
+    young_modulus: float = 1e6
+    assumed: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        where = "init"
+        if self.gravity not in DIRECTIONS:
+            remedy = f"one of {', '.join(DIRECTIONS)}: where things fall, z being away from the clamp"
+            raise InputError(f"gravity = {self.gravity!r} is no direction", where=where, remedy=remedy)
+        if self.shape not in SHAPES:
+            raise InputError(f"unknown shape {self.shape!r}", where=where, remedy=f"one of {', '.join(SHAPES)}")
+        for key in ("length", "radius", "young_modulus", "spool_radius"):
+            if not getattr(self, key) > 0.0:
+                raise InputError(f"{key} = {getattr(self, key):g} is not positive", where=where)
+        if self.segments < 1 or self.cables < 1:
+            raise InputError("an arm has one segment and one cable at least", where=where)
+        if self.pairs and self.cables % 2:
+            raise InputError(f"{self.cables} cables make no pairs", where=where, remedy="give an even number")
+        if self.shape == "disks" and self.disks % self.segments:
+            raise InputError(f"{self.disks} disks do not share out over {self.segments} segments", where=where)
+        if not self.markers:
+            raise InputError("no markers", where=where, remedy="give at least the tip's")
+
+    @property
+    def section(self) -> Cylinder | Cone | Tube | Disks:
+        """The body's shape; layers end where segments do."""
+        layers = self.segments * max(LAYERS_PER_SEGMENT, -(-LEAST_LAYERS // self.segments))
+        tip = self.radius if self.tip_radius is None else self.tip_radius
+        if self.shape == "cone":
+            return Cone(length_m=self.length, layers=layers, radius_m=(self.radius, tip))
+        if self.shape == "tube":
+            inner = self.inner_radius or 0.5 * min(self.radius, tip)
+            return Tube(length_m=self.length, layers=layers, radius_m=(self.radius, tip), inner_radius_m=inner)
+        if self.shape == "disks":
+            return Disks(
+                length_m=self.length,
+                disks=self.disks,
+                radius_m=self.radius,
+                thickness_m=self.disk_thickness,
+                backbone_radius_m=self.inner_radius or 0.2 * self.radius,
+            )
+        return Cylinder(length_m=self.length, layers=layers, radius_m=self.radius)
+
+    @property
+    def trunk_mass(self) -> float:
+        """Mass [kg], given or assumed."""
+        return SILICONE * section_profile([self.section]).volume_m3 if self.mass is None else self.mass
+
+    def guide_heights(self) -> np.ndarray:
+        """Where cables are guided: in the middle of the disks, or at the ends of the layers."""
+        station = np.array(section_profile([self.section]).station_m)
+        return 0.5 * (station[1::2] + station[2::2]) if self.shape == "disks" else station[1:]
+
+    def channel_names(self) -> list[str]:
+        """One per cable, or one per pair of cables."""
+        count = self.cables // 2 if self.pairs else self.cables
+        word = "motor" if self.command_unit == "rad" or self.pairs else "pull"
+        if self.segments == 1:
+            return [f"{word}_{k + 1}" for k in range(count)]
+        return [f"s{s + 1}_{word}_{k + 1}" for s in range(self.segments) for k in range(count)]
+
+
+def robot_text(outline: RobotOutline) -> str:
+    """A commented robot file."""
+    return "\n".join(
+        [*_head(outline), *_channels(outline), *_cables(outline), *_markers(outline), *_parameters(outline)]
+    )
+
+
+def _head(o: RobotOutline) -> list[str]:
+    sign, axis = DIRECTIONS[o.gravity]
+    gravity = [0.0, 0.0, 0.0]
+    gravity[axis] = GRAVITY if sign == "+" else -GRAVITY
+    section = o.section.model_dump()
+    return [
+        "# Written by rfdropo init; docs/reference/robot.md has every key. SI units, in the frame of the base: z along",
+        "# the undeformed body, away from the clamp. What is marked ASSUMED was not given: measure it, or let it be",
+        "# inferred.",
+        f'name = "{o.name}"',
+        f'description = "{o.segments} segment{"s" if o.segments > 1 else ""}, {o.segments * o.cables} cables"',
+        f"gravity_m_s2 = {gravity}{_mark(o, 'gravity')}",
+        "time_step_s = 0.01             # halve it to see whether it is short enough",
+        'initial_state = "equilibrium"  # or "rest": undeformed',
+        "",
+        "[command]",
+        f'unit = "{o.command_unit}"',
+        "ramp_s = 0.0                   # a change of command is carried out linearly over this time",
+        "dead_time_s = 0.0              # and begins so much later",
+        "",
+        "# Shapes one after the other from the clamp to the tip: cylinder, cone, tube, disks. In their place six lists",
+        "# of areas and moments may stand, for sections of any form.",
+        "[[body.section]]" + _mark(o, "shape", "length", "radius", "tip_radius"),
+        *(f"{key} = {_toml(value)}" for key, value in section.items()),
+        "",
+    ]
+
+
+def _channels(o: RobotOutline) -> list[str]:
+    names = o.channel_names()
+    gain = np.zeros((o.segments * o.cables, len(names)))
+    for row in range(len(gain)):
+        segment, cable = divmod(row, o.cables)
+        half = o.cables // 2
+        column = segment * half + cable % half if o.pairs else row
+        gain[row, column] = -1.0 if o.pairs and cable >= half else 1.0
+    lines = [
+        "# Cable displacement = gain @ command, times the spool's radius where commands are angles; pull > 0.",
+        "[channels]",
+        f"names = {_toml(names)}",
+        "gain = [",
+        *(f"    {_toml(row.tolist())}," for row in gain),
+        "]",
+    ]
+    return [*lines, *(['radius_parameter = "spool_radius"'] if o.command_unit == "rad" else []), ""]
+
+
+def _cables(o: RobotOutline) -> list[str]:
+    heights = o.guide_heights()
+    tip = o.radius if o.tip_radius is None or o.shape in ("cylinder", "disks") else o.tip_radius
+    at_base = 0.75 * o.radius if o.cable_radius is None else o.cable_radius
+    radius = at_base * (1.0 + (tip / o.radius - 1.0) * heights / o.length)
+    lines = ["# Cables at their azimuth, from +x towards +y, through guides up to where they end." + _mark(o, "cables")]
+    for row in range(o.segments * o.cables):
+        segment, cable = divmod(row, o.cables)
+        azimuth = 360.0 / o.cables * (cable + segment / o.segments)
+        end = o.length * (segment + 1) / o.segments
+        inside = heights <= end + 1e-9
+        name = f"cable_{cable + 1}" if o.segments == 1 else f"s{segment + 1}_cable_{cable + 1}"
+        lines += [
+            "[[cables]]",
+            f'name = "{name}"',
+            f"azimuth_deg = {azimuth:g}",
+            "anchor_z_m = 0.0",
+            f"anchor_radius_m = {at_base:.6g}",
+            f"guide_z_m = {_toml([round(float(z), 6) for z in heights[inside]])}",
+            f"guide_radius_m = {_toml([round(float(r), 6) for r in radius[inside]])}",
+            f"displacement_limit_m = [{-o.length:.6g}, {0.5 * o.length:.6g}]",
+            "",
+        ]
+    return lines
+
+
+def _markers(o: RobotOutline) -> list[str]:
+    lines = ["# Measured points where they lie in the undeformed body: x, y, z." + _mark(o, "markers")]
+    for name, height in o.markers.items():
+        lines += ["[[markers]]", f'name = "{name}"', f"point_m = [0.0, 0.0, {height:.6g}]", ""]
+    return lines
+
+
+def _parameters(o: RobotOutline) -> list[str]:
+    modulus, mass = o.young_modulus, o.trunk_mass
+    lines = ["# Parameters: hard bounds, and the prior that an experiment asks for with {}."]
+
+    def add(name: str, unit: str, nominal: float, bounds: tuple[float, float], prior: str, words: str) -> None:
+        lines.extend(
+            [
+                f"[parameters.{name}]" + _mark(o, name),
+                f'unit = "{unit}"',
+                f"nominal = {nominal:.6g}",
+                f"low = {bounds[0]:.6g}",
+                f"high = {bounds[1]:.6g}",
+                f"prior = {{ {prior} }}",
+                f'description = "{words}"',
+                *(['each = "cable"'] if name == "initial_displacement" else []),
+                "",
+            ]
+        )
+
+    def log_normal(name: str, median: float, spread: float | None = None) -> str:
+        sigma = spread or (ASSUMED if name in o.assumed else KNOWN)
+        return f'distribution = "LogNormal", median = {median:.6g}, sigma = {sigma:g}'
+
+    spread = log_normal("young_modulus", modulus, ASSUMED)
+    add("young_modulus", "Pa", modulus, (modulus / 1e3, modulus * 1e3), spread, "Young's modulus of the body")
+    ratio = 'distribution = "Uniform", low = 0.4, high = 0.499'
+    add("poisson_ratio", "-", 0.45, (0.1, 0.499), ratio, "Poisson's ratio; rubber is near 0.5")
+    prior = log_normal("mass" if "mass" in o.assumed else "trunk_mass", mass)
+    add("trunk_mass", "kg", mass, (mass / 100.0, mass * 100.0), prior, "mass of the body")
+    prior = log_normal("rayleigh_mass", 0.1, ASSUMED)
+    add("rayleigh_mass", "1/s", 0.1, (0.0, 20.0), prior, "damping proportional to mass")
+    prior = log_normal("rayleigh_stiffness", 0.05, ASSUMED)
+    add("rayleigh_stiffness", "s", 0.05, (0.0, 2.0), prior, "damping proportional to stiffness")
+    if o.command_unit == "rad":
+        prior = log_normal("spool_radius", o.spool_radius)
+        bounds = (o.spool_radius / 10.0, o.spool_radius * 10.0)
+        add("spool_radius", "m", o.spool_radius, bounds, prior, "cable wound up per angle of the motor")
+    prior = 'distribution = "Normal", loc = 0.0, scale = 0.001'
+    add("initial_displacement", "m", 0.0, (-0.05, 0.05), prior, "cable displacement at zero command")
+    prior = 'distribution = "Normal", loc = 0.0, scale = 0.005'
+    for axis in "xyz":
+        words = f"shift of the measured positions along {axis}"
+        add(f"offset_{axis}", "m", 0.0, (-1.0, 1.0), prior, words)
+    return lines
+
+
+def _mark(o: RobotOutline, *names: str) -> str:
+    """A comment behind what was not given."""
+    also = {"trunk_mass": "mass"}
+    missing = [name for name in names if name in o.assumed or also.get(name) in o.assumed]
+    return f"  # ASSUMED: {', '.join(missing)}" if missing else ""
+
+
+def _toml(value: object) -> str:
+    """A string, a number or a list of these as TOML writes it."""
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_toml(item) for item in value)}]"
+    return repr(float(f"{value:.9g}")) if isinstance(value, float) else str(value)

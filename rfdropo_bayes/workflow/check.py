@@ -1,0 +1,256 @@
+"""``rfdropo check``: what an experiment's robot, recordings and model are, in words and as pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from rfdropo_bayes.data import RecordingEntry, Trajectory, load_recordings, noise_floor
+from rfdropo_bayes.data.repeats import group_repeats
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.methods import make_config
+from rfdropo_bayes.report.recording_figures import RestShape, save_recording
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.workflow.assembly import build_model, build_simulator, find_robot
+from rfdropo_bayes.workflow.calibration import inference_options
+from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
+from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.listings import robot_facts
+from rfdropo_bayes.workflow.placement import far_from_rest, placement_hints
+
+MILLIMETRES = 1e3
+IRREGULAR = 1.5
+"""A gap longer than so many median sample times is said."""
+MOST_NAMES = 12
+
+Result = TypeVar("Result")
+
+
+@dataclass
+class Check:
+    """What was read.
+
+    Attributes:
+        lines: what there is, as pairs of a label and a text; an empty label goes on with the one before.
+        notes: what is allowed, and perhaps not meant.
+        problems: what keeps the experiment from running.
+        files: pictures, one per recording.
+    """
+
+    lines: list[tuple[str, str]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+
+
+def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
+    """Read everything that an experiment names, and say what was read.
+
+    Args:
+        path: the experiment file.
+        out: folder for the pictures, ``NAME.png`` for each recording.
+        overrides: assignments that replace entries of the file.
+
+    Raises:
+        InputError: the experiment file or the robot cannot be read; whatever else is wrong is among the problems.
+    """
+    experiment, _ = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    robot = find_robot(experiment, folder)
+    found = Check()
+    _say_robot(found, experiment, robot)
+    recordings = {role: list(_read(found, experiment, folder, role)) for role in ("fit", "test")}
+    for role, trajectories in recordings.items():
+        for trajectory in trajectories:
+            _say_recording(found, trajectory, role, robot)
+    _say_repeats(found, [*recordings["fit"], *recordings["test"]])
+    _say_model(found, experiment, robot, folder, recordings["fit"])
+    if any(recordings.values()):
+        out = output_folder(out)
+    cables = [np.vstack([anchor, guides]) for anchor, guides in zip(robot.anchors(), robot.guides(), strict=True)]
+    body, points = robot.body, robot.marker_points()
+    rest = RestShape(np.array(body.station_m), np.array(body.half_width_m), cables, robot.marker_names, points)
+    for trajectory in (*recordings["fit"], *recordings["test"]):
+        file = out / f"{trajectory.name.replace('/', '_')}.png"
+        save_recording(trajectory, rest, file)
+        found.files.append(file)
+    return found
+
+
+def _try(found: Check, action: Callable[[], Result]) -> Result | None:
+    """What an action returns; what keeps it from that is a problem."""
+    try:
+        return action()
+    except InputError as error:
+        if str(error) not in found.problems:
+            found.problems.append(str(error))
+        return None
+
+
+def _say_robot(found: Check, experiment: Experiment, robot: Robot) -> None:
+    facts = robot_facts(robot)
+    for label in ("robot", "body", "gravity", "starts", "commands", "cables", "markers"):
+        found.lines.append((label, facts[label]))
+
+
+def _read(found: Check, experiment: Experiment, folder: Path, role: str) -> Iterator[Trajectory]:
+    """The recordings of one role, those that can be read."""
+    spec = experiment.data
+    if spec is None:
+        if role == "fit":
+            found.lines.append(("recordings", "none: the experiment has no [data], and can only be simulated"))
+        return
+    entries: list[RecordingEntry] = spec.fit if role == "fit" else spec.test
+    for entry in entries:
+        alone = spec.model_copy(update={"fit": [entry], "test": []})
+        yield from _try(found, lambda alone=alone: load_recordings(alone, folder)) or []
+    _try(found, lambda: load_recordings(spec, folder, role="fit" if role == "fit" else "test"))
+
+
+def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Robot) -> None:
+    """Rows, markers, masks and commands of one recording, beside those of the robot."""
+    gaps = np.diff(trajectory.time)
+    step = float(np.median(gaps))
+    rows = f"{len(trajectory.time)} rows over {trajectory.time[-1]:.4g} s, one every {1e3 * step:.4g} ms"
+    if gaps.max() > IRREGULAR * step:
+        rows += f"; the longest gap is {1e3 * gaps.max():.4g} ms, at {trajectory.time[np.argmax(gaps)]:.4g} s"
+    found.lines.append((f"{role}: {trajectory.name}", rows))
+    found.lines += [("", text) for text in (*_markers(found, trajectory, robot), *_commands(found, trajectory, robot))]
+    further = [
+        word
+        for word, values in (
+            ("cable tensions", trajectory.tension),
+            ("motor angles", trajectory.motor_angle),
+            ("poses of an object", trajectory.object_pose),
+        )
+        if values is not None
+    ]
+    if further:
+        found.lines.append(("", f"also {' and '.join(further)}"))
+
+
+def _markers(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[str]:
+    shared = [name for name in robot.marker_names if name in trajectory.marker_names]
+    unknown = [name for name in trajectory.marker_names if name not in shared]
+    unseen = [name for name in robot.marker_names if name not in shared]
+    if not shared:
+        found.problems.append(
+            f"{trajectory.name}: none of its markers ({_names(trajectory.marker_names)}) is one of the robot's "
+            f"({_names(robot.marker_names)}); name them, in the order of positions, under [data.columns] markers, "
+            "or rename those of the robot"
+        )
+        yield f"markers {_names(trajectory.marker_names)}: NONE is the robot's"
+        return
+    words = f"markers {_names(shared)}: as the robot's"
+    if unknown:
+        words += f"; {_names(unknown)}: not the robot's, left out"
+    yield words + (f"; the robot's {_names(unseen)}: not measured" if unseen else "")
+    usable = trajectory.position[trajectory.position_mask]
+    if len(usable):
+        ranges = ", ".join(
+            f"{axis} {MILLIMETRES * low:.4g} to {MILLIMETRES * high:.4g}"
+            for axis, low, high in zip("xyz", usable.min(axis=0), usable.max(axis=0), strict=True)
+        )
+        yield f"positions in mm, in the robot's frame: {ranges}"
+    yield _masks(trajectory)
+    place = far_from_rest(robot, trajectory)
+    if place is None:
+        yield "first row: every position is masked"
+        return
+    distances = ", ".join(f"{name} {MILLIMETRES * value:.3g}" for name, value in place.items())
+    yield f"first row, distance from the undeformed robot in mm: {distances}"
+    found.notes += [f"{trajectory.name}: {hint}" for hint in placement_hints(robot, trajectory)]
+
+
+def _masks(trajectory: Trajectory) -> str:
+    masked, every = int((~trajectory.position_mask).sum()), trajectory.position_mask.size
+    if not masked:
+        return "no position is masked"
+    counts = trajectory.settings.get("faults", {})
+    kinds = ", ".join(f"{sum(each)} {kind}" for kind, each in counts.items() if sum(each) and kind != "breaks")
+    return f"{masked} of {every} positions are masked" + (f" (in the whole file: {kinds})" if kinds else "")
+
+
+def _commands(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[str]:
+    names, unit, command = trajectory.cable_names, trajectory.command_unit, trajectory.command
+    yield f"{len(names)} commands in {unit}: {_names(names)}; from {command.min():.4g} to {command.max():.4g}"
+    initial = trajectory.initial_command
+    known = "zero" if not np.any(initial) else f"[{', '.join(f'{value:.4g}' for value in initial)}]"
+    same = ", as in the first row" if np.array_equal(initial, command[0]) else ""
+    yield f"command before the first row: {known}{same}"
+    if len(names) != len(robot.channel_names):
+        found.problems.append(
+            f"{trajectory.name}: {len(names)} commands ({_names(names)}) for the robot's {len(robot.channel_names)} "
+            f"channels ({_names(robot.channel_names)}); name one column per channel under [data.columns] commands"
+        )
+        return
+    if unit != robot.command_unit:
+        found.problems.append(
+            f"{trajectory.name}: commands in {unit} for a robot that is commanded in {robot.command_unit}; "
+            "correct command_unit, or [command] unit of the robot"
+        )
+        return
+    if tuple(names) != robot.channel_names:
+        yield f"the robot calls them {_names(robot.channel_names)}, in this order"
+    asked = command @ np.asarray(robot.channel_matrix({})).T
+    for cable, low, high, (least, most) in zip(
+        robot.cable_names, asked.min(axis=0), asked.max(axis=0), robot.displacement_limits(), strict=True
+    ):
+        if low < least - 1e-9 or high > most + 1e-9:
+            found.notes.append(
+                f"{trajectory.name}: cable {cable} is asked for {MILLIMETRES * low:.3g} to {MILLIMETRES * high:.3g} "
+                f"mm; beyond its displacement_limit_m, {MILLIMETRES * least:.3g} to {MILLIMETRES * most:.3g} mm, it is "
+                "held"
+            )
+
+
+def _say_repeats(found: Check, trajectories: Sequence[Trajectory]) -> None:
+    groups = [group for group in group_repeats(trajectories) if len(group) > 1]
+    for group in groups:
+        found.lines.append(("repeats", _names([trajectories[index].name for index in group])))
+    floor = _try(found, lambda: noise_floor(trajectories)) if groups else None
+    if floor:
+        words = ", ".join(f"{name} {MILLIMETRES * value:.3g}" for name, value in floor.items())
+        found.lines.append(("noise", f"spread of the repeats in mm: {words}"))
+    elif trajectories:
+        found.notes.append("no recording was repeated: nothing tells noise from what the simulator misses")
+
+
+def _say_model(found: Check, experiment: Experiment, robot: Robot, folder: Path, fitted: list[Trajectory]) -> None:
+    """What is inferred, and how; a model that cannot be built is a problem."""
+    method = experiment.inference.method
+    _try(found, lambda: make_config(method, inference_options(experiment)))
+    found.lines.append(("method", f"{method}, {experiment.inference.rollouts} rollouts, seed {experiment.seed}"))
+    found.lines.append(("mechanisms", ", ".join(experiment.model.mechanisms) or "none"))
+    simulator = _try(found, lambda: build_simulator(experiment, robot, folder))
+    if simulator is None or not fitted:
+        return
+    step = float(simulator.description["time_step_s"])  # type: ignore[arg-type]
+    found.lines.append(("time step", f"{1e3 * step:.4g} ms"))
+    model = _try(found, lambda: build_model(experiment, simulator, fitted))
+    if model is not None:
+        for index, parameter in enumerate(model.space.parameters):
+            table = parameter.table or {}
+            words = ", ".join(f"{k} {v:g}" for k, v in table.items() if k != "distribution")
+            text = f"{parameter.name} [{parameter.spec.unit}] ~ {table.get('distribution')}({words})"
+            found.lines.append(("inferred" if index == 0 else "", text))
+    recorded = {
+        "tension": any(t.tension is not None for t in fitted),
+        "motor_angle": any(t.motor_angle is not None for t in fitted),
+        "object_pose": any(t.object_pose is not None for t in fitted),
+    }
+    for key, there in recorded.items():
+        if there and not getattr(experiment.model, key):
+            words = key.replace("_", " ")
+            found.notes.append(f"{words} was recorded, and is no data: [model] {key} = true would make it so")
+
+
+def _names(names: Sequence[str]) -> str:
+    """Names with commas; of many the first and the last."""
+    if len(names) <= MOST_NAMES:
+        return ", ".join(names)
+    return f"{', '.join(names[:3])}, ..., {names[-1]} ({len(names)})"

@@ -1,0 +1,152 @@
+"""What the columns of a CSV are, guessed from their names and sizes: for a first experiment file, to be looked over."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from rfdropo_bayes.errors import InputError
+
+TIME = re.compile(r"^(t|time|timestamp|stamp|secs?|seconds|clock)(?![a-z])", re.IGNORECASE)
+AXIS = re.compile(r"(?<![a-z])[xyz](?![a-z])", re.IGNORECASE)
+FORCE = re.compile(r"force|tension|load|(?<![a-z])[fn]\d", re.IGNORECASE)
+MEASURED = re.compile(r"meas|actual|encoder|enc(?![a-z])|feedback|(?<![a-z])fb", re.IGNORECASE)
+COMMAND = re.compile(
+    r"cmd|command|motor|servo|pull|cable|tendon|action|target|ref|theta|angle|(?<![a-z])[aucqm]_?\d", re.IGNORECASE
+)
+ANGLE = re.compile(r"motor|servo|theta|angle|(?<![a-z])q_?\d", re.IGNORECASE)
+WORD = re.compile(r"[a-z0-9]+")
+UNITS = {"mm", "cm", "m", "deg", "rad"}
+LOOKED_AT = 2000
+"""Rows that sizes are taken from."""
+MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
+"""A soft arm moves by less than so many metres, and its drives turn by less than so many radians."""
+
+
+class Guess(NamedTuple):
+    """Columns of a file, by their part.
+
+    Attributes:
+        time, time_unit: column and unit of times; None without one.
+        commands, command_unit: columns and unit of the commands.
+        positions, position_unit: columns of x, y and z of each marker, and their unit.
+        markers: a name for each marker, made of its columns'; numbered where they tell none.
+        tensions, motor_angles: columns of measured forces and angles, as many as commands; else empty.
+        left: columns that are nothing of these.
+    """
+
+    time: str | None
+    time_unit: str
+    commands: list[str]
+    command_unit: str
+    positions: list[list[str]]
+    position_unit: str
+    markers: list[str]
+    tensions: list[str]
+    motor_angles: list[str]
+    left: list[str]
+
+
+def guess_columns(path: Path) -> Guess:
+    """Guess what the columns of a CSV are.
+
+    Raises:
+        InputError: a file that cannot be read, or in which no positions or commands are found.
+    """
+    table = _head(path)
+    names = [str(name) for name in table.columns]
+    time = next((name for name in names if TIME.search(name)), None)
+    triples = _triples([name for name in names if name != time])
+    positions = list(triples.values())
+    rest = [name for name in names if name != time and not any(name in triple for triple in positions)]
+    tensions = [name for name in rest if FORCE.search(name)]
+    angles = [name for name in rest if MEASURED.search(name) and name not in tensions]
+    free = [name for name in rest if name not in (*tensions, *angles)]
+    commands = [name for name in free if COMMAND.search(name)] or free
+    for what, found in (("positions (columns in x, y and z)", positions), ("commands", commands)):
+        if not found:
+            raise InputError(
+                f"found no {what} among the columns {', '.join(names)}",
+                where=str(path),
+                remedy="leave the recording out, and write [data.columns] as docs/reference/experiment.md says",
+            )
+    return Guess(
+        time,
+        _time_unit(table, time),
+        commands,
+        _command_unit(table, commands),
+        positions,
+        _written_unit(names_of(positions)) or _length_unit(table[names_of(positions)]),
+        _marker_names(list(triples)),
+        tensions if len(tensions) == len(commands) else [],
+        angles if len(angles) == len(commands) else [],
+        [name for name in free if name not in commands],
+    )
+
+
+def names_of(positions: list[list[str]]) -> list[str]:
+    """The columns of all markers."""
+    return [name for triple in positions for name in triple]
+
+
+def _head(path: Path) -> pd.DataFrame:
+    """The first rows of a file, whatever stands between its columns, and whichever sign its decimals have."""
+    try:
+        with pd.io.common.get_handle(path, "r", compression="infer", encoding="utf-8", errors="replace") as opened:
+            lines = [opened.handle.readline() for _ in range(2)]
+        separator = max(",;\t", key=lines[0].count)
+        decimal = "," if separator != "," and re.search(r"\d,\d", lines[1]) else "."
+        table = pd.read_csv(path, sep=separator, decimal=decimal, nrows=LOOKED_AT, encoding_errors="replace")
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read as a CSV: {error}", where=str(path), remedy="give a CSV file") from None
+    table.columns = [str(name).strip() for name in table.columns]
+    return table.select_dtypes("number")
+
+
+def _triples(names: list[str]) -> dict[str, list[str]]:
+    """Columns that differ in one letter, x, y or z: what they have in common, and the three in this order."""
+    found: dict[str, dict[str, str]] = {}
+    for name in names:
+        for match in AXIS.finditer(name):
+            common = f"{name[: match.start()]}*{name[match.end() :]}".lower()
+            found.setdefault(common, {})[match[0].lower()] = name
+    return {common: [axes[a] for a in "xyz"] for common, axes in found.items() if set(axes) == set("xyz")}
+
+
+def _marker_names(commons: list[str]) -> list[str]:
+    """Names that robot files allow, made of what the columns of each marker have in common."""
+    names = []
+    for number, common in enumerate(commons, start=1):
+        name = "_".join(word for word in WORD.findall(common) if word not in UNITS)
+        names.append(name if re.match(r"[a-z]", name) else f"m{name or number}")
+    return names if len(set(names)) == len(names) else [f"m{k}" for k in range(1, len(names) + 1)]
+
+
+def _written_unit(names: list[str]) -> str | None:
+    """The unit that all of some columns carry in their names, such as ``x1_mm`` or ``tip x [m]``."""
+    told = [{word for word in WORD.findall(name.lower()) if word in UNITS} for name in names]
+    return told[0].pop() if told and all(len(each) == 1 and each == told[0] for each in told) else None
+
+
+def _length_unit(table: pd.DataFrame) -> str:
+    return "mm" if float(np.nanmax(np.abs(table.to_numpy()))) > MILLIMETRES_ABOVE else "m"
+
+
+def _time_unit(table: pd.DataFrame, time: str | None) -> str:
+    if time is None or len(table) < 2:
+        return "s"
+    return "ms" if float(np.nanmedian(np.diff(table[time]))) > 1.0 else "s"
+
+
+def _command_unit(table: pd.DataFrame, commands: list[str]) -> str:
+    written = _written_unit(commands)
+    if written or not commands:
+        return written or "mm"
+    largest = float(np.nanmax(np.abs(table[commands].to_numpy())))
+    if all(ANGLE.search(name) for name in commands):
+        return "deg" if largest > DEGREES_ABOVE else "rad"
+    return "mm" if largest > 0.2 else "m"

@@ -1,0 +1,79 @@
+"""Robots from a few answers: what is written can be read, and is what was answered."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots.outline import SILICONE, RobotOutline, robot_text
+
+ARM = {"name": "arm", "length": 0.3, "radius": 0.015, "markers": {"low": 0.15, "tip": 0.3}}
+
+
+def written(tmp_path, **answers):
+    path = tmp_path / "arm.toml"
+    path.write_text(robot_text(RobotOutline(**ARM | answers)))
+    return load_robot(path)
+
+
+@pytest.mark.parametrize(
+    "answers",
+    [
+        {},
+        {"shape": "cone", "tip_radius": 0.009},
+        {"shape": "tube", "inner_radius": 0.005},
+        {"shape": "disks", "disks": 12, "inner_radius": 0.003, "segments": 3},
+        {"segments": 3, "cables": 3, "command_unit": "rad", "spool_radius": 0.008},
+        {"cables": 4, "pairs": True, "command_unit": "rad", "gravity": "-y"},
+    ],
+)
+def test_every_outline_is_a_robot(tmp_path, answers):
+    outline, robot = RobotOutline(**ARM | answers), written(tmp_path, **answers)
+    assert robot.marker_names == ("low", "tip")
+    assert robot.body.station_m[-1] == pytest.approx(0.3)
+    assert len(robot.cables) == outline.segments * outline.cables
+    assert robot.channel_names == tuple(outline.channel_names())
+    assert robot.command_unit == outline.command_unit
+    assert robot.nominal()["trunk_mass"] == pytest.approx(SILICONE * robot.body.volume_m3, rel=1e-5)
+    for cable, guides in zip(robot.cables, robot.guides(), strict=True):
+        segment = robot.cables.index(cable) // outline.cables
+        assert guides[-1, 2] == pytest.approx(0.3 * (segment + 1) / outline.segments, abs=0.002)
+
+
+def test_pairs_pull_and_let_out(tmp_path):
+    robot = written(tmp_path, cables=4, pairs=True, command_unit="rad", spool_radius=0.01)
+    expected = 0.01 * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+    np.testing.assert_allclose(robot.channel_matrix(robot.nominal()), expected)
+
+
+def test_cables_follow_the_taper(tmp_path):
+    robot = written(tmp_path, shape="cone", tip_radius=0.0075, cable_radius=0.01)
+    guides = robot.guides()[0]
+    np.testing.assert_allclose(guides[:, 0], 0.01 * (1.0 - 0.5 * guides[:, 2] / 0.3), atol=1e-6)
+
+
+def test_what_was_assumed_is_marked_and_has_a_wide_prior(tmp_path):
+    text = robot_text(RobotOutline(**ARM, mass=0.2, assumed=frozenset({"gravity"})))
+    assert "gravity_m_s2 = [0.0, 0.0, 9.81]  # ASSUMED: gravity" in text
+    assumed = robot_text(RobotOutline(**ARM, assumed=frozenset({"mass"})))
+    assert "[parameters.trunk_mass]  # ASSUMED: trunk_mass" in assumed
+    spread = [written(tmp_path, **a).parameters["trunk_mass"].prior["sigma"] for a in ({}, {"assumed": {"mass"}})]
+    assert spread[1] > 2 * spread[0]
+
+
+@pytest.mark.parametrize(
+    ("answers", "message"),
+    [
+        ({"gravity": "down"}, "is no direction; one of"),
+        ({"shape": "box"}, "unknown shape 'box'"),
+        ({"length": -1.0}, "length = -1 is not positive"),
+        ({"cables": 3, "pairs": True}, "make no pairs"),
+        ({"shape": "disks", "disks": 10, "segments": 3}, "do not share out"),
+        ({"markers": {}}, "no markers"),
+    ],
+)
+def test_answers_that_make_no_robot_are_refused(answers, message):
+    with pytest.raises(InputError, match=message):
+        RobotOutline(**ARM | answers)
