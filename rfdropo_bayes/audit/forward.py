@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import time
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -27,8 +29,14 @@ Points = Float[np.ndarray, "n d"]
 Series = Float[np.ndarray, "... recording time channel"]
 
 
+class OutOfTime(Exception):
+    """A batch of rollouts was due after the time by which its lanes were to end."""
+
+
 class Lanes:
     """A simulator behind two compiled functions of a fixed number of lanes.
+
+    After the time ``until`` of the monotonic clock [s] the next call raises `OutOfTime`.
 
     Args:
         simulator: with the base model's mechanisms and every candidate at its null value.
@@ -45,6 +53,7 @@ class Lanes:
         self.width = width
         self.slope_rollouts = slope_rollouts
         self.physical = tuple(spec.name for spec in simulator.parameters)
+        self.until = math.inf
 
     def _observe(self, theta: jax.Array, commands: Commands) -> tuple[jax.Array, jax.Array]:
         values = dict(zip(self.physical, theta, strict=True))
@@ -83,6 +92,8 @@ class Lanes:
     def _chunks(self, function: Any, commands: Commands, lane: np.ndarray, *arrays: np.ndarray) -> list[Any]:
         parts = []
         for start in range(0, len(lane), self.width):
+            if time.monotonic() > self.until:
+                raise OutOfTime
             index = np.minimum(np.arange(start, start + self.width), len(lane) - 1)
             chosen = Commands(*(np.asarray(part)[lane[index]] for part in commands))
             parts.append(jax.device_get(function(*(a[index] for a in arrays), chosen)))
@@ -104,6 +115,16 @@ class RoutedLanes(Lanes):
         self._kept = np.array([self.physical.index(name) for name in fast.physical])
         self._further = np.setdiff1d(np.arange(len(self.physical)), self._kept)
         self._null = np.array([null[self.physical[i]] for i in self._further])
+
+    @property
+    def until(self) -> float:  # type: ignore[override]
+        """See `Lanes`."""
+        return self.slow.until
+
+    @until.setter
+    def until(self, until: float) -> None:
+        if hasattr(self, "slow"):
+            self.fast.until = self.slow.until = until
 
     def _needs_slow(self, theta: np.ndarray) -> np.ndarray:
         return ~np.isclose(theta[:, self._further], self._null, rtol=1e-6, atol=1e-12).all(axis=1)

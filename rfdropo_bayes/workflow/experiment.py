@@ -137,6 +137,12 @@ class AuditTable(Table):
     minutes: float = Field(default=10.0, ge=0.0)
 
 
+class DesignTable(Table):
+    """[design]: ``minutes`` that ``rfdropo design`` may take; it then proposes the best of what it has looked at."""
+
+    minutes: float = Field(default=10.0, gt=0.0)
+
+
 class SeparationTable(Table):
     """[separation]: ``mechanisms`` that join the base model, to see which of them the recordings tell apart; ``groups``
     names sets of them that are asked for together, such as all ways to be late."""
@@ -176,6 +182,7 @@ class Experiment(Table):
     simulator: SimulatorTable = Field(default_factory=SimulatorTable)
     inference: InferenceTable = Field(default_factory=InferenceTable)
     audit: AuditTable = Field(default_factory=AuditTable)
+    design: DesignTable = Field(default_factory=DesignTable)
     separation: SeparationTable | None = None
 
 
