@@ -124,10 +124,7 @@ def embed(figure: Figure, alt: str, caption: str = "") -> Picture:
             engine.execute(figure)
             figure.set_layout_engine("none")
         cells = _cells(figure)
-        if not cells:
-            panels = [Panel(_svg(figure, None), 100.0, "whole")]
-        else:
-            panels = _panels(figure, cells)
+        panels = [Panel(_svg(figure, None), 100.0, "whole")] if not cells else _panels(figure, cells)
     return Picture(tuple(panels), alt, caption, round(96 * figure.get_figwidth()))
 
 

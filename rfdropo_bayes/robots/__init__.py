@@ -5,6 +5,7 @@ from rfdropo_bayes.robots.cable import Cable, Channels
 from rfdropo_bayes.robots.catalogue import known_robots, load_robot
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.robot import Command, Marker, PushScene, Robot
+from rfdropo_bayes.robots.shape import outline
 
 __all__ = [
     "Body",
@@ -18,4 +19,5 @@ __all__ = [
     "Robot",
     "known_robots",
     "load_robot",
+    "outline",
 ]
