@@ -18,17 +18,21 @@ class Deadline:
 
     Attributes:
         minutes: from its making on; infinite for no limit.
+        where: the setting that holds them.
+        share: part of the time after which rollouts stop.
         reached: whether anything was left undone.
     """
 
     minutes: float = float("inf")
+    where: str = "[audit] minutes"
+    share: float = 1.0 - KEPT
     began: float = field(default_factory=time.monotonic)
     reached: bool = False
 
     @property
     def left(self) -> float:
         """Minutes until rollouts stop."""
-        return (1.0 - KEPT) * self.minutes - (time.monotonic() - self.began) / 60.0
+        return self.share * self.minutes - (time.monotonic() - self.began) / 60.0
 
     def check(self) -> None:
         """Raise OutOfTime once the time is up."""

@@ -57,7 +57,8 @@ def outlooks(
     """
     forward = target.forward
     stacked = stack_commands(sequences)
-    fresh = Forward(forward.lanes, forward.coordinates, stacked, {f"new {k}": k for k in range(len(sequences))})
+    names = {f"new {k}": k for k in range(len(sequences))}
+    fresh = Forward(forward.lanes, forward.coordinates, stacked, names, deadline=forward.deadline)
     first = target.measurements.valid[0]
     models = [base, *(h.fit for h in hypotheses)]
     predicted, _ = fresh.positions(np.stack([fit.x for fit in models]))

@@ -244,8 +244,8 @@ def base_model(
     except OutOfTime:
         raise InputError(
             "the time was up before the base model was fitted",
-            where="[audit] minutes",
-            remedy="raise it and go on with --resume, or start from a calibration by --base",
+            where=(deadline or Deadline()).where,
+            remedy="raise it, fit fewer or shorter recordings, or start from a calibration",
         ) from None
 
 

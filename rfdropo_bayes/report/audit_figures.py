@@ -26,6 +26,7 @@ class Residuals:
         share: of the mean square that this pattern holds.
         time: [s]; command: of every channel at that time, and its rate per second; tension: of every cable [N].
         position: simulated coordinate along the same pattern [m].
+        channels, cables: their names; unit: of the commands.
     """
 
     main: Float[np.ndarray, " row"]
@@ -37,6 +38,7 @@ class Residuals:
     position: Float[np.ndarray, " row"]
     channels: tuple[str, ...]
     cables: tuple[str, ...]
+    unit: str
 
 
 def _strongest(series: np.ndarray, main: np.ndarray) -> int:
@@ -55,9 +57,9 @@ def panels_figure(residuals: Residuals) -> Figure:
     figure = Figure(figsize=(style.WIDTH, 5.2))
     panels = [
         ("time [s]", residuals.time),
-        (f"command {residuals.channels[held]}", residuals.command[:, held]),
-        (f"rate of {residuals.channels[channel]} [1/s]", residuals.rate[:, channel]),
-        (f"sign of the rate of {residuals.channels[channel]}", np.sign(residuals.rate[:, channel])),
+        (f"command {residuals.channels[held]} [{residuals.unit}]", residuals.command[:, held]),
+        (f"rate of {residuals.channels[channel]} [{residuals.unit}/s]", residuals.rate[:, channel]),
+        (f"sign of the rate of {residuals.channels[channel]} [-]", np.sign(residuals.rate[:, channel])),
         ("position along the pattern [mm]", MILLIMETRES * residuals.position),
         (f"tension of {residuals.cables[cable]} [N]", residuals.tension[:, cable]),
     ]
@@ -69,7 +71,8 @@ def panels_figure(residuals: Residuals) -> Figure:
         axes.errorbar(centre, mean, 2 * error, color=style.POSTERIOR, marker="o", markersize=3, capsize=2)
         axes.axhline(0.0, color=style.MEASURED, linewidth=0.8)
         axes.set_xlabel(label)
-    figure.supylabel(f"residual, dominant pattern ({100 * residuals.share:.0f} % of it) [mm]", fontsize=9)
+        axes.set_ylabel(f"residual, {100 * residuals.share:.0f} % of it [mm]")
+        axes.tick_params(labelleft=True)  # each can be seen by itself
     return figure
 
 
@@ -96,7 +99,7 @@ def blocks_figure(blocks: Sequence[Sequence[float]], seconds: float, titles: Seq
     for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
         ticks(LogFormatter(minor_thresholds=(1.5, 0.6)))
     axes.set_xlabel("time [s]")
-    axes.set_ylabel("misfit (noise = 1)")
+    axes.set_ylabel("mean square / that of noise [-]")
     figure.legend(loc="outside upper center", ncols=4)
     return figure
 
@@ -124,7 +127,7 @@ def cosine_figure(names: Sequence[str], cosines: Float[np.ndarray, "k k"]) -> Fi
                     fontsize=6.5,
                     color="white" if abs(value) > 0.6 else "black",
                 )
-    figure.colorbar(image, ax=axes, shrink=0.8, label="cosine")
+    figure.colorbar(image, ax=axes, shrink=0.8, label="cosine [-]")
     return figure
 
 
@@ -138,9 +141,8 @@ def overlay_figure(
     for axis, axes in enumerate(figure.subplots(1, 3)):
         for label, values in series.items():
             axes.plot(time, MILLIMETRES * values[:, axis], color=colours[label], label=label, linewidth=1.1)
-        axes.set_title("xyz"[axis])
         axes.set_xlabel("time [s]")
-    figure.axes[0].set_ylabel(f"{title} [mm]")
+        axes.set_ylabel(f"{title}, {'xyz'[axis]} [mm]")
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3)
     return figure

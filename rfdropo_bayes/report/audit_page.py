@@ -15,6 +15,7 @@ from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.score import likeness
 from rfdropo_bayes.report import audit_figures as figures
 from rfdropo_bayes.report.page import breakable, duration, number
+from rfdropo_bayes.report.robot_figure import robot_figure
 from rfdropo_bayes.report.style import Picture, embed
 from rfdropo_bayes.report.units import display_name
 
@@ -30,7 +31,9 @@ MOST_COSINES = 16
 LEAST_P = 1e-16
 
 
-def render_audit(answer: Answer, content: Mapping[str, Any], title: str, config: str) -> str:
+def render_audit(
+    answer: Answer, content: Mapping[str, Any], title: str, config: str, outline: Mapping[str, Any] | None = None
+) -> str:
     """HTML of an audit.
 
     Args:
@@ -38,6 +41,7 @@ def render_audit(answer: Answer, content: Mapping[str, Any], title: str, config:
         content: of audit.json.
         title: of the experiment.
         config: the experiment file as it was run.
+        outline: of the robot, for its picture.
     """
     environment = Environment(
         loader=PackageLoader("rfdropo_bayes.report", "templates"),
@@ -54,7 +58,7 @@ def render_audit(answer: Answer, content: Mapping[str, Any], title: str, config:
         title=title,
         sections=SECTIONS,
         stylesheet=Markup(stylesheet),
-        pictures=_pictures(answer),
+        pictures=_pictures(answer, outline),
         config=config,
     )
 
@@ -97,14 +101,16 @@ def residuals_of(answer: Answer) -> figures.Residuals:
         (position - position[:, :1])[rows] @ pattern,
         tuple(forward.lanes.simulator.channel_names),
         tuple(forward.lanes.simulator.cable_names),
+        forward.lanes.simulator.robot.command_unit,
     )
 
 
-def _pictures(answer: Answer) -> dict[str, Picture | None]:
+def _pictures(answer: Answer, outline: Mapping[str, Any] | None) -> dict[str, Picture | None]:
     measured = answer.target.measurements
     step = float(np.median(np.diff(measured.time[0])))
     titles = ["base model", *(f"with {display_name(s.name)}" for s in answer.steps)]
     found: dict[str, Picture | None] = {
+        "robot": embed(robot_figure(outline), "The robot from the side and from its base") if outline else None,
         "panels": embed(
             figures.panels_figure(residuals_of(answer)), "Residual against time, command, rate, position and tension"
         ),

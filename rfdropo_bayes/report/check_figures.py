@@ -38,12 +38,17 @@ def error_figure(rows: Sequence[Mapping[str, Any]], noise_floor: float | None) -
     """
     titles = {"test": "test, over time", "fit": "fit, over time", "moving": "moving part", "final": "final pose"}
     keys = [key for key in titles if any(row.get(key) is not None for row in rows)]
-    figure = Figure(figsize=(style.WIDTH, 0.9 + 0.34 * len(rows)))
-    for number, (axes, key) in enumerate(zip(figure.subplots(1, len(keys), squeeze=False)[0], keys, strict=True)):
+    columns = min(2, len(keys))
+    lines = -(-len(keys) // columns)
+    figure = Figure(figsize=(style.WIDTH, lines * (0.9 + 0.34 * len(rows))))
+    grid = figure.subplots(lines, columns, squeeze=False).reshape(-1)
+    for axes in grid[len(keys) :]:
+        style.empty(axes)
+    for axes, key in zip(grid, keys, strict=False):
         _bars(axes, rows, key, noise_floor)
         axes.set_title(titles[key])
         axes.set_xlabel("error of the last marker [mm]")
-        axes.set_yticks(range(len(rows)), [row["title"] for row in rows] if number == 0 else [])
+        axes.set_yticks(range(len(rows)), [row["title"] for row in rows])
         for label, row in zip(axes.get_yticklabels(), rows, strict=False):
             label.set_fontweight("bold" if row["own"] else "normal")
         axes.invert_yaxis()

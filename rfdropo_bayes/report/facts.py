@@ -85,6 +85,7 @@ class RunFacts:
         limits: sentences on what this analysis cannot see, beside those that always hold.
         versions: of the software.
         details: further plain values of the method.
+        outline: of the robot, as `robots.outline` makes it, for its picture.
     """
 
     title: str
@@ -110,6 +111,7 @@ class RunFacts:
     limits: Sequence[str] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
+    outline: Mapping[str, Any] | None = None
 
 
 def software_versions() -> dict[str, str]:

@@ -17,6 +17,7 @@ from rfdropo_bayes.report import check_figures, posterior_figures, trajectory_fi
 from rfdropo_bayes.report.coverage import coverage, transform_curve
 from rfdropo_bayes.report.headline import best_baseline
 from rfdropo_bayes.report.limits import limits
+from rfdropo_bayes.report.robot_figure import robot_figure
 from rfdropo_bayes.report.scores import MeasuredPath, settled_rows
 from rfdropo_bayes.report.style import Picture, embed
 from rfdropo_bayes.report.units import display_name, display_unit
@@ -197,7 +198,9 @@ def _run_figures(record: PosteriorRecord, summary: Mapping[str, Any]) -> dict[st
     pair = posterior_figures.paired_names(record)
     own = [info.name for info in record.free if "@" in info.name]
     shared = [info.name for info in record.parameters if "@" not in info.name][: posterior_figures.MOST_PANELS]
+    outline = summary.get("outline")
     return {
+        "robot": embed(robot_figure(outline), "The robot from the side and from its base") if outline else None,
         "error_rows": rows,
         "errors": embed(
             check_figures.error_figure(rows, list(floor.values())[-1] if floor else None),

@@ -254,7 +254,7 @@ def forest_figure(record: PosteriorRecord, names: Sequence[str]) -> Figure:
     bases = list(dict.fromkeys(name.split("@", 1)[0] for name in names))
     recordings = list(dict.fromkeys(name.split("@", 1)[1] for name in names))
     infos = {info.name: info for info in record.parameters}
-    columns = min(4, len(bases))
+    columns = min(2, len(bases))
     rows = -(-len(bases) // columns)
     figure = Figure(figsize=(style.WIDTH, rows * (0.9 + 0.26 * len(recordings))))
     grid = figure.subplots(rows, columns, squeeze=False, sharey=True).reshape(-1)
@@ -274,7 +274,8 @@ def forest_figure(record: PosteriorRecord, names: Sequence[str]) -> Figure:
         axes.xaxis.set_major_locator(MaxNLocator(5))
     for axes in grid[len(bases) :]:
         style.empty(axes)
-    for axes in grid[::columns]:
+    for axes in grid[: len(bases)]:
+        axes.tick_params(labelleft=True)  # each can be seen by itself
         axes.set_yticks(range(len(recordings)), [r if len(r) < 34 else f"…{r[-32:]}" for r in recordings])
         axes.set_ylim(len(recordings) - 0.5, -0.5)
     return figure

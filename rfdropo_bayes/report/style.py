@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import wraps
-from typing import Any, ParamSpec
+from typing import Any, Literal, ParamSpec
 
 import matplotlib
 import numpy as np
 from cycler import cycler
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 from rfdropo_bayes.report.units import display_name
 
@@ -29,6 +32,7 @@ CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#1A1
 
 WIDTH = 10.0  # [inch]; 960 px in a browser
 POINTS = 800  # of a line, at most
+LEAST_CELL, ROW_GAP = 2.2, 0.05  # [inch]: of the width of a cell that can stand by itself; above and below it
 
 STYLE: Any = {
     "figure.dpi": 96,
@@ -62,17 +66,32 @@ P = ParamSpec("P")
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A figure inside a page.
+class Panel:
+    """A part of a figure: one cell of its grid, or its legend.
 
     Attributes:
         source: data URI.
+        share: of the figure's width, in percent.
+        kind: "cell"; "legend"; "whole" where the figure has no parts.
+    """
+
+    source: str
+    share: float
+    kind: Literal["cell", "legend", "whole"]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure inside a page: panels that fill its rows side by side, or stand below each other on a narrow screen.
+
+    Attributes:
+        panels: from the upper left to the lower right.
         alt: what it shows, for those who cannot see it.
         caption: how to read it.
         width: in CSS pixels.
     """
 
-    source: str
+    panels: tuple[Panel, ...]
     alt: str
     caption: str
     width: int
@@ -98,16 +117,71 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 
 def embed(figure: Figure, alt: str, caption: str = "") -> Picture:
-    """Figure as SVG inside a data URI."""
-    buffer = io.BytesIO()
+    """Figure as SVGs inside data URIs, without a background: the page's shows through."""
     with _our_style():
         engine = figure.get_layout_engine()
         if engine is not None:  # once, here: savefig would draw everything a second time for it
             engine.execute(figure)
             figure.set_layout_engine("none")
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-    data = base64.b64encode(buffer.getvalue()).decode("ascii")
-    return Picture(f"data:image/svg+xml;base64,{data}", alt, caption, round(96 * figure.get_figwidth()))
+        cells = _cells(figure)
+        panels = [Panel(_svg(figure, None), 100.0, "whole")] if not cells else _panels(figure, cells)
+    return Picture(tuple(panels), alt, caption, round(96 * figure.get_figwidth()))
+
+
+def _svg(figure: Figure, box: Bbox | None) -> str:
+    """The part of a figure in a box [inch] as a data URI."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True, bbox_inches=box)
+    return f"data:image/svg+xml;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+
+
+def _panels(figure: Figure, cells: Sequence[tuple[Axes, Bbox]]) -> list[Panel]:
+    """A picture of each legend and each cell, with everything else hidden."""
+    width = figure.get_figwidth()
+    parts: list[tuple[Artist, Bbox, Literal["cell", "legend"]]] = []
+    for legend in figure.legends:
+        parts.append((legend, _inches(figure, legend.get_window_extent()).padded(0.04), "legend"))
+    parts += [(axes, box, "cell") for axes, box in cells]
+    artists = [*figure.legends, *figure.axes]
+    seen = [artist.get_visible() for artist in artists]
+    found = []
+    for own, box, kind in parts:
+        for artist in artists:
+            artist.set_visible(artist is own)
+        found.append(Panel(_svg(figure, box), 100.0 * box.width / width, kind))
+    for artist, visible in zip(artists, seen, strict=True):
+        artist.set_visible(visible)
+    return found
+
+
+def _inches(figure: Figure, box: Bbox) -> Bbox:
+    return box.transformed(figure.dpi_scale_trans.inverted())
+
+
+def _cells(figure: Figure) -> list[tuple[Axes, Bbox]]:
+    """Axes that stand in a grid, each with its cell [inch]; cells of a row fill the width of the figure.
+
+    None where the figure is one piece: a single column, axes outside of a grid, or a grid too fine to be taken apart.
+    """
+    shown = [axes for axes in figure.axes if axes.axison]
+    specs = {axes: axes.get_subplotspec() for axes in shown}
+    if len(shown) < 2 or any(spec is None or len(spec.rowspan) > 1 for spec in specs.values()) or figure.texts:
+        return []
+    boxes = {axes: _inches(figure, axes.get_tightbbox()) for axes in shown}
+    rows: dict[int, list[Axes]] = {}
+    for axes in sorted(shown, key=lambda own: boxes[own].x0):
+        rows.setdefault(specs[axes].rowspan.start, []).append(axes)  # type: ignore[union-attr]
+    width = figure.get_figwidth()
+    if width / max(len(row) for row in rows.values()) < LEAST_CELL:
+        return []
+    cells = []
+    for _, row in sorted(rows.items()):
+        low, high = min(boxes[a].y0 for a in row), max(boxes[a].y1 for a in row)
+        between = [0.5 * (boxes[a].x1 + boxes[b].x0) for a, b in itertools.pairwise(row)]
+        last = width if len(row) == max(len(r) for r in rows.values()) else boxes[row[-1]].x1 + 0.02
+        for axes, left, right in zip(row, [0.0, *between], [*between, last], strict=True):
+            cells.append((axes, Bbox([[left, low - ROW_GAP], [right, high + ROW_GAP]])))
+    return cells
 
 
 def thin(rows: int) -> np.ndarray:

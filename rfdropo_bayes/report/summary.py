@@ -104,6 +104,7 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
         "objects": {name: asdict(scores) for name, scores in facts.objects.items()},
         "warnings": list(facts.warnings),
         "limits": list(facts.limits),
+        "outline": facts.outline and dict(facts.outline),
         "versions": dict(facts.versions),
         "details": dict(facts.details),
     }

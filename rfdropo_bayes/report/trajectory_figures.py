@@ -41,10 +41,8 @@ def bands_figure(recording: RecordingPrediction) -> Figure:
                 recording.time[rows], measured[:, marker, axis], color=style.MEASURED, linewidth=1.1, label="measured"
             )
             _at_least(axes, LEAST_SPAN)
-            if row == 0:
-                axes.set_title(AXES[axis])
-            if axis == 0:
-                axes.set_ylabel(f"{recording.marker_names[marker]} [mm]")
+            axes.set_ylabel(f"{recording.marker_names[marker]} {AXES[axis]} [mm]")
+            axes.tick_params(labelbottom=True)  # each can be seen by itself
             if row == len(markers) - 1:
                 axes.set_xlabel("time [s]")
     handles, labels = grid[0, 0].get_legend_handles_labels()

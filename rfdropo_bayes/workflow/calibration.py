@@ -23,6 +23,7 @@ from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, soft
 from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_warnings
 from rfdropo_bayes.report.run_folder import POSTERIOR
+from rfdropo_bayes.robots import outline
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
 from rfdropo_bayes.workflow.files import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
@@ -241,6 +242,7 @@ def gather_facts(
         objects=score_objects(unseen, [*fitted, *tested]),
         versions=software_versions(),
         details=result.details,
+        outline=outline(problem.model.simulator.robot),
     )
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +14,46 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from rfdropo_bayes.audit.deadline import Deadline, OutOfTime
 from rfdropo_bayes.audit.experiment_design import Hypothesis, Outlook, at_hand, best, outlooks
 from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry
-from rfdropo_bayes.audit.pipeline import base_model
-from rfdropo_bayes.audit.screen import Look
+from rfdropo_bayes.audit.fit import Fit, Target
+from rfdropo_bayes.audit.pipeline import Question, base_model
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.plain_csv import command_columns
+from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.workflow.assembly import load_data
 from rfdropo_bayes.workflow.audit import build_question
-from rfdropo_bayes.workflow.experiment import load_experiment
-from rfdropo_bayes.workflow.files import output_folder
+from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
+from rfdropo_bayes.workflow.files import hashes, run_folder
 
 COMMANDS, DESIGN = "next_commands.csv", "design.json"
-SEQUENCES, HYPOTHESES = 24, 4
+SEQUENCES, HYPOTHESES, KINDS = 24, 4, 4
+FITTED_BY, SCREENED_BY, REFITTED_BY = 0.5, 0.7, 0.85  # shares of the time by which these parts have to end
+
+
+class Clock(Deadline):
+    """The time that a design may take; each part of the work has to end by its share of it.
+
+    Attributes:
+        missed: parts that were given up, in words.
+    """
+
+    def __init__(self, minutes: float) -> None:
+        super().__init__(minutes, "[design] minutes")
+        self.missed: list[str] = []
+
+    @contextmanager
+    def part(self, share: float, words: str) -> Iterator[None]:
+        """Work that is given up when the time is up, which is then noted in ``words``."""
+        self.share = share
+        try:
+            yield
+        except OutOfTime:
+            self.missed.append(words)
+        finally:
+            self.share = math.inf
 
 
 def run_design(
@@ -40,40 +69,48 @@ def run_design(
 
     The proposals stay within the range of commands that the recordings have used, are as long as the first recording
     and of four kinds: random walks, holds, slow loops and chirps. Where no candidate is significant, the sequence that
-    tells most about the base parameters is proposed.
+    tells most about the base parameters is proposed. When the time of [design] minutes is up, it is the best of the
+    sequences, and the leading one of the explanations, that have been looked at.
 
     Returns:
         the content of design.json.
 
     Raises:
-        InputError: bad input.
+        InputError: bad input, or a base model that was not fitted in half of the time.
     """
-    experiment, _ = load_experiment(path, overrides)
+    experiment, tables = load_experiment(path, overrides)
     folder = Path(path).resolve().parent
     fitted = load_data(experiment, folder, "fit")
     question = build_question(experiment, folder, fitted, [], experiment.seed if seed is None else seed)
-    out = output_folder(out)
+    settings = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": {"seed": question.seed}}
+    with run_folder(out, "design", **settings, overwrite=overwrite) as out:
+        content = _designed(experiment, question, fitted, out, report)
+        write_text(out / DESIGN, json.dumps(content, indent=2) + "\n")
+    return content
+
+
+def _designed(
+    experiment: Experiment,
+    question: Question,
+    fitted: Sequence[Trajectory],
+    out: Path,
+    report: Callable[[str], None],
+) -> dict[str, Any]:
+    """Write the proposal; return the content of design.json."""
+    clock = Clock(experiment.design.minutes)
     rng = np.random.default_rng(question.seed)
-    target, base = base_model(question, question.seed)
-    inquiry = Inquiry(target, question.candidates, question.rules, question.seed)
-    found, _ = inquiry.look_at(base)
-    hypotheses = _hypotheses(inquiry, found, report)
-    first = fitted[0]
-    proposals = list(_proposals(first, fitted, rng))
-    simulator = question.lanes.simulator
-    sequences = [simulator.commands(t, v, first.initial_command, first.time) for _, t, v in proposals]
-    shaped = _shaped(sequences, question.recordings.commands)
-    outlook = outlooks(target, base, hypotheses, shaped)
+    clock.share = FITTED_BY
+    target, base = base_model(question, question.seed, report=report, deadline=clock)
+    report("base model fitted")
+    hypotheses = _hypotheses(Inquiry(target, question.candidates, question.rules, question.seed), base, clock, report)
+    proposals = list(_proposals(fitted[0], fitted, rng))
+    outlook = _outlooks(question, target, base, hypotheses, fitted[0], proposals, clock, report)
     chosen = best(outlook, len(hypotheses) > 1)
-    kind, time, value = proposals[chosen]
-    if experiment.data is not None and experiment.data.columns is not None:
-        columns = command_columns(experiment.data.columns, time, value)
-    else:
-        columns = {"time_s": time} | {f"{c}_{first.command_unit}": value[:, k] for k, c in enumerate(first.cable_names)}
-    pd.DataFrame(columns).to_csv(out / COMMANDS, index=False, float_format="%.6f")
+    kind, times, value = proposals[chosen]
+    _write_commands(experiment, fitted[0], times, value, out / COMMANDS)
     now = at_hand(target, hypotheses)
-    content = {
-        "sentence": _sentence(kind, outlook[chosen], now),
+    return {
+        "sentence": _sentence(kind, outlook[chosen], now) + _unfinished(clock),
         "commands": str(out / COMMANDS),
         "kind": kind,
         "hypotheses": [h.name for h in hypotheses],
@@ -83,24 +120,65 @@ def run_design(
         "information_gain_nats": outlook[chosen].information,
         "tried": [
             {"kind": k, "separation": o.separation, "information_nats": o.information}
-            for (k, _, _), o in zip(proposals, outlook, strict=True)
+            for (k, _, _), o in zip(proposals, outlook, strict=False)
         ],
+        "not_finished": clock.missed,
+        "minutes": round((time.monotonic() - clock.began) / 60.0, 2),
         "seed": question.seed,
         "schema_version": 1,
     }
-    (out / DESIGN).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    return content
 
 
-def _hypotheses(inquiry: Inquiry, found: Look, report: Callable[[str], None]) -> list[Hypothesis]:
+def _hypotheses(inquiry: Inquiry, base: Fit, clock: Clock, report: Callable[[str], None]) -> list[Hypothesis]:
     """The leading significant candidates, each refitted."""
+    found = None
+    with clock.part(SCREENED_BY, "screening of the candidates"):
+        found, _ = inquiry.look_at(base)
+    if found is None:
+        return []
     rows = [row for row in found.rows if row.adjusted_p <= inquiry.rules.family and row.name != DISCRETISATION]
+    report(f"{len(rows)} candidates are significant")
     hypotheses = []
     for row in rows[: 2 * HYPOTHESES]:
-        hypotheses.append(Hypothesis(row.name, inquiry.refit(found.fit, row)))
-        report(f"hypothesis {row.name}")
+        with clock.part(REFITTED_BY, f"refit with {row.name}"):
+            hypotheses.append(Hypothesis(row.name, inquiry.refit(found.fit, row)))
+            report(f"hypothesis {row.name}")
     hypotheses.sort(key=lambda h: -h.fit.log_evidence)
     return hypotheses[:HYPOTHESES]
+
+
+def _outlooks(
+    question: Question,
+    target: Target,
+    base: Fit,
+    hypotheses: Sequence[Hypothesis],
+    first: Trajectory,
+    proposals: Sequence[tuple[str, np.ndarray, np.ndarray]],
+    clock: Clock,
+    report: Callable[[str], None],
+) -> list[Outlook]:
+    """Outlooks of the proposals, one of each kind at a time; of the first few, whatever the time."""
+    simulator = question.lanes.simulator
+    sequences = [simulator.commands(t, v, first.initial_command, first.time) for _, t, v in proposals]
+    shaped = _shaped(sequences, question.recordings.commands)
+    outlook = outlooks(target, base, hypotheses, shaped[:KINDS])
+    for start in range(KINDS, len(shaped), KINDS):
+        report(f"{start} of {len(shaped)} command sequences")
+        with clock.part(1.0, f"{len(shaped) - start} of {len(shaped)} command sequences"):
+            outlook += outlooks(target, base, hypotheses, shaped[start : start + KINDS])
+        if len(outlook) == start:
+            break
+    return outlook
+
+
+def _write_commands(experiment: Experiment, first: Trajectory, time: np.ndarray, value: np.ndarray, path: Path) -> None:
+    """The proposal in the columns of the experiment's recordings."""
+    if experiment.data is not None and experiment.data.columns is not None:
+        columns = command_columns(experiment.data.columns, time, value)
+    else:
+        columns = {"time_s": time} | {f"{c}_{first.command_unit}": value[:, k] for k, c in enumerate(first.cable_names)}
+    with whole(path) as partial:
+        pd.DataFrame(columns).to_csv(partial, index=False, float_format="%.6f")
 
 
 def _shaped(sequences: Sequence[Commands], like: Commands) -> list[Commands]:
@@ -153,6 +231,15 @@ def _held(level: np.ndarray, moved: np.ndarray, initial: np.ndarray) -> np.ndarr
         last = np.where(moved[row], level[row], last)
         value[row] = last
     return value
+
+
+def _unfinished(clock: Clock) -> str:
+    if not clock.missed:
+        return ""
+    return (
+        f" The {clock.minutes:g} minutes of [design] minutes were up before the end; not looked at: "
+        f"{', '.join(name.replace('_', ' ') for name in clock.missed)}."
+    )
 
 
 def _sentence(kind: str, outlook: Outlook, now: dict[tuple[str, str], float]) -> str:

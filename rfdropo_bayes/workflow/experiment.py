@@ -178,6 +178,16 @@ class AuditTable(Table):
     )
 
 
+class DesignTable(Table):
+    """[design]: effort of ``rfdropo design``."""
+
+    minutes: float = Field(
+        default=10.0,
+        gt=0.0,
+        description="bound of the whole run: when they are up, it proposes the best of what it has looked at",
+    )
+
+
 class SeparationTable(Table):
     """[separation]: mechanisms that ``rfdropo separate`` compares."""
 
@@ -236,6 +246,7 @@ class Experiment(Table):
         description="method, budget and the method's options",
     )
     audit: AuditTable = Field(default_factory=AuditTable, description="candidates and effort of rfdropo audit")
+    design: DesignTable = Field(default_factory=DesignTable, description="effort of rfdropo design")
     separation: SeparationTable | None = Field(default=None, description="what rfdropo separate compares")
 
 

@@ -1,0 +1,25 @@
+"""What a robot looks like at rest, as plain numbers for a picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.robots.robot import Robot
+
+
+def outline(robot: Robot) -> dict[str, Any]:
+    """Section widths along the axis, cables from anchor to last guide, markers, and the direction of gravity.
+
+    All in metres and the base frame: ``station`` and ``half_width`` (x, y) of the body, ``cables`` and ``markers`` as
+    points by name, ``gravity`` in m/s2.
+    """
+    cables = {cable.name: np.vstack([cable.anchor()[None], cable.guides()]).tolist() for cable in robot.cables}
+    return {
+        "station": list(robot.body.station_m),
+        "half_width": np.asarray(robot.body.half_width_m).tolist(),
+        "cables": cables,
+        "markers": dict(zip(robot.marker_names, robot.marker_points().tolist(), strict=True)),
+        "gravity": robot.gravity.tolist(),
+    }
