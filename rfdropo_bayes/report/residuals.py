@@ -18,7 +18,7 @@ from rfdropo_bayes.posteriors import RecordingPrediction
 
 TOO_NARROW = 1.2  # a fifth: as much as a correlation of 0.2 from row to row
 FAR = 4.0  # deviations; normal noise is farther off in 1 of 16,000 values
-MORE_THAN_CHANCE = 1e-3  # false alarm of either warning
+MORE_THAN_CHANCE = 1e-3  # for a given number of lags; that it is chosen makes it up to 1 % (15 to 600 rows)
 REMEDIES = {
     "white": 'use noise = "auto", which finds how long the noise lasts',
     "student-t": 'use noise = "auto", which finds how long the noise lasts',

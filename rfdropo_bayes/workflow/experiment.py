@@ -37,7 +37,9 @@ class ModelTable(Table):
         description="effects on top of the base simulator, by name, or file.py:ClassName of one's own",
     )
     noise: Literal["auto", "white", "ar1", "student-t"] = Field(
-        default="auto", description="noise of the positions; see docs/inference.md"
+        default="auto",
+        description="noise of the positions: white and lasting (auto), white, lasting (ar1), or heavy-tailed (student-t);"
+        " see docs/inference.md",
     )
     priors: dict[str, dict[str, Any]] = Field(
         default_factory=dict,

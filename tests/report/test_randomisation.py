@@ -14,6 +14,8 @@ from rfdropo_bayes.report.randomisation import judge
 from rfdropo_bayes.report.summary import build_summary
 from rfdropo_bayes.report.tables import bound_reached
 
+CORRELATED = {"all": {"correlated": True, "narrowing": 2.4}}
+
 
 @pytest.fixture(scope="module")
 def summary(run):
@@ -60,6 +62,9 @@ def test_without_grounds_against_it_is_safe(run, summary):
         (lambda s: s["warnings"].extend(stage_warnings([LEAP, LAST], 10.0, 0.3)), "10 rollouts ran out"),
         (lambda s: s["warnings"].extend(stage_warnings([LAST | {"correlation": 0.98}], 10.0, 0.3)), "0.98 correlated"),
         (lambda s: s["excluded"].update(diverged=9000), "45 % of the rollouts failed"),
+        (lambda s: s["coverage_by_role"]["test"]["tip"].update({"0.9": 0.77}), "only 77 % at the tip (tip)"),
+        (lambda s: s["coverage_by_role"]["test"]["middle"].update({"0.9": 0.5}), "only 50 % at middle"),
+        (lambda s: s["residuals"].update(CORRELATED), "too narrow by up to 2.4 times"),
     ],
 )
 def test_every_grave_ground_makes_it_unsafe(run, summary, change, words):
@@ -68,6 +73,32 @@ def test_every_grave_ground_makes_it_unsafe(run, summary, change, words):
     safety = judge(run.record, changed)
     assert safety.verdict == "unsafe"
     assert words in safety.sentence
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda s: s["noise_floor_mm"].update(tip=0.1), "where repeats differ by 0.1 mm"),
+        (lambda s: s["error_correlation"]["test"].update(tip=0.83), "correlation 0.83 at the tip (tip)"),
+        (lambda s: s["rmse"]["test"].update(middle=0.88), "0.88 against"),
+    ],
+)
+def test_errors_that_no_noise_explains_ask_for_care(run, summary, change, words):
+    changed = clean(summary)
+    change(changed)
+    safety = judge(run.record, changed)
+    assert safety.verdict == "with care"
+    assert words in safety.sentence
+
+
+def test_without_repeats_an_error_that_lasts_is_held_against_the_best_baseline(run, summary):
+    """The share of the squared error that does not last counts as noise: here there is none of it, then all is."""
+    changed = clean(summary)
+    changed["noise_floor_mm"] = None
+    changed["error_correlation"]["test"] = {"middle": 0.0, "tip": 0.0}
+    assert judge(run.record, changed).verdict == "safe"
+    changed["error_correlation"]["test"]["tip"] = 0.4
+    assert "at the tip (tip)" in judge(run.record, changed).sentence
 
 
 def test_a_prior_that_excludes_the_data_is_said(run, summary):

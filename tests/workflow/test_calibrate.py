@@ -10,11 +10,12 @@ import sys
 import time
 from pathlib import Path
 
+import arviz
 import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.posteriors import PosteriorRecord, load_posterior
 from rfdropo_bayes.workflow.calibration import earlier_draws, run_calibration
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -40,6 +41,28 @@ def test_a_calibration_writes_what_it_promises(tmp_path):
     record = PosteriorRecord.load(tmp_path / "posterior.nc")
     assert {r.split for r in record.recordings} == {"fit", "test"}
     assert all(np.isfinite(record.flat(p.name)).all() for p in record.parameters)
+
+
+@pytest.mark.slow
+def test_two_runs_of_the_same_data_are_compared_by_what_they_predict_of_each_row(tmp_path):
+    """Independent replicates are chains, and every row's log likelihood is there for ArviZ."""
+    runs = {}
+    for noise in ("white", "auto"):
+        overrides = [*SHORT, "inference.rollouts=3000", f'model.noise="{noise}"']
+        run_calibration(DEMO, tmp_path / noise, overrides=overrides)
+        runs[noise] = load_posterior(tmp_path / noise / "posterior.nc")
+        summary = json.loads((tmp_path / noise / "summary.json").read_text())
+        rows = [row for row in summary["parameters"].values() if not row.get("derived")]
+        assert runs[noise].posterior.sizes["chain"] > 1
+        assert all(np.isfinite(row["r_hat"]) for row in rows)
+        assert summary["rollouts"] <= 3300
+    compared = arviz.compare(runs, ic="loo")
+    assert set(compared.index) == set(runs)
+    assert np.isfinite(compared["elpd_loo"].astype(float)).all()
+    for data in runs.values():
+        total = data.log_likelihood["row"].sum("row_index")
+        assert data.log_likelihood["row"].shape[2] == 21
+        assert arviz.loo(data).elpd_loo <= float(np.log(np.mean(np.exp(total - total.max()))) + total.max()) + 1e-9
 
 
 def command(out: Path, *extra: str) -> list[str]:
