@@ -38,7 +38,7 @@ class ModelTable(Table):
     )
     noise: Literal["auto", "white", "ar1", "student-t"] = Field(
         default="auto",
-        description="noise of the positions: white and lasting (auto), white, lasting (ar1), or heavy-tailed (student-t);"
+        description="noise of the positions: white and lasting (auto), white, lasting (ar1), heavy-tailed (student-t);"
         " see docs/inference.md",
     )
     priors: dict[str, dict[str, Any]] = Field(
