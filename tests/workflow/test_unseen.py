@@ -34,7 +34,7 @@ COMMANDS = "demo/demo_3.nc"
 SHIFT = np.array([0.004, -0.003, 0.002])  # [m]
 RANGES = {"young_modulus": (1.9e6, 2.1e6), "trunk_mass": (0.088, 0.092), "observation_noise": (0.0019, 0.0021)}
 UNITS = {"young_modulus": "Pa", "trunk_mass": "kg", "observation_noise": "m"}
-COARSE = ("simulator.refine=1", "simulator.precision=float64")
+COARSE = ("simulator.refine=1", "simulator.precision=float64", "model.noise=white")
 
 
 @pytest.fixture(scope="module")
