@@ -27,9 +27,12 @@ def find_files(pattern: str, base: Path) -> list[Path]:
         roots, wanted = [Path(wanted.anchor)], wanted.relative_to(wanted.anchor)
     for root in roots:
         files = sorted(root.glob(str(wanted))) if any(sign in pattern for sign in _GLOB) else [root / wanted]
-        files = [file for file in files if file.is_file()]
-        if files:
-            return files
+        found = [file for file in files if file.is_file()]
+        if found:
+            return found
+        if files and files[0].is_dir():
+            remedy = f'name its files, e.g. "{pattern.rstrip("/")}/*.csv"'
+            raise InputError("is a folder, not a file", where=pattern, remedy=remedy)
     looked = " and ".join(str(root) for root in roots)
     raise InputError(
         f"no such file; looked in {looked} ({DATA_VARIABLE} is {'set' if variable else 'not set'})",

@@ -98,7 +98,7 @@ def gather_tension(simulator: Simulator, trajectories: Sequence[Trajectory], len
             )
         columns.append([names.index(name) for name in trajectory.cable_names])
         tension = np.asarray(trajectory.tension, dtype=float)
-        known = np.isfinite(tension)
+        known = np.asarray(trajectory.tension_mask)
         missing = ((0, length - len(tension)), (0, 0))
         measured.append(np.pad(np.where(known, tension, 0.0), missing))
         valid.append(np.pad(known, missing))

@@ -27,7 +27,7 @@ from rfdropo_bayes.bayes.forces import (
 from rfdropo_bayes.bayes.noise import Noise, Timeline, draw_noise, noise_values, row_log_density, timeline, whiten
 from rfdropo_bayes.bayes.objects import ObjectData, Placing, object_log_density, object_residuals, offset_of
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Trajectory, check_channels, shared_markers
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.simulators.protocol import Observation, Simulator
@@ -118,7 +118,7 @@ def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) 
     if len(set(names)) < len(names):
         raise InputError(f"two recordings share a name: {', '.join(names)}", where="[data]", remedy="list each once")
     length = max(len(trajectory.time) for trajectory in trajectories)
-    markers = _common_markers(simulator, trajectories)
+    markers = shared_markers(trajectories, simulator.marker_names)
     times, positions, valid, commands = [], [], [], []
     for trajectory in trajectories:
         chosen = [trajectory.marker_names.index(name) for name in markers]
@@ -143,36 +143,10 @@ def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) 
     )
 
 
-def _common_markers(simulator: Simulator, trajectories: Sequence[Trajectory]) -> tuple[str, ...]:
-    """The simulator's markers that every recording has, in the simulator's order."""
-    shared = set.intersection(*(set(trajectory.marker_names) for trajectory in trajectories))
-    markers = tuple(name for name in simulator.marker_names if name in shared)
-    if not markers:
-        known = ", ".join(trajectories[0].marker_names)
-        raise InputError(
-            f"no marker of the robot ({', '.join(simulator.marker_names)}) is in all recordings",
-            where=trajectories[0].name,
-            remedy=f"the recording has {known}: use the robot that was recorded",
-        )
-    return markers
-
-
 def _commands(simulator: Simulator, trajectory: Trajectory) -> Commands:
-    value = np.asarray(trajectory.command)
-    if value.shape[1] != len(simulator.channel_names):
-        raise InputError(
-            f"the recording has {value.shape[1]} command channels, the robot {len(simulator.channel_names)}",
-            where=trajectory.name,
-            remedy="use the robot that was recorded",
-        )
     unit = getattr(simulator, "command_unit", trajectory.command_unit)
-    if trajectory.command_unit != unit:
-        raise InputError(
-            f"the recording's commands are in {trajectory.command_unit}, the robot's in {unit}",
-            where=trajectory.name,
-            remedy="give the unit of the commands in the recording's columns, or use the robot that was recorded",
-        )
-    return simulator.commands(trajectory.command_time, value, trajectory.initial_command, trajectory.time)
+    check_channels(trajectory, simulator.channel_names, unit)
+    return simulator.commands(trajectory.command_time, trajectory.command, trajectory.initial_command, trajectory.time)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from rfdropo_bayes.data.asl_csv import read_asl_csv, read_motor_step
 from rfdropo_bayes.data.faults import Faults, find_faults
+from rfdropo_bayes.data.matching import check_channels, shared_markers
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
 from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
 from rfdropo_bayes.data.registration import Registration, clock_offset, register, shift_commands, to_base_frame
@@ -21,6 +22,7 @@ __all__ = [
     "RecordingEntry",
     "Registration",
     "Trajectory",
+    "check_channels",
     "clock_offset",
     "find_data_file",
     "find_faults",
@@ -36,6 +38,7 @@ __all__ = [
     "read_plain_csv",
     "read_sofa_csv",
     "register",
+    "shared_markers",
     "shift_commands",
     "start_is_known",
     "to_base_frame",

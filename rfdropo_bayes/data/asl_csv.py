@@ -2,7 +2,7 @@
 
 Timing. Both files run at 100 Hz. Row k of the observations is the state just before command row k is sent, so command
 row k is in force from ``time[k]`` until ``time[k + 1]``, and the observations have one row more than the commands. What
-was in force before row 0 is not recorded: ``initial_command`` repeats command row 0 (recordings start smoothly).
+was in force before row 0 is not recorded (`first_command`); ``initial_command`` repeats command row 0.
 
 Frame. Motion capture has y up and the trunk hangs. Base frame: x = mocap x, y = mocap z, z = -mocap y (down, along the
 axis); right-handed. No origin is subtracted: the mocap origin is arbitrary and moved by a centimetre between days, so a
@@ -159,7 +159,7 @@ def _motion(recording: _Recording, command: np.ndarray, commands: Path | None) -
         )
     angle = None
     if all(name in recording.table for name in _ANGLES):
-        angle = np.deg2rad(recording.table.numbers(_ANGLES))
+        angle = np.deg2rad(recording.table.numbers(_ANGLES, allow_missing=True))
     return {
         "time": recording.time,
         "position": fill_missing(recording.time, recording.position),

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import codecs
+import csv
 import difflib
 import gzip
 import io
+import re
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -31,6 +36,8 @@ def read_text(path: Path) -> str:
     Raises:
         InputError: the file is missing, unreadable, a damaged gzip archive or not text.
     """
+    if path.is_dir():
+        raise InputError("is a folder, not a file", where=str(path), remedy=f'name its files, e.g. "{path.name}/*.csv"')
     try:
         raw = path.read_bytes()
     except FileNotFoundError:
@@ -42,15 +49,54 @@ def read_text(path: Path) -> str:
     try:
         if raw[:2] == b"\x1f\x8b":
             raw = gzip.decompress(raw)
-        return raw.decode("utf-8-sig")
     except (EOFError, OSError, zlib.error):
         raise InputError("the gzip archive is cut short or damaged", where=str(path), remedy="fetch it again") from None
-    except UnicodeDecodeError:
-        raise InputError("is not a text file", where=str(path), remedy="give a CSV file, plain or gzipped") from None
+    text = _decoded(raw)
+    if any(ord(sign) < 32 and sign not in "\t\n\r\f" for sign in text[:4096]):
+        raise InputError("is not a text file", where=str(path), remedy="give a CSV file, plain or gzipped")
+    return text
+
+
+def _decoded(raw: bytes) -> str:
+    """Text in UTF-8 or, with its byte order mark, UTF-16; what is neither is in Latin-1, as older loggers write it."""
+    marked = raw[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    with suppress(UnicodeDecodeError):
+        text = raw.decode("utf-16" if marked else "utf-8-sig")
+        if "\n" in text or not marked:
+            return text
+    return raw.decode("latin-1")
+
+
+class Dialect(NamedTuple):
+    """How a CSV file separates its values, and what stands before their decimals."""
+
+    separator: str
+    decimal: str
+
+
+def dialect_of(lines: Sequence[str]) -> Dialect:
+    """Separator of a file (comma, semicolon or tab, whichever gives its header the most names) and decimal sign.
+
+    Decimals follow a comma where cells do that are not separated by commas, or are quoted.
+    """
+    separator = max(",;\t", key=lambda sign: len(_cells(lines[0], sign)))
+    wall = '"' if separator == "," else f'["{separator}]'
+    comma = re.compile(rf"(?:^|{wall})\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*(?:$|{wall})")
+    if separator == "," and '"' not in "".join(lines[1:]):
+        return Dialect(separator, ".")
+    return Dialect(separator, "," if any(comma.search(line) for line in lines[1:]) else ".")
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    if '"' not in line:
+        return line.split(separator)
+    return next(csv.reader([line], delimiter=separator, skipinitialspace=True))
 
 
 class CsvTable:
     """A rectangular table of numbers with named columns.
+
+    Values may be separated by commas, semicolons or tabs, and decimals may follow a comma (`dialect_of`).
 
     Args:
         path: the file, plain or gzipped.
@@ -64,21 +110,32 @@ class CsvTable:
     def __init__(self, path: Path, required: Sequence[str], *, machine_written: bool = True) -> None:
         self.path = path
         text = read_text(path)
-        lines = text.splitlines()
+        lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+        if lines[0].lower().startswith("sep="):  # spreadsheets write so which separator follows
+            lines.pop(0)
         while lines and not lines[-1].strip():
             lines.pop()
         if not lines:
             raise InputError("the file is empty", where=str(path), remedy="give a CSV with a header and rows")
         if len(lines) == 1:
             raise InputError("has a header but no rows", where=str(path), remedy="record or export it again")
-        _check_rectangular(path, lines)
+        dialect = dialect_of(lines)
+        self.decimal = dialect.decimal
+        _check_rectangular(path, lines, dialect.separator)
         if machine_written and not text.endswith("\n"):
             raise InputError(
                 "the last line does not end: the file is cut short",
                 where=f"{path}, row {len(lines) - 2}",
                 remedy="fetch it again, or drop that row, or end it with a newline if it is whole",
             )
-        self.frame = pd.read_csv(io.StringIO("\n".join(lines)), skipinitialspace=True, low_memory=False)
+        self.frame = pd.read_csv(
+            io.StringIO("\n".join(lines)),
+            sep=dialect.separator,
+            decimal=dialect.decimal,
+            skipinitialspace=True,
+            low_memory=False,
+            index_col=False,
+        )
         self.frame.columns = [str(name).strip() for name in self.frame.columns]
         self.require(required)
 
@@ -109,7 +166,7 @@ class CsvTable:
         """
         self.require(names)
         cells = self.frame[list(names)]
-        values = np.array(cells.apply(pd.to_numeric, errors="coerce"), dtype=np.float64)
+        values = np.array(cells.apply(self._number), dtype=np.float64)
         text = np.isnan(values) & cells.notna().to_numpy()
         if text.any():
             row, column = np.argwhere(text)[0]
@@ -128,31 +185,43 @@ class CsvTable:
             )
         return values
 
+    def _number(self, cells: pd.Series) -> pd.Series:
+        """Cells of a column as numbers; pandas leaves those of a column with any text as they were."""
+        if self.decimal == "," and not pd.api.types.is_numeric_dtype(cells):
+            cells = cells.map(
+                lambda cell: str(cell).replace(",", ".") if "." not in str(cell) else "", na_action="ignore"
+            )
+        return pd.to_numeric(cells, errors="coerce")
+
     def points(self, names: Sequence[str], *, allow_missing: bool = False) -> Float[np.ndarray, "rows points 3"]:
         """Columns x, y, z of several points, in the order of ``names``."""
         return self.numbers(names, allow_missing=allow_missing).reshape(len(self), -1, 3)
 
-    def pose(self, names: Sequence[str], unit: float) -> Float[np.ndarray, "rows 7"] | None:
+    def pose(
+        self, names: Sequence[str], unit: float, *, allow_missing: bool = False
+    ) -> Float[np.ndarray, "rows 7"] | None:
         """Columns of a position in a ``unit`` of so many metres, then of a quaternion; None where there are none."""
         if not any(name in self for name in names):
             return None
-        values = self.numbers(names)
+        values = self.numbers(names, allow_missing=allow_missing)
         values[:, :3] *= unit
         return values
 
 
-def _check_rectangular(path: Path, lines: Sequence[str]) -> None:
-    fields = lines[0].count(",") + 1
-    header = [name.strip() for name in lines[0].split(",")]
+def _check_rectangular(path: Path, lines: Sequence[str], separator: str) -> None:
+    header = [name.strip() for name in _cells(lines[0], separator)]
+    fields = len(header)
     repeated = sorted({name for name in header if header.count(name) > 1})
     if repeated:
         raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy="rename one of them")
     for row, line in enumerate(lines[1:]):
-        found = line.count(",") + 1
+        found = len(_cells(line, separator))
         if found != fields:
             last = row == len(lines) - 2
             raise InputError(
                 f"has {found} values where the header names {fields}" + (": the file is cut short" if last else ""),
                 where=f"{path}, row {row}",
-                remedy="fetch the file again or drop the row" if last else "repair the row",
+                remedy="separate values by semicolons where decimals follow a comma"
+                if found == 2 * fields
+                else ("fetch the file again or drop the row" if last else "repair the row"),
             )

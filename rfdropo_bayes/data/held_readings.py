@@ -1,16 +1,30 @@
-"""Readings that a slower loop repeats until it has a new one (a zero-order hold): which of them are new."""
+"""Readings of sensors: those that are missing, and those that a slower loop repeats (a zero-order hold)."""
 
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Float
 
 HELD = 1.5  # samples: readings that last longer are held
 
 
+def present_readings(reading: np.ndarray | None) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Readings with the last one (or else the next) in place of those that are not a number, and True where they were.
+
+    The second is None where none is missing.
+    """
+    values = None if reading is None else np.array(reading, dtype=float)
+    if values is None or values.ndim != 2 or np.isfinite(values).all():
+        return reading, None
+    present = np.isfinite(values)
+    filled = pd.DataFrame(np.where(present, values, np.nan)).ffill().bfill().fillna(0.0)
+    return filled.to_numpy(), present
+
+
 def hold_time(time: Float[np.ndarray, " time"], reading: Float[np.ndarray, "time channel"]) -> float:
     """For how long a reading is repeated, the median over the recording [s]; 0 where there are too few changes."""
-    changes = np.flatnonzero(_changed(reading))
+    changes = np.flatnonzero(_changed(np.asarray(present_readings(reading)[0])))
     return float(np.median(np.diff(time[changes]))) if changes.size > 2 else 0.0
 
 

@@ -38,7 +38,7 @@ def read_optitrack_csv(path: Path, *, mask_missing: bool = False) -> Trajectory:
 
     Args:
         path: the file.
-        mask_missing: mask lost marker positions instead of rejecting the file.
+        mask_missing: leave lost markers and cubes out instead of rejecting the file.
 
     Raises:
         InputError: on a damaged file (see ``CsvTable``), a wrong action, or rows missing in the middle.
@@ -62,7 +62,7 @@ def read_optitrack_csv(path: Path, *, mask_missing: bool = False) -> Trajectory:
         command=actions.cumulative_displacement(acted),
         command_unit="m",
         cable_names=actions.CABLE_NAMES,
-        object_pose=table.pose(_CUBE, _MILLIMETRE),
+        object_pose=table.pose(_CUBE, _MILLIMETRE, allow_missing=mask_missing),
         provenance=f"{path.name}: OptiTrack",
         settings=actions.SETTINGS | {"faults": faults.counts},
     )

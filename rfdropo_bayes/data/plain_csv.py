@@ -1,14 +1,15 @@
 """Any CSV, plain or gzipped, through a mapping of its columns: the way in for one's own robot.
 
 Timing. The command in row k is in force from the time of row k until that of row k + 1, as a loop that measures, then
-commands, writes it; before row 0 the command of row 0 was in force. Commands may stand in a file of their own, with as
-many rows as the observations or one fewer.
+commands, writes it; what was in force before row 0 is another matter (`first_command`). Commands may stand in a file of
+their own, with as many rows as the observations or one fewer.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -36,30 +37,83 @@ def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
     return axes
 
 
-class CsvColumns(BaseModel):
-    """The table [data.columns]: which column is what, in which unit.
+_ORIENTATION = re.compile("orient|quat|euler|rot|imu|acc|gyro|magnet|angular|inert", re.IGNORECASE)
+_POSITIONS_ONLY = (
+    "a marker is a position: leave orientations and inertial readings out (columns that are not named are not read). "
+    "From a rigid body's pose, a second point on the body can be computed and named as a marker; object_pose is the "
+    "pose of a pushed body"
+)
 
-    ``axes`` says which file axis the base frame's x, y, z are, e.g. ["x", "z", "-y"] for a trunk that hangs in a y-up
-    motion-capture frame. Times come from the column ``time`` or from a constant ``sample_time`` [s].
+
+class CsvColumns(BaseModel):
+    """The table [data.columns]: which column is what, in which unit. Columns that are not named are not read.
+
+    Times come from the column ``time`` or from a constant ``sample_time``.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    time: str | None = None
-    time_unit: Literal["s", "ms"] = "s"
-    sample_time: Annotated[float, Field(gt=0)] | None = None
-    commands: Annotated[list[str], Field(min_length=1)]
-    command_unit: Literal["m", "cm", "mm", "rad", "deg"]
-    positions: Annotated[list[tuple[str, str, str]], Field(min_length=1)]
-    position_unit: Literal["m", "cm", "mm"]
-    axes: Annotated[tuple[str, str, str], AfterValidator(_right_handed)] = ("x", "y", "z")
-    markers: list[str] | None = None
-    cables: list[str] | None = None
-    tensions: list[str] | None = None
-    motor_angles: list[str] | None = None
-    motor_angle_unit: Literal["rad", "deg"] = "rad"
-    object_pose: Annotated[list[str], Field(min_length=7, max_length=7)] | None = None
-    robot: str = ""
+    time: str | None = Field(None, description="column of the times; or give sample_time")
+    time_unit: Literal["s", "ms"] = Field("s", description="unit of the times")
+    sample_time: float | None = Field(None, gt=0, description="time between rows [s], where no column holds times")
+    commands: list[str] = Field(
+        min_length=1,
+        description="columns of the commands as they were sent, one for each of the robot's channels, in its order",
+    )
+    command_unit: Literal["m", "cm", "mm", "rad", "deg"] = Field(
+        description="unit of the commands: a length of cable, or an angle of a motor"
+    )
+    positions: list[tuple[str, str, str]] = Field(
+        min_length=1, description="columns of x, y and z of each marker, base to tip"
+    )
+    position_unit: Literal["m", "cm", "mm"] = Field(description="unit of the positions")
+    axes: Annotated[tuple[str, str, str], AfterValidator(_right_handed)] = Field(
+        ("x", "y", "z"),
+        description="the base frame's x, y, z in terms of the file's axes, e.g. "
+        '["x", "z", "-y"] for a trunk that hangs in a frame with y up',
+    )
+    markers: list[str] | None = Field(
+        None, description="the robot's name of each marker in positions; m1, m2, ... by default"
+    )
+    cables: list[str] | None = Field(
+        None, description="name of each channel in commands; those of the columns by default"
+    )
+    tensions: list[str] | None = Field(
+        None, description="columns of the cable tensions [N], one for each command; empty cells are left out"
+    )
+    motor_angles: list[str] | None = Field(
+        None, description="columns of the measured motor angles, one for each command; empty cells are left out"
+    )
+    motor_angle_unit: Literal["rad", "deg"] = Field("rad", description="unit of the motor angles")
+    object_pose: list[str] | None = Field(
+        None,
+        min_length=7,
+        max_length=7,
+        description="columns of the pushed body's centre x, y, z and unit quaternion x, y, z, w; empty rows are left "
+        "out",
+    )
+    robot: str = Field("", description="name of the robot that was recorded")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _positions_only(cls, table: Any) -> Any:
+        if isinstance(table, dict):
+            unknown = set(table) - set(cls.model_fields)
+            for key in unknown:
+                if _ORIENTATION.search(str(key)):
+                    raise InputError(f"unknown key {key!r}", where="[data.columns]", remedy=_POSITIONS_ONLY)
+            if "positions" not in table and not unknown:
+                remedy = f'add positions = [["x1", "y1", "z1"], ...]; {_POSITIONS_ONLY}'
+                raise InputError("no positions of markers", where="[data.columns]", remedy=remedy)
+            points = table.get("positions")
+            for point in points if isinstance(points, list) else []:
+                if isinstance(point, list) and len(point) != 3:
+                    raise InputError(
+                        f"the marker {', '.join(str(name) for name in point)} has {len(point)} columns, not x, y and z",
+                        where="[data.columns] positions",
+                        remedy=_POSITIONS_ONLY if len(point) > 3 else "name its three columns",
+                    )
+        return table
 
     @model_validator(mode="after")
     def _fits(self) -> CsvColumns:
@@ -72,7 +126,8 @@ class CsvColumns(BaseModel):
             ("motor_angles", self.motor_angles, len(self.commands)),
         ):
             if names is not None and len(names) != count:
-                raise ValueError(f"{key} has {len(names)} entries where {count} are needed")
+                what = "marker in positions" if key == "markers" else "channel in commands"
+                raise ValueError(f"{key} has {len(names)} entries where {count} are needed, one for each {what}")
         return self
 
 
@@ -109,7 +164,8 @@ def read_plain_csv(
     command = _commands(table, commands, columns)
     angle = None
     if columns.motor_angles is not None:
-        angle = (np.pi / 180.0 if columns.motor_angle_unit == "deg" else 1.0) * table.numbers(columns.motor_angles)
+        degree = np.pi / 180.0 if columns.motor_angle_unit == "deg" else 1.0
+        angle = degree * table.numbers(columns.motor_angles, allow_missing=True)
     return Trajectory.build(
         name=path.name.removesuffix(".gz").removesuffix(".csv"),
         robot=columns.robot,
@@ -123,7 +179,7 @@ def read_plain_csv(
         command_unit=_COMMANDS[columns.command_unit][0],
         initial_command=command[0],
         cable_names=columns.cables or columns.commands,
-        tension=None if columns.tensions is None else table.numbers(columns.tensions),
+        tension=None if columns.tensions is None else table.numbers(columns.tensions, allow_missing=True),
         motor_angle=angle,
         object_pose=_pose(table, columns),
         provenance=path.name,
@@ -214,5 +270,7 @@ def _commands(table: CsvTable, path: Path | None, columns: CsvColumns) -> Float[
 def _pose(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows 7"] | None:
     if columns.object_pose is None:
         return None
-    pose = table.numbers(columns.object_pose) * np.array([_METRES[columns.position_unit]] * 3 + [1.0] * 4)
+    pose = table.numbers(columns.object_pose, allow_missing=True) * np.array(
+        [_METRES[columns.position_unit]] * 3 + [1.0] * 4
+    )
     return rotate_pose(pose, axes_matrix(columns.axes), np.zeros(3))

@@ -84,9 +84,12 @@ def to_base_frame(trajectory: Trajectory, registration: Registration) -> Traject
 def rotate_pose(
     pose: Float[np.ndarray, "rows 7"], rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "rows 7"]:
-    """Poses (x y z [m], quaternion x y z w) seen from the frame that ``rotation @ point + translation`` leads to."""
-    turned = Rotation.from_matrix(rotation) * Rotation.from_quat(pose[:, 3:])
-    return np.hstack([pose[:, :3] @ rotation.T + translation, turned.as_quat()])
+    """Poses (x y z [m], quaternion x y z w) seen from the frame that ``rotation @ point + translation`` leads to; those
+    that are not a number stay so."""
+    known = np.isfinite(pose).all(axis=1)
+    turned = np.full((len(pose), 4), np.nan)
+    turned[known] = (Rotation.from_matrix(rotation) * Rotation.from_quat(pose[known, 3:])).as_quat()
+    return np.hstack([pose[:, :3] @ rotation.T + translation, turned])
 
 
 def clock_offset(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -21,48 +21,50 @@ from rfdropo_bayes.tables import parse_table
 Format = Literal["sofa-csv", "optitrack-csv", "asl-csv", "csv", "netcdf"]
 
 
-class RecordingEntry(BaseModel):
-    """One entry of ``fit`` or ``test``; a bare string is its ``observations``.
+InitialCommand = Literal["first", "zero"] | list[float] | None
 
-    ``observations`` may be a glob. ``commands`` is the file of commands where the format keeps them apart ("none": zero
-    commands). ``rows`` keeps the observation rows first to last, both included, counted from 0. ``initial_command`` is
-    that of `DataSpec`, for this entry.
-    """
+
+class RecordingEntry(BaseModel):
+    """One entry of ``fit`` or ``test``; a bare string is its ``observations``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    observations: str
-    commands: str | None = None
-    rows: tuple[int, int] | None = None
-    initial_command: Literal["first", "zero"] | list[float] | None = None
+    observations: str = Field(description="file, or several by wildcards")
+    commands: str | None = Field(
+        None, description='file of the commands, where they have one of their own; "none": zero commands'
+    )
+    rows: tuple[int, int] | None = Field(
+        None, description="keep observation rows first to last only, both included, counted from 0"
+    )
+    initial_command: InitialCommand = Field(None, description="as in [data], for this entry")
 
 
 class DataSpec(BaseModel):
-    """The [data] table: where the recordings are and how to read them.
-
-    Args:
-        format: how the files are written.
-        fit: recordings that a fit may see.
-        test: recordings that no fit sees.
-        columns: what the columns are, for format "csv".
-        resample: sample time [s] to bring every recording to; as recorded by default.
-        missing: whether a lost marker position is an error or is masked.
-        initial_command: in force before the first row of a file: "first" (its first command was already), "zero", or
-            one value per channel [m or rad]; recognised from the first rows by default, where the file does not say.
-        lead_in: for so long [s] before the first of ``rows`` commands are simulated, too, so that a piece that starts
-            in motion is in motion. A piece starts at rest under the command in force by default.
-    """
+    """The [data] table: where the recordings are and how to read them."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    format: Format
-    fit: Annotated[list[RecordingEntry], Field(min_length=1)]
-    test: list[RecordingEntry] = []
-    columns: CsvColumns | None = None
-    resample: Annotated[float, Field(gt=0)] | None = None
-    missing: Literal["error", "mask"] = "error"
-    initial_command: Literal["first", "zero"] | list[float] | None = None
-    lead_in: Annotated[float, Field(ge=0)] = 0.0
+    format: Format = Field(description="how the files are written")
+    fit: list[RecordingEntry] = Field(min_length=1, description="recordings that a fit may see")
+    test: list[RecordingEntry] = Field([], description="recordings that no fit sees")
+    columns: CsvColumns | None = Field(None, description='what the columns are, for format "csv"')
+    resample: float | None = Field(
+        None, gt=0, description="sample time to bring every recording to [s]; as recorded by default"
+    )
+    missing: Literal["error", "mask"] = Field(
+        "error", description="whether a lost marker position is an error or is left out"
+    )
+    initial_command: InitialCommand = Field(
+        None,
+        description='command before the first row of a file: "first" (its first command was in force already), "zero", '
+        "or one value per channel [m or rad]; where the file does not say, recognised from the first rows by default",
+    )
+    lead_in: float = Field(
+        0.0,
+        ge=0,
+        description="for so long [s] before the first of rows commands are simulated, too: a piece that starts in "
+        "motion is then in motion, and starts at rest under the command in force without",
+    )
 
     @field_validator("fit", "test", mode="before")
     @classmethod
@@ -92,7 +94,7 @@ class _Source(NamedTuple):
     commands: Path | None
     zero_command: bool
     rows: tuple[int, int] | None
-    initial_command: Literal["first", "zero"] | list[float] | None
+    initial_command: InitialCommand
 
 
 def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "fit") -> list[Trajectory]:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.data import checks
-from rfdropo_bayes.data.held_readings import new_readings
+from rfdropo_bayes.data.held_readings import new_readings, present_readings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole
 
@@ -24,7 +24,8 @@ POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 SCHEMA = "rfdropo_bayes.trajectory/1"
 FIRST_COMMAND = "first_command"  # among the settings: which command was in force before the first row
 _HASHED = ("time", "command_time", "position", "position_mask", "command", "initial_command")
-_OPTIONAL = ("tension", "motor_angle", "motor_angle_mask", "object_pose")
+_OPTIONAL = ("tension", "tension_mask", "motor_angle", "motor_angle_mask", "object_pose")
+MISSING = "missing_readings"  # among the settings: how many tensions, motor angles and poses a recording lacks
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,9 @@ class Trajectory:
     - ``command(command_time, cable)``, unit in its attribute ("m" or "rad"): cumulative command, pull > 0, unclipped,
       piecewise constant. Row k is in force from ``command_time[k]`` until the next row's time, the last one for ever;
     - ``initial_command(cable)``: in force before ``command_time[0]``, hence the state the recording starts from;
-    - optionally ``tension(time, cable)`` [N], ``motor_angle(time, cable)`` [rad] and its ``motor_angle_mask``, False
-      where an older reading is repeated, and ``object_pose(time, pose)`` (x y z [m], unit quaternion x y z w).
+    - optionally ``tension(time, cable)`` [N] and its ``tension_mask``, False where one is missing;
+      ``motor_angle(time, cable)`` [rad] and its ``motor_angle_mask``, False where one is missing or an older reading is
+      repeated; ``object_pose(time, pose)`` (x y z [m], unit quaternion x y z w; not a number where it is missing).
 
     ``time`` is in seconds from the first observation row. ``command_time`` shares that clock.
 
@@ -82,17 +84,23 @@ class Trajectory:
 
         ``initial_command`` defaults to zero; ``position_mask`` to all True. Times are shifted so that the first
         observation is at 0. ``settings`` are facts about the recording that a model may need (JSON); of motor angles
-        with a ``motor_angle_hold`` [s] among them only new readings are to be used (`held_readings`).
+        with a ``motor_angle_hold`` [s] among them only new readings are to be used (`held_readings`). Tensions, motor
+        angles and poses that are not a number are missing: they are left out and counted.
         """
         facts = dict(settings or {})
+        tension, tension_mask = present_readings(tension)
+        motor_angle, angle_mask = present_readings(motor_angle)
+        facts |= _missing(tension_mask, angle_mask, object_pose)
+        new = _angle_mask(time, motor_angle, float(facts.get("motor_angle_hold", 0.0)))
         arrays = {
             "position": position,
             "position_mask": np.ones(np.shape(position)[:2], dtype=bool) if position_mask is None else position_mask,
             "command": command,
             "initial_command": np.zeros(len(cable_names)) if initial_command is None else initial_command,
             "tension": tension,
+            "tension_mask": tension_mask,
             "motor_angle": motor_angle,
-            "motor_angle_mask": _angle_mask(time, motor_angle, float(facts.get("motor_angle_hold", 0.0))),
+            "motor_angle_mask": angle_mask if new is None else (new if angle_mask is None else new & angle_mask),
             "object_pose": None if object_pose is None else continuous_quaternions(object_pose),
         }
         dataset = _assemble(name, arrays, time, command_time, marker_names, cable_names)
@@ -174,6 +182,22 @@ class Trajectory:
     def object_pose(self) -> Float[np.ndarray, "time 7"] | None:
         """Pose of the manipulated object (x y z [m], quaternion x y z w), if there is one."""
         return self._array("object_pose") if "object_pose" in self.dataset else None
+
+    @property
+    def tension_mask(self) -> Bool[np.ndarray, "time cable"] | None:
+        """True where a tension was measured; None where there are none."""
+        if "tension_mask" in self.dataset:
+            return self._array("tension_mask")
+        return np.ones(self.dataset["tension"].shape, dtype=bool) if "tension" in self.dataset else None
+
+    @property
+    def left_out(self) -> str:
+        """What is left out of this recording as faulty or missing, in words; empty if nothing is."""
+        faults = self.settings.get("faults", {})
+        counts = {"held poses": "held", "jumps": "jump", "lost markers": "missing"}
+        said = [f"{sum(faults[kind])} {name}" for name, kind in counts.items() if sum(faults.get(kind, ()))]
+        said += [f"{count} missing {kind}" for kind, count in self.settings.get(MISSING, {}).items()]
+        return ", ".join(said)
 
     @property
     def marker_names(self) -> tuple[str, ...]:
@@ -374,6 +398,18 @@ def _angle_mask(time: np.ndarray, angle: np.ndarray | None, hold: float) -> Bool
     return new_readings(np.asarray(time), np.asarray(angle), hold) if hold > 0.0 and fits else None
 
 
+def _missing(
+    tension_mask: np.ndarray | None, angle_mask: np.ndarray | None, pose: np.ndarray | None
+) -> dict[str, dict[str, int]]:
+    counts = {
+        "tensions": 0 if tension_mask is None else int((~tension_mask).sum()),
+        "motor angles": 0 if angle_mask is None else int((~angle_mask).sum()),
+        "poses of the object": 0 if pose is None else int((~np.isfinite(pose).all(axis=-1)).sum()),
+    }
+    found = {kind: count for kind, count in counts.items() if count}
+    return {MISSING: found} if found else {}
+
+
 def continuous_quaternions(pose: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time 7"]:
     """Poses whose quaternion keeps its sign from row to row, the first with w >= 0 (q and -q are the same rotation)."""
     pose = np.array(pose, dtype=float)
@@ -393,9 +429,11 @@ def _brackets(time: Float[np.ndarray, " rows"], grid: Float[np.ndarray, " n"]) -
 
 
 def _slerp(quaternion: np.ndarray, left: np.ndarray, right: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    start, end = Rotation.from_quat(quaternion[left]), Rotation.from_quat(quaternion[right])
+    known = np.isfinite(quaternion[left]).all(axis=1) & np.isfinite(quaternion[right]).all(axis=1)
+    start, end = Rotation.from_quat(quaternion[left[known]]), Rotation.from_quat(quaternion[right[known]])
     turn = (start.inv() * end).as_rotvec()
-    between = (start * Rotation.from_rotvec(weight[:, None] * turn)).as_quat()
+    between = np.full((len(left), 4), np.nan)
+    between[known] = (start * Rotation.from_rotvec(weight[known, None] * turn)).as_quat()
     return continuous_quaternions(np.hstack([np.zeros((len(between), 3)), between]))[:, 3:]
 
 

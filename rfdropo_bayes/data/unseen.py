@@ -80,7 +80,9 @@ def _piece(whole: Trajectory, spec: DataSpec, rows: tuple[int, int] | None) -> T
 
 def first_row_only(trajectory: Trajectory) -> Trajectory:
     """The same commands and times with every measurement after the first row taken out."""
-    dataset = trajectory.dataset.drop_vars(["tension", "motor_angle", "motor_angle_mask"], errors="ignore").copy()
+    dataset = trajectory.dataset.drop_vars(
+        ["tension", "tension_mask", "motor_angle", "motor_angle_mask"], errors="ignore"
+    ).copy()
     position, mask = dataset["position"].values.copy(), dataset["position_mask"].values.copy()
     position[1:], mask[1:] = position[:1], False
     if "object_pose" in dataset:

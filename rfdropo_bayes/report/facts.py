@@ -21,7 +21,8 @@ class RecordingFacts:
     """One recording as the data section lists it.
 
     ``masked`` counts marker positions that are left out as faults, of ``positions`` in all; ``seconds`` is its length;
-    ``first_command`` says which command was in force before the first row, and how that is known.
+    ``first_command`` says which command was in force before the first row, and how that is known, ``left_out`` what is
+    faulty or missing.
     """
 
     name: str
@@ -36,6 +37,7 @@ class RecordingFacts:
     synthetic: bool
     provenance: str = ""
     first_command: str = ""
+    left_out: str = ""
 
     @classmethod
     def of_trajectory(cls, trajectory: Trajectory, split: str) -> RecordingFacts:
@@ -55,6 +57,7 @@ class RecordingFacts:
             trajectory.synthetic,
             str(attributes["provenance"]),
             trajectory.first_command,
+            trajectory.left_out,
         )
 
 

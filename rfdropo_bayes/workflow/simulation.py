@@ -13,7 +13,7 @@ import pandas as pd
 from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Trajectory, check_channels, shared_markers
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.simulators.parameters import nearest
@@ -70,9 +70,10 @@ def simulate_all(experiment: Experiment, folder: Path, out: Path, balance: bool 
     report: dict[str, Any] = {"simulator": simulator.description, "parameters": values, "recordings": {}}
     distances = []
     for index, source in enumerate(sources):
+        markers = shared_markers([source], simulator.marker_names)
+        check_channels(source, simulator.channel_names, simulator.command_unit)
         commands = simulator.commands(source.command_time, source.command, source.initial_command, source.time)
         observation = jax.device_get(rollout({k: np.asarray(v) for k, v in values.items()}, commands))
-        markers = [name for name in simulator.marker_names if name in source.marker_names]
         chosen = [simulator.marker_names.index(name) for name in markers]
         position = np.asarray(observation.position)[:, chosen]
         result = Result(int(observation.status))

@@ -7,7 +7,16 @@ import gzip
 import numpy as np
 import pytest
 
-from rfdropo_bayes.data import CsvColumns, DataSpec, read_asl_csv, read_optitrack_csv, read_plain_csv, read_sofa_csv
+from rfdropo_bayes.data import (
+    CsvColumns,
+    DataSpec,
+    Trajectory,
+    load_recordings,
+    read_asl_csv,
+    read_optitrack_csv,
+    read_plain_csv,
+    read_sofa_csv,
+)
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.errors import InputError
 
@@ -188,3 +197,105 @@ def test_tables_with_a_mistake(change, message):
 def test_a_missing_key_is_named():
     with fails(r"\[data\]: the key 'fit' is missing"):
         DataSpec.parse({"format": "netcdf"})
+
+
+def plain(path, text: str, encoding: str = "utf-8", **changes):
+    path.write_bytes(text.encode(encoding))
+    return read_plain_csv(path, CsvColumns.model_validate(COLUMNS | changes))
+
+
+ROWS = "x,y,z,u\n100.5,0,0,1.5\n100,1,0,2\n100,2,0,2\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        ROWS,
+        ROWS.replace(",", ";"),
+        ROWS.replace(",", "\t"),
+        ROWS.replace(",", ";").replace(".", ","),
+        ROWS.replace(",", "\t").replace(".", ","),
+        ROWS.replace(",", " ; "),
+        "sep=;\n" + ROWS.replace(",", ";").replace(".", ","),
+        ROWS.replace("100.5", '"100,5"').replace("1.5", '"1,5"'),
+        ROWS.replace("\n", "\r\n"),
+        ROWS.replace("\n", "\r"),
+        ROWS.removesuffix("\n"),
+        '"x","y","z","u"\n"100.5","0","0","1.5"\n100,1,0,2\n100,2,0,2\n',
+    ],
+)
+def test_separators_and_decimal_signs(tmp_path, text):
+    found = plain(tmp_path / "own.csv", text)
+    np.testing.assert_allclose(found.position[0, 0], [0.1005, 0.0, 0.0])
+    np.testing.assert_allclose(found.command[0], 1.5e-3)
+    assert found.position.shape == (3, 1, 3)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+def test_encodings(tmp_path, encoding):
+    found = plain(tmp_path / "own.csv", ROWS.replace("u\n", "Länge µm\n"), encoding, commands=["Länge µm"])
+    assert found.cable_names == ("Länge µm",)
+
+
+def test_decimal_commas_between_commas_are_explained(tmp_path):
+    with fails("has 8 values where the header names 4.*separate values by semicolons"):
+        plain(tmp_path / "own.csv", "x,y,z,u\n100,5,0,0,0,0,1,5\n100,5,0,0,0,0,1,5\n")
+    with fails(r"row 1, column 'x': '1\.005,5' is not a number"):
+        plain(tmp_path / "own.csv", "x;y;z;u\n100,5;0;0;1,5\n1.005,5;0;0;1,5\n100;0;0;1\n")
+
+
+def test_a_folder_is_no_recording(tmp_path):
+    (tmp_path / "monday").mkdir()
+    spec = DataSpec.parse({"format": "csv", "fit": ["monday"], "columns": COLUMNS})
+    with fails(r'monday: is a folder, not a file; name its files, e.g. "monday/\*.csv"'):
+        load_recordings(spec, tmp_path)
+    with fails("is a folder, not a file"):
+        read_plain_csv(tmp_path / "monday", CsvColumns.model_validate(COLUMNS))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"orientations": [["qx", "qy", "qz", "qw"]]}, "unknown key 'orientations'; a marker is a position"),
+        ({"imu": ["ax", "ay", "az"]}, "unknown key 'imu'; a marker is a position"),
+        (
+            {"positions": [["x", "y", "z", "qx", "qy", "qz", "qw"]]},
+            "has 7 columns, not x, y and z; a marker is a position",
+        ),
+        ({"positions": [["x", "y"]]}, "the marker x, y has 2 columns, not x, y and z; name its three columns"),
+        ({"tensions": ["f1", "f2"]}, "tensions has 2 entries where 1 are needed, one for each channel in commands"),
+        ({"motor_angles": ["f1", "f2"]}, "motor_angles has 2 entries where 1 are needed"),
+    ],
+)
+def test_columns_that_are_no_positions_say_what_to_do(change, message):
+    with fails(message):
+        DataSpec.parse({"format": "csv", "fit": ["a.csv"], "columns": COLUMNS | change})
+
+
+def test_a_table_without_positions_says_what_to_add():
+    columns = {key: value for key, value in COLUMNS.items() if key != "positions"}
+    with fails("no positions of markers; add positions = "):
+        DataSpec.parse({"format": "csv", "fit": ["a.csv"], "columns": columns})
+
+
+def test_missing_readings_are_left_out_and_counted(tmp_path):
+    """One missing tension, angle or pose refuses nothing; marker positions and commands are another matter."""
+    pose = ["ox", "oy", "oz", "qx", "qy", "qz", "qw"]
+    text = "x,y,z,u,f,a," + ",".join(pose) + "\n"
+    text += "".join(f"{100 + row},0,0,{row},{row + 5},{row / 9},{row},0,0,0,0,0,1\n" for row in range(6))
+    lines = text.splitlines()
+    lines[3] = "102,0,0,2,,nan,,,,,,,"
+    found = plain(tmp_path / "own.csv", "\n".join(lines), tensions=["f"], motor_angles=["a"], object_pose=pose)
+    assert found.tension_mask[:, 0].tolist() == [True, True, False, True, True, True]
+    assert not found.motor_angle_mask[2, 0]
+    np.testing.assert_array_equal(np.isnan(found.object_pose).all(axis=1), [False, False, True, False, False, False])
+    assert found.left_out.endswith("1 missing motor angles, 1 missing poses of the object, 1 missing tensions")
+    coarse = found.resample(0.2)
+    assert coarse.tension_mask[:, 0].tolist() == [True, False, True]
+    assert np.isnan(coarse.object_pose).any(axis=1).tolist() == [False, True, False]
+    found.save(tmp_path / "own.nc")
+    again = Trajectory.load(tmp_path / "own.nc")
+    np.testing.assert_array_equal(again.tension_mask, found.tension_mask)
+    lines[3] = lines[3].replace("102", "")
+    with fails("row 2, column 'x': NaN or empty cell"):
+        plain(tmp_path / "own.csv", "\n".join(lines), tensions=["f"], motor_angles=["a"], object_pose=pose)

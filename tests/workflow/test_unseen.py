@@ -26,7 +26,7 @@ from rfdropo_bayes.workflow.assembly import pooling
 from rfdropo_bayes.workflow.experiment import Experiment
 from rfdropo_bayes.workflow.first_row import match_first_row, weighed_by_first_row
 from rfdropo_bayes.workflow.prediction import MARKER_ERRORS, _for_new_recordings
-from rfdropo_bayes.workflow.simulation import run_simulation
+from rfdropo_bayes.workflow.simulation import simulate_all
 from rfdropo_bayes.workflow.unseen import run_prediction
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
@@ -290,7 +290,7 @@ def test_a_simulated_recording_is_predicted_from_its_first_row(name, sign, tmp_p
         "commands": commands | {"recordings": ["new"]},
         "model": {"mechanisms": [name], "fixed": values},
     }
-    run_simulation(Experiment.model_validate(made), tmp_path, tmp_path)
+    simulate_all(Experiment.model_validate(made), tmp_path, tmp_path)
     data = {"format": "netcdf", "fit": ["trajectory.nc"]}
     (tmp_path / "own.toml").write_text(tomli_w.dumps(experiment | {"data": data}))
     fixed = {"observation_noise": 1e-6} | values
