@@ -37,29 +37,50 @@ def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
 
 
 class CsvColumns(BaseModel):
-    """The table [data.columns]: which column is what, in which unit.
-
-    ``axes`` says which file axis the base frame's x, y, z are, e.g. ["x", "z", "-y"] for a trunk that hangs in a y-up
-    motion-capture frame. Times come from the column ``time`` or from a constant ``sample_time`` [s].
-    """
+    """[data.columns]: which column is what, in which unit."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    time: str | None = None
-    time_unit: Literal["s", "ms"] = "s"
-    sample_time: Annotated[float, Field(gt=0)] | None = None
-    commands: Annotated[list[str], Field(min_length=1)]
-    command_unit: Literal["m", "cm", "mm", "rad", "deg"]
-    positions: Annotated[list[tuple[str, str, str]], Field(min_length=1)]
-    position_unit: Literal["m", "cm", "mm"]
-    axes: Annotated[tuple[str, str, str], AfterValidator(_right_handed)] = ("x", "y", "z")
-    markers: list[str] | None = None
-    cables: list[str] | None = None
-    tensions: list[str] | None = None
-    motor_angles: list[str] | None = None
-    motor_angle_unit: Literal["rad", "deg"] = "rad"
-    object_pose: Annotated[list[str], Field(min_length=7, max_length=7)] | None = None
-    robot: str = ""
+    time: str | None = Field(default=None, description="column of the times; either this or sample_time")
+    time_unit: Literal["s", "ms"] = Field(default="s", description="unit of the times")
+    sample_time: Annotated[float, Field(gt=0)] | None = Field(
+        default=None,
+        description="constant time from row to row [s]",
+    )
+    commands: Annotated[list[str], Field(min_length=1)] = Field(
+        description="columns of the commands, one for each of the robot's channels, in their order",
+    )
+    command_unit: Literal["m", "cm", "mm", "rad", "deg"] = Field(
+        description="unit of the commands: of cable pulled in, or of a motor's angle",
+    )
+    positions: Annotated[list[tuple[str, str, str]], Field(min_length=1)] = Field(
+        description="columns of x, y and z of each marker",
+    )
+    position_unit: Literal["m", "cm", "mm"] = Field(description="unit of the positions")
+    axes: Annotated[tuple[str, str, str], AfterValidator(_right_handed)] = Field(
+        default=("x", "y", "z"),
+        description='which of the file\'s axes the x, y and z of the robot\'s base are, e.g. ["x", "z", "-y"] for a '
+        "trunk that hangs in a y-up motion-capture frame",
+    )
+    markers: list[str] | None = Field(
+        default=None,
+        description="the robot's names of the markers, in the order of positions; m1, m2, ... by default",
+    )
+    cables: list[str] | None = Field(
+        default=None,
+        description="names of the commands; those of their columns by default",
+    )
+    tensions: list[str] | None = Field(default=None, description="columns of cable tensions [N], one for each command")
+    motor_angles: list[str] | None = Field(
+        default=None,
+        description="columns of measured motor angles, one for each command",
+    )
+    motor_angle_unit: Literal["rad", "deg"] = Field(default="rad", description="unit of the motor angles")
+    object_pose: Annotated[list[str], Field(min_length=7, max_length=7)] | None = Field(
+        default=None,
+        description="columns of a pushed object's pose: x, y, z in position_unit, and quaternion x, y, z, w",
+    )
+    robot: str = Field(default="", description="name of the robot, for the record")
 
     @model_validator(mode="after")
     def _fits(self) -> CsvColumns:

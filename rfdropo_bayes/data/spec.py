@@ -22,47 +22,57 @@ Format = Literal["sofa-csv", "optitrack-csv", "asl-csv", "csv", "netcdf"]
 
 
 class RecordingEntry(BaseModel):
-    """One entry of ``fit`` or ``test``; a bare string is its ``observations``.
-
-    ``observations`` may be a glob. ``commands`` is the file of commands where the format keeps them apart ("none": zero
-    commands). ``rows`` keeps the observation rows first to last, both included, counted from 0. ``initial_command`` is
-    that of `DataSpec`, for this entry.
-    """
+    """One recording, or several by a wildcard; a bare string stands for its ``observations``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    observations: str
-    commands: str | None = None
-    rows: tuple[int, int] | None = None
-    initial_command: Literal["first", "zero"] | list[float] | None = None
+    observations: str = Field(
+        description="file of the recording, relative to the experiment file or to RFDROPO_DATA; wildcards allowed",
+    )
+    commands: str | None = Field(
+        default=None,
+        description='file of its commands, where the format keeps them apart; "none": zero commands',
+    )
+    rows: tuple[int, int] | None = Field(
+        default=None,
+        description="observation rows that are kept, first and last, both included, counted from 0",
+    )
+    initial_command: Literal["first", "zero"] | list[float] | None = Field(
+        default=None,
+        description="that of [data], for this entry",
+    )
 
 
 class DataSpec(BaseModel):
-    """The [data] table: where the recordings are and how to read them.
-
-    Args:
-        format: how the files are written.
-        fit: recordings that a fit may see.
-        test: recordings that no fit sees.
-        columns: what the columns are, for format "csv".
-        resample: sample time [s] to bring every recording to; as recorded by default.
-        missing: whether a lost marker position is an error or is masked.
-        initial_command: in force before the first row of a file: "first" (its first command was already), "zero", or
-            one value per channel [m or rad]; recognised from the first rows by default, where the file does not say.
-        lead_in: for so long [s] before the first of ``rows`` commands are simulated, too, so that a piece that starts
-            in motion is in motion. A piece starts at rest under the command in force by default.
-    """
+    """[data]: where the recordings are and how to read them."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    format: Format
-    fit: Annotated[list[RecordingEntry], Field(min_length=1)]
-    test: list[RecordingEntry] = []
-    columns: CsvColumns | None = None
-    resample: Annotated[float, Field(gt=0)] | None = None
-    missing: Literal["error", "mask"] = "error"
-    initial_command: Literal["first", "zero"] | list[float] | None = None
-    lead_in: Annotated[float, Field(ge=0)] = 0.0
+    format: Format = Field(description="how the files are written")
+    fit: Annotated[list[RecordingEntry], Field(min_length=1)] = Field(
+        description="recordings that a fit may see; a bare string stands for its observations",
+    )
+    test: list[RecordingEntry] = Field(default=[], description="recordings that no fit sees")
+    columns: CsvColumns | None = Field(default=None, description='what the columns are; for format "csv"')
+    resample: Annotated[float, Field(gt=0)] | None = Field(
+        default=None,
+        description="sample time to bring every recording to [s]; as recorded by default",
+    )
+    missing: Literal["error", "mask"] = Field(
+        default="error",
+        description="whether a lost marker position is an error or is masked",
+    )
+    initial_command: Literal["first", "zero"] | list[float] | None = Field(
+        default=None,
+        description='in force before the first row of a file: "first" (its first command was already), "zero", or one'
+        " value per channel [m or rad]; recognised from the first rows by default, where the file does "
+        "not say",
+    )
+    lead_in: Annotated[float, Field(ge=0)] = Field(
+        default=0.0,
+        description="for so long [s] before the first of rows commands are simulated, too, so that a piece that "
+        "starts in motion is in motion",
+    )
 
     @field_validator("fit", "test", mode="before")
     @classmethod
