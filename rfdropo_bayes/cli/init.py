@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -141,7 +141,7 @@ def _outline(name: str, disks: int, unit: str, answers: dict[str, Any], assumed:
         if key in given:
             given[key] = factor * given[key]
     given["markers"] = {marker: MILLIMETRES * height for marker, height in given["markers"].items()}
-    kind = "rad" if unit in ("deg", "rad") else "m"
+    kind: Literal["m", "rad"] = "rad" if unit in ("deg", "rad") else "m"
     return RobotOutline(name, disks=disks, command_unit=kind, assumed=frozenset(assumed), **given)
 
 
