@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -109,9 +109,7 @@ def init(
     if unit in ("deg", "rad"):
         answers["spool_radius"] = ask.answer("spool_radius", spool_radius, "Radius of the spools [mm]", 10.0)
     answers["gravity"] = ask.answer("gravity", gravity, "Things fall along (+z: hangs, -z: stands, -y: level)", "+z")
-    answers["mass"] = mass
-    if mass is None:
-        ask.assumed.add("mass")
+    answers["mass"] = ask.answer("mass", mass, "Mass of the body [g]; 0: that of silicone", 0.0) or None
     answers["young_modulus"] = ask.answer("young_modulus", modulus, "Young's modulus [MPa]", 1.0)
     answers["markers"] = _markers(ask, guess, markers, answers["length"])
     outline = _outline(_name(folder), disks, unit, answers, ask.assumed)
@@ -143,7 +141,7 @@ def _outline(name: str, disks: int, unit: str, answers: dict[str, Any], assumed:
         if key in given:
             given[key] = factor * given[key]
     given["markers"] = {marker: MILLIMETRES * height for marker, height in given["markers"].items()}
-    kind = "rad" if unit in ("deg", "rad") else "m"
+    kind: Literal["m", "rad"] = "rad" if unit in ("deg", "rad") else "m"
     return RobotOutline(name, disks=disks, command_unit=kind, assumed=frozenset(assumed), **given)
 
 

@@ -142,7 +142,7 @@ def _head(o: RobotOutline) -> list[str]:
         'initial_state = "equilibrium"  # or "rest": undeformed',
         "",
         "[command]",
-        f'unit = "{o.command_unit}"',
+        f'unit = "{o.command_unit}"' + _mark(o, "command_unit"),
         "ramp_s = 0.0                   # a change of command is carried out linearly over this time",
         "dead_time_s = 0.0              # and begins so much later",
         "",

@@ -178,10 +178,7 @@ def _masks(trajectory: Trajectory) -> str:
 def _commands(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[str]:
     names, unit, command = trajectory.cable_names, trajectory.command_unit, trajectory.command
     yield f"{len(names)} commands in {unit}: {_names(names)}; from {command.min():.4g} to {command.max():.4g}"
-    initial = trajectory.initial_command
-    known = "zero" if not np.any(initial) else f"[{', '.join(f'{value:.4g}' for value in initial)}]"
-    same = ", as in the first row" if np.array_equal(initial, command[0]) else ""
-    yield f"command before the first row: {known}{same}"
+    yield f"command before the first row: {trajectory.first_command}"
     if len(names) != len(robot.channel_names):
         found.problems.append(
             f"{trajectory.name}: {len(names)} commands ({_names(names)}) for the robot's {len(robot.channel_names)} "
