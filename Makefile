@@ -17,7 +17,7 @@ ALL     = $(VENV)/all.stamp
 export OPENBLAS_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint format bench validate notebooks reference demo-data clean
+.PHONY: help demo test test-all lint format bench validate notebooks notebook-outputs reference demo-data clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-16s%s\n", $$1, $$2 }'
@@ -52,6 +52,9 @@ notebooks: $(DEV) ## run every notebook from top to bottom
 
 reference: $(CORE) ## write docs/reference from the code
 	$(BIN)/python tools/reference.py
+
+notebook-outputs: $(DEV) ## run every notebook and keep its outputs in it
+	cd notebooks && ../$(BIN)/jupyter-execute --inplace --timeout=1800 *.ipynb
 
 demo-data: $(CORE) ## make the recordings of the bundled example again
 	$(BIN)/rfdropo simulate experiments/demo_data.toml --out experiments/demo --overwrite

@@ -208,7 +208,7 @@ def _run_figures(record: PosteriorRecord, summary: Mapping[str, Any]) -> dict[st
         )
         if scored
         else None,
-        "pair": embed(posterior_figures.pair_figure(record, pair), "Scatter of each pair of parameters")
+        "pair": embed(posterior_figures.pair_figure(record, pair), "Scatter of each pair of parameters", whole=True)
         if len(pair) > 1
         else None,
         "pair_names": pair,

@@ -24,7 +24,7 @@ def robot_figure(outline: Mapping[str, Any]) -> Figure:
         outline: as `robots.outline` makes it.
     """
     figure = Figure(figsize=(style.WIDTH, 3.0))
-    side, section = figure.subplots(1, 2, width_ratios=(2.2, 1.0))
+    side, section = figure.subplots(1, 2, width_ratios=(1.4, 1.0))
     colours = {name: style.CYCLE[i % (len(style.CYCLE) - 1)] for i, name in enumerate(outline["cables"])}
     gravity = np.abs(outline["gravity"])
     _side(side, outline, 0 if gravity[0] > gravity[1] else 1, colours)

@@ -116,14 +116,17 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     return drawn
 
 
-def embed(figure: Figure, alt: str, caption: str = "") -> Picture:
-    """Figure as SVGs inside data URIs, without a background: the page's shows through."""
+def embed(figure: Figure, alt: str, caption: str = "", *, whole: bool = False) -> Picture:
+    """Figure as SVGs inside data URIs, without a background: the page's shows through.
+
+    ``whole`` keeps it in one piece, for panels that share their axes' labels.
+    """
     with _our_style():
         engine = figure.get_layout_engine()
         if engine is not None:  # once, here: savefig would draw everything a second time for it
             engine.execute(figure)
             figure.set_layout_engine("none")
-        cells = _cells(figure)
+        cells = [] if whole else _cells(figure)
         panels = [Panel(_svg(figure, None), 100.0, "whole")] if not cells else _panels(figure, cells)
     return Picture(tuple(panels), alt, caption, round(96 * figure.get_figwidth()))
 
