@@ -77,9 +77,9 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
             f"(joint test p {_p(answer)}{_resolution(answer)}{_assumption(answer)})."
         )
     if not findings and answer.looks[0].omnibus.p > answer.question.rules.base_passes:
-        left = 1e3 * noise_distance(answer.target.noise)
+        distance = 1e3 * noise_distance(answer.target.noise)
         return (
-            f"What the base model leaves, {left:.2g} mm, changes too slowly to be the noise of a measurement, but "
+            f"What the base model leaves, {distance:.2g} mm, changes too slowly to be the noise of a measurement, but "
             f"without repeats it cannot be told from noise, and no candidate stands out of it "
             f"(joint test p {_p(answer)})."
         )

@@ -33,10 +33,17 @@ class Problem(Protocol):
     - ``log_likelihood_at(u)`` of one unconstrained point, traceable by JAX, as NUTS and nested sampling want it.
     """
 
-    names: tuple[str, ...]
-    units: dict[str, str]
-    bounds: dict[str, tuple[float, float]]
-    n_rows: int
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def units(self) -> dict[str, str]: ...
+
+    @property
+    def bounds(self) -> dict[str, tuple[float, float]]: ...
+
+    @property
+    def n_rows(self) -> int: ...
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
         """Independent prior draws."""

@@ -53,9 +53,11 @@ class CsvColumns(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    time: str | None = Field(None, description="column of the times; or give sample_time")
-    time_unit: Literal["s", "ms"] = Field("s", description="unit of the times")
-    sample_time: float | None = Field(None, gt=0, description="time between rows [s], where no column holds times")
+    time: str | None = Field(default=None, description="column of the times; or give sample_time")
+    time_unit: Literal["s", "ms"] = Field(default="s", description="unit of the times")
+    sample_time: float | None = Field(
+        default=None, gt=0, description="time between rows [s], where no column holds times"
+    )
     commands: list[str] = Field(
         min_length=1,
         description="columns of the commands as they were sent, one for each of the robot's channels, in its order",
@@ -73,20 +75,20 @@ class CsvColumns(BaseModel):
         '["x", "z", "-y"] for a trunk that hangs in a frame with y up',
     )
     markers: list[str] | None = Field(
-        None, description="the robot's name of each marker in positions; m1, m2, ... by default"
+        default=None, description="the robot's name of each marker in positions; m1, m2, ... by default"
     )
     cables: list[str] | None = Field(
-        None, description="name of each channel in commands; those of the columns by default"
+        default=None, description="name of each channel in commands; those of the columns by default"
     )
     tensions: list[str] | None = Field(
-        None, description="columns of the cable tensions [N], one for each command; empty cells are left out"
+        default=None, description="columns of the cable tensions [N], one for each command; empty cells are left out"
     )
     motor_angles: list[str] | None = Field(
-        None, description="columns of the measured motor angles, one for each command; empty cells are left out"
+        default=None, description="columns of the measured motor angles, one for each command; empty cells are left out"
     )
-    motor_angle_unit: Literal["rad", "deg"] = Field("rad", description="unit of the motor angles")
+    motor_angle_unit: Literal["rad", "deg"] = Field(default="rad", description="unit of the motor angles")
     object_pose: list[str] | None = Field(
-        None,
+        default=None,
         min_length=7,
         max_length=7,
         description="columns of the pushed body's centre x, y, z and unit quaternion x, y, z, w; empty rows are left "

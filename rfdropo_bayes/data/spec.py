@@ -31,12 +31,12 @@ class RecordingEntry(BaseModel):
 
     observations: str = Field(description="file, or several by wildcards")
     commands: str | None = Field(
-        None, description='file of the commands, where they have one of their own; "none": zero commands'
+        default=None, description='file of the commands, where they have one of their own; "none": zero commands'
     )
     rows: tuple[int, int] | None = Field(
-        None, description="keep observation rows first to last only, both included, counted from 0"
+        default=None, description="keep observation rows first to last only, both included, counted from 0"
     )
-    initial_command: InitialCommand = Field(None, description="as in [data], for this entry")
+    initial_command: InitialCommand = Field(default=None, description="as in [data], for this entry")
 
 
 class DataSpec(BaseModel):
@@ -47,20 +47,20 @@ class DataSpec(BaseModel):
     format: Format = Field(description="how the files are written")
     fit: list[RecordingEntry] = Field(min_length=1, description="recordings that a fit may see")
     test: list[RecordingEntry] = Field([], description="recordings that no fit sees")
-    columns: CsvColumns | None = Field(None, description='what the columns are, for format "csv"')
+    columns: CsvColumns | None = Field(default=None, description='what the columns are, for format "csv"')
     resample: float | None = Field(
-        None, gt=0, description="sample time to bring every recording to [s]; as recorded by default"
+        default=None, gt=0, description="sample time to bring every recording to [s]; as recorded by default"
     )
     missing: Literal["error", "mask"] = Field(
-        "error", description="whether a lost marker position is an error or is left out"
+        default="error", description="whether a lost marker position is an error or is left out"
     )
     initial_command: InitialCommand = Field(
-        None,
+        default=None,
         description='command before the first row of a file: "first" (its first command was in force already), "zero", '
         "or one value per channel [m or rad]; where the file does not say, recognised from the first rows by default",
     )
     lead_in: float = Field(
-        0.0,
+        default=0.0,
         ge=0,
         description="for so long [s] before the first of rows commands are simulated, too: a piece that starts in "
         "motion is then in motion, and starts at rest under the command in force without",

@@ -101,7 +101,7 @@ def residuals_of(answer: Answer) -> figures.Residuals:
         (position - position[:, :1])[rows] @ pattern,
         tuple(forward.lanes.simulator.channel_names),
         tuple(forward.lanes.simulator.cable_names),
-        forward.lanes.simulator.robot.command_unit,
+        answer.question.trajectories[0].command_unit,
     )
 
 

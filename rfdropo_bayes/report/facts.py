@@ -88,7 +88,7 @@ class RunFacts:
         limits: sentences on what this analysis cannot see, beside those that always hold.
         versions: of the software.
         details: further plain values of the method.
-        outline: of the robot, as `robots.outline` makes it, for its picture.
+        outline: of the robot, as `robots.robot_shape` makes it, for its picture.
     """
 
     title: str

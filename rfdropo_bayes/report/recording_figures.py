@@ -63,7 +63,7 @@ def _coordinates(axes: Axes, trajectory: Trajectory, marker: int) -> None:
     for axis, colour in enumerate(style.AXIS_COLOURS):
         axes.plot(trajectory.time[rows], values[rows, axis], color=colour, label=AXES[axis])
     for row in np.flatnonzero(~mask):
-        low, high = max(row - 1, 0), min(row + 1, len(mask) - 1)
+        low, high = max(int(row) - 1, 0), min(int(row) + 1, len(mask) - 1)
         axes.axvspan(trajectory.time[low], trajectory.time[high], color=style.TEST, alpha=0.15)
     if not mask.all():
         axes.axvspan(np.nan, np.nan, color=style.TEST, alpha=0.15, label="masked")

@@ -21,7 +21,7 @@ def robot_figure(outline: Mapping[str, Any]) -> Figure:
     """Seen from the side, gravity in the picture where it points across the robot, and from the base.
 
     Args:
-        outline: as `robots.outline` makes it.
+        outline: as `robots.robot_shape` makes it.
     """
     figure = Figure(figsize=(style.WIDTH, 3.0))
     side, section = figure.subplots(1, 2, width_ratios=(1.4, 1.0))

@@ -170,7 +170,7 @@ def _cells(figure: Figure) -> list[tuple[Axes, Bbox]]:
     specs = {axes: axes.get_subplotspec() for axes in shown}
     if len(shown) < 2 or any(spec is None or len(spec.rowspan) > 1 for spec in specs.values()) or figure.texts:
         return []
-    boxes = {axes: _inches(figure, axes.get_tightbbox()) for axes in shown}
+    boxes = {axes: _inches(figure, box) for axes in shown if (box := axes.get_tightbbox()) is not None}
     rows: dict[int, list[Axes]] = {}
     for axes in sorted(shown, key=lambda own: boxes[own].x0):
         rows.setdefault(specs[axes].rowspan.start, []).append(axes)  # type: ignore[union-attr]

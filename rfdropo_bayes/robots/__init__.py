@@ -6,7 +6,7 @@ from rfdropo_bayes.robots.catalogue import find_robot_file, known_robots, load_r
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.robot import Command, Marker, PushScene, Robot
 from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, section_profile
-from rfdropo_bayes.robots.shape import outline
+from rfdropo_bayes.robots.shape import robot_shape
 
 __all__ = [
     "Body",
@@ -25,6 +25,6 @@ __all__ = [
     "find_robot_file",
     "known_robots",
     "load_robot",
-    "outline",
+    "robot_shape",
     "section_profile",
 ]

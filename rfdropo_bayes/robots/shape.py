@@ -9,7 +9,7 @@ import numpy as np
 from rfdropo_bayes.robots.robot import Robot
 
 
-def outline(robot: Robot) -> dict[str, Any]:
+def robot_shape(robot: Robot) -> dict[str, Any]:
     """Section widths along the axis, cables from anchor to last guide, markers, and the direction of gravity.
 
     All in metres and the base frame: ``station`` and ``half_width`` (x, y) of the body, ``cables`` and ``markers`` as

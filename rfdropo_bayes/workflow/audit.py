@@ -29,7 +29,7 @@ from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.audit_page import render_audit
 from rfdropo_bayes.report.summary import combined_hash
-from rfdropo_bayes.robots import Robot, outline
+from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.compiled import CompiledEngine, effects_costly
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, obstacle
@@ -107,7 +107,7 @@ def run_audit(
         )
         write_text(out / AUDIT, json.dumps(content, indent=2, allow_nan=False) + "\n")
         write_text(out / EXTENDED, describe(extended_tables(tables, answer, folder, out)))
-        shape = outline(find_robot(experiment, folder))
+        shape = robot_shape(find_robot(experiment, folder))
         page = render_audit(answer, content, experiment.title or path.stem, describe(tables), shape)
         write_text(out / REPORT, page)
     return content

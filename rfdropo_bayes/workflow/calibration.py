@@ -23,7 +23,7 @@ from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, soft
 from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_warnings
 from rfdropo_bayes.report.run_folder import POSTERIOR
-from rfdropo_bayes.robots import outline
+from rfdropo_bayes.robots import robot_shape
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
 from rfdropo_bayes.workflow.files import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
@@ -208,6 +208,7 @@ def gather_facts(
     """What the report says beside the posterior."""
     unseen = [prediction for prediction in record.recordings if prediction.split == "test"]
     description = problem.model.simulator.description
+    robot = getattr(problem.model.simulator, "robot", None)
     checks = check_fit(problem, record)
     floor = noise_floor([*fitted, *tested])
     return RunFacts(
@@ -242,7 +243,7 @@ def gather_facts(
         objects=score_objects(unseen, [*fitted, *tested]),
         versions=software_versions(),
         details=result.details,
-        outline=outline(problem.model.simulator.robot),
+        outline=robot_shape(robot) if robot is not None else None,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -107,7 +108,7 @@ def _read(found: Check, experiment: Experiment, folder: Path, role: str) -> Iter
     entries: list[RecordingEntry] = spec.fit if role == "fit" else spec.test
     for entry in entries:
         alone = spec.model_copy(update={"fit": [entry], "test": []})
-        yield from _try(found, lambda alone=alone: load_recordings(alone, folder)) or []
+        yield from _try(found, partial(load_recordings, alone, folder)) or []
     _try(found, lambda: load_recordings(spec, folder, role="fit" if role == "fit" else "test"))
 
 
