@@ -31,7 +31,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "training": {"posteriors", "robots", "inference", "envs"},
     "deployment": {"data", "robots"},
 }
-MAY_IMPORT["workflow"] = set(MAY_IMPORT) - {"envs", "training", "deployment"}
+MAY_IMPORT["workflow"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from rfdropo_bayes import __version__
-from rfdropo_bayes.cli import audit, check, inference, init, listings, pictures, prediction
+from rfdropo_bayes.cli import audit, check, inference, init, listings, pictures, prediction, training
 from rfdropo_bayes.cli.options import (
     AsJson,
     ExperimentFile,
@@ -126,6 +126,8 @@ app.command()(audit.design)
 app.command()(inference.export)
 app.command()(pictures.view)
 app.command()(prediction.predict)
+app.command()(training.train)
+app.command()(training.evaluate)
 app.command()(listings.robots)
 app.command()(listings.mechanisms)
 app.command()(listings.formats)

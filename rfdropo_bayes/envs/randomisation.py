@@ -138,12 +138,43 @@ class Draws:
         return dict(zip(self.names, map(float, row), strict=True))
 
 
+@dataclass(frozen=True)
+class Fixed:
+    """Another randomisation, with further parameters held at one value."""
+
+    drawn: Randomisation
+    values: Mapping[str, float]
+
+    @property
+    def kind(self) -> str:
+        """That of the randomisation."""
+        return self.drawn.kind
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters that vary, and those that are held."""
+        return tuple(dict.fromkeys((*self.drawn.names, *self.values)))
+
+    @property
+    def sha256(self) -> str:
+        """Of both."""
+        return _digest([self.drawn.sha256, dict(self.values)])
+
+    def draw(self, rng: np.random.Generator) -> dict[str, float]:
+        """A draw; what is held does not overwrite what varies."""
+        return {**self.values, **self.drawn.draw(rng)}
+
+
 def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Randomisation:
     """The randomisation, if every value that it can give lies within the hard bounds of a parameter of the simulator.
 
     Raises:
         InputError: an unknown parameter, or values outside its bounds; of a posterior the number of such draws is said.
     """
+    if isinstance(randomisation, Fixed):
+        fitting(Point(randomisation.values), specs)
+        fitting(randomisation.drawn, specs)
+        return randomisation
     where = f"randomisation ({randomisation.kind})"
     check_names(randomisation.names, specs, where=where)
     known = {spec.name: spec for spec in specs}

@@ -155,6 +155,14 @@ def layout_of(
     )
 
 
+def observed_of(layout: PolicyLayout) -> Observed:
+    """Which observation a layout has; see `layout_of`."""
+    sizes = {part.name: part.size for part in layout.observation}
+    if "commands" not in sizes:
+        return "paper"
+    return "markers" if sizes["markers"] == 3 * len(TRACKED_HEIGHTS) else "full"
+
+
 def command_limits(robot: Robot) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
     """Least and greatest command of each channel [m or rad] at nominal parameters.
 

@@ -23,6 +23,8 @@ class TrainingTable(BaseModel):
         description="full: centre line, goal, object, cable levels and changes; paper: without cable levels and "
         "changes; markers: what motion capture sees of the robot, with cable levels and changes",
     )
+    period: float = Field(default=0.05, gt=0.0, description="time from one action to the next [s]")
+    noise: float = Field(default=0.0, ge=0.0, description="white noise on what is seen of the markers [m]")
     algorithm: str = Field(default="PPO", description="an algorithm of Stable-Baselines3 by its name")
     options: dict[str, Any] = Field(
         default_factory=dict, description="options of the algorithm by Stable-Baselines3's names, net_arch among them"

@@ -25,7 +25,7 @@ from rfdropo_bayes.training.config import TrainingTable
 from rfdropo_bayes.training.evaluation import Case, Episode, draw_cases, play
 
 EVALUATION_SEED = 1_000_003  # cases of an evaluation are none of the episodes that training begins with
-CHECKPOINT = "checkpoint"
+CHECKPOINT, EPISODES = "checkpoints", "episodes.jsonl"
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,10 @@ def train(
     """Train a policy.
 
     Args:
-        environments: makes so many environments as one ``VecEnv`` with a ``layout``.
+        environments: makes so many environments as one ``VecEnv`` with a ``layout`` and a ``log``.
         table: algorithm and budget.
-        out: folder for ``log.jsonl``, TensorBoard's files and the checkpoint.
+        out: folder for ``log.jsonl``, ``episodes.jsonl`` (what every training episode began with and how it ended),
+            TensorBoard's files and the checkpoint.
         seed: of everything.
         gamma: discount factor of a control period, unless the options have one.
         resume: go on from the checkpoint in ``out``.
@@ -88,12 +89,11 @@ def train(
     folder = Path(out) / CHECKPOINT
     state = _load_state(folder, known) if resume else None
     model, normalisation = _begin(maker, options, venv, table, folder, state, out, seed)
-    judges = environments(min(table.environments, table.evaluation_episodes))
-    cases = draw_cases(judges, table.evaluation_episodes, EVALUATION_SEED + seed)
+    cases = draw_cases(venv, table.evaluation_episodes, EVALUATION_SEED + seed)
     state = state or {"known": known, "leg": 0, "seconds": 0.0, "diverged": 0, "curve": []}
     with Progress(f"{table.algorithm} {table.task}", show=None, log=Path(out) / "log.jsonl") as progress:
         while model.num_timesteps < table.steps:
-            state = _leg(model, normalisation, venv, judges, cases, table, state, seed)
+            state = _leg(model, normalisation, venv, cases, table, state, seed, Path(out) / EPISODES)
             _save(model, normalisation, folder, state)
             progress.stage(model.num_timesteps / table.steps, **state["curve"][-1])
     return Trained(model, normalisation, state["curve"], state["diverged"], state["seconds"])
@@ -135,24 +135,26 @@ def _leg(
     model: Any,
     normalisation: Any,
     venv: Any,
-    judges: Any,
     cases: Sequence[Case],
     table: TrainingTable,
     state: Mapping[str, Any],
     seed: int,
+    log: Path,
 ) -> dict[str, Any]:
-    """Learn until the next evaluation, and evaluate."""
+    """Learn until the next evaluation, and evaluate in the same environments: each leg resets them all."""
     began = time.monotonic()
     leg = int(state["leg"]) + 1
     model.set_random_seed(int(np.random.SeedSequence([seed, leg]).generate_state(1)[0] % 2**31))
     model.set_env(normalisation or venv, force_reset=True)
+    venv.set_attr("log", log)
     count = _Failures()
     steps = min(table.evaluate_every, table.steps - model.num_timesteps)
     model.learn(steps, callback=count.callback(), reset_num_timesteps=False, tb_log_name="run", log_interval=None)
+    venv.set_attr("log", None)
     policy = Trained(model, normalisation, [], 0, 0.0)
     if normalisation is not None:
         normalisation.training = False
-    episodes = play(policy.act, judges, cases)
+    episodes = play(policy.act, venv, cases)
     if normalisation is not None:
         normalisation.training = True
     seconds = state["seconds"] + time.monotonic() - began

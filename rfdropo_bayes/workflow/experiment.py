@@ -12,6 +12,7 @@ from rfdropo_bayes.data import DataSpec
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable
 from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.training.config import TrainingTable
 from rfdropo_bayes.workflow.experiment_file import override, read_tables
 
 
@@ -249,6 +250,7 @@ class Experiment(Table):
     )
     audit: AuditTable = Field(default_factory=AuditTable, description="candidates and effort of rfdropo audit")
     design: DesignTable = Field(default_factory=DesignTable, description="effort of rfdropo design")
+    training: TrainingTable | None = Field(default=None, description="what rfdropo train learns, and how")
     separation: SeparationTable | None = Field(default=None, description="what rfdropo separate compares")
 
 

@@ -38,6 +38,8 @@ COMMANDS = {
     "audit": Command(("audit.json", "extended.toml", "report.html"), resumable=True),
     "separate": Command(("separation.json", "separation.md", "separation.png"), resumable=True),
     "design": Command(("design.json", "next_commands.csv")),
+    "train": Command(("summary.json", "policy.onnx", "card.md", "curve.png", "episodes.jsonl"), resumable=True),
+    "evaluate": Command(("evaluation.json", "evaluation.md", "episodes.csv", "success.png")),
     "benchmark table1": Command(("table1.json", "table1.md", "table1.png", "fits.jsonl"), resumable=True),
 }
 

@@ -75,7 +75,7 @@ def test_a_run_that_was_killed_goes_on_as_if_it_had_not_been(trained, tmp_path) 
 
 def test_a_kill_between_two_renames_loses_nothing(trained, tmp_path) -> None:
     source, _ = trained
-    shutil.copytree(source / "checkpoint", tmp_path / "checkpoint.old")
+    shutil.copytree(source / "checkpoints", tmp_path / "checkpoints.old")
     assert train(Points, TABLE, tmp_path, seed=3, gamma=0.9, resume=True).curve[-1]["steps"] == 6400
 
 
@@ -85,7 +85,7 @@ def test_a_kill_between_two_renames_loses_nothing(trained, tmp_path) -> None:
 )
 def test_a_checkpoint_of_other_settings_is_refused(trained, tmp_path, change, seed, words) -> None:
     source, _ = trained
-    shutil.copytree(source / "checkpoint", tmp_path / "checkpoint")
+    shutil.copytree(source / "checkpoints", tmp_path / "checkpoints")
     with pytest.raises(InputError, match=f"other settings: .*{words}"):
         train(Points, TABLE.model_copy(update=change), tmp_path, seed=seed, gamma=0.9, resume=True)
 

@@ -1,0 +1,327 @@
+"""``rfdropo train`` and ``rfdropo evaluate``: policies on the simulator of an experiment."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.envs.episodes import Episodes, Settings
+from rfdropo_bayes.envs.randomisation import Fixed, Phi, Point, Randomisation, Uniform, read_phi, read_posterior
+from rfdropo_bayes.envs.rendering import picture
+from rfdropo_bayes.envs.tasks import Task, observed_of, task_named
+from rfdropo_bayes.envs.vec_env import TrunkVecEnv
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import whole, write_text
+from rfdropo_bayes.report import software_versions
+from rfdropo_bayes.robots.policy_layout import PolicyLayout
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.training.config import TrainingTable
+from rfdropo_bayes.training.evaluation import (
+    Case,
+    Episode,
+    draw_cases,
+    episode_table,
+    interquartile_mean,
+    median_episode,
+    play,
+    success,
+)
+from rfdropo_bayes.training.export import ExportedPolicy, export_policy, latency
+from rfdropo_bayes.training.figures import curve_figure, save_animation, success_figure
+from rfdropo_bayes.training.run import Trained, train
+from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values
+from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
+from rfdropo_bayes.workflow.files import run_folder
+
+POLICY, CARD, SUMMARY, CURVE = "policy.onnx", "card.md", "summary.json", "curve.png"
+EVALUATION, TABLE, CSV, FIGURE = "evaluation.json", "evaluation.md", "episodes.csv", "success.png"
+THRESHOLDS = (0.005, 0.01, 0.01525, 0.02157, 0.030)  # m; the last three are the paper's
+EVALUATION_SEED = 2_000_003  # none of the seeds that training or its evaluations use
+SCHEMA_VERSION = 1
+
+
+def run_training(
+    path: Path, out: Path, *, overrides: Sequence[str] = (), resume: bool = False, overwrite: bool = False
+) -> dict[str, Any]:
+    """Train a policy on an experiment's simulator, and export it.
+
+    Args:
+        path: experiment file with a table [training].
+        out: folder to write to: policy.onnx, card.md, summary.json, curve.png, episodes.jsonl, TensorBoard's files and
+            checkpoints.
+
+    Returns:
+        the content of summary.json.
+
+    Raises:
+        InputError: bad input, before anything long has started.
+    """
+    experiment, tables = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    table, task, simulator = _training(experiment, folder)
+    randomisation = _randomisation(table, experiment, simulator, folder)
+    settings = Settings(actions=table.actions, observed=table.observation, period=table.period, noise=table.noise)
+    known = {"randomisation": randomisation.sha256, "simulator": simulator.description["content_sha256"]}
+
+    def environments(lanes: int) -> TrunkVecEnv:
+        return TrunkVecEnv(Episodes(simulator, task, lanes, randomisation, settings))
+
+    options: dict[str, Any] = {"tables": tables, "folder": folder, "data": known}
+    with run_folder(out, "train", **options, resume=resume, overwrite=overwrite) as out:
+        seed = experiment.seed
+        found = train(environments, table, out, seed=seed, gamma=task.gamma, resume=resume, fingerprint=known)
+        layout = found.model.get_env().get_attr("layout")[0]
+        facts = {
+            "rfdropo_version": software_versions()["rfdropo_bayes"],
+            "randomisation": randomisation.kind,
+            "posterior_sha256": randomisation.sha256,
+            "simulator_sha256": str(known["simulator"]),
+            "seed": str(seed),
+        }
+        policy = ExportedPolicy(export_policy(found.model, found.normalisation, layout, out / POLICY, facts))
+        _check_parity(policy, found)
+        summary = _summary(table, found, policy, facts)
+        curve_figure(found.curve).savefig(out / CURVE, dpi=150)
+        write_text(out / CARD, policy_card(summary, layout))
+        write_text(out / SUMMARY, json.dumps(summary, indent=2) + "\n")
+    return summary
+
+
+def run_evaluation(
+    path: Path,
+    policies: Sequence[Path],
+    out: Path,
+    *,
+    episodes: int = 200,
+    lanes: int = 64,
+    seed: int = 0,
+    overrides: Sequence[str] = (),
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Play exported policies on the same episodes of an experiment's simulator.
+
+    Args:
+        path: experiment file; its table [training] says which task and from where parameters are drawn.
+        policies: policy.onnx, or folders that hold one; named after their folders.
+        out: folder to write to: evaluation.json, evaluation.md, episodes.csv, success.png, and a GIF of each policy's
+            median episode.
+        episodes: of each policy.
+        lanes: episodes that are simulated at once.
+        seed: of the cases.
+
+    Returns:
+        the content of evaluation.json.
+
+    Raises:
+        InputError: bad input, or a policy for another layout.
+    """
+    experiment, tables = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    table, task, simulator = _training(experiment, folder)
+    randomisation = _randomisation(table, experiment, simulator, folder)
+    loaded = {_name(p): ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies}
+    options: dict[str, Any] = {"tables": tables, "folder": folder, "options": {"episodes": episodes, "seed": seed}}
+    with run_folder(out, "evaluate", **options, overwrite=overwrite) as out:
+        cases: list[Case] = []
+        found: dict[str, list[Episode]] = {}
+        for name, policy in loaded.items():
+            batch = _episodes_for(policy.layout, simulator, task, min(lanes, episodes), randomisation, table, name)
+            venv = TrunkVecEnv(batch)
+            cases = cases or draw_cases(venv, episodes, EVALUATION_SEED + seed)
+            found[name] = play(policy.act, venv, cases)
+            _film(batch, found[name], cases, out / f"{name}.gif")
+        content = _judged(found, cases, experiment.seed)
+        with whole(out / CSV) as partial:
+            episode_table(found, cases).to_csv(partial, index=False)
+        success_figure(found, THRESHOLDS).savefig(out / FIGURE, dpi=150)
+        write_text(out / TABLE, evaluation_table(content))
+        write_text(out / EVALUATION, json.dumps(content, indent=2) + "\n")
+    return content
+
+
+def _training(experiment: Experiment, folder: Path) -> tuple[TrainingTable, Task, RobotSimulator]:
+    if experiment.training is None:
+        raise InputError(
+            "the experiment has no table [training]", where="training", remedy='add it, with task = "TrunkReach-v0"'
+        )
+    task = task_named(experiment.training.task)
+    simulator_table = experiment.simulator.model_copy(update={"push": task.push})
+    experiment = experiment.model_copy(update={"simulator": simulator_table})
+    return (
+        experiment.training or TrainingTable(),
+        task,
+        build_simulator(experiment, find_robot(experiment, folder), folder),
+    )
+
+
+def _randomisation(
+    table: TrainingTable, experiment: Experiment, simulator: RobotSimulator, folder: Path
+) -> Randomisation:
+    """Where parameters come from, with the experiment's fixed values."""
+    fixed = {
+        n: v for n, v in fixed_values(experiment, simulator).items() if n in {s.name for s in simulator.parameters}
+    }
+    if table.randomisation == "none":
+        return Point(fixed)
+    if table.randomisation == "uniform":
+        if not table.ranges:
+            raise InputError(
+                "no ranges", where="[training.ranges]", remedy="give name = [low, high] for each parameter"
+            )
+        return Fixed(Uniform(table.ranges), fixed) if fixed else Uniform(table.ranges)
+    if table.source is None:
+        raise InputError(
+            f"randomisation = {table.randomisation!r} without a source",
+            where="[training]",
+            remedy="name the folder of a calibration: source = ...",
+        )
+    beside = folder / table.source
+    source = beside if beside.exists() else Path(table.source)
+    drawn: Randomisation | Phi
+    drawn = (
+        read_phi(source, simulator.parameters)
+        if table.randomisation == "phi"
+        else read_posterior(source, simulator.parameters)[0]
+    )
+    return Fixed(drawn, fixed) if fixed else drawn
+
+
+def _episodes_for(
+    layout: PolicyLayout,
+    simulator: RobotSimulator,
+    task: Task,
+    lanes: int,
+    randomisation: Randomisation,
+    table: TrainingTable,
+    name: str,
+) -> Episodes:
+    """Lanes that show a policy what it was trained to see."""
+    settings = Settings(
+        actions=layout.kind,
+        observed=observed_of(layout),
+        period=layout.period_s,
+        step=float(np.max(layout.moves)),
+        noise=table.noise,
+    )
+    batch = Episodes(simulator, task, lanes, randomisation, settings)
+    batch.layout.require(layout, where=name)
+    return batch
+
+
+def _name(path: Path) -> str:
+    return path.name if path.is_dir() else (path.parent.name if path.stem == "policy" else path.stem)
+
+
+def _check_parity(policy: ExportedPolicy, trained: Trained) -> None:
+    """Raise if the exported policy does not act as the trained one does, on what it may see."""
+    seen = np.random.default_rng(0).normal(0.0, 0.05, (256, policy.layout.size)).astype(np.float32)
+    apart = float(np.max(np.abs(policy.act(seen).astype(float) - np.asarray(trained.act(seen), dtype=float))))
+    if apart > 1e-4:
+        raise InputError(
+            f"the exported policy acts otherwise than the trained one, by {apart:.2g}",
+            where=POLICY,
+            remedy="report this as an error",
+        )
+
+
+def _summary(table: TrainingTable, found: Trained, policy: ExportedPolicy, facts: Mapping[str, str]) -> dict[str, Any]:
+    return {
+        "task": table.task,
+        "algorithm": table.algorithm,
+        "steps": found.curve[-1]["steps"],
+        "seconds": found.seconds,
+        "diverged_episodes": found.diverged,
+        "evaluation": {key: value for key, value in found.curve[-1].items() if key not in ("steps", "seconds")},
+        "curve": found.curve,
+        "latency": latency(policy),
+        "layout_sha256": policy.layout.sha256,
+        "settings": table.model_dump(mode="json"),
+        **facts,
+        "versions": software_versions(),
+        "status": "done",
+        "schema_version": SCHEMA_VERSION,
+    }
+
+
+def policy_card(summary: Mapping[str, Any], layout: PolicyLayout) -> str:
+    """What somebody needs to know before using a policy, as Markdown."""
+    last, times = summary["evaluation"], summary["latency"]
+    parts = "\n".join(f"| {part.name} | {part.size} | {part.unit} |" for part in layout.observation)
+    what = (
+        f"one of {len(layout.moves)} moves of a channel by {np.max(layout.moves):g} {layout.unit}"
+        if layout.kind == "discrete"
+        else f"change of each of {len(layout.channels)} commands, up to {np.max(layout.moves):g} {layout.unit}"
+    )
+    return f"""# A policy for {summary["task"]}
+
+Trained in simulation by {summary["algorithm"]}: {summary["steps"]} steps in {summary["seconds"]:.0f} s, seed {summary["seed"]}.
+Parameters of every episode: {summary["randomisation"]}, SHA-256 {summary["posterior_sha256"][:16]}.
+
+In its last evaluation half of {summary["settings"]["evaluation_episodes"]} episodes end within
+{1e3 * last["distance_median"]:.2f} mm of the goal, 95 % within {1e3 * last["distance_q95"]:.2f} mm.
+One decision takes {1e3 * times["median_s"]:.3f} ms, {1e3 * times["p99_s"]:.3f} ms at the 99th percentile.
+
+| Observation | Numbers | Unit |
+|---|---|---|
+{parts}
+
+Action, every {layout.period_s:g} s: {what}. Layout SHA-256 {summary["layout_sha256"][:16]}.
+
+It has seen a simulator only. `rfdropo evaluate` says how it does on others; summary.json says what made it.
+"""
+
+
+def _film(batch: Episodes, episodes: Sequence[Episode], cases: Sequence[Case], path: Path) -> None:
+    """The median episode again, as an animation."""
+    episode = median_episode(episodes)
+    case = cases[episode.case]
+    option = {"parameters": dict(case.parameters), "goal": list(case.goal)}
+    batch.reset(np.arange(batch.lanes), [option] * batch.lanes)
+    frames = [picture(batch, 0)]
+    for action in episode.actions:
+        batch.act(np.repeat(np.asarray(action)[None], batch.lanes, axis=0))
+        frames.append(picture(batch, 0))
+    save_animation(frames, path)
+
+
+def _judged(found: Mapping[str, Sequence[Episode]], cases: Sequence[Case], seed: int) -> dict[str, Any]:
+    policies = {}
+    for name, episodes in found.items():
+        middle = interquartile_mean([episodes], seed)
+        rates = {f"{1e3 * t:g}": success(episodes, t) for t in THRESHOLDS}
+        policies[name] = {
+            "success_mm": {key: {"share": s, "low": low, "high": high} for key, (s, low, high) in rates.items()},
+            "interquartile_mean_mm": dict(zip(("value", "low", "high"), (1e3 * m for m in middle), strict=True)),
+            "median_mm": 1e3 * float(np.median([episode.distance for episode in episodes])),
+            "diverged": int(np.sum([episode.diverged for episode in episodes])),
+        }
+    return {"episodes": len(cases), "policies": policies, "seed": seed, "schema_version": SCHEMA_VERSION}
+
+
+def evaluation_table(content: Mapping[str, Any]) -> str:
+    """Success of every policy within each distance, with 95 % Wilson intervals, as Markdown."""
+    names = next(iter(content["policies"].values()))["success_mm"]
+    lines = [
+        f"Share of {content['episodes']} episodes, the same for all policies, that end within a distance of the goal,",
+        "with 95 % Wilson intervals; median and interquartile mean of the final distance.",
+        "",
+        f"| policy | {' | '.join(f'{name} mm' for name in names)} | median [mm] | IQM [mm] | diverged |",
+        f"|{'---|' * (len(names) + 4)}",
+    ]
+    for name, row in content["policies"].items():
+        cells = [
+            f"{100 * r['share']:.0f} % [{100 * r['low']:.0f}, {100 * r['high']:.0f}]"
+            for r in row["success_mm"].values()
+        ]
+        middle = row["interquartile_mean_mm"]
+        cells += [
+            f"{row['median_mm']:.2f}",
+            f"{middle['value']:.2f} [{middle['low']:.2f}, {middle['high']:.2f}]",
+            str(row["diverged"]),
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
