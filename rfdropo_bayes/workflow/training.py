@@ -249,7 +249,7 @@ def _summary(table: TrainingTable, found: Trained, policy: ExportedPolicy, facts
 
 def policy_card(summary: Mapping[str, Any], layout: PolicyLayout) -> str:
     """What somebody needs to know before using a policy, as Markdown."""
-    last, times = summary["evaluation"], summary["latency"]
+    last, times, seed = summary["evaluation"], summary["latency"], summary["seed"]
     parts = "\n".join(f"| {part.name} | {part.size} | {part.unit} |" for part in layout.observation)
     what = (
         f"one of {len(layout.moves)} moves of a channel by {np.max(layout.moves):g} {layout.unit}"
@@ -258,7 +258,7 @@ def policy_card(summary: Mapping[str, Any], layout: PolicyLayout) -> str:
     )
     return f"""# A policy for {summary["task"]}
 
-Trained in simulation by {summary["algorithm"]}: {summary["steps"]} steps in {summary["seconds"]:.0f} s, seed {summary["seed"]}.
+Trained in simulation by {summary["algorithm"]}: {summary["steps"]} steps in {summary["seconds"]:.0f} s, seed {seed}.
 Parameters of every episode: {summary["randomisation"]}, SHA-256 {summary["posterior_sha256"][:16]}.
 
 In its last evaluation half of {summary["settings"]["evaluation_episodes"]} episodes end within
