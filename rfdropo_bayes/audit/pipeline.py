@@ -140,18 +140,9 @@ def audit(
     if question.finer is not None:
         finer = _forward(question, True, target.measurements, deadline)
     unexamined = unaffordable(question.candidates, target, base, question.rules.slowest * question.rules.minutes)
-    for name, minutes in unexamined.items():
-        report(f"{name} is not examined: on the slower engine it would take {minutes:.0f} minutes")
-    examined = [c for c in question.candidates if c.name not in unexamined]
-    inquiry = Inquiry(target, examined, question.rules, question.seed, finer, report)
-    if base.converged:
-        steps, last = inquiry.name_causes(base)
-    else:
-        steps, last = [], look(target, base, [], [], [question.seed, 0], question.rules.bootstraps)
-    if steps and target.noise.source == RESIDUALS:
-        with suppress(OutOfTime):
-            inquiry, base = _asked_again(inquiry, base, steps[-1].fit)
-            target, (steps, last) = inquiry.target, inquiry.name_causes(base)
+    inquiry = _inquiry(question, target, finer, unexamined, report)
+    inquiry, base, steps, last = _inquired(inquiry, base)
+    target = inquiry.target
     held_out = None
     with suppress(OutOfTime):
         held_out = _held_out(question, target, inquiry, base, steps)
@@ -167,10 +158,8 @@ def audit(
     looks = [*(step.before for step in steps), last]
     stages = [held_out.gain(0, k) for k in range(1, len(steps) + 1)] if held_out else []
     gain = stages[-1] if stages else None
-    members = [len(step.members) for step in steps]
-    verdict = decide(
-        question.rules, looks[0].omnibus.p, last.omnibus.p if steps else None, members, gain, target.noise.doubtful
-    )
+    sizes_of, after = [len(step.members) for step in steps], last.omnibus.p if steps else None
+    verdict = decide(question.rules, looks[0].omnibus.p, after, sizes_of, gain, target.noise.doubtful)
     if not base.converged or (verdict == UNEXPLAINED and deadline.reached):
         verdict = NO_VERDICT
     suspected = None
@@ -204,6 +193,38 @@ def audit(
         target.forward.rollouts + (finer.rollouts if finer else 0),
         time.monotonic() - deadline.began,
     )
+
+
+def _inquiry(
+    question: Question,
+    target: Target,
+    finer: Forward | None,
+    unexamined: Mapping[str, float],
+    report: Callable[[str], None],
+) -> Inquiry:
+    """The inquiry into the candidates that can be afforded."""
+    for name, minutes in unexamined.items():
+        report(f"{name} is not examined: on the slower engine it would take {minutes:.0f} minutes")
+    examined = [c for c in question.candidates if c.name not in unexamined]
+    return Inquiry(target, examined, question.rules, question.seed, finer, report)
+
+
+def _inquired(inquiry: Inquiry, base: Fit) -> tuple[Inquiry, Fit, list[Step], Look]:
+    """Named causes, and the look at the model with them; asked once more where the noise is that of residuals.
+
+    Returns:
+        the inquiry and the base fit that they are of, the steps, and the look.
+    """
+    if not base.converged:
+        return inquiry, base, [], look(inquiry.target, base, [], [], [inquiry.seed, 0], inquiry.rules.bootstraps)
+    steps, last = inquiry.name_causes(base)
+    if steps and inquiry.target.noise.source == RESIDUALS:
+        with suppress(OutOfTime):
+            again, renewed = _asked_again(inquiry, base, steps[-1].fit)
+            found = again.name_causes(renewed)
+            if not inquiry.target.forward.deadline.reached:
+                return again, renewed, *found
+    return inquiry, base, steps, last
 
 
 def _with_differences_of(question: Question, target: Target) -> Question:
