@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -17,6 +19,7 @@ from rfdropo_bayes.audit.deadline import Deadline
 from rfdropo_bayes.audit.journal import digest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.differences import DIFFERENCE, FORWARD
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
 # Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. Processors take
@@ -57,6 +60,21 @@ class Lanes:
         observation = self.simulator.rollout(values, commands, steps)
         position = observation.position[:, self.marker_index]
         return position.reshape(position.shape[0], -1), observation.status, observation.tension
+
+    @property
+    def difference(self) -> float | None:
+        """Relative step of its derivatives; None where they are exact."""
+        engine = getattr(self.simulator, "engine", None)
+        if not hasattr(engine, "difference"):
+            return None
+        usual = FORWARD if getattr(engine, "one_sided", False) else DIFFERENCE[engine.precision]
+        return engine.difference or usual
+
+    def with_difference(self, step: float) -> Lanes:
+        """The same with central differences over another step."""
+        simulator: Any = self.simulator
+        changed = replace(simulator, engine=replace(simulator.engine, difference=step))
+        return Lanes(changed, self.marker_index, self.width)
 
     @cached_property
     def _rolled(self) -> Any:
@@ -122,7 +140,17 @@ class RoutedLanes(Lanes):
         self.fast, self.slow = fast, slow
         self._kept = np.array([self.physical.index(name) for name in fast.physical])
         self._further = np.setdiff1d(np.arange(len(self.physical)), self._kept)
+        self.null = null
         self._null = np.array([null[self.physical[i]] for i in self._further])
+
+    @property
+    def difference(self) -> float | None:
+        """See `Lanes.difference`."""
+        return self.fast.difference
+
+    def with_difference(self, step: float) -> Lanes:
+        """See `Lanes.with_difference`."""
+        return RoutedLanes(self.fast.with_difference(step), self.slow.with_difference(step), self.null)
 
     def _needs_slow(self, theta: np.ndarray) -> np.ndarray:
         return ~np.isclose(theta[:, self._further], self._null, rtol=1e-6, atol=1e-12).all(axis=1)
@@ -206,7 +234,22 @@ class Forward:
         named = (simulator.description, own.names, own.base, sorted(own.fixed.items()), sorted(own.nominal.items()))
         scale = own.values(np.stack([np.zeros(len(own.names)), np.ones(len(own.names))]))
         prior = (own.prior_mean, own.prior_sd, *own.bounds)
-        return digest(repr(named), self.lanes.marker_index, scale, self.slots, *prior, *map(np.asarray, self.commands))
+        return digest(
+            repr(named),
+            self.lanes.difference,
+            self.lanes.marker_index,
+            scale,
+            self.slots,
+            *prior,
+            *map(np.asarray, self.commands),
+        )
+
+    def with_difference(self, step: float) -> Forward:
+        """The same with derivatives over another step."""
+        changed = copy.copy(self)
+        changed.__dict__.pop("identity", None)
+        changed.lanes = self.lanes.with_difference(step)
+        return changed
 
     def positions(self, points: Points) -> tuple[Series, np.ndarray]:
         """Marker coordinates [m] of every recording, and True where all its rollouts ended well."""

@@ -25,7 +25,7 @@ from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
 from rfdropo_bayes.audit.noise import RESIDUALS, STATED, NoiseModel
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Look, look
-from rfdropo_bayes.audit.search import better_nearby, search
+from rfdropo_bayes.audit.search import better_nearby, search, with_usable_differences
 from rfdropo_bayes.audit.verdict import NO_VERDICT, PARTLY, UNEXPLAINED, decide
 from rfdropo_bayes.bayes.model import RecordingSet
 from rfdropo_bayes.data import Trajectory
@@ -115,7 +115,10 @@ class Answer:
 
 
 def audit(
-    question: Question, report: Callable[[str], None] = lambda line: None, journal: Journal | None = None
+    question: Question,
+    report: Callable[[str], None] = lambda line: None,
+    journal: Journal | None = None,
+    deadline: Deadline | None = None,
 ) -> Answer:
     """Run the audit. Same question, same answer.
 
@@ -123,30 +126,23 @@ def audit(
         question: see `Question`.
         report: called with a line of words now and then.
         journal: keeps what was computed, for an audit that is interrupted.
+        deadline: of a run that has begun before; by default the question's minutes from now on.
 
     Raises:
         InputError: rollouts at the optimum do not end well.
     """
-    began, deadline = time.monotonic(), Deadline(question.rules.minutes)
+    deadline = deadline or Deadline(question.rules.minutes)
     target, base = base_model(question, question.seed, journal, report, deadline)
+    question = _with_differences_of(question, target)
     shared = "" if target.noise.correlation is None else ", shared between channels"
     report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.order}){shared}")
     finer = None
     if question.finer is not None:
         finer = _forward(question, True, target.measurements, deadline)
     unexamined = unaffordable(question.candidates, target, base, question.rules.slowest * question.rules.minutes)
-    for name, minutes in unexamined.items():
-        report(f"{name} is not examined: on the slower engine it would take {minutes:.0f} minutes")
-    examined = [c for c in question.candidates if c.name not in unexamined]
-    inquiry = Inquiry(target, examined, question.rules, question.seed, finer, report)
-    if base.converged:
-        steps, last = inquiry.name_causes(base)
-    else:
-        steps, last = [], look(target, base, [], [], [question.seed, 0], question.rules.bootstraps)
-    if steps and target.noise.source == RESIDUALS:
-        with suppress(OutOfTime):
-            inquiry, base = _asked_again(inquiry, base, steps[-1].fit)
-            target, (steps, last) = inquiry.target, inquiry.name_causes(base)
+    inquiry = _inquiry(question, target, finer, unexamined, report)
+    inquiry, base, steps, last = _inquired(inquiry, base)
+    target = inquiry.target
     held_out = None
     with suppress(OutOfTime):
         held_out = _held_out(question, target, inquiry, base, steps)
@@ -162,10 +158,8 @@ def audit(
     looks = [*(step.before for step in steps), last]
     stages = [held_out.gain(0, k) for k in range(1, len(steps) + 1)] if held_out else []
     gain = stages[-1] if stages else None
-    members = [len(step.members) for step in steps]
-    verdict = decide(
-        question.rules, looks[0].omnibus.p, last.omnibus.p if steps else None, members, gain, target.noise.doubtful
-    )
+    sizes_of, after = [len(step.members) for step in steps], last.omnibus.p if steps else None
+    verdict = decide(question.rules, looks[0].omnibus.p, after, sizes_of, gain, target.noise.doubtful)
     if not base.converged or (verdict == UNEXPLAINED and deadline.reached):
         verdict = NO_VERDICT
     suspected = None
@@ -197,8 +191,49 @@ def audit(
         target.measurements.shift,
         stopped,
         target.forward.rollouts + (finer.rollouts if finer else 0),
-        time.monotonic() - began,
+        time.monotonic() - deadline.began,
     )
+
+
+def _inquiry(
+    question: Question,
+    target: Target,
+    finer: Forward | None,
+    unexamined: Mapping[str, float],
+    report: Callable[[str], None],
+) -> Inquiry:
+    """The inquiry into the candidates that can be afforded."""
+    for name, minutes in unexamined.items():
+        report(f"{name} is not examined: on the slower engine it would take {minutes:.0f} minutes")
+    examined = [c for c in question.candidates if c.name not in unexamined]
+    return Inquiry(target, examined, question.rules, question.seed, finer, report)
+
+
+def _inquired(inquiry: Inquiry, base: Fit) -> tuple[Inquiry, Fit, list[Step], Look]:
+    """Named causes, and the look at the model with them; asked once more where the noise is that of residuals.
+
+    Returns:
+        the inquiry and the base fit that they are of, the steps, and the look.
+    """
+    if not base.converged:
+        return inquiry, base, [], look(inquiry.target, base, [], [], [inquiry.seed, 0], inquiry.rules.bootstraps)
+    steps, last = inquiry.name_causes(base)
+    if steps and inquiry.target.noise.source == RESIDUALS:
+        with suppress(OutOfTime):
+            again, renewed = _asked_again(inquiry, base, steps[-1].fit)
+            found = again.name_causes(renewed)
+            if not inquiry.target.forward.deadline.reached:
+                return again, renewed, *found
+    return inquiry, base, steps, last
+
+
+def _with_differences_of(question: Question, target: Target) -> Question:
+    """The question with derivatives over the steps that the base fit has found usable."""
+    step = target.forward.lanes.difference
+    if step is None or step == question.lanes.difference:
+        return question
+    finer = question.finer and (question.finer[0].with_difference(step), question.finer[1])
+    return replace(question, lanes=target.forward.lanes, finer=finer)
 
 
 def _forward(question: Question, finer: bool, measurements: Measurements, deadline: Deadline | None) -> Forward:
@@ -239,7 +274,7 @@ def base_model(
     known = noise or NoiseModel(np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf)
     target = Target(forward, measurements, known, journal)
     try:
-        fit = _base_fit(target, question.start, seed, report)
+        target, fit = _base_fit(target, question.start, seed, report)
         return (target, fit) if noise is not None else _under_residual_noise(target, fit)
     except OutOfTime:
         raise InputError(
@@ -249,20 +284,25 @@ def base_model(
         ) from None
 
 
-def _base_fit(target: Target, start: dict[str, float] | None, seed: int, report: Callable[[str], None]) -> Fit:
+def _base_fit(
+    target: Target, start: dict[str, float] | None, seed: int, report: Callable[[str], None]
+) -> tuple[Target, Fit]:
     """Posterior mode of the base model, from a given start or from where `calibrate`'s search leads; climbed on while
     rollouts beside it are better."""
     coordinates = target.forward.coordinates
     free = np.arange(coordinates.base)
     first = search(target, jax.random.key(seed)) if start is None else coordinates.encode(start)
+    usual, target = target.forward.lanes.difference, with_usable_differences(target, first)
+    if target.forward.lanes.difference != usual:
+        report(f"motion is rough: derivatives over relative steps of {target.forward.lanes.difference:g}")
     fit = climb(target, first, free)
     for _ in range(AGAIN):
         better = better_nearby(target, fit)
         if better is None:
-            return fit
+            return target, fit
         report(f"base model: sum of squares {fit.residual @ fit.residual:.0f}, and better beside it")
         fit = climb(target, better, free)
-    return fit if better_nearby(target, fit) is None else replace(fit, promise=np.inf)
+    return target, fit if better_nearby(target, fit) is None else replace(fit, promise=np.inf)
 
 
 def _under_residual_noise(target: Target, fit: Fit) -> tuple[Target, Fit]:

@@ -87,6 +87,9 @@ def next_experiment(answer: Answer) -> dict[str, Any] | None:
     """What to do next: how to split a class, or how to learn more where nothing was named; None if all is well."""
     if answer.verdict == NO_DISCREPANCY:
         return None
+    if not answer.base.converged:
+        words = "Run `rfdropo calibrate`, look at its fit, and start the audit from it with --base."
+        return {"sentence": words, "separates": []}
     if answer.suspected is not None:
         words = "Repeat one command sequence three times: then it shows whether the noise is what [noise] states."
         return {"sentence": words, "separates": []}

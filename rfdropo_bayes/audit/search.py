@@ -8,7 +8,7 @@ not derivatives, whether the summit that was found is one.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +18,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.audit.fit import CLOSE, Fit, Target
 from rfdropo_bayes.inference.laplace import LaplaceConfig, find_modes
+from rfdropo_bayes.simulators.differences import usable_difference
 
 CLIMBED = 0.1  # nats that a step of these climbs promises at their end; the audit's own climb goes on from there
 POLLED = (0.3, 0.03, 0.003)  # prior deviations to each side of a summit that are tried
@@ -133,6 +134,26 @@ def search(target: Target, key: PRNGKeyArray) -> Float[np.ndarray, " d"]:
         return {"x": problem._points(mode.mean[None])[0]}
 
     return target.recall("search", [np.asarray(jax.random.key_data(key))], compute)["x"]
+
+
+def with_usable_differences(target: Target, x: Float[np.ndarray, " d"]) -> Target:
+    """The target with derivatives over steps on whose scale its motion is smooth around a point.
+
+    Slopes over the steps of a ladder are compared, of all base parameters at once; rollouts say which steps agree.
+    """
+    usual, coordinates = target.forward.lanes.difference, target.forward.coordinates
+    if usual is None:
+        return target
+    directions = np.eye(len(x))[: coordinates.base]
+
+    def slope(step: float) -> np.ndarray:
+        points = np.clip(np.concatenate([x + step * directions, x - step * directions]), *coordinates.bounds)
+        found = target.recall("ladder", [points], lambda: {"residual": target.residual(points)})["residual"]
+        ahead, behind = np.split(found, 2)
+        return (ahead - behind) / (2.0 * step)
+
+    step = usable_difference(slope)
+    return target if step <= usual else replace(target, forward=target.forward.with_difference(step))
 
 
 def better_nearby(target: Target, fit: Fit) -> Float[np.ndarray, " d"] | None:

@@ -93,7 +93,7 @@ class CompiledEngine:
         from_equilibrium: start in the static equilibrium of the initial displacements, else undeformed.
         precision: of all arithmetic.
         threads: None for all processors.
-        one_sided: derivatives from one rollout per direction, see `with_differences`.
+        one_sided, difference: how derivatives are taken, see `with_differences`.
     """
 
     assembly: Assembly
@@ -102,6 +102,7 @@ class CompiledEngine:
     precision: Literal["float64", "float32"] = "float64"
     threads: int | None = None
     one_sided: bool = False
+    difference: float | None = None
     lanes: ClassVar[int] = 512
 
     @cached_property
@@ -149,7 +150,7 @@ class CompiledEngine:
 
     @cached_property
     def _differentiable(self) -> Callable[[Inputs, Array], Motion]:
-        return with_differences(self._call, input_sizes, self.precision, self.one_sided)
+        return with_differences(self._call, input_sizes, self.precision, self.one_sided, self.difference)
 
     def _call(self, inputs: Inputs, limit: Array) -> Motion:
         material, start, displacement = inputs

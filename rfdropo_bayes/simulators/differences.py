@@ -26,6 +26,7 @@ def with_differences(
     sizes: Callable[[Inputs], Inputs],
     precision: str,
     one_sided: bool = False,
+    difference: float | None = None,
 ) -> Callable[[Inputs, Array], Output]:
     """``call(inputs, limit)`` with derivatives with respect to the inputs.
 
@@ -35,8 +36,11 @@ def with_differences(
         precision: of the engine, a key of `DIFFERENCE`.
         one_sided: one rollout per direction beside that of the value, good to 1e-5 where motion is smooth and 1e-3
             elsewhere; in double precision only.
+        difference: relative perturbation of a central difference, where `DIFFERENCE` is not to be taken, as motion is
+            rough on that scale; see `usable_difference`.
     """
-    forward = one_sided and precision == "float64"
+    forward = one_sided and precision == "float64" and difference is None
+    width = difference or DIFFERENCE[precision]
 
     @jax.custom_jvp
     def motion(inputs: Inputs, limit: Array) -> Output:
@@ -45,21 +49,44 @@ def with_differences(
     @motion.defjvp
     def _(primals: tuple, tangents: tuple) -> tuple[Output, Output]:
         (inputs, limit), (directions, _) = primals, tangents
-        step = (FORWARD if forward else DIFFERENCE[precision]) / _relative_size(sizes(inputs), directions)
+        step = (FORWARD if forward else width) / _relative_size(sizes(inputs), directions)
 
         def moved(by: Array) -> Output:
             return call(jax.tree.map(lambda x, d: x + by * d, inputs, directions), limit)
 
         value, ahead = call(inputs, limit), moved(step)
-        behind, width = (value, step) if forward else (moved(-step), 2.0 * step)
+        behind, apart = (value, step) if forward else (moved(-step), 2.0 * step)
         slope = jax.tree.map(
-            lambda a, b: (a - b) / width if a.dtype == jnp.float64 else np.zeros(a.shape, jax.dtypes.float0),
+            lambda a, b: (a - b) / apart if a.dtype == jnp.float64 else np.zeros(a.shape, jax.dtypes.float0),
             ahead,
             behind,
         )
         return value, slope
 
     return motion
+
+
+LADDER = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+AGREE = 0.5  # share by which slopes over two successive steps of the ladder may differ
+
+
+def usable_difference(slope: Callable[[float], Float[np.ndarray, "..."]]) -> float:
+    """Smallest step of `LADDER` from which on slopes agree; the largest one where none do.
+
+    A motion can be rough: smooth on the smallest scales, with slopes there that are thousands of times those of the
+    changes that matter (a body of tetrahedra that jitters). Rounding is rough, too.
+
+    Args:
+        slope: secant over one step to each side, of all outputs along all directions of interest.
+    """
+    chosen = LADDER[-1]
+    larger = slope(chosen)
+    for step in LADDER[-2::-1]:
+        smaller = slope(step)
+        if np.linalg.norm(smaller - larger) > AGREE * np.linalg.norm(larger):
+            break
+        chosen, larger = step, smaller
+    return chosen
 
 
 def _relative_size(sizes: Inputs, directions: Inputs) -> Float[Array, ""]:

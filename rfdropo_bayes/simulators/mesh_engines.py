@@ -125,12 +125,14 @@ class CompiledMeshEngine:
         time_step: of the simulation [s].
         precision: of all arithmetic.
         threads: None for all processors.
+        difference: of derivatives, see `with_differences`.
     """
 
     assembly: MeshAssembly
     time_step: float
     precision: Literal["float64", "float32"] = "float64"
     threads: int | None = None
+    difference: float | None = None
     lanes: ClassVar[int] = 64
 
     @cached_property
@@ -162,7 +164,7 @@ class CompiledMeshEngine:
 
     @cached_property
     def _differentiable(self) -> Callable[[Inputs, Array], MeshMotion]:
-        return with_differences(self._call, input_sizes, self.precision)
+        return with_differences(self._call, input_sizes, self.precision, difference=self.difference)
 
     def _call(self, inputs: Inputs, limit: Array) -> MeshMotion:
         material, displacement = inputs

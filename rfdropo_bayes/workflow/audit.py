@@ -13,6 +13,7 @@ import numpy as np
 
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
+from rfdropo_bayes.audit.deadline import Deadline
 from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
 from rfdropo_bayes.audit.fit import widening
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
@@ -90,6 +91,7 @@ def run_audit(
         InputError: bad input, before anything long has started.
     """
     experiment, tables = load_experiment(path, overrides)
+    deadline = Deadline(experiment.audit.minutes)
     folder = Path(path).resolve().parent
     fitted, tested = (load_data(experiment, folder, role) for role in ("fit", "test"))
     chosen = experiment.seed if seed is None else seed
@@ -97,7 +99,7 @@ def run_audit(
     settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes([*fitted, *tested])}
     options = {"base": base, "seed": chosen}
     with run_folder(out, "audit", **settings, options=options, resume=resume, overwrite=overwrite) as out:
-        answer = audit(question, report, Journal(out / JOURNAL, resume=resume))
+        answer = audit(question, report, Journal(out / JOURNAL, resume=resume), deadline)
         inspect(answer)
         content = record(
             answer,
@@ -167,7 +169,7 @@ def build_question(
     finer = _finer(experiment, robot)
     return Question(
         lanes(experiment)[0],
-        None if finer is None else lanes(finer),
+        lanes(finer),
         coordinates,
         recordings,
         list(fitted),
@@ -275,13 +277,15 @@ def _costly(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
     return effects_costly(mechanism.embody(values, plain, simulator.assembly.system.body).effects)
 
 
-def _finer(experiment: Experiment, robot: Robot) -> Experiment | None:
-    """The experiment with twice the layers and half the time step; only bodies of layers can be refined."""
+def _finer(experiment: Experiment, robot: Robot) -> Experiment:
+    """The experiment with half the time step, and twice the layers of a body of layers; a mesh stays as it is."""
     table = experiment.simulator
-    if table.body != "layered":
-        return None
-    step = (table.time_step or robot.time_step_s) / FINER
-    changed = table.model_copy(update={"refine": min(FINER * table.refine, 16), "time_step": step})
+    finer: dict[str, Any] = {"time_step": (table.time_step or robot.time_step_s) / FINER}
+    if table.body == "layered":
+        finer["refine"] = min(FINER * table.refine, 16)
+    elif table.tetrahedra is not None and table.tetrahedra.drive_rate is not None:  # which is per step
+        finer["tetrahedra"] = table.tetrahedra.model_copy(update={"drive_rate": table.tetrahedra.drive_rate / FINER})
+    changed = table.model_copy(update=finer)
     return experiment.model_copy(update={"simulator": changed})
 
 
@@ -351,7 +355,10 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path, out: P
     for step in answer.adopted:
         if step.name == DISCRETISATION:
             assert answer.question.finer is not None
-            simulator["refine"] = FINER * int(simulator.get("refine", 1))
+            if simulator.get("body", "layered") == "layered":
+                simulator["refine"] = FINER * int(simulator.get("refine", 1))
+            elif "drive_rate" in simulator["tetrahedra"]:
+                simulator["tetrahedra"]["drive_rate"] /= FINER
             simulator["time_step"] = answer.question.finer[0].simulator.description["time_step_s"]
         else:
             candidate = next(c for c in answer.question.candidates if c.name == step.name)

@@ -81,6 +81,9 @@ def test_candidates_that_do_not_run_on_a_mesh_are_left_out_and_listed(bar_mesh, 
     assert "layered bodies only" in asked.left_out["coulomb_friction"]
     assert "layered bodies only" in asked.left_out["own.py:Glue"]
     assert {c.name for c in asked.candidates} == set(REGISTRY) - layered | {"fur"}
+    assert asked.finer is not None
+    steps = [lanes.simulator.description["time_step_s"] for lanes in (asked.lanes, asked.finer[0])]
+    assert steps[1] == steps[0] / 2
     position, status = asked.lanes.roll(
         asked.coordinates.physical_values(asked.coordinates.null[None], asked.coordinates.slots(["bar"]))[:, 0],
         asked.recordings.commands,

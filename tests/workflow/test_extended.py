@@ -31,6 +31,7 @@ def answered(candidate: Candidate, x: list[float]) -> Any:
 
 def test_a_mechanism_of_the_users_own_is_found_again_and_tried_no_more(tmp_path: Path) -> None:
     answer = answered(Candidate("own", (0, 1), REGISTRY["drive_creep"](), "own.py:Own"), [0.5, 0.0])
+    (tmp_path / "own.py").touch()
     tables = {"robot": "smooth_arm", "audit": {"candidates": ["own.py:Own", "own.py:Other"]}}
     extended = extended_tables(tables, answer, tmp_path)
     assert extended["model"]["mechanisms"] == [f"{tmp_path / 'own.py'}:Own"]

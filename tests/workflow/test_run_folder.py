@@ -242,3 +242,11 @@ def test_an_interrupted_calibration_says_how_to_go_on_and_does(tmp_path):
         capture_output=True,
     )
     assert simulated.returncode == 0
+
+
+def test_an_audit_whose_minutes_were_up_goes_on_with_more_of_them(tmp_path):
+    tables = {"robot": "smooth_arm", "audit": {"minutes": 1.0}}
+    finish(tmp_path, "audit", tables=tables)
+    finish(tmp_path, "audit", tables=tables | {"audit": {"minutes": 9.0}}, resume=True)
+    with pytest.raises(InputError, match=r"other settings: audit\.bootstraps"):
+        finish(tmp_path, "audit", tables=tables | {"audit": {"minutes": 9.0, "bootstraps": 299}}, resume=True)
