@@ -22,7 +22,7 @@ from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference import bridge, horizon_smc, refinement
 from rfdropo_bayes.inference.checkpoints import run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES, MOST_REPLICATES, SmcConfig
+from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES, MOST_REPLICATES, WORTH_A_REPLICATE, SmcConfig
 from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.numpyro_problem import NumpyroProblem
@@ -84,8 +84,8 @@ def run(
     horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
     way = way_from_prior(problem, found.modes[0], horizons, config.target_ess, way_key)
     left = None if config.rollouts is None else config.rollouts - found.climbs.ledger.rollouts
-    if config.start == "auto" and (replicates := _affordable(way, config, left)):
-        result = horizon_smc.run(problem, replace(config, rollouts=left, replicates=replicates), sample_key, logbook)
+    if config.start == "auto" and _affordable(way, config, left):
+        result = horizon_smc.run(problem, _several(way, config, left), sample_key, logbook)
         return _with_climbs(result, found, way)
     return _from_optima(problem, config, found, way, sample_key, logbook)
 
@@ -119,14 +119,22 @@ def _worth_climbing(problem: Problem, config: SmcConfig) -> bool:
     return config.rollouts >= 40.0 * config.chains * max(FEWEST_PARTICLES, len(problem.names))
 
 
-def _affordable(way: Way, config: SmcConfig, left: float | None) -> int:
-    """Replicates whose way from the prior the budget covers: those asked for or none, else up to four."""
+def _affordable(way: Way, config: SmcConfig, left: float | None) -> bool:
     if left is None:
-        return config.chains
-    one = MARGIN * max(config.particles or ENOUGH, FEWEST_PARTICLES) * way.rollouts
-    if config.replicates is not None:
-        return config.replicates if config.replicates * one <= left else 0
-    return min(int(left / one), MOST_REPLICATES)
+        return True
+    return MARGIN * max(config.particles or ENOUGH, FEWEST_PARTICLES) * config.chains * way.rollouts <= left
+
+
+def _several(way: Way, config: SmcConfig, left: float | None) -> SmcConfig:
+    """Settings of a start at the prior: unless it is said how many, as many replicates as can go all the way."""
+    config = replace(config, rollouts=left)
+    if config.replicates is not None or left is None:
+        return config
+    one = MARGIN * max(config.particles or WORTH_A_REPLICATE, FEWEST_PARTICLES) * way.rollouts
+    replicates = int(np.clip(left / one, 1, MOST_REPLICATES))
+    if replicates > 1 and config.particles is None:
+        config = replace(config, particles=int(left / (replicates * MARGIN * way.rollouts)))
+    return replace(config, replicates=replicates)
 
 
 def _with_climbs(result: InferenceResult, found: Modes, way: Way) -> InferenceResult:

@@ -8,12 +8,12 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import climbs as climbs_of
-from rfdropo_bayes.inference import laplace, methods, starts
+from rfdropo_bayes.inference import horizon_smc, laplace, methods, starts
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.horizon_smc import SmcConfig
 from rfdropo_bayes.inference.levenberg import Laplace
 from rfdropo_bayes.inference.mixture import ModeMixture
-from rfdropo_bayes.inference.sharpness import way_from_prior
+from rfdropo_bayes.inference.sharpness import Way, way_from_prior
 
 from .toys import Decay, LinearGaussian, Ratio, Spring, TwoModes, Washboard
 
@@ -216,3 +216,28 @@ def test_climbs_keep_their_budget():
     assert result.rollouts <= 160  # the Laplace approximation itself comes on top
     free = methods.run(Decay(n_rows=40, traceable=False), "laplace", {"screen": 16}, KEY)
     assert free.rollouts > result.rollouts
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, (4, 111)),  # of 45 rollouts a particle, the margin included
+        ({"particles": 200}, (2, 200)),
+        ({"particles": 1000}, (1, 1000)),
+        ({"replicates": 1}, (1, None)),
+        ({"replicates": 3, "particles": 50}, (3, 50)),
+    ],
+)
+def test_as_many_replicates_start_at_the_prior_as_can_go_all_the_way(options, expected):
+    config = starts._several(Way(stages=10.0, rollouts=15.0, information=5.0), SmcConfig(**options), 20000.0)
+    assert (config.replicates, config.particles) == expected
+    assert config.rollouts == 20000.0
+
+
+def test_a_budget_decides_on_replicates_and_without_one_there_is_one():
+    """20 rollouts a particle and 100 particles each, or what a look at every row costs, if that is more."""
+    assert horizon_smc.decided(30, SmcConfig(rollouts=1000.0)).chains == 1
+    assert horizon_smc.decided(30, SmcConfig(rollouts=5000.0)).chains == 2
+    assert horizon_smc.decided(30, SmcConfig(rollouts=1e5)).chains == 4
+    assert horizon_smc.decided(200, SmcConfig(rollouts=5000.0, spacing="every")).chains == 1
+    assert horizon_smc.decided(30, SmcConfig()).chains == 1

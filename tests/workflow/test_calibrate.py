@@ -48,14 +48,14 @@ def test_two_runs_of_the_same_data_are_compared_by_what_they_predict_of_each_row
     """Independent replicates are chains, and every row's log likelihood is there for ArviZ."""
     runs = {}
     for noise in ("white", "auto"):
-        overrides = [*SHORT, "inference.rollouts=3000", f'model.noise="{noise}"']
+        overrides = [*SHORT, "inference.rollouts=6000", f'model.noise="{noise}"']
         run_calibration(DEMO, tmp_path / noise, overrides=overrides)
         runs[noise] = load_posterior(tmp_path / noise / "posterior.nc")
         summary = json.loads((tmp_path / noise / "summary.json").read_text())
         rows = [row for row in summary["parameters"].values() if not row.get("derived")]
         assert runs[noise].posterior.sizes["chain"] > 1
         assert all(np.isfinite(row["r_hat"]) for row in rows)
-        assert summary["rollouts"] <= 3300
+        assert summary["rollouts"] <= 6600
     compared = arviz.compare(runs, ic="loo")
     assert set(compared.index) == set(runs)
     assert np.isfinite(compared["elpd_loo"].astype(float)).all()
