@@ -281,7 +281,12 @@ def test_a_simulated_recording_is_predicted_from_its_first_row(name, sign, tmp_p
     experiment = {
         "robot": "smooth_arm",
         "simulator": {"time_step": 0.005},
-        "model": {"mechanisms": [name], "priors": {"offset": {}}, "per_recording": {"offset": "all"}},
+        "model": {
+            "mechanisms": [name],
+            "noise": "white",
+            "priors": {"offset": {}},
+            "per_recording": {"offset": "all"},
+        },
     }
     specs = [spec for mechanism in mechanisms_named([name], load_robot("smooth_arm")) for spec in mechanism.parameters]
     values = {spec.name: beyond_null(spec, sign) for spec in specs}
