@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -117,6 +118,8 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
         key = (source.observations, source.commands, str(rule))
         if key not in loaded:
             loaded[key] = begun_from(_read(spec, source), rule)
+            said = loaded[key].name, loaded[key].first_command
+            logging.getLogger(__name__).info("%s: command before the first row: %s", *said)
         recording = loaded[key] if source.rows is None else loaded[key].slice_rows(*source.rows, spec.lead_in)
         recordings.append(recording if spec.resample is None else recording.resample(spec.resample))
     return _distinct_names(recordings, sources)

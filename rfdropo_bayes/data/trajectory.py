@@ -196,8 +196,12 @@ class Trajectory:
         faults = self.settings.get("faults", {})
         counts = {"held poses": "held", "jumps": "jump", "lost markers": "missing"}
         said = [f"{sum(faults[kind])} {name}" for name, kind in counts.items() if sum(faults.get(kind, ()))]
-        said += [f"{count} missing {kind}" for kind, count in self.settings.get(MISSING, {}).items()]
-        return ", ".join(said)
+        return ", ".join([*said, self.missing] if self.missing else said)
+
+    @property
+    def missing(self) -> str:
+        """How many tensions, motor angles and poses of an object are missing, in words; empty if none is."""
+        return ", ".join(f"{count} missing {kind}" for kind, count in self.settings.get(MISSING, {}).items())
 
     @property
     def marker_names(self) -> tuple[str, ...]:

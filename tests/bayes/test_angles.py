@@ -108,9 +108,9 @@ def test_the_density_of_the_angles_is_that_of_normals_at_new_readings_only():
     chosen, plain = problem(read), problem(read, angles=False)
     values = batch(actuator_lag=0.05, motor_angle_noise=0.01)
     with_angles, without = chosen.row_log_likelihood(values, 60)[0][0], plain.row_log_likelihood(values, 60)[0][0]
-    drive, kept = read.initial_command, 0.05 / (STEP + 0.05)
+    drive, kept = read.initial_command, np.exp(-STEP / 0.05)
     for row in range(1, 60):
-        drive = read.command[row - 1] + kept * (drive - read.command[row - 1])  # backward Euler
+        drive = read.command[row - 1] + kept * (drive - read.command[row - 1])  # held over each step
         new = row % 3 == 0
         expected = stats.norm.logpdf(read.motor_angle[row], drive, 0.01).sum() if new else 0.0
         assert with_angles[row] - without[row] == pytest.approx(expected, abs=1e-9)
