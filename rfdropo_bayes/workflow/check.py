@@ -10,7 +10,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from rfdropo_bayes.data import RecordingEntry, Trajectory, load_recordings, noise_floor
+from rfdropo_bayes.data import (
+    RecordingEntry,
+    Trajectory,
+    check_channels,
+    load_recordings,
+    noise_floor,
+    shared_markers,
+)
 from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.methods import make_config
@@ -135,17 +142,12 @@ def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Robot
 
 
 def _markers(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[str]:
-    shared = [name for name in robot.marker_names if name in trajectory.marker_names]
-    unknown = [name for name in trajectory.marker_names if name not in shared]
-    unseen = [name for name in robot.marker_names if name not in shared]
-    if not shared:
-        found.problems.append(
-            f"{trajectory.name}: none of its markers ({_names(trajectory.marker_names)}) is one of the robot's "
-            f"({_names(robot.marker_names)}); name them, in the order of positions, under [data.columns] markers, "
-            "or rename those of the robot"
-        )
+    shared = _try(found, lambda: shared_markers([trajectory], robot.marker_names))
+    if shared is None:
         yield f"markers {_names(trajectory.marker_names)}: NONE is the robot's"
         return
+    unknown = [name for name in trajectory.marker_names if name not in shared]
+    unseen = [name for name in robot.marker_names if name not in shared]
     words = f"markers {_names(shared)}: as the robot's"
     if unknown:
         words += f"; {_names(unknown)}: not the robot's, left out"
@@ -180,17 +182,9 @@ def _commands(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[st
     names, unit, command = trajectory.cable_names, trajectory.command_unit, trajectory.command
     yield f"{len(names)} commands in {unit}: {_names(names)}; from {command.min():.4g} to {command.max():.4g}"
     yield f"command before the first row: {trajectory.first_command}"
-    if len(names) != len(robot.channel_names):
-        found.problems.append(
-            f"{trajectory.name}: {len(names)} commands ({_names(names)}) for the robot's {len(robot.channel_names)} "
-            f"channels ({_names(robot.channel_names)}); name one column per channel under [data.columns] commands"
-        )
-        return
-    if unit != robot.command_unit:
-        found.problems.append(
-            f"{trajectory.name}: commands in {unit} for a robot that is commanded in {robot.command_unit}; "
-            "correct command_unit, or [command] unit of the robot"
-        )
+    problems = len(found.problems)
+    _try(found, lambda: check_channels(trajectory, robot.channel_names, robot.command_unit))
+    if len(found.problems) > problems:
         return
     if tuple(names) != robot.channel_names:
         yield f"the robot calls them {_names(robot.channel_names)}, in this order"
