@@ -72,7 +72,8 @@ def fixed_values(experiment: Experiment, simulator: RobotSimulator) -> dict[str,
     specs = simulator.parameters + measurement_specs(table)
     check_used(table.fixed, experiment, simulator, where="[model.fixed]")
     by_name = {spec.name: spec for spec in specs}
-    return {name: check_value(by_name[name], v, where="[model.fixed]") for name, v in table.fixed.items()}
+    given = expand_groups(table.fixed, specs)
+    return {name: check_value(by_name[name], value, where="[model.fixed]") for name, value in given.items()}
 
 
 def check_used(names: Iterable[str], experiment: Experiment, simulator: RobotSimulator, *, where: str) -> None:
