@@ -142,12 +142,12 @@ def build_model(
     fixed = fixed_values(experiment, simulator)
     check_used(table.priors, experiment, simulator, where="[model.priors]")
     check_used(table.per_recording, experiment, simulator, where="[model.per_recording]")
-    both = sorted(set(fixed) & set(table.priors))
-    if both:
-        raise InputError(f"{both[0]!r} has a prior and a fixed value", where="[model]", remedy="remove one of them")
     added = [spec.name for mechanism in simulator.mechanisms for spec in mechanism.parameters]
     specs = simulator.parameters + measurement
     given = expand_groups(table.priors, specs)
+    both = sorted(set(fixed) & set(given))
+    if both:
+        raise InputError(f"{both[0]!r} has a prior and a fixed value", where="[model]", remedy="remove one of them")
     shared = expand_groups(table.per_recording, specs)
     defaults = [*added, *shared, *(spec.name for spec in measurement if spec != TENSION_GAIN)]
     priors = {**given, **{name: {} for name in defaults if name not in fixed and name not in given}}
