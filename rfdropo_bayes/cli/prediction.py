@@ -36,15 +36,20 @@ def predict(
     facts = run_prediction(
         experiment,
         posterior,
-        commands,
+        _from_here(commands),
         out,
-        start=start,
+        start=None if start is None else _from_here(start),
         rows=_window(rows),
         overrides=overrides or [],
         seed=seed,
         overwrite=overwrite,
     )
     typer.echo(json.dumps(facts, indent=2))
+
+
+def _from_here(name: str) -> str:
+    """A path that counts from the current folder, where it has such a file; else as it is, for the experiment's."""
+    return str(Path(name).resolve()) if Path(name).is_file() else name
 
 
 def _window(rows: str | None) -> tuple[int, int] | None:

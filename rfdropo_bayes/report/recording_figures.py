@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -20,23 +19,13 @@ BODY = "#DCE6EC"
 MOST_LABELS = 8
 
 
-class RestShape(NamedTuple):
-    """An undeformed robot as it is drawn, in metres in the frame of its base."""
-
-    station: Float[np.ndarray, " station"]
-    half_width: Float[np.ndarray, "station 2"]
-    cables: Sequence[Float[np.ndarray, "point 3"]]
-    marker_names: Sequence[str]
-    marker_points: Float[np.ndarray, "marker 3"]
-
-
-def save_recording(trajectory: Trajectory, rest: RestShape, path: Path) -> None:
-    """Write the picture of a recording as PNG."""
+def save_recording(trajectory: Trajectory, rest: Mapping[str, Any], path: Path) -> None:
+    """Write the picture of a recording as PNG; ``rest`` is the robot's `robots.robot_shape`."""
     recording_figure(trajectory, rest).savefig(path)
 
 
 @style.styled
-def recording_figure(trajectory: Trajectory, rest: RestShape) -> Figure:
+def recording_figure(trajectory: Trajectory, rest: Mapping[str, Any]) -> Figure:
     """Left: coordinates of up to four markers over time, then the commands; right: the robot at rest from two sides."""
     markers = shown_markers(len(trajectory.marker_names))
     rows = len(markers) + 1
@@ -82,17 +71,17 @@ def _commands(axes: Axes, trajectory: Trajectory) -> None:
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _rest(axes: Axes, trajectory: Trajectory, rest: RestShape, across: int) -> None:
+def _rest(axes: Axes, trajectory: Trajectory, rest: Mapping[str, Any], across: int) -> None:
     """The undeformed robot with its cables and markers, the first row, and the path of the last marker."""
-    along = MILLIMETRES * np.concatenate([rest.station, rest.station[::-1]])
-    half = MILLIMETRES * rest.half_width[:, across]
+    along = MILLIMETRES * np.concatenate([rest["station"], rest["station"][::-1]])
+    half = MILLIMETRES * np.array(rest["half_width"])[:, across]
     axes.fill(along, np.concatenate([half, -half[::-1]]), color=BODY, label="at rest")
-    for cable in rest.cables:
-        line = MILLIMETRES * cable
+    for cable in rest["cables"].values():
+        line = MILLIMETRES * np.array(cable)
         axes.plot(line[:, 2], line[:, across], color=style.PRIOR, linewidth=0.6)
-    points = MILLIMETRES * rest.marker_points
+    points = MILLIMETRES * np.array(list(rest["markers"].values()))
     axes.plot(points[:, 2], points[:, across], "o", mfc="none", color=style.POSTERIOR, label="markers at rest")
-    for name, point in zip(rest.marker_names, points, strict=True):
+    for name, point in zip(rest["markers"], points, strict=True):
         if len(points) <= MOST_LABELS:
             axes.annotate(name, point[[2, across]], (0, 6), textcoords="offset points", ha="center", fontsize=8)
     position = MILLIMETRES * np.where(trajectory.position_mask[..., None], trajectory.position, np.nan)

@@ -72,7 +72,8 @@ def fixed_values(experiment: Experiment, simulator: RobotSimulator) -> dict[str,
     specs = simulator.parameters + measurement_specs(table)
     check_used(table.fixed, experiment, simulator, where="[model.fixed]")
     by_name = {spec.name: spec for spec in specs}
-    return {name: check_value(by_name[name], v, where="[model.fixed]") for name, v in table.fixed.items()}
+    given = expand_groups(table.fixed, specs)
+    return {name: check_value(by_name[name], value, where="[model.fixed]") for name, value in given.items()}
 
 
 def check_used(names: Iterable[str], experiment: Experiment, simulator: RobotSimulator, *, where: str) -> None:
@@ -141,12 +142,12 @@ def build_model(
     fixed = fixed_values(experiment, simulator)
     check_used(table.priors, experiment, simulator, where="[model.priors]")
     check_used(table.per_recording, experiment, simulator, where="[model.per_recording]")
-    both = sorted(set(fixed) & set(table.priors))
-    if both:
-        raise InputError(f"{both[0]!r} has a prior and a fixed value", where="[model]", remedy="remove one of them")
     added = [spec.name for mechanism in simulator.mechanisms for spec in mechanism.parameters]
     specs = simulator.parameters + measurement
     given = expand_groups(table.priors, specs)
+    both = sorted(set(fixed) & set(given))
+    if both:
+        raise InputError(f"{both[0]!r} has a prior and a fixed value", where="[model]", remedy="remove one of them")
     shared = expand_groups(table.per_recording, specs)
     defaults = [*added, *shared, *(spec.name for spec in measurement if spec != TENSION_GAIN)]
     priors = {**given, **{name: {} for name in defaults if name not in fixed and name not in given}}

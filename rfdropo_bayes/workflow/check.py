@@ -21,8 +21,8 @@ from rfdropo_bayes.data import (
 from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.methods import make_config
-from rfdropo_bayes.report.recording_figures import RestShape, save_recording
-from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.report.recording_figures import save_recording
+from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.workflow.assembly import build_model, build_simulator, find_robot
 from rfdropo_bayes.workflow.calibration import inference_options
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
@@ -70,7 +70,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
     folder = Path(path).resolve().parent
     robot = find_robot(experiment, folder)
     found = Check()
-    _say_robot(found, experiment, robot)
+    _say_robot(found, robot)
     recordings = {role: list(_read(found, experiment, folder, role)) for role in ("fit", "test")}
     for role, trajectories in recordings.items():
         for trajectory in trajectories:
@@ -79,9 +79,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
     _say_model(found, experiment, robot, folder, recordings["fit"])
     if any(recordings.values()):
         out = output_folder(out)
-    cables = [np.vstack([anchor, guides]) for anchor, guides in zip(robot.anchors(), robot.guides(), strict=True)]
-    body, points = robot.body, robot.marker_points()
-    rest = RestShape(np.array(body.station_m), np.array(body.half_width_m), cables, robot.marker_names, points)
+    rest = robot_shape(robot)
     for trajectory in (*recordings["fit"], *recordings["test"]):
         file = out / f"{trajectory.name.replace('/', '_')}.png"
         save_recording(trajectory, rest, file)
@@ -99,7 +97,7 @@ def _try(found: Check, action: Callable[[], Result]) -> Result | None:
         return None
 
 
-def _say_robot(found: Check, experiment: Experiment, robot: Robot) -> None:
+def _say_robot(found: Check, robot: Robot) -> None:
     facts = robot_facts(robot)
     for label in ("robot", "body", "gravity", "starts", "commands", "cables", "markers"):
         found.lines.append((label, facts[label]))
@@ -144,13 +142,12 @@ def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Robot
 
 
 def _markers(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[str]:
-    shared = [name for name in robot.marker_names if name in trajectory.marker_names]
-    unknown = [name for name in trajectory.marker_names if name not in shared]
-    unseen = [name for name in robot.marker_names if name not in shared]
-    if not shared:
-        _try(found, lambda: shared_markers([trajectory], robot.marker_names))
+    shared = _try(found, lambda: shared_markers([trajectory], robot.marker_names))
+    if shared is None:
         yield f"markers {_names(trajectory.marker_names)}: NONE is the robot's"
         return
+    unknown = [name for name in trajectory.marker_names if name not in shared]
+    unseen = [name for name in robot.marker_names if name not in shared]
     words = f"markers {_names(shared)}: as the robot's"
     if unknown:
         words += f"; {_names(unknown)}: not the robot's, left out"
@@ -185,9 +182,9 @@ def _commands(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[st
     names, unit, command = trajectory.cable_names, trajectory.command_unit, trajectory.command
     yield f"{len(names)} commands in {unit}: {_names(names)}; from {command.min():.4g} to {command.max():.4g}"
     yield f"command before the first row: {trajectory.first_command}"
-    before = len(found.problems)
+    problems = len(found.problems)
     _try(found, lambda: check_channels(trajectory, robot.channel_names, robot.command_unit))
-    if len(found.problems) > before:
+    if len(found.problems) > problems:
         return
     if tuple(names) != robot.channel_names:
         yield f"the robot calls them {_names(robot.channel_names)}, in this order"

@@ -57,6 +57,12 @@ def experiment(tmp_path: Path, *changes: tuple[str, str]) -> str:
             "trunk_mass = -0.1 kg is outside",
         ),
         ("young_modulus = {}", "young_modulus = {}\n[model.fixed]\nyoung_modulus = 3e6", "a prior and a fixed value"),
+        (
+            "young_modulus = {}",
+            "offset = {}\n[model.fixed]\noffset_x = 0.001",
+            "'offset_x' has a prior and a fixed value",
+        ),
+        ("young_modulus = {}", "young_modulus = {}\n[model.fixed]\noffset = 3.0", "offset_x = 3 m is outside"),
         ('"smc"', '"mcmc"', "unknown method 'mcmc'"),
         ("rollouts = 50", "rolouts = 50", "'rolouts'"),
         ("demo_1.nc", "demo_9.nc", "no such file"),
