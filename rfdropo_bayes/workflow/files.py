@@ -21,6 +21,8 @@ RUN, CONFIG, LOG, CHECKPOINTS = "run.json", "config.toml", "log.jsonl", "checkpo
 RUNNING, INTERRUPTED, FAILED, DONE = "running", "interrupted", "failed", "done"
 SCHEMA_VERSION = 1
 NAMED_DIFFERENCES = 3
+# Nothing that is computed depends on these.
+FREE_TO_CHANGE = ("experiment.title", "experiment.audit.minutes", "experiment.design.minutes")
 
 
 class Command(NamedTuple):
@@ -188,7 +190,7 @@ def check_folder(out: Path, command: str, *, resume: bool = False, overwrite: bo
 def _check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise InputError where the run began with other settings; names the first few."""
     old, new = dict(_flat(before)), dict(_flat(json.loads(json.dumps(now, default=str))))
-    differing = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    differing = [name for name in {**old, **new} if name not in FREE_TO_CHANGE and old.get(name) != new.get(name)]
     if not differing:
         return
     absent = "not set"
