@@ -114,7 +114,7 @@ def run_folder(
         if isinstance(error, KeyboardInterrupt) or interrupted():
             with suppress(InputError):
                 _write(out, record, INTERRUPTED)
-            raise Interrupted(str(out), COMMANDS[command].resumable) from None
+            raise Interrupted(str(out), "--resume" if COMMANDS[command].resumable else None) from None
         with suppress(InputError):
             _write(out, record, FAILED)
         if isinstance(error, OSError) and not isinstance(error, FileNotFoundError):
