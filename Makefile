@@ -54,7 +54,7 @@ reference: $(CORE) ## write docs/reference from the code
 	$(BIN)/python tools/reference.py
 
 notebook-outputs: $(DEV) ## run every notebook and keep its outputs in it
-	cd notebooks && ../$(BIN)/jupyter-execute --inplace --timeout=1800 *.ipynb
+	cd notebooks && PYTHONWARNINGS='ignore:IProgress not found' ../$(BIN)/jupyter-execute --inplace --timeout=1800 *.ipynb
 
 demo-data: $(CORE) ## make the recordings of the bundled example again
 	$(BIN)/rfdropo simulate experiments/demo_data.toml --out experiments/demo --overwrite

@@ -27,8 +27,13 @@ class NoLikelihoodError(InputError):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C in the middle of a run; ``folder`` is where the run writes, ``resumable`` whether it can go on."""
+    """Ctrl-C in the middle of a run.
 
-    def __init__(self, folder: str, resumable: bool) -> None:
-        self.folder, self.resumable = folder, resumable
+    Args:
+        folder: where the run writes.
+        going_on: what to add to its command to go on with it, may be nothing; None where it has to start again.
+    """
+
+    def __init__(self, folder: str, going_on: str | None) -> None:
+        self.folder, self.going_on = folder, going_on
         super().__init__(folder)

@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Literal
 
 EXIT_STATUS = 3
-NOTHING_LOST = "interrupted before anything was computed; nothing is lost"
+NOTHING_LOST = "interrupted; nothing is lost"
 STOPPING = "stopping at the end of this step; Ctrl-C again stops at once"
 
 _pressed = 0
@@ -32,11 +32,11 @@ def watch_interrupts() -> None:
 def running(*, checks: bool) -> Iterator[None]:
     """A part in which Ctrl-C raises KeyboardInterrupt; with ``checks``, the first one does so in `check_interrupt`."""
     global _answer
-    _answer = "note" if checks else "raise"
+    before, _answer = _answer, "note" if checks else "raise"
     try:
         yield
     finally:
-        _answer = "exit"
+        _answer = before
 
 
 def interrupted() -> bool:

@@ -167,8 +167,8 @@ def main() -> None:
 def _after(stop: BaseException) -> str:
     """What an interrupted user can do next."""
     again = [argument for argument in sys.argv[1:] if argument not in ("--resume", "--overwrite")]
-    if isinstance(stop, Interrupted) and stop.resumable:
-        command = shlex.join(["rfdropo", *again, "--resume"])
+    if isinstance(stop, Interrupted) and stop.going_on is not None:
+        command = shlex.join(["rfdropo", *again, *stop.going_on.split()])
         return f"interrupted; what is done is kept in {stop.folder}; to go on: {command}"
     if isinstance(stop, Interrupted):
         return f"interrupted; {stop.folder} holds no result; to start again: {shlex.join(['rfdropo', *again])}"

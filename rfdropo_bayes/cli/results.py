@@ -18,6 +18,7 @@ COLOURS = {
     "with care": FAIR,
     "unsafe": BAD,
     "no_discrepancy": GOOD,
+    "no_verdict": FAIR,
     "explained": GOOD,
     "equivalent": FAIR,
     "partly_explained": FAIR,

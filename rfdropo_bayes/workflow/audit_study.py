@@ -18,9 +18,10 @@ from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.pipeline import Answer, simulated
 from rfdropo_bayes.audit.record import STIFFNESS
 from rfdropo_bayes.audit.verdict import EQUIVALENT, EXPLAINED, NO_DISCREPANCY, PARTLY, UNEXPLAINED
-from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.errors import InputError, Interrupted
 from rfdropo_bayes.files import write_text
 from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.interrupts import running
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.workflow.audit import JOURNAL, Workshop, run_audit
 from rfdropo_bayes.workflow.files import output_folder
@@ -104,8 +105,10 @@ def run_study(
     jobs = [{"condition": c.name, "index": k, "seed": seed} for k in range(datasets) for c in chosen]
     one = partial(_one, library=library, exclude=list(exclude), folder=out / "data")
     try:
-        with Progress("audits", show=None) as progress:
+        with running(checks=True), Progress("audits", show=None) as progress:
             run_fits(jobs, one, out / LEDGER, resume=True, cluster=cluster, progress=progress)
+    except KeyboardInterrupt:
+        raise Interrupted(str(out), "") from None
     finally:  # a study that is interrupted counts what it has
         done = _kept(out / LEDGER, seed)
         content = {

@@ -20,8 +20,14 @@ from rfdropo_bayes.workflow.experiment_file import ROBOT_COPY, describe, self_co
 RUN, CONFIG, LOG, CHECKPOINTS = "run.json", "config.toml", "log.jsonl", "checkpoints"
 RUNNING, INTERRUPTED, FAILED, DONE = "running", "interrupted", "failed", "done"
 SCHEMA_VERSION = 1
-HOW_LONG = ("experiment.audit.minutes",)  # settings that bound a run and change nothing of what it computes
 NAMED_DIFFERENCES = 3
+# What a run computes does not depend on these; they say how it is headed and how far it goes.
+FREE_TO_CHANGE = (
+    "experiment.title",
+    "experiment.audit.minutes",
+    "experiment.design.minutes",
+    "experiment.training.steps",
+)
 
 
 class Command(NamedTuple):
@@ -115,7 +121,7 @@ def run_folder(
         if isinstance(error, KeyboardInterrupt) or interrupted():
             with suppress(InputError):
                 _write(out, record, INTERRUPTED)
-            raise Interrupted(str(out), COMMANDS[command].resumable) from None
+            raise Interrupted(str(out), "--resume" if COMMANDS[command].resumable else None) from None
         with suppress(InputError):
             _write(out, record, FAILED)
         if isinstance(error, OSError) and not isinstance(error, FileNotFoundError):
@@ -191,7 +197,7 @@ def check_folder(out: Path, command: str, *, resume: bool = False, overwrite: bo
 def _check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise InputError where the run began with other settings; names the first few."""
     old, new = dict(_flat(before)), dict(_flat(json.loads(json.dumps(now, default=str))))
-    differing = [name for name in {**old, **new} if name not in HOW_LONG and old.get(name) != new.get(name)]
+    differing = [name for name in {**old, **new} if name not in FREE_TO_CHANGE and old.get(name) != new.get(name)]
     if not differing:
         return
     absent = "not set"

@@ -40,7 +40,7 @@ def press_control_c(folder: Path) -> None:
 def interrupt(out: Path) -> None:
     with pytest.raises(Interrupted) as stopped, run_folder(out, "calibrate", **SETTINGS) as folder:
         press_control_c(folder)
-    assert stopped.value.resumable
+    assert stopped.value.going_on == "--resume"
     assert stopped.value.folder == str(out)
 
 
