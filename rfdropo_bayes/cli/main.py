@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from rfdropo_bayes import __version__
-from rfdropo_bayes.cli import audit, check, inference, init, listings, pictures, prediction, training
+from rfdropo_bayes.cli import audit, check, inference, init, listings, motors, pictures, prediction, training
 from rfdropo_bayes.cli.options import (
     AsJson,
     ExperimentFile,
@@ -132,6 +132,7 @@ app.command()(listings.robots)
 app.command()(listings.mechanisms)
 app.command()(listings.formats)
 app.command()(listings.methods)
+motors.register(app)
 
 benchmark = typer.Typer(help="Comparisons that take hours; each can be interrupted and resumed.", no_args_is_help=True)
 benchmark.command()(inference.table1)

@@ -1,8 +1,9 @@
-"""Robot descriptions: geometry, section profile, cables, markers and parameters, read from TOML and validated."""
+"""Robot descriptions: geometry, section profile, cables, motors, markers and parameters, read from TOML and validated."""
 
 from rfdropo_bayes.robots.body import Body, PointMass
 from rfdropo_bayes.robots.cable import Cable, Channels
 from rfdropo_bayes.robots.catalogue import find_robot_file, known_robots, load_robot
+from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.robot import Command, Marker, PushScene, Robot
 from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, section_profile
@@ -17,6 +18,7 @@ __all__ = [
     "Cylinder",
     "Disks",
     "Marker",
+    "Motor",
     "Parameter",
     "PointMass",
     "PushScene",

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from rfdropo_bayes.robots.body import Body
 from rfdropo_bayes.robots.cable import Cable, Channels
+from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.table import Name, Positive, Table, Vector
 from rfdropo_bayes.tables import nearest
@@ -86,6 +87,9 @@ class Robot(Table):
     body: Body = Field(description="geometry: a section profile, or shapes that make one up")
     markers: tuple[Marker, ...] = Field(min_length=1, description="measured points of the body")
     push: PushScene | None = Field(default=None, description="object on a plate, if the robot has one")
+    motors: tuple[Motor, ...] = Field(
+        default=(), description="drives of the channels, in their order; none where the robot is only recorded"
+    )
     parameters: dict[Name, Parameter] = Field(description="physical parameters with bounds and default priors, by name")
 
     @model_validator(mode="after")
@@ -113,7 +117,16 @@ class Robot(Table):
         if self.parameters["trunk_mass"].low <= 0 or any(self.parameters[name].low < 0 for name in masses):
             raise ValueError("the bounds of a mass let it be negative, or the trunk massless")
         self._check_inside()
+        self._check_motors()
         return self
+
+    def _check_motors(self) -> None:
+        driven = tuple(motor.channel for motor in self.motors)
+        if driven and driven != self.channels.names:
+            raise ValueError(f"motors drive {', '.join(driven)}; the channels are {', '.join(self.channels.names)}")
+        nodes = [motor.node for motor in self.motors]
+        if len(set(nodes)) != len(nodes):
+            raise ValueError("two motors share a node")
 
     def _check_inside(self) -> None:
         station = np.array(self.body.station_m)

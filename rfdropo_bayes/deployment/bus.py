@@ -1,0 +1,109 @@
+"""The CAN bus of a session: any interface of python-can, or our hub; every frame logged, sent ones too."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+from typing import Any
+
+import can
+import canopen
+from pydantic import BaseModel, ConfigDict, Field
+
+from rfdropo_bayes.deployment.hub import HubBus
+from rfdropo_bayes.errors import InputError
+
+
+class BusTable(BaseModel):
+    """The table [bus] of a deployment file.
+
+    Attributes:
+        interface: "hub", or any interface of python-can ("socketcan" on a robot).
+        channel: as the interface wants it; HOST:PORT or a path for the hub.
+        bitrate: [bit/s], where the interface sets it.
+        options: anything else that the interface takes.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    interface: str = "socketcan"
+    channel: str = "can0"
+    bitrate: int | None = Field(default=None, gt=0)
+    options: dict[str, Any] = {}
+
+
+def open_bus(table: BusTable) -> can.BusABC:
+    """Open the bus.
+
+    Raises:
+        InputError: if it cannot be opened; says with what interface and why.
+    """
+    if table.interface == "hub":
+        return HubBus(table.channel, **table.options)
+    bitrate = {} if table.bitrate is None else {"bitrate": table.bitrate}
+    # Over UDP a frame must not leave the machine: two laboratories in one network would drive each other's motors.
+    local = {"hop_limit": 0} if table.interface == "udp_multicast" else {}
+    try:
+        return can.Bus(interface=table.interface, channel=table.channel, **bitrate, **(local | table.options))
+    except Exception as error:  # each interface raises what its driver raises
+        raise InputError(
+            f"cannot be opened ({type(error).__name__}: {error})",
+            where=f"bus {table.interface} {table.channel}",
+            remedy="bring the interface up (ip link set can0 up type can bitrate 1000000), or correct [bus]",
+        ) from None
+
+
+class FrameLog(can.Listener):
+    """Every frame in a file that python-can chooses by its ending: .log (candump), .blf, .asc, .csv."""
+
+    def __init__(self, path: Path) -> None:
+        self._writer = can.Logger(str(path))
+
+    def on_message_received(self, msg: can.Message) -> None:
+        """Write a frame."""
+        self._writer.on_message_received(msg)
+
+    def flush(self) -> None:
+        """Hand what is written to the operating system."""
+        file = getattr(self._writer, "file", None)
+        if file is not None:
+            with contextlib.suppress(ValueError):  # closed meanwhile
+                file.flush()
+
+    def stop(self) -> None:
+        """Close the file."""
+        self._writer.stop()
+
+
+class LoggedNetwork(canopen.Network):
+    """canopen's network on an open bus, with a log of the frames of both directions."""
+
+    def __init__(self, bus: can.BusABC, log: FrameLog | None = None) -> None:
+        super().__init__(bus)
+        self._log = log
+        self.listeners += [log] if log is not None else []
+        self.connect()
+
+    def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
+        """Send a frame.
+
+        Raises:
+            CanError: if the bus does not take it, or reception has ended with an error.
+        """
+        message = can.Message(is_extended_id=can_id > 0x7FF, arbitration_id=can_id, data=data, is_remote_frame=remote)
+        with self.send_lock:
+            if self.bus is None:
+                raise can.CanOperationError("the bus is closed")
+            try:
+                self.bus.send(message)
+            except OSError as error:  # some interfaces let the socket's own error through
+                raise can.CanOperationError(f"{type(error).__name__}: {error}") from None
+            if self._log is not None:
+                message.is_rx = False
+                message.timestamp = time.time()
+                self._log.on_message_received(message)
+        try:
+            self.check()
+        except OSError as error:
+            raise can.CanOperationError(f"reception has ended: {error}") from None

@@ -1,0 +1,107 @@
+"""The clock of the control loop: absolute deadlines, real-time scheduling where the system permits it, and its lateness."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import math
+import os
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+PRIORITY = 50  # SCHED_FIFO: above every ordinary process, below the kernel's own interrupt threads
+_SWITCH = 5e-4  # [s]: other threads of this process give the interpreter back after so long; 5 ms by default
+
+
+class Tick(NamedTuple):
+    """One beat: its number, its time [s, monotonic], how late the loop woke [s], and how many beats passed unused."""
+
+    number: int
+    time: float
+    lateness: float
+    missed: int
+
+
+class CycleClock:
+    """Beats at ``start + number x period``. A late beat shifts no later one, and beats that have passed are left out."""
+
+    def __init__(self, period: float) -> None:
+        self.period = period
+        self._start = time.monotonic()
+        self._number = 0
+
+    def wait(self) -> Tick:
+        """Sleep until the next beat.
+
+        A loop that wakes more than a whole period late has missed beats: they are counted, not made up for.
+        """
+        self._number += 1
+        due = self._start + self._number * self.period
+        delay = due - time.monotonic()
+        if delay > 0.0:
+            time.sleep(delay)
+        lateness = time.monotonic() - due
+        missed = max(0, math.floor(lateness / self.period))
+        self._number += missed
+        return Tick(self._number, due + missed * self.period, lateness, missed)
+
+
+def schedule_fifo(thread: int = 0) -> bool:
+    """Give a thread of this process (this one by default) real-time priority; False where the system does not permit it."""
+    try:
+        os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except (OSError, AttributeError):
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def steady_interpreter() -> Iterator[None]:
+    """No pauses of the garbage collector, and short turns for the other threads."""
+    switch, collecting = sys.getswitchinterval(), gc.isenabled()
+    gc.collect()
+    gc.disable()
+    sys.setswitchinterval(_SWITCH)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(switch)
+        if collecting:
+            gc.enable()
+
+
+class Jitter(NamedTuple):
+    """Lateness of the beats of an idle loop.
+
+    Attributes:
+        fifo: whether the system permitted real-time scheduling.
+        lateness: of each beat [s].
+        missed: beats that passed unused.
+    """
+
+    fifo: bool
+    lateness: Float[np.ndarray, " beats"]
+    missed: int
+
+
+def measure_jitter(period: float, seconds: float, fifo: bool = True) -> Jitter:
+    """Run an idle loop, in a thread of its own so that this one keeps its priority."""
+    found: list[Jitter] = []
+
+    def loop() -> None:
+        granted = schedule_fifo() if fifo else False
+        clock = CycleClock(period)
+        ticks = [clock.wait() for _ in range(max(2, round(seconds / period)))]
+        found.append(Jitter(granted, np.array([tick.lateness for tick in ticks]), sum(tick.missed for tick in ticks)))
+
+    with steady_interpreter():
+        thread = threading.Thread(target=loop, name="idle loop")
+        thread.start()
+        thread.join()
+    return found[0]

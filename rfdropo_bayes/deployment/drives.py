@@ -1,0 +1,456 @@
+"""The drives of a robot, seen from the master: set-up through SDOs with read-back, one exchange of process data per cycle.
+
+canopen carries the object dictionary and the SDOs. Process data, SYNC, heartbeats and emergencies are handled here, in the
+thread of the control loop, because each needs a time and a defined end where canopen's own threads have neither.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import can
+import canopen
+from canopen.pdo.base import PdoMap
+
+from rfdropo_bayes.deployment import objects
+from rfdropo_bayes.deployment.bus import LoggedNetwork
+from rfdropo_bayes.deployment.cia402 import CYCLIC_SYNCHRONOUS_POSITION, Command, State, controlword_towards, state_of
+from rfdropo_bayes.deployment.objects import Nmt, NmtState, Object
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots import Motor
+
+
+class Emergency(NamedTuple):
+    """An emergency message: when it came [s, monotonic], from which channel, its code and error register."""
+
+    time: float
+    channel: str
+    code: int
+    register: int
+
+
+class Reading(NamedTuple):
+    """What a drive's last TPDO said: statusword, position [counts], torque [per mille], when it came [s, monotonic]."""
+
+    statusword: int
+    position: int
+    torque: int
+    time: float
+
+
+class Identity(NamedTuple):
+    """Object 0x1018; None stands for any."""
+
+    vendor: int | None = None
+    product: int | None = None
+    revision: int | None = None
+    serial: int | None = None
+
+
+class Drive:
+    """One drive.
+
+    Args:
+        network: that it is on.
+        motor: what it drives.
+        eds: path of its electronic data sheet.
+        offset: counts at length zero.
+    """
+
+    def __init__(self, network: LoggedNetwork, motor: Motor, eds: str, offset: float) -> None:
+        self.motor, self.offset = motor, offset
+        self.network = network
+        try:
+            self.node = canopen.RemoteNode(motor.node, eds)
+        except Exception as error:  # configparser and canopen raise many types on damaged data sheets
+            raise InputError(f"is no readable data sheet ({error})", where=eds, remedy=_EDS_REMEDY) from None
+        network.add_node(self.node)
+        self._sdo = threading.Lock()
+        self.controlword, self.target = int(Command.DISABLE_VOLTAGE), 0
+        self.reading: Reading | None = None
+        self.short_frames = 0
+        self.nmt: int | None = None
+        self.heartbeat = 0.0  # time of the last one [s, monotonic]
+        network.subscribe(objects.HEARTBEAT + motor.node, self._on_heartbeat)
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return f"drive {self.motor.channel!r} (node {self.motor.node})"
+
+    @property
+    def state(self) -> State | None:
+        """State that the last TPDO shows."""
+        return None if self.reading is None else state_of(self.reading.statusword)
+
+    @property
+    def length(self) -> float:
+        """Cable on the drum [m] at the last TPDO."""
+        assert self.reading is not None
+        return self.motor.length(self.reading.position, self.offset)
+
+    @property
+    def tension(self) -> float:
+        """Tension [N] that the torque of the last TPDO holds."""
+        assert self.reading is not None
+        return self.motor.tension(self.reading.torque)
+
+    # SDO
+
+    def knows(self, index: int, subindex: int = 0) -> bool:
+        """Whether the data sheet has the object."""
+        return self.node.object_dictionary.get_variable(index, subindex) is not None
+
+    def read(self, index: int, subindex: int = 0) -> int:
+        """Read an object.
+
+        Raises:
+            InputError: if the drive does not answer, or refuses; with index and reason.
+        """
+        variable = self.node.object_dictionary.get_variable(index, subindex)
+        where = f"{self.name}, object 0x{index:04X}:{subindex}"
+        if variable is None:
+            raise InputError("is not in its data sheet", where=where, remedy=_EDS_REMEDY)
+        try:
+            with self._sdo:
+                data = self.node.sdo.upload(index, subindex)
+        except (canopen.SdoError, can.CanError, OSError) as error:
+            raise InputError(f"cannot be read ({error})", where=where, remedy=_SDO_REMEDY) from None
+        if 8 * len(data) < len(variable):
+            raise InputError(
+                f"has {len(data)} bytes, {len(variable) // 8} by the data sheet", where=where, remedy=_EDS_REMEDY
+            )
+        return int(variable.decode_raw(data))
+
+    def write(self, index: int, value: int, subindex: int = 0, read_back: bool = True) -> None:
+        """Write an object, and read it again.
+
+        Raises:
+            InputError: if the drive does not answer, refuses, or keeps another value.
+        """
+        variable = self.node.object_dictionary.get_variable(index, subindex)
+        where = f"{self.name}, object 0x{index:04X}:{subindex}"
+        if variable is None:
+            raise InputError("is not in its data sheet", where=where, remedy=_EDS_REMEDY)
+        try:
+            with self._sdo:
+                self.node.sdo.download(index, subindex, variable.encode_raw(value))
+        except (canopen.SdoError, can.CanError, OSError) as error:
+            raise InputError(f"does not take {value} ({error})", where=where, remedy=_SDO_REMEDY) from None
+        if read_back and variable.readable and (kept := self.read(index, subindex)) != value:
+            raise InputError(f"keeps {kept} where {value} was written", where=where, remedy="look into its manual")
+
+    # Set-up
+
+    def check(self, identity: Identity) -> dict[str, int]:
+        """Read who the drive is and whether it can do what is asked; nothing is written.
+
+        Returns:
+            Its identity, statusword, position, supported modes and rated torque.
+
+        Raises:
+            InputError: on silence, a wrong identity or type, no cyclic synchronous position, another rated torque.
+        """
+        kind = self.read(Object.DEVICE_TYPE)
+        if kind & 0xFFFF != 402:
+            raise InputError(
+                f"is no CiA 402 drive (device type 0x{kind:08X})", where=self.name, remedy="correct its node"
+            )
+        found = {}
+        for subindex, (key, expected) in enumerate(identity._asdict().items(), start=1):
+            if not self.knows(Object.IDENTITY, subindex):
+                continue
+            found[key] = self.read(Object.IDENTITY, subindex)
+            if expected is not None and found[key] != expected:
+                raise InputError(
+                    f"{key} is 0x{found[key]:X}, not 0x{expected:X}",
+                    where=f"{self.name}, object 0x1018:{subindex}",
+                    remedy="this is another drive: correct the wiring, the node, or [drives]",
+                )
+        if self.knows(Object.SUPPORTED_MODES):
+            found["modes"] = self.read(Object.SUPPORTED_MODES)
+            if not found["modes"] & objects.CSP_BIT:
+                raise InputError("has no cyclic synchronous position mode", where=self.name, remedy="use another drive")
+        if self.knows(Object.RATED_TORQUE):
+            found["rated_torque"] = self.read(Object.RATED_TORQUE)
+            expected = 1e3 * self.motor.rated_torque_n_m
+            if abs(found["rated_torque"] - expected) > 0.02 * expected + 1:
+                raise InputError(
+                    f"its rated torque is {found['rated_torque']} mN m, that of the robot file {expected:g}",
+                    where=f"{self.name}, object 0x6076",
+                    remedy="correct rated_torque_n_m: tensions are computed from it",
+                )
+        found["statusword"] = self.read(Object.STATUSWORD)
+        found["position"] = self.read(Object.POSITION)
+        return found
+
+    def disable(self) -> bool:
+        """Bring a drive that is found powered to rest, before anything is configured; True if it was.
+
+        It is commanded by SDO: process data of whoever had it last may still be configured.
+        """
+        end = time.monotonic() + 1.0
+        found, previous = False, 0
+        while (state := state_of(self.read(Object.STATUSWORD))) is not None:
+            if not state.powered and state is not State.SWITCHED_ON:
+                return found
+            found = True
+            previous = controlword_towards(state, State.SWITCH_ON_DISABLED, previous)
+            self.write(Object.CONTROLWORD, previous, read_back=False)
+            if time.monotonic() > end:
+                break
+        raise InputError(
+            "stays powered", where=self.name, remedy="switch it off, and find out which other master commands it"
+        )
+
+    def configure(self, period: float, guards: Guards) -> None:
+        """Set mode, limits and guards, and map the process data; the node must be PRE-OPERATIONAL.
+
+        Raises:
+            InputError: where the drive does not keep what is written.
+        """
+        for index, subindex, value in self._settings(period, guards):
+            if self.knows(index, subindex):
+                self.write(index, value, subindex)
+        if (mode := self.read(Object.MODE_DISPLAY)) != CYCLIC_SYNCHRONOUS_POSITION:
+            raise InputError(
+                f"stays in mode {mode}", where=f"{self.name}, object 0x6061", remedy="look into its manual"
+            )
+        node = self.motor.node
+        rpdos, tpdos = self.node.rpdo, self.node.tpdo
+        for number, maps in ((1, rpdos), (2, rpdos), (1, tpdos)):
+            if number not in maps:
+                raise InputError(f"has no process data {number}", where=f"{self.name}, data sheet", remedy=_EDS_REMEDY)
+        self._map(rpdos[1], objects.RPDO1 + node, 1, objects.SETPOINT_MAP)
+        self._map(rpdos[2], objects.RPDO2 + node, 255, objects.COMMAND_MAP)
+        self._map(tpdos[1], objects.TPDO1 + node, 1, objects.STATUS_MAP)
+        for index, maps, used in ((Object.RPDO, rpdos, 2), (Object.TPDO, tpdos, 1)):
+            for number in maps:
+                if number > used:
+                    cob = self.read(index + number - 1, 1)
+                    if not cob & objects.PDO_INVALID:
+                        self.write(index + number - 1, cob | objects.PDO_INVALID, 1)
+        self.network.subscribe(objects.TPDO1 + node, self._on_status)
+        self.target = self.read(Object.POSITION)
+        self.controlword = int(Command.DISABLE_VOLTAGE)
+
+    def _settings(self, period: float, guards: Guards) -> list[tuple[int, int, int]]:
+        """Index, subindex and value of everything that is set, where the drive's data sheet has it."""
+        motor = self.motor
+        ends = sorted(motor.counts(length, self.offset) for length in motor.length_limit_m)
+        fastest = motor.rate_limit_m_s * motor.counts_per_metre
+        turns = 60.0 * 1.5 * fastest / motor.counts_per_turn  # half as much again: it must not cut into the set-points
+        greatest = motor.per_mille(motor.tension_limit_n[1])
+        return [
+            (Object.MODE, 0, CYCLIC_SYNCHRONOUS_POSITION),
+            (Object.INTERPOLATION_TIME, 2, -3),
+            (Object.INTERPOLATION_TIME, 1, round(1e3 * period)),
+            (Object.POSITION_LIMIT, 1, ends[0]),
+            (Object.POSITION_LIMIT, 2, ends[1]),
+            (Object.FOLLOWING_WINDOW, 0, round(guards.following_error_m * motor.counts_per_metre)),
+            (Object.FOLLOWING_TIMEOUT, 0, round(1e3 * guards.following_time_s)),
+            (Object.MAX_TORQUE, 0, round(1.2 * greatest)),
+            (Object.MAX_MOTOR_SPEED, 0, max(1, round(turns))),
+            (Object.QUICK_STOP_DECELERATION, 0, round(motor.acceleration_limit_m_s2 * motor.counts_per_metre)),
+            (Object.QUICK_STOP_OPTION, 0, 6),  # slow down on the quick stop ramp, and hold
+            (Object.ABORT_CONNECTION, 0, 3),  # quick stop where the master is lost
+            (Object.CONSUMER_HEARTBEAT, 1, guards.master_node << 16 | round(1e3 * guards.master_timeout_s)),
+            (Object.PRODUCER_HEARTBEAT, 0, round(1e3 * guards.drive_heartbeat_s)),
+        ]
+
+    def _map(self, pdo: PdoMap, cob: int, kind: int, entries: Sequence[tuple[int, int, int]]) -> None:
+        """Map one PDO in the order that the standard asks for (off, empty, fill, count, on), and read it back."""
+        where = f"{self.name}, process data 0x{cob:03X}"
+        wanted = [(int(index), subindex, bits) for index, subindex, bits in entries]
+        try:
+            with self._sdo:
+                pdo.read()
+                pdo.clear()
+                for index, subindex, bits in wanted:
+                    if pdo.add_variable(index, subindex, bits) is None:
+                        raise InputError(f"lacks object 0x{index:04X}", where=where, remedy=_EDS_REMEDY)
+                pdo.cob_id, pdo.trans_type, pdo.enabled = cob, kind, True
+                pdo.save()
+                pdo.read()
+        except (canopen.SdoError, can.CanError, OSError, KeyError) as error:
+            raise InputError(f"cannot be mapped ({error})", where=where, remedy=_SDO_REMEDY) from None
+        found = [(variable.index, variable.subindex, variable.length) for variable in pdo.map]
+        if found != wanted or pdo.cob_id != cob or pdo.trans_type != kind or not pdo.enabled:
+            said = ", ".join(f"0x{index:04X}:{sub} {bits} bits" for index, sub, bits in found)
+            raise InputError(
+                f"the drive keeps another mapping ({said}; 0x{pdo.cob_id:X}, type {pdo.trans_type})",
+                where=where,
+                remedy="look into its manual: it may map only what its EDS says",
+            )
+        # canopen would take frames of ours that the bus echoes for the drive's, and overwrite its buffer.
+        with_echo = self.network.subscribers.get(cob, [])
+        if pdo.on_message in with_echo:
+            self.network.unsubscribe(cob, pdo.on_message)
+
+    # Process data
+
+    def _on_status(self, identifier: int, data: bytearray, timestamp: float) -> None:
+        if len(data) != objects.STATUS.size:
+            self.short_frames += 1
+            return
+        self.reading = Reading(*objects.STATUS.unpack(data), time.monotonic())
+        self.on_status(self)
+
+    on_status: Callable[[Drive], None] = staticmethod(lambda drive: None)
+
+    def _on_heartbeat(self, identifier: int, data: bytearray, timestamp: float) -> None:
+        if data:
+            self.nmt, self.heartbeat = data[0] & 0x7F, time.monotonic()
+
+
+class Guards(NamedTuple):
+    """What watches over what.
+
+    Attributes:
+        master_node: node number under which the master sends heartbeats.
+        master_timeout_s: drives quick-stop where none came for so long.
+        drive_heartbeat_s: how often drives send theirs.
+        following_error_m, following_time_s: a drive faults where it lags behind its set-point by so much for so long.
+    """
+
+    master_node: int = 127
+    master_timeout_s: float = 0.08
+    drive_heartbeat_s: float = 0.02
+    following_error_m: float = 0.005
+    following_time_s: float = 0.05
+
+
+class Drives:
+    """All drives of a robot.
+
+    Args:
+        network: that they are on.
+        drives: in the order of the robot's channels.
+        guards: see there.
+    """
+
+    def __init__(self, network: LoggedNetwork, drives: Sequence[Drive], guards: Guards) -> None:
+        self.network, self.guards = network, guards
+        self.all = tuple(drives)
+        self.emergencies: deque[Emergency] = deque(maxlen=1000)
+        self._awaited: set[int] = set()
+        self._complete = threading.Event()
+        self._sending = threading.Lock()
+        self._stopped = threading.Event()
+        self._next_heartbeat = 0.0
+        for drive in self.all:
+            drive.on_status = self._arrived
+            network.subscribe(objects.EMCY + drive.motor.node, self._on_emergency)
+        self._names = {drive.motor.node: drive.motor.channel for drive in self.all}
+
+    def manage(self, command: Nmt) -> None:
+        """Send a command of network management to every drive of ours, and to no other node."""
+        for drive in self.all:
+            self.network.send_message(objects.NMT, bytes([command, drive.motor.node]))
+
+    def configure(self, period: float, say: Callable[[str], None]) -> None:
+        """Bring every drive to rest, then configure it, then start its process data.
+
+        Raises:
+            InputError: see `Drive.configure`; or if a drive does not become OPERATIONAL within a second.
+        """
+        for drive in self.all:
+            if drive.disable():
+                say(f"{drive.name} was found powered, and has been switched off")
+        self.manage(Nmt.PRE_OPERATIONAL)
+        for drive in self.all:
+            drive.configure(period, self.guards)
+        self.manage(Nmt.START)
+        end = time.monotonic() + 1.0
+        while waiting := [drive for drive in self.all if drive.nmt != NmtState.OPERATIONAL]:
+            if time.monotonic() > end:
+                raise InputError(
+                    f"does not become OPERATIONAL (its heartbeat says {waiting[0].nmt})",
+                    where=waiting[0].name,
+                    remedy="power it off and on",
+                )
+            time.sleep(0.005)
+
+    def exchange(self, timeout: float) -> bool:
+        """One cycle: set-points, SYNC, heartbeat; then wait for the answers.
+
+        Args:
+            timeout: how long to wait [s].
+
+        Returns:
+            Whether every drive has answered in time.
+
+        Raises:
+            CanError: if the bus does not take a frame.
+        """
+        with self._sending:
+            stopped = self._stopped.is_set()
+            for drive in self.all:
+                if stopped:
+                    drive.controlword = int(Command.QUICK_STOP)
+                data = objects.SETPOINT.pack(drive.controlword, drive.target)
+                self.network.send_message(objects.RPDO1 + drive.motor.node, data)
+            self._awaited = {drive.motor.node for drive in self.all}
+            self._complete.clear()
+            self.network.send_message(objects.SYNC, b"")
+        self.send_heartbeat()
+        return self._complete.wait(timeout)
+
+    def send_heartbeat(self) -> None:
+        """The master's heartbeat, where it is due: four in the time that drives are patient."""
+        now = time.monotonic()
+        if now >= self._next_heartbeat:
+            self._next_heartbeat = now + 0.25 * self.guards.master_timeout_s - 1e-3
+            self.network.send_message(objects.HEARTBEAT + self.guards.master_node, bytes([NmtState.OPERATIONAL]))
+
+    def quick_stop(self, patience: float = 0.02) -> list[str]:
+        """Stop every drive at once, from any thread, whatever the control loop does; it stays stopped.
+
+        The controlword goes out in a PDO of its own that needs no SYNC. Where a frame cannot be sent, the others still are,
+        and the drive's own guard stops it.
+
+        Returns:
+            What could not be sent.
+        """
+        self._stopped.set()
+        # Behind a cycle that is being sent: its set-points still say "enable", and would undo the stop.
+        held = self._sending.acquire(timeout=patience)
+        failures = []
+        try:
+            for drive in self.all:
+                drive.controlword = int(Command.QUICK_STOP)
+                try:
+                    self.network.send_message(
+                        objects.RPDO2 + drive.motor.node, objects.COMMAND.pack(Command.QUICK_STOP)
+                    )
+                except can.CanError as error:
+                    failures.append(f"{drive.name}: {error}")
+        finally:
+            if held:
+                self._sending.release()
+        return failures
+
+    @property
+    def stopped(self) -> bool:
+        """Whether `quick_stop` was called."""
+        return self._stopped.is_set()
+
+    def _arrived(self, drive: Drive) -> None:
+        self._awaited.discard(drive.motor.node)
+        if not self._awaited:
+            self._complete.set()
+
+    def _on_emergency(self, identifier: int, data: bytearray, timestamp: float) -> None:
+        if len(data) != 8:
+            data = bytearray(data[:8].ljust(8, b"\0"))
+        code, register, _ = objects.EMERGENCY.unpack(data)
+        channel = self._names.get(identifier - objects.EMCY, "?")
+        self.emergencies.append(Emergency(time.monotonic(), channel, code, register))
+
+
+_EDS_REMEDY = "give the data sheet that came with this drive"
+_SDO_REMEDY = "check power, node number, bit rate and termination; `rfdropo doctor` lists who answers"

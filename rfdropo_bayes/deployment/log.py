@@ -1,0 +1,208 @@
+"""The log of a session: a journal of every cycle that a crash cannot take back, and the recording made of it.
+
+Each cycle is one fixed-size record, handed to the operating system at once: if the program is killed, nothing is lost, and
+if the machine loses power, at most the last second. `session.nc` is written from the journal at the end, or after a crash.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Shaped
+
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.deployment.bus import FrameLog
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots import Robot
+
+JOURNAL, EVENTS, SESSION, FRAMES, SUMMARY = "cycles.bin", "log.jsonl", "session.nc", "frames.log", "summary.json"
+FORMAT = "drive-session"
+SCHEMA_VERSION = 1
+_SYNC = 1.0  # [s]: how often the disk is told to keep what it has
+_HEADER = 4096  # [bytes]
+
+
+def record_type(channels: int, markers: int) -> np.dtype[np.void]:
+    """One cycle. Times in s (monotonic clock), lengths in m of cable, tensions in N, commands in the command unit."""
+    return np.dtype(
+        [
+            ("time", "<f8"),
+            ("lateness", "<f8"),
+            ("missed", "<u2"),
+            ("phase", "u1"),
+            ("acted", "?"),  # a new command came into force in this cycle
+            ("raw", "<f8", (channels,)),
+            ("asked", "<f8", (channels,)),
+            ("command", "<f8", (channels,)),
+            ("set_point", "<f8", (channels,)),
+            ("length", "<f8", (channels,)),
+            ("tension", "<f8", (channels,)),
+            ("fresh", "?", (channels,)),
+            ("statusword", "<u2", (channels,)),
+            ("controlword", "<u2", (channels,)),
+            ("position", "<f8", (markers, 3)),
+            ("seen", "?", (markers,)),
+        ]
+    )
+
+
+class SessionLog:
+    """Writes a session's folder while it runs.
+
+    Args:
+        folder: to write to; it must not hold a session yet.
+        robot: that is driven.
+        facts: about the session, kept in the recording's settings.
+        frames: name of the file of CAN frames; its ending chooses the format.
+
+    Raises:
+        InputError: if the folder holds a session, or cannot be written to.
+    """
+
+    def __init__(self, folder: Path, robot: Robot, facts: Mapping[str, Any], frames: str = FRAMES) -> None:
+        self.folder = Path(folder)
+        if (self.folder / JOURNAL).exists():
+            raise InputError("holds a session already", where=str(folder), remedy="give another folder with --out")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._journal = os.open(self.folder / JOURNAL, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+            self._events = (self.folder / EVENTS).open("a", encoding="utf-8")
+        except OSError as error:
+            raise InputError(
+                f"cannot be written ({error})", where=str(folder), remedy="choose another folder"
+            ) from None
+        header = {
+            "robot": robot.model_dump(mode="json"),
+            "facts": dict(facts),
+            "wall_time": time.time(),
+            "monotonic": time.monotonic(),
+            "schema_version": SCHEMA_VERSION,
+        }
+        text = json.dumps(header).encode()
+        size = _HEADER * (1 + len(text) // _HEADER)
+        os.write(self._journal, str(size).encode().rjust(8) + text.ljust(size - 8))
+        self.record = np.zeros((), record_type(len(robot.channel_names), len(robot.marker_names)))
+        self.frames = FrameLog(self.folder / frames)
+        self._closed, self._writing = threading.Event(), threading.Lock()
+        self._keeper = threading.Thread(target=self._keep, name="log", daemon=True)
+        self._keeper.start()
+
+    def write(self) -> None:
+        """Add ``record`` as it stands."""
+        os.write(self._journal, self.record.tobytes())
+
+    def event(self, kind: str, text: str, **more: Any) -> None:
+        """Add a line to log.jsonl."""
+        line = {"time": time.time(), "monotonic": time.monotonic(), "event": kind, "text": text} | more
+        with self._writing:
+            self._events.write(json.dumps(line) + "\n")
+            self._events.flush()
+
+    def close(self) -> None:
+        """End the journal."""
+        self._closed.set()
+        self._keeper.join()
+        self._sync()
+        self.frames.stop()
+        os.close(self._journal)
+        self._events.close()
+
+    def _keep(self) -> None:
+        while not self._closed.wait(_SYNC):
+            self._sync()
+
+    def _sync(self) -> None:
+        self.frames.flush()
+        with contextlib.suppress(OSError):  # a full disk must not stop a robot in motion; the next write says it
+            os.fsync(self._journal)
+            os.fsync(self._events.fileno())
+
+
+def read_journal(folder: Path) -> tuple[dict[str, Any], Shaped[np.ndarray, " cycle"]]:
+    """Header and records of a session; a record that a crash cut short is left out.
+
+    Raises:
+        InputError: if there is none, or it is no journal of ours.
+    """
+    path = Path(folder) / JOURNAL
+    try:
+        content = path.read_bytes()
+        size = int(content[:8])
+        header = json.loads(content[8:size])
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"is no journal of a session ({error})", where=str(path), remedy="give a session's folder"
+        ) from None
+    robot = header["robot"]
+    kind = record_type(len(robot["channels"]["names"]), len(robot["markers"]))
+    whole = (len(content) - size) // kind.itemsize
+    return header, np.frombuffer(content, kind, count=whole, offset=size)
+
+
+def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> Trajectory:
+    """The recording of a session, from its journal.
+
+    Commands are those in force at the policy's rate, before the set-points' limits on rate and acceleration, after those on
+    length; drum angles [rad] are measured, tensions [N] come from the drives' torque. Where a drive was silent its last
+    value stands, and ``tension_mask`` is False. Statuswords, set-points and raw actions are kept beside, outside the hash:
+    they say how the session went, not what the robot did.
+
+    Args:
+        folder: of the session.
+        phases: take the cycles of these phases alone, where there are at least two.
+
+    Raises:
+        InputError: if it has fewer than two cycles.
+    """
+    header, rows = read_journal(folder)
+    robot = Robot.model_validate(header["robot"])
+    if phases is not None and np.count_nonzero(np.isin(rows["phase"], phases)) > 1:
+        rows = rows[np.isin(rows["phase"], phases)]
+    if len(rows) < 2:
+        raise InputError(f"has {len(rows)} cycles", where=str(folder), remedy="there is nothing to make a recording of")
+    seen = rows["seen"]
+    acted = np.flatnonzero(rows["acted"])
+    first = acted if acted.size else np.array([0])
+    radius = np.array([motor.drum_radius_m for motor in robot.motors])
+    before = rows["command"][max(first[0] - 1, 0)]
+    trajectory = Trajectory.build(
+        name=Path(folder).name,
+        robot=robot.name,
+        format=FORMAT,
+        time=rows["time"],
+        position=rows["position"],
+        position_mask=seen,
+        command_time=rows["time"][first],
+        command=rows["command"][first],
+        initial_command=before,
+        command_unit=robot.command_unit,
+        marker_names=robot.marker_names,
+        cable_names=robot.channel_names,
+        tension=rows["tension"],
+        motor_angle=rows["length"] / radius,
+        provenance=f"session of {time.strftime('%Y-%m-%d %H:%M:%S', time.gmtime(header['wall_time']))} UTC",
+        settings=header["facts"] | ({} if seen.any() else {"unseen": True}),
+    )
+    cycle, command = ("time", "cable"), ("command_time", "cable")
+    beside = {
+        "tension_mask": xr.Variable(cycle, rows["fresh"]),
+        "set_point": xr.Variable(cycle, rows["set_point"], {"unit": "m"}),
+        "length": xr.Variable(cycle, rows["length"], {"unit": "m"}),
+        "statusword": xr.Variable(cycle, rows["statusword"]),
+        "controlword": xr.Variable(cycle, rows["controlword"]),
+        "phase": xr.Variable("time", rows["phase"]),
+        "lateness": xr.Variable("time", rows["lateness"], {"unit": "s"}),
+        "missed": xr.Variable("time", rows["missed"]),
+        "raw_action": xr.Variable(command, rows["raw"][first]),
+        "asked_command": xr.Variable(command, rows["asked"][first], {"unit": robot.command_unit}),
+    }
+    return Trajectory(trajectory.dataset.assign(beside))

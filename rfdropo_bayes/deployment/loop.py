@@ -1,0 +1,343 @@
+"""The control loop: set-points out and status in at every beat, and every phase of a session from enabling to rest."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import can
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.deployment.causes import Cause, Reaction, Stop
+from rfdropo_bayes.deployment.cia402 import State, controlword_towards
+from rfdropo_bayes.deployment.clock import CycleClock, Tick
+from rfdropo_bayes.deployment.drives import Drive, Drives
+from rfdropo_bayes.deployment.log import SessionLog
+from rfdropo_bayes.deployment.objects import Nmt
+from rfdropo_bayes.deployment.policy import CommandSource, Scene
+from rfdropo_bayes.deployment.sensors import MarkerView
+from rfdropo_bayes.deployment.setpoints import SetPoints
+from rfdropo_bayes.deployment.settings import SafetyTable
+from rfdropo_bayes.deployment.watch import Watch
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots import Robot
+
+_ANSWER = 0.6  # of a period: how long a cycle waits for the drives; the rest is for policy, log and sleep
+
+
+class Phase(IntEnum):
+    """What a cycle was for, as the log tells it."""
+
+    ENABLING = 1
+    HOMING = 2
+    STARTING = 3
+    SETTLING = 4
+    RUNNING = 5
+    STOPPING = 6
+    HOLDING = 7
+    BRAKED = 8
+    SHADOW = 9
+
+
+class Snapshot(NamedTuple):
+    """What the display shows: phase, time left [s], last lateness [s], misses, act time [s] and the drives."""
+
+    phase: Phase | None
+    left: float
+    lateness: float
+    missed: int
+    act_time: float
+    set_point: Float[np.ndarray, " channel"]
+    drives: Sequence[Drive]
+
+
+class ControlLoop:
+    """One session on configured drives. Runs in a thread of its own; `run` returns why it ended.
+
+    Args:
+        robot: that is driven.
+        drives: configured and operational.
+        markers: what is seen.
+        log: every cycle goes there.
+        safety: see there.
+        period: of the cycle [s].
+        say: takes a line for the log.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        drives: Drives,
+        markers: MarkerView,
+        log: SessionLog,
+        safety: SafetyTable,
+        period: float,
+        say: Callable[[str], None],
+    ) -> None:
+        self.robot, self.drives, self.markers, self.log = robot, drives, markers, log
+        self.safety, self.period, self._say = safety, period, say
+        channels = len(robot.motors)
+        self.motors = [drive.motor for drive in drives.all]
+        radius = np.array([motor.drum_radius_m for motor in self.motors])
+        self.scale = radius if robot.command_unit == "rad" else np.ones(channels)  # command unit -> m
+        self._least = np.array([motor.tension_limit_n[0] for motor in self.motors])
+        self.set_points = SetPoints(self.motors, period, np.zeros(channels))
+        self.command = np.zeros(channels)  # in force [m]
+        self._raw, self._asked = np.zeros(channels), np.zeros(channels)
+        self.watch = Watch(drives, period, safety.patience())
+        self._clock: CycleClock
+        self._wanted = State.SWITCH_ON_DISABLED
+        self._expected: State | None = None
+        self.pulse: float | None = None
+        self.demanded: Stop | None = None  # by another thread
+        self.lateness: list[float] = []
+        self.act_times: list[float] = []
+        self.snapshot = Snapshot(None, 0.0, 0.0, 0, 0.0, np.zeros(channels), drives.all)
+        self._left = 0.0
+        self.stop_time: float | None = None
+
+    # One cycle
+
+    def cycle(self, phase: Phase, acted: bool = False) -> Tick:
+        """Wait for the beat; send set-points; take in status and markers; look at both; log.
+
+        Raises:
+            Stop: if this cycle must be the last of its phase.
+        """
+        tick = self._clock.wait()
+        self.pulse = time.monotonic()
+        if self.demanded is not None and phase is not Phase.BRAKED:
+            raise self.demanded
+        for drive, length in zip(self.drives.all, self.set_points.length, strict=True):
+            state = drive.state
+            if state is not None:
+                drive.controlword = controlword_towards(state, self._wanted, drive.controlword)
+            if state is State.OPERATION_ENABLED:
+                drive.target = drive.motor.counts(length, drive.offset)
+            elif drive.reading is not None:
+                drive.target = drive.reading.position  # a drive must find itself where it is when it is enabled
+        try:
+            self.drives.exchange(_ANSWER * self.period)
+        except can.CanError as error:
+            raise Stop(Cause.SEND_ERROR, str(error)) from None
+        self.markers.update(self.pulse)
+        try:
+            if phase is not Phase.BRAKED:
+                self.watch.check(tick, self._expected)
+        finally:
+            self._write(tick, phase, acted)
+        return tick
+
+    def _write(self, tick: Tick, phase: Phase, acted: bool) -> None:
+        self.lateness.append(tick.lateness)
+        if all(drive.reading is not None for drive in self.drives.all):
+            record, all_drives = self.log.record, self.drives.all
+            record["time"], record["lateness"], record["missed"] = tick.time, tick.lateness, min(tick.missed, 65535)
+            record["phase"], record["acted"] = phase, acted
+            record["raw"], record["asked"] = self._raw, self._asked
+            record["command"] = self.command / self.scale
+            record["set_point"] = self.set_points.length
+            record["length"] = self.lengths()
+            record["tension"] = self.tensions()
+            record["fresh"] = [drive.reading is not None and drive.reading.time >= tick.time for drive in all_drives]
+            record["statusword"] = [drive.reading.statusword for drive in all_drives if drive.reading]
+            record["controlword"] = [drive.controlword for drive in all_drives]
+            record["position"], record["seen"] = self.markers.position, self.markers.fresh
+            self.log.write()
+        act_time = self.act_times[-1] if self.act_times else 0.0
+        self.snapshot = Snapshot(
+            phase, self._left, tick.lateness, self.watch.missed, act_time, self.set_points.length, self.drives.all
+        )
+
+    def lengths(self) -> Float[np.ndarray, " channel"]:
+        """Measured cable on each drum [m]."""
+        return np.array([drive.length for drive in self.drives.all])
+
+    def tensions(self) -> Float[np.ndarray, " channel"]:
+        """Measured tensions [N]."""
+        return np.array([drive.tension for drive in self.drives.all])
+
+    # Phases
+
+    def run(self, phases: Callable[[ControlLoop], None]) -> Stop:
+        """Go through the phases, and come to rest whatever happens.
+
+        Returns:
+            Why it ended.
+        """
+        self.watch.begin()
+        self._clock = CycleClock(self.period)
+        try:
+            phases(self)
+            stop = Stop(Cause.FINISHED)
+        except Stop as raised:
+            stop = raised
+        except InputError as error:
+            stop = Stop(Cause.PROGRAM_ERROR, str(error))
+        except Exception as error:  # the drives must come to rest before anything else
+            stop = Stop(Cause.PROGRAM_ERROR, f"{type(error).__name__}: {error}")
+        return self._come_to_rest(stop)
+
+    def find(self) -> None:
+        """First status of every drive; set-points begin where the drives are."""
+        end = time.monotonic() + 1.0
+        while silent := [drive.name for drive in self.drives.all if drive.reading is None]:
+            self.cycle(Phase.ENABLING)
+            if time.monotonic() > end:
+                raise Stop(Cause.STALE_STATUS, f"{silent[0]} sends no status")
+        self.set_points.length = self.lengths()
+        self.command = self.set_points.length.copy()
+
+    def enable(self) -> None:
+        """Bring every drive to OPERATION ENABLED, with the target where it stands.
+
+        Raises:
+            Stop: if one does not come within the time, or stands outside its limits.
+        """
+        self.find()
+        for drive, low, high in zip(self.drives.all, self.set_points.low, self.set_points.high, strict=True):
+            if not low - 1e-4 <= drive.length <= high + 1e-4:
+                raise Stop(
+                    Cause.NOT_ENABLED,
+                    f"{drive.name} stands at {1e3 * drive.length:.1f} mm, outside its limits: home it",
+                )
+        self._wanted = State.OPERATION_ENABLED
+        end = time.monotonic() + self.safety.enable_s
+        while waiting := [drive for drive in self.drives.all if drive.state is not State.OPERATION_ENABLED]:
+            if time.monotonic() > end:
+                state = waiting[0].state
+                raise Stop(
+                    Cause.NOT_ENABLED, f"{waiting[0].name} stays in {state.words if state else 'no known state'}"
+                )
+            self.cycle(Phase.ENABLING)
+        self._expected = State.OPERATION_ENABLED
+
+    def go_to(self, length: Float[np.ndarray, " channel"], phase: Phase, settle: float) -> None:
+        """Move slowly to these lengths [m], and rest there."""
+        slow = self.safety.start_rate_m_s
+        limit = np.array([motor.rate_limit_m_s for motor in self.motors]) / 5.0 if slow is None else slow
+        goal = self.set_points.clamp(length)
+        self.command = goal.copy()
+        acted = True
+        while np.any(np.abs(self.set_points.length - goal) > 1e-7) or not self.set_points.at_rest:
+            self.set_points.towards(goal, rate_limit=limit)
+            self.cycle(phase, acted)
+            acted = False
+        for _ in range(round(settle / self.period)):
+            self.cycle(Phase.SETTLING, acted)
+            acted = False
+
+    def follow(self, source: CommandSource, duration: float, phase: Phase = Phase.RUNNING) -> None:
+        """Let the source command for so long [s]; what it asks is ramped over its own period, within all limits.
+
+        Raises:
+            Stop: if it commands what cannot be followed, or a marker it needs is lost.
+        """
+        cycles = round(1.0 / (source.rate_hz * self.period))
+        previous = self.command.copy()
+        for number in range(round(duration / self.period)):
+            self._left = duration - number * self.period
+            share = number % cycles
+            if share == 0:
+                previous = self.command.copy()
+                if not self._act(source, cycles * self.period):
+                    return
+            goal = self._without_slack(self.command)
+            ramp = self._without_slack(previous + (self.command - previous) * (share + 1) / cycles)
+            self.set_points.towards(goal, ramp)
+            self.cycle(phase, acted=share == 0)
+
+    def _act(self, source: CommandSource, period: float) -> bool:
+        now = time.monotonic()
+        if source.sees_markers and (name := self.markers.lost(now)):
+            raise Stop(Cause.MARKERS_LOST, f"marker {name!r} is lost")
+        self.markers.act(now)
+        unit = self.command / self.scale
+        scene = Scene(self.markers.position, self.markers.velocity, unit, self._raw, self.lengths(), self.tensions())
+        act = source.act(scene)
+        self.act_times.append(time.monotonic() - now)
+        if act is None:
+            return False
+        if not np.all(np.isfinite(act.command)):
+            raise Stop(Cause.ACTION_NOT_FINITE, f"the command is {act.command.tolist()}")
+        self._raw, self._asked = act.raw, act.command
+        reach = self.set_points.rate_limit * period
+        asked = np.clip(act.command * self.scale, self.command - reach, self.command + reach)
+        self.command = self.set_points.clamp(asked)
+        return True
+
+    def _without_slack(self, length: Float[np.ndarray, " channel"]) -> Float[np.ndarray, " channel"]:
+        """Cables below their least tension are not let out further."""
+        slack = self.tensions() < self._least
+        return np.where(slack, np.maximum(length, self.set_points.length), length)
+
+    # Rest
+
+    def _come_to_rest(self, stop: Stop) -> Stop:
+        """Ramp or brake, then hold; a second cause on the way brakes."""
+        self._say(str(stop))
+        began = time.monotonic()
+        if self._expected is None:  # nothing was enabled, so that nothing needs a ramp
+            self._brake(began)
+            return stop
+        if stop.cause.reaction is Reaction.RAMP:
+            try:
+                acted = True
+                while not self.set_points.at_rest:
+                    self.set_points.halt()
+                    self.command = self.set_points.length.copy()
+                    self.cycle(Phase.STOPPING, acted)
+                    acted = False
+                self.stop_time = time.monotonic() - began
+                for _ in range(round(self.safety.hold_s / self.period)):
+                    self.cycle(Phase.HOLDING)
+                if stop.cause is Cause.FINISHED and self.safety.after == "release":
+                    self._release()
+                    return stop
+            except Stop as second:
+                self._say(f"while stopping: {second}")
+                stop = stop if stop.cause is not Cause.FINISHED else second
+        self._brake(began)
+        return stop
+
+    def _release(self) -> None:
+        """Switch the drives off, one state down at a time."""
+        self._wanted, self._expected = State.SWITCH_ON_DISABLED, None
+        end = time.monotonic() + self.safety.enable_s
+        while any(drive.state is not State.SWITCH_ON_DISABLED for drive in self.drives.all):
+            self.cycle(Phase.HOLDING)
+            if time.monotonic() > end:
+                raise Stop(Cause.DRIVE_STATE, "a drive does not switch off")
+
+    def _brake(self, began: float) -> None:
+        """Quick stop, and look on until the drives have shown that they stand."""
+        self._wanted = State.QUICK_STOP_ACTIVE
+        for failure in self.drives.quick_stop():
+            self._say(f"quick stop not sent: {failure}")
+        end = time.monotonic() + self.safety.hold_s
+        failed = False
+        while time.monotonic() < end:
+            try:
+                self.cycle(Phase.BRAKED)
+            except Stop as error:
+                if not failed:
+                    self._say(f"while braking: {error}; the drives' own guards stop them")
+                failed = True
+            if self.stop_time is None and all(_stands(drive) for drive in self.drives.all):
+                self.stop_time = time.monotonic() - began
+        if self.stop_time is None:
+            for drive in self.drives.all:
+                if not _stands(drive):
+                    self._say(f"{drive.name} has not shown that it stands")
+            try:  # the last word that the bus has; nodes that are lost quick-stop by object 0x6007
+                self.drives.manage(Nmt.STOP)
+            except can.CanError:
+                self._say("the bus is lost: the drives' heartbeat guards stop them")
+        self.pulse = None
+
+
+def _stands(drive: Drive) -> bool:
+    return drive.state in (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.FAULT, State.READY_TO_SWITCH_ON)

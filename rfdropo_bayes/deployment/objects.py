@@ -1,0 +1,100 @@
+"""Objects of CiA 301 and CiA 402 that master and simulated drive speak about, and the layout of their process data."""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+from pathlib import Path
+
+SIMULATED_EDS = Path(__file__).with_name("simulated_drive.eds")
+"""Electronic data sheet of the simulated drive; users of real drives give their own drive's."""
+
+
+class Object(IntEnum):
+    """Indices of the object dictionary."""
+
+    DEVICE_TYPE = 0x1000
+    ERROR_REGISTER = 0x1001
+    ERROR_FIELD = 0x1003
+    CYCLE_PERIOD = 0x1006  # [us]
+    CONSUMER_HEARTBEAT = 0x1016  # node << 16 | ms
+    PRODUCER_HEARTBEAT = 0x1017  # [ms]
+    IDENTITY = 0x1018
+    RPDO = 0x1400
+    RPDO_MAP = 0x1600
+    TPDO = 0x1800
+    TPDO_MAP = 0x1A00
+    SIMULATED_FAULT = 0x2F00
+    ABORT_CONNECTION = 0x6007
+    ERROR_CODE = 0x603F
+    CONTROLWORD = 0x6040
+    STATUSWORD = 0x6041
+    QUICK_STOP_OPTION = 0x605A
+    MODE = 0x6060
+    MODE_DISPLAY = 0x6061
+    POSITION_DEMAND = 0x6062
+    POSITION = 0x6064
+    FOLLOWING_WINDOW = 0x6065
+    FOLLOWING_TIMEOUT = 0x6066  # [ms]
+    VELOCITY = 0x606C
+    MAX_TORQUE = 0x6072  # [per mille of rated]
+    RATED_TORQUE = 0x6076  # [mN m]
+    TORQUE = 0x6077  # [per mille of rated]
+    TARGET_POSITION = 0x607A
+    POSITION_LIMIT = 0x607D
+    MAX_MOTOR_SPEED = 0x6080  # [1/min]
+    QUICK_STOP_DECELERATION = 0x6085
+    INTERPOLATION_TIME = 0x60C2
+    FOLLOWING_ERROR = 0x60F4
+    SUPPORTED_MODES = 0x6502
+
+
+PDO_INVALID = 1 << 31
+PDO_NO_REMOTE = 1 << 30
+CSP_BIT = 1 << 7  # of 0x6502
+
+SETPOINT_MAP = ((Object.CONTROLWORD, 0, 16), (Object.TARGET_POSITION, 0, 32))
+"""First RPDO: applied on SYNC."""
+COMMAND_MAP = ((Object.CONTROLWORD, 0, 16),)
+"""Second RPDO: the controlword alone, applied at once, so that a stop needs no SYNC."""
+STATUS_MAP = ((Object.STATUSWORD, 0, 16), (Object.POSITION, 0, 32), (Object.TORQUE, 0, 16))
+"""First TPDO: sent on SYNC."""
+
+SETPOINT, COMMAND, STATUS = struct.Struct("<Hi"), struct.Struct("<H"), struct.Struct("<Hih")
+EMERGENCY = struct.Struct("<HB5s")
+
+NMT, SYNC = 0x000, 0x080
+EMCY, TPDO1, RPDO1, RPDO2, HEARTBEAT = 0x080, 0x180, 0x200, 0x300, 0x700
+"""Identifiers of the predefined connection set, to which the node is added."""
+
+
+class Nmt(IntEnum):
+    """Commands of network management."""
+
+    START = 1
+    STOP = 2
+    PRE_OPERATIONAL = 128
+    RESET_NODE = 129
+    RESET_COMMUNICATION = 130
+
+
+class NmtState(IntEnum):
+    """States of a node, as its heartbeat tells them."""
+
+    BOOT_UP = 0
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
+
+
+class EmergencyCode(IntEnum):
+    """Codes of emergency messages that the simulated drive sends (CiA 301 table 26, CiA 402 table 6)."""
+
+    NONE = 0x0000
+    GENERIC = 0x1000
+    OVER_CURRENT = 0x2310
+    SYNC_LOST = 0x8100
+    HEARTBEAT_LOST = 0x8130
+    PDO_SHORT = 0x8210
+    PDO_TIMEOUT = 0x8250
+    FOLLOWING_ERROR = 0x8611

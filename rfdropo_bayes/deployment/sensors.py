@@ -1,0 +1,291 @@
+"""Where marker positions come from: motion capture (NatNet), a simulation, or a recording that is played again."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.deployment.simulation import DATAGRAM, MAGIC
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots import Robot
+
+
+class Sighting(NamedTuple):
+    """The newest frame of markers.
+
+    Attributes:
+        number: rises with every frame; 0 before the first.
+        time: when it came [s, monotonic].
+        position: of each marker in the robot's base frame [m].
+        seen: False where the marker was lost; its position is then of no use.
+    """
+
+    number: int
+    time: float
+    position: Float[np.ndarray, "marker 3"]
+    seen: Bool[np.ndarray, " marker"]
+
+
+class MarkerSensor(Protocol):
+    """A source of marker positions."""
+
+    def latest(self) -> Sighting:
+        """The newest frame; returns at once."""
+        ...
+
+    def close(self) -> None:
+        """Let go of sockets and threads."""
+        ...
+
+
+class SensorTable(BaseModel):
+    """The table [sensor] of a deployment file.
+
+    Attributes:
+        kind: "natnet", "simulated" or "none".
+        server, local: addresses of Motive's machine and of this one (natnet).
+        multicast: how Motive streams (natnet).
+        rigid_bodies: marker name -> identifier of the rigid body in Motive (natnet).
+        rotation: rows of the matrix from the sensor's frame to the robot's base frame.
+        origin_m: origin of the base frame in the sensor's frame.
+        port: that a simulation sends to (simulated).
+        stale_s: older frames count as lost.
+        lost_s: a policy that sees markers ends where one is lost for so long.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    kind: Literal["natnet", "simulated", "none"] = "none"
+    server: str = "127.0.0.1"
+    local: str = "127.0.0.1"
+    multicast: bool = True
+    rigid_bodies: dict[str, int] = {}
+    rotation: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    port: int = Field(default=0, ge=0, le=65535)
+    stale_s: float = Field(default=0.05, gt=0.0)
+    lost_s: float = Field(default=0.05, gt=0.0)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> SensorTable:
+        matrix = np.array(self.rotation)
+        if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
+            raise ValueError("rotation is no rotation matrix")
+        if np.linalg.det(matrix) < 0.0:
+            raise ValueError("rotation is a reflection: an axis points the wrong way")
+        return self
+
+
+def _nothing(markers: int) -> Sighting:
+    return Sighting(0, 0.0, np.zeros((markers, 3)), np.zeros(markers, dtype=bool))
+
+
+class NoSensor:
+    """No markers: all are lost."""
+
+    def __init__(self, markers: int) -> None:
+        self._sighting = _nothing(markers)
+
+    def latest(self) -> Sighting:
+        """Nothing seen."""
+        return self._sighting
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+
+class SimulatedMarkers:
+    """Markers of a simulation, which comes as UDP datagrams; the newest is kept.
+
+    Args:
+        markers: how many there are.
+        port: to listen at, on this machine alone; 0 takes a free one.
+    """
+
+    def __init__(self, markers: int, port: int = 0) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind(("127.0.0.1", port))
+        except OSError as error:
+            self._socket.close()
+            raise InputError(f"port {port} is taken ({error})", where="sensor.port", remedy="choose another") from None
+        self._socket.setblocking(False)
+        self._sighting = _nothing(markers)
+
+    @property
+    def address(self) -> str:
+        """Where to send to."""
+        host, port = self._socket.getsockname()
+        return f"{host}:{port}"
+
+    def latest(self) -> Sighting:
+        """Read what has come; a datagram of another size belongs to another robot and is left out."""
+        size = DATAGRAM.size + 24 * len(self._sighting.seen)
+        while True:
+            try:
+                data = self._socket.recv(65536)
+            except (BlockingIOError, OSError):
+                return self._sighting
+            if len(data) == size and data[:4] == MAGIC:
+                position = np.frombuffer(data, dtype="<f8", offset=DATAGRAM.size).reshape(-1, 3).copy()
+                seen = np.all(np.isfinite(position), axis=1)
+                self._sighting = Sighting(DATAGRAM.unpack_from(data)[1], time.monotonic(), position, seen)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class RecordedMarkers:
+    """The markers of a recording at the pace at which they were seen; time starts with the first call.
+
+    Read recordings with the importers of `data` ("csv", "optitrack-csv", ...).
+    """
+
+    def __init__(self, recording: Trajectory, robot: Robot) -> None:
+        if recording.marker_names != robot.marker_names:
+            raise InputError(
+                f"has markers {', '.join(recording.marker_names)}; the robot has {', '.join(robot.marker_names)}",
+                where=recording.name,
+                remedy="play a recording of this robot",
+            )
+        self._recording = recording
+        self._start: float | None = None
+
+    def latest(self) -> Sighting:
+        """The row that is due; after the last one nothing new comes."""
+        now = time.monotonic()
+        self._start = now if self._start is None else self._start
+        row = int(np.searchsorted(self._recording.time, now - self._start, side="right")) - 1
+        at = self._start + float(self._recording.time[row])
+        return Sighting(row + 1, at, self._recording.position[row], self._recording.position_mask[row])
+
+    def close(self) -> None:
+        """Nothing to let go of."""
+
+
+class NatNetMarkers:
+    """Rigid bodies that OptiTrack's Motive streams, by the package natnet; each stands for one marker.
+
+    Args:
+        table: addresses, identifiers and frame.
+        robot: whose markers they are.
+
+    Raises:
+        InputError: if a marker has no rigid body, the package is missing, or Motive does not answer.
+    """
+
+    def __init__(self, table: SensorTable, robot: Robot) -> None:
+        missing = [name for name in robot.marker_names if name not in table.rigid_bodies]
+        if missing:
+            raise InputError(
+                f"marker {missing[0]!r} has none", where="sensor.rigid_bodies", remedy="give its identifier"
+            )
+        self._identifiers = {table.rigid_bodies[name]: place for place, name in enumerate(robot.marker_names)}
+        self._rotation, self._origin = np.array(table.rotation), np.array(table.origin_m)
+        self._lock = threading.Lock()
+        self._sighting = _nothing(len(robot.marker_names))
+        self._client = self._connect(table)
+
+    def _connect(self, table: SensorTable) -> Any:
+        try:
+            from natnet import NatNetClient, NatNetError
+        except ImportError:
+            raise InputError(
+                "natnet is not installed", where="sensor", remedy="pip install rfdropo_bayes[deploy]"
+            ) from None
+        client = NatNetClient(table.server, table.local, use_multicast=table.multicast)
+        client.on_data_frame_received_event.handlers.append(self.receive)
+        try:
+            client.connect(timeout=3.0)
+            client.run_async()
+        except (NatNetError, OSError) as error:
+            raise InputError(
+                f"Motive does not answer at {table.server} ({error})",
+                where="sensor",
+                remedy="switch streaming on in Motive, and check server and local",
+            ) from None
+        return client
+
+    def receive(self, frame: Any) -> None:
+        """Take a frame of natnet's: rigid bodies that are not tracked count as lost."""
+        position = self._sighting.position.copy()
+        seen = np.zeros(len(position), dtype=bool)
+        for body in frame.rigid_bodies:
+            place = self._identifiers.get(body.id_num)
+            if place is not None and body.tracking_valid is not False and np.all(np.isfinite(body.pos)):
+                position[place] = self._rotation @ (np.array(body.pos) - self._origin)
+                seen[place] = True
+        with self._lock:
+            self._sighting = Sighting(self._sighting.number + 1, time.monotonic(), position, seen)
+
+    def latest(self) -> Sighting:
+        """The newest frame."""
+        with self._lock:
+            return self._sighting
+
+    def close(self) -> None:
+        """Stop streaming."""
+        self._client.stop_async()
+        self._client.shutdown()
+
+
+def open_sensor(table: SensorTable, robot: Robot) -> MarkerSensor:
+    """The sensor that the table describes.
+
+    Raises:
+        InputError: if it cannot be reached.
+    """
+    makers: Mapping[str, Callable[[], MarkerSensor]] = {
+        "natnet": lambda: NatNetMarkers(table, robot),
+        "simulated": lambda: SimulatedMarkers(len(robot.marker_names), table.port),
+        "none": lambda: NoSensor(len(robot.marker_names)),
+    }
+    return makers[table.kind]()
+
+
+class MarkerView:
+    """What the loop sees of a sensor: each marker's last good position, how old it is, and its velocity between acts.
+
+    Args:
+        sensor: that is asked.
+        table: says what is stale, and when a marker is lost.
+        names: of the markers.
+    """
+
+    def __init__(self, sensor: MarkerSensor, table: SensorTable, names: tuple[str, ...]) -> None:
+        self._sensor, self._table, self._names = sensor, table, names
+        self.position = np.zeros((len(names), 3))
+        self.velocity = np.zeros((len(names), 3))
+        self.fresh = np.zeros(len(names), dtype=bool)
+        self._last = np.full(len(names), -np.inf)  # time of the last good position
+        self._number = 0
+        self._acted: tuple[float, np.ndarray] | None = None
+
+    def update(self, now: float) -> None:
+        """Look at the sensor once a cycle."""
+        sighting = self._sensor.latest()
+        new = sighting.number != self._number and now - sighting.time <= self._table.stale_s
+        self._number = sighting.number
+        self.fresh = sighting.seen & new & np.all(np.isfinite(sighting.position), axis=1)
+        self.position[self.fresh] = sighting.position[self.fresh]
+        self._last[self.fresh] = sighting.time
+
+    def lost(self, now: float) -> str:
+        """Name of a marker that has been lost for too long; empty if none."""
+        gone = np.flatnonzero(now - self._last > self._table.lost_s)
+        return self._names[gone[0]] if gone.size else ""
+
+    def act(self, now: float) -> None:
+        """Note an act of the policy: velocities are differences between acts, as in training."""
+        if self._acted is not None and now > self._acted[0]:
+            self.velocity = (self.position - self._acted[1]) / (now - self._acted[0])
+        self._acted = (now, self.position.copy())

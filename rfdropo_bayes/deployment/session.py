@@ -1,0 +1,352 @@
+"""One session: check the drives, home them, run a policy on them, watch it in the shadow, or replay a recording."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import platform
+import threading
+from collections.abc import Mapping
+from enum import StrEnum
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import can
+import numpy as np
+import tomli_w
+from rich.live import Live
+
+from rfdropo_bayes import __version__
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork, open_bus
+from rfdropo_bayes.deployment.causes import Cause, Stop
+from rfdropo_bayes.deployment.clock import schedule_fifo, steady_interpreter
+from rfdropo_bayes.deployment.display import session_table
+from rfdropo_bayes.deployment.drives import Drive, Drives
+from rfdropo_bayes.deployment.emergency import EmergencyStop, Hook, file_hook, signals_held
+from rfdropo_bayes.deployment.homing import Homing, homing_motors, homing_result, load_homing
+from rfdropo_bayes.deployment.log import SCHEMA_VERSION, SESSION, SUMMARY, SessionLog, session_trajectory
+from rfdropo_bayes.deployment.loop import ControlLoop, Phase
+from rfdropo_bayes.deployment.policy import CommandSource, OnnxPolicy, RecordedCommands
+from rfdropo_bayes.deployment.sensors import MarkerSensor, MarkerView, SimulatedMarkers, open_sensor
+from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, load_deployment
+from rfdropo_bayes.deployment.simulation import SimulationTable, simulated_drives
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots import Motor, Robot, load_robot
+
+
+class Mode(StrEnum):
+    """What a session does.
+
+    ``CHECK`` reads and writes nothing; ``HOME`` finds length zero; ``DRY_RUN`` is ``RUN`` on simulated drives; ``SHADOW`` lets the
+    policy see and command while nothing moves; ``REPLAY`` sends the commands of a recording again.
+    """
+
+    CHECK = "check"
+    HOME = "home"
+    DRY_RUN = "dry-run"
+    SHADOW = "shadow"
+    RUN = "run"
+    REPLAY = "replay"
+
+
+class Outcome(NamedTuple):
+    """How a session ended.
+
+    Attributes:
+        cause, detail: why.
+        folder: what it wrote.
+        figures: lateness, misses, the policy's time, the time to a stop; as in summary.json.
+        drives: what each drive said of itself when it was checked.
+    """
+
+    cause: Cause
+    detail: str
+    folder: Path
+    figures: dict[str, Any]
+    drives: dict[str, dict[str, int]]
+
+    @property
+    def finished(self) -> bool:
+        """Whether it ended as planned."""
+        return self.cause is Cause.FINISHED
+
+
+def deploy(
+    settings: Deployment | Path | str,
+    mode: Mode | str,
+    out: Path,
+    *,
+    simulated: bool = False,
+    recording: Path | None = None,
+    hooks: tuple[Hook, ...] = (),
+    show: bool = False,
+    keyboard: bool = False,
+    bus: can.BusABC | None = None,
+    sensor: MarkerSensor | None = None,
+    source: CommandSource | None = None,
+) -> Outcome:
+    """Run one session.
+
+    Args:
+        settings: the deployment, or its file.
+        mode: see `Mode`.
+        out: folder for log, frames, recording and summary.
+        simulated: use simulated drives whatever the mode; a dry run always does.
+        recording: of `Mode.REPLAY`: a session's folder, or a trajectory of ours.
+        hooks: each returns True while its emergency button is pressed.
+        show: live view in the terminal.
+        keyboard: keys of the terminal stop the drives.
+        bus, sensor, source: instead of those that the settings describe.
+
+    Raises:
+        InputError: if anything does not fit: a drive's identity, data sheet or mapping, units, rates, the policy's card or
+            hash, the homing. Nothing has been enabled then, and the log says why.
+    """
+    settings = load_deployment(Path(settings)) if isinstance(settings, Path | str) else settings
+    mode = Mode(mode)
+    robot = load_robot(settings.robot)
+    if not robot.motors:
+        raise InputError("has no motors", where=f"robot {robot.name}", remedy="add [[motors]], one per channel")
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(signals_held())
+        session = _Session(settings, mode, robot, Path(out), simulated or mode is Mode.DRY_RUN, stack)
+        try:
+            session.open(bus, sensor)
+            session.prepare(source, recording)
+            return session.run(hooks, show, keyboard)
+        except (InputError, can.CanError) as error:
+            session.log.event("refused", str(error))
+            session.summarise("refused", str(error), {})
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"the bus fails: {error}", where="bus", remedy="look at its wiring and power") from None
+
+
+class _Session:
+    """What `deploy` holds together; everything opened is closed by the stack."""
+
+    def __init__(
+        self,
+        settings: Deployment,
+        mode: Mode,
+        robot: Robot,
+        out: Path,
+        simulated: bool,
+        stack: contextlib.ExitStack,
+    ) -> None:
+        self.settings, self.mode, self.robot, self.out = settings, mode, robot, out
+        self.simulated, self._stack = simulated, stack
+        self.period = 1.0 / settings.rate_hz
+        self._facts: dict[str, Any] = {"mode": mode.value, "simulated": simulated, "rate_hz": settings.rate_hz}
+        self.found: dict[str, dict[str, int]] = {}
+        self.source: CommandSource | None = None
+        self._load_policy()
+        self.offsets = self._offsets()
+        self.log = SessionLog(out, robot, self._facts, settings.frames)
+        stack.callback(self.log.close)
+        content = settings.model_dump(mode="json", exclude_none=True)
+        (out / "config.toml").write_text(tomli_w.dumps({"mode": mode.value} | content), encoding="utf-8")
+
+    def _load_policy(self) -> None:
+        """Before anything is opened: a policy that does not fit is refused without a drive having been touched."""
+        settings = self.settings
+        if settings.policy is not None and self.mode in (Mode.CHECK, Mode.RUN, Mode.DRY_RUN, Mode.SHADOW):
+            policy = OnnxPolicy(Path(settings.policy.file), self.robot, settings.goal, settings.policy.sha256)
+            self._facts["policy_sha256"] = policy.sha256
+            self.source = policy
+
+    def _offsets(self) -> list[float]:
+        table = self.settings.homing
+        if table.file is None or self.simulated or self.mode in (Mode.HOME, Mode.CHECK):
+            return [float(motor.offset_counts) for motor in self.robot.motors]
+        result = load_homing(Path(table.file), self.robot, table.valid_h)
+        self._facts["homed"] = result.date.isoformat()
+        return [float(home.offset_counts) for home in result.homes]
+
+    def open(self, bus: can.BusABC | None, sensor: MarkerSensor | None) -> None:
+        """Start the simulation where there is one; open sensor, bus and drives."""
+        settings, sensor_table = self.settings, self.settings.sensor
+        bus_table, identity = settings.bus, settings.drives
+        if self.simulated:
+            sensor = sensor or SimulatedMarkers(len(self.robot.marker_names))
+            identity = DrivesTable(product=0x52464401)
+            if bus is None:
+                bus_table = self._stack.enter_context(simulated_drives(self._simulation(sensor)))
+        self.sensor = sensor if sensor is not None else open_sensor(sensor_table, self.robot)
+        self._stack.callback(self.sensor.close)
+        opened = open_bus(bus_table) if bus is None else bus
+        self.network = LoggedNetwork(opened, self.log.frames)
+        self._stack.callback(self._leave)
+        for thread in threading.enumerate():
+            if thread.name.startswith("can.notifier") and thread.native_id is not None:
+                schedule_fifo(thread.native_id)
+        guards = settings.safety.guards()
+        motors = self._motors()
+        drives = [
+            Drive(self.network, motor, identity.eds, offset) for motor, offset in zip(motors, self.offsets, strict=True)
+        ]
+        self.drives = Drives(self.network, drives, guards)
+        for drive in drives:
+            self.found[drive.motor.channel] = drive.check(identity.identity(drive.motor.channel))
+            self.log.event("checked", drive.name, **self.found[drive.motor.channel])
+        if self.mode is Mode.HOME:
+            for drive in drives:
+                drive.offset = float(self.found[drive.motor.channel]["position"])
+
+    def _motors(self) -> list[Motor]:
+        motors = list(self.robot.motors)
+        return homing_motors(motors, self.settings.homing) if self.mode is Mode.HOME else motors
+
+    def _simulation(self, sensor: MarkerSensor) -> SimulationTable:
+        address = sensor.address if isinstance(sensor, SimulatedMarkers) else ""
+        table = self.settings.simulation
+        hub = BusTable(interface="hub", channel="127.0.0.1:0")
+        return SimulationTable(self.settings.robot, hub, table.plant, table.settings, table.own_process, address)
+
+    def _leave(self) -> None:
+        with contextlib.suppress(can.CanError, OSError):
+            self.network.disconnect()
+
+    def prepare(self, source: CommandSource | None, recording: Path | None) -> None:
+        """Find the source of commands, and configure the drives unless they are only checked."""
+        if source is not None:
+            self.source = source
+        elif self.mode is Mode.REPLAY:
+            if recording is None:
+                raise InputError("names no recording", where="replay", remedy="give one with --recording")
+            path = Path(recording)
+            trajectory = session_trajectory(path, (Phase.RUNNING,)) if path.is_dir() else Trajectory.load(path)
+            self.source = RecordedCommands(trajectory, self.robot, _rate_of(trajectory, self.settings.rate_hz))
+        if self.source is None and self.mode not in (Mode.CHECK, Mode.HOME):
+            raise InputError("names no policy", where="deployment", remedy="add [policy] file")
+        if self.source is not None:
+            cycles = self.settings.rate_hz / self.source.rate_hz
+            if abs(cycles - round(cycles)) > 1e-6 or cycles < 1.0:
+                raise InputError(
+                    f"the policy acts at {self.source.rate_hz:g} Hz, which does not divide {self.settings.rate_hz:g} Hz",
+                    where="rate_hz",
+                    remedy="choose a multiple of the policy's rate",
+                )
+        if self.mode is not Mode.CHECK:
+            self.drives.configure(self.period, lambda text: self.log.event("note", text))
+
+    def run(self, hooks: tuple[Hook, ...], show: bool, keyboard: bool) -> Outcome:
+        """Run the phases of the mode in a thread of their own, with the emergency stop beside it."""
+        if self.mode is Mode.CHECK:
+            return self._outcome(Stop(Cause.FINISHED, "nothing was written"), None)
+        safety = self.settings.safety
+        markers = MarkerView(self.sensor, self.settings.sensor, self.robot.marker_names)
+        loop = ControlLoop(
+            self.robot, self.drives, markers, self.log, safety, self.period, lambda text: self.log.event("stop", text)
+        )
+        if safety.button_file is not None:
+            hooks = (*hooks, file_hook(Path(safety.button_file), safety.button_pressed))
+
+        def press(what: str, silence: bool) -> None:
+            loop.demanded = Stop(Cause.DEADLINES if silence else Cause.EMERGENCY_STOP, what)
+            failures = self.drives.quick_stop()
+            self.log.event("pressed", what, failures=failures)
+
+        homing = Homing(self.settings.homing)
+        phases = homing if self.mode is Mode.HOME else self._phases
+        ended: list[Stop] = []
+
+        def body() -> None:
+            if not schedule_fifo():
+                self.log.event("note", "no real-time scheduling: the system does not permit SCHED_FIFO")
+            ended.append(loop.run(phases))
+
+        patience = (safety.misses + 1.5) * self.period
+        with steady_interpreter(), EmergencyStop(press, hooks, lambda: loop.pulse, patience, keyboard):
+            thread = threading.Thread(target=body, name="control loop")
+            thread.start()
+            self._wait(thread, loop, show)
+        stop = ended[0]
+        if self.mode is Mode.HOME and stop.cause is Cause.FINISHED:
+            self._keep_homing(homing)
+        return self._outcome(stop, loop)
+
+    def _wait(self, thread: threading.Thread, loop: ControlLoop, show: bool) -> None:
+        live = Live(refresh_per_second=4) if show else None
+        with live or contextlib.nullcontext():
+            while thread.is_alive():
+                thread.join(0.2)
+                if live is not None:
+                    live.update(session_table(loop.snapshot, self.mode.value))
+
+    def _phases(self, loop: ControlLoop) -> None:
+        assert self.source is not None
+        if self.mode is Mode.SHADOW:
+            loop.find()
+            loop.follow(self.source, self.settings.duration_s, Phase.SHADOW)
+            return
+        loop.enable()
+        start = self.source.start * loop.scale
+        loop.go_to(start, Phase.STARTING, self.settings.safety.settle_s)
+        loop.follow(self.source, self.settings.duration_s)
+
+    def _keep_homing(self, homing: Homing) -> None:
+        result = homing_result(self.robot, homing)
+        result.save(Path(self.settings.homing.file or self.out / "homing.json"))
+        for home in result.homes:
+            self.log.event("homed", home.channel, offset_counts=home.offset_counts, tension_n=home.tension_n)
+
+    def _outcome(self, stop: Stop, loop: ControlLoop | None) -> Outcome:
+        figures = {} if loop is None else _figures(loop, self.period)
+        if loop is not None:
+            self._write_recording(stop)
+        self.summarise(stop.cause.word, stop.detail, figures)
+        return Outcome(stop.cause, stop.detail, self.out, figures, self.found)
+
+    def _write_recording(self, stop: Stop) -> None:
+        running = (Phase.RUNNING, Phase.STOPPING, Phase.HOLDING, Phase.BRAKED, Phase.SHADOW)
+        try:
+            trajectory = session_trajectory(self.out, running if self.mode is not Mode.HOME else None)
+            trajectory.with_attributes(settings={"cause": stop.cause.word}).save(self.out / SESSION)
+        except InputError as error:
+            self.log.event("note", f"no {SESSION}: {error}")
+
+    def summarise(self, cause: str, detail: str, figures: Mapping[str, Any]) -> None:
+        """Write summary.json."""
+        names = ("canopen", "python-can", "onnxruntime", "numpy")
+        content = {
+            "mode": self.mode.value,
+            "robot": self.robot.name,
+            "cause": cause,
+            "detail": detail,
+            "facts": self._facts,
+            "figures": dict(figures),
+            "drives": self.found,
+            "versions": {"rfdropo_bayes": __version__, "python": platform.python_version()}
+            | {name: metadata.version(name) for name in names},
+            "schema_version": SCHEMA_VERSION,
+        }
+        (self.out / SUMMARY).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def _rate_of(trajectory: Trajectory, rate_hz: float) -> float:
+    """Rate of a recording's commands: the nearest that divides the rate of the loop."""
+    gaps = np.diff(trajectory.command_time)
+    gap = float(np.median(gaps)) if gaps.size else 0.1
+    return rate_hz / max(1, round(rate_hz * gap))
+
+
+def _figures(loop: ControlLoop, period: float) -> dict[str, Any]:
+    late, acts = np.array(loop.lateness or [0.0]), np.array(loop.act_times or [0.0])
+    return {
+        "cycles": len(loop.lateness),
+        "period_s": period,
+        "lateness_s": {"p50": _at(late, 50), "p99": _at(late, 99), "max": float(late.max())},
+        "missed": loop.watch.missed,
+        "act_s": {"p50": _at(acts, 50), "p99": _at(acts, 99), "max": float(acts.max())},
+        "stop_s": loop.stop_time,
+    }
+
+
+def _at(values: np.ndarray, percent: float) -> float:
+    return float(np.percentile(values, percent))
+
+
+__all__ = ["Mode", "Outcome", "deploy"]

@@ -1,0 +1,74 @@
+"""Set-points: lengths that keep every motor's limits on length, rate and acceleration, whatever is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.robots import Motor
+
+
+class SetPoints:
+    """Set-points of all motors, one step per cycle.
+
+    A step never exceeds the limits on rate and acceleration, and never leaves less than the distance that a stop at the
+    final goal takes: a goal within the limits on length is never overshot into them.
+
+    Args:
+        motors: give the limits.
+        period: of the cycle [s].
+        length: to start from, at rest [m].
+    """
+
+    def __init__(self, motors: Sequence[Motor], period: float, length: Float[np.ndarray, " motor"]) -> None:
+        self.period = period
+        self.low = np.array([motor.length_limit_m[0] for motor in motors])
+        self.high = np.array([motor.length_limit_m[1] for motor in motors])
+        self.rate_limit = np.array([motor.rate_limit_m_s for motor in motors])
+        self.acceleration_limit = np.array([motor.acceleration_limit_m_s2 for motor in motors])
+        self.length = np.array(length, dtype=float)
+        self.rate = np.zeros(len(motors))
+
+    def clamp(self, length: Float[np.ndarray, " motor"]) -> Float[np.ndarray, " motor"]:
+        """The nearest lengths within the limits; where a motor stands outside them already, it may stay or come back."""
+        return np.clip(length, np.minimum(self.low, self.length), np.maximum(self.high, self.length))
+
+    def towards(
+        self,
+        goal: Float[np.ndarray, " motor"],
+        ramp: Float[np.ndarray, " motor"] | None = None,
+        rate_limit: Float[np.ndarray, " motor"] | float = np.inf,
+    ) -> Float[np.ndarray, " motor"]:
+        """The next set-points [m].
+
+        Args:
+            goal: where the motion ends [m].
+            ramp: where it should be at the next cycle on its way there [m]; the goal itself by default.
+            rate_limit: slower than the motors' own [m/s].
+        """
+        wanted = ((goal if ramp is None else ramp) - self.length) / self.period
+        distance = goal - self.length
+        step = self.acceleration_limit * self.period
+        # Largest rate from which steps of the acceleration limit still end at the goal: v^2 + a dt v = 2 a |distance|.
+        stopping = 0.5 * (np.sqrt(step**2 + 8.0 * self.acceleration_limit * np.abs(distance)) - step)
+        fastest = np.minimum(self.rate_limit, rate_limit)
+        upper = np.minimum(fastest, np.where(distance > 0.0, stopping, 0.0))
+        lower = -np.minimum(fastest, np.where(distance < 0.0, stopping, 0.0))
+        return self._step(np.clip(wanted, lower, upper))
+
+    def halt(self) -> Float[np.ndarray, " motor"]:
+        """The next set-points on the shortest way to rest."""
+        return self._step(np.zeros_like(self.rate))
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether nothing moves."""
+        return bool(np.all(self.rate == 0.0))
+
+    def _step(self, wanted: Float[np.ndarray, " motor"]) -> Float[np.ndarray, " motor"]:
+        change = self.acceleration_limit * self.period
+        self.rate = np.clip(wanted, self.rate - change, self.rate + change)
+        self.length = self.length + self.period * self.rate
+        return self.length

@@ -1,0 +1,194 @@
+"""The deployment file: bus, drives, policy, sensor, safety, homing of one robot, as validated tables."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from rfdropo_bayes.deployment.bus import BusTable
+from rfdropo_bayes.deployment.drives import Guards, Identity
+from rfdropo_bayes.deployment.objects import SIMULATED_EDS
+from rfdropo_bayes.deployment.sensors import SensorTable
+from rfdropo_bayes.deployment.watch import Patience
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.tables import parse_table
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class DrivesTable(_Table):
+    """Who the drives are.
+
+    Attributes:
+        eds: their electronic data sheet; that of the simulated drive by default.
+        vendor, product, revision: what object 0x1018 must say; not asked where left out.
+        serial: channel -> serial number.
+    """
+
+    eds: str = str(SIMULATED_EDS)
+    vendor: int | None = None
+    product: int | None = None
+    revision: int | None = None
+    serial: dict[str, int] = {}
+
+    def identity(self, channel: str) -> Identity:
+        """What the drive of a channel must say of itself."""
+        return Identity(self.vendor, self.product, self.revision, self.serial.get(channel))
+
+
+class PolicyTable(_Table):
+    """Which policy.
+
+    Attributes:
+        file: the ONNX file.
+        sha256: hash that it must have; `rfdropo deploy --mode check` prints the one it has.
+    """
+
+    file: str
+    sha256: str | None = None
+
+
+class SafetyTable(_Table):
+    """What is borne, and how the session starts and ends.
+
+    Attributes:
+        misses, misses_within_s: so many deadlines may be missed by more than a cycle within this time.
+        stale_cycles: so many cycles may pass without a drive's status.
+        heartbeat_s: drives and master each stop where the other's heartbeat is missing for so long.
+        following_error_m, following_time_s: a drive faults where it lags so far behind for so long.
+        enable_s: within this time the drives must be enabled.
+        start_rate_m_s: of the ramp to the start pose; a fifth of each motor's own limit by default.
+        settle_s: rest in the start pose before the policy begins.
+        hold_s: the drives are watched for so long after a stop.
+        after: "hold" leaves the drives braked and holding; "release" goes back to the start pose and switches them off,
+            where the session ended as planned.
+        button_file, button_pressed: a file that shows a button, and its content while it is pressed.
+    """
+
+    misses: int = Field(default=3, ge=0)
+    misses_within_s: float = Field(default=1.0, gt=0.0)
+    stale_cycles: int = Field(default=3, ge=1)
+    heartbeat_s: float = Field(default=0.08, ge=0.02)
+    following_error_m: float = Field(default=0.005, gt=0.0)
+    following_time_s: float = Field(default=0.05, gt=0.0)
+    enable_s: float = Field(default=2.0, gt=0.0)
+    start_rate_m_s: float | None = Field(default=None, gt=0.0)
+    settle_s: float = Field(default=1.0, ge=0.0)
+    hold_s: float = Field(default=0.3, ge=0.1)
+    after: Literal["hold", "release"] = "hold"
+    button_file: str | None = None
+    button_pressed: str = "0"
+
+    def patience(self) -> Patience:
+        """For the watch."""
+        return Patience(self.misses, self.misses_within_s, self.stale_cycles, self.heartbeat_s)
+
+    def guards(self) -> Guards:
+        """For the drives."""
+        return Guards(
+            master_timeout_s=self.heartbeat_s,
+            drive_heartbeat_s=0.25 * self.heartbeat_s,
+            following_error_m=self.following_error_m,
+            following_time_s=self.following_time_s,
+        )
+
+
+class HomingTable(_Table):
+    """How length zero is found.
+
+    Attributes:
+        file: where the result is kept; none for motors whose offset stands in the robot file.
+        rate_m_s: of the search.
+        travel_m: greatest way of each cable.
+        time_s: for each cable.
+        torque_factor: the drive's torque is limited to so many times the homing tension.
+        rounds: how often all cables are gone through: one that is pulled changes the others.
+        valid_h: an older result is refused.
+    """
+
+    file: str | None = None
+    rate_m_s: float = Field(default=0.002, gt=0.0)
+    travel_m: float = Field(default=0.03, gt=0.0)
+    time_s: float = Field(default=30.0, gt=0.0)
+    torque_factor: float = Field(default=2.0, gt=1.0)
+    rounds: int = Field(default=2, ge=1)
+    valid_h: float = Field(default=24.0, gt=0.0)
+
+
+class SimulationSettings(_Table):
+    """What stands in for the hardware with `--mode dry-run` and `--simulated`.
+
+    Attributes:
+        plant: "springs", or MODULE:CALLABLE.
+        settings: of the plant.
+        own_process: whether the plant runs in a process of its own.
+    """
+
+    plant: str = "springs"
+    settings: dict[str, float | str | int | bool] = {}
+    own_process: bool = False
+
+
+class Deployment(_Table):
+    """A deployment file.
+
+    Attributes:
+        robot: name or file of a robot with motors.
+        rate_hz: of the set-point loop.
+        duration_s: of the policy.
+        frames: file of CAN frames in the session's folder; .log is candump, .blf binary.
+        goal: values of the policy's "goal." inputs.
+        bus, drives, policy, sensor, safety, homing, simulation: see the tables.
+    """
+
+    robot: str
+    rate_hz: float = Field(default=100.0, ge=10.0, le=200.0)
+    duration_s: float = Field(default=10.0, gt=0.0)
+    frames: str = Field(default="frames.log", pattern=r"^[\w.-]+\.(log|blf|asc|csv)$")
+    goal: dict[str, float] = {}
+    bus: BusTable = BusTable()
+    drives: DrivesTable = DrivesTable()
+    policy: PolicyTable | None = None
+    sensor: SensorTable = SensorTable()
+    safety: SafetyTable = SafetyTable()
+    homing: HomingTable = HomingTable()
+    simulation: SimulationSettings = SimulationSettings()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Deployment:
+        period = 1e3 / self.rate_hz
+        if abs(period - round(period)) > 1e-6:
+            raise ValueError(f"rate_hz = {self.rate_hz:g}: the period is not a whole number of milliseconds")
+        return self
+
+
+def load_deployment(path: Path) -> Deployment:
+    """Read a deployment file; paths in it are relative to it.
+
+    Raises:
+        InputError: if it cannot be read, or a value does not hold.
+    """
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"cannot be read ({error})", where=str(path), remedy="give a readable TOML file") from None
+    settings = parse_table(Deployment, table, where=str(path))
+    return settings.model_copy(update=_resolved(settings, path.resolve().parent))
+
+
+def _resolved(settings: Deployment, base: Path) -> dict[str, object]:
+    found: dict[str, object] = {}
+    if settings.robot.endswith(".toml"):
+        found["robot"] = str(base / settings.robot)
+    if settings.policy is not None:
+        found["policy"] = settings.policy.model_copy(update={"file": str(base / settings.policy.file)})
+    found["drives"] = settings.drives.model_copy(update={"eds": str(base / settings.drives.eds)})
+    if settings.homing.file is not None:
+        found["homing"] = settings.homing.model_copy(update={"file": str(base / settings.homing.file)})
+    return found

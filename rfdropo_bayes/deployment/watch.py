@@ -1,0 +1,116 @@
+"""What ends a session while it runs: everything the drives, the bus and the clock can show."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import NamedTuple
+
+from rfdropo_bayes.deployment.causes import Cause, Stop
+from rfdropo_bayes.deployment.cia402 import State, Status
+from rfdropo_bayes.deployment.clock import Tick
+from rfdropo_bayes.deployment.drives import Drive, Drives
+from rfdropo_bayes.deployment.objects import NmtState
+
+
+class Patience(NamedTuple):
+    """How much is borne.
+
+    Attributes:
+        misses: deadlines missed by more than a cycle within ``misses_within_s``; one more ends the session.
+        misses_within_s: see above [s].
+        stale_cycles: cycles without a TPDO of some drive.
+        heartbeat_s: time without a drive's heartbeat [s].
+    """
+
+    misses: int = 3
+    misses_within_s: float = 1.0
+    stale_cycles: int = 3
+    heartbeat_s: float = 0.08
+
+
+class Watch:
+    """Looks at every cycle and raises `Stop` where one must be the last.
+
+    Args:
+        drives: to look at.
+        period: of the cycle [s].
+        patience: see there.
+    """
+
+    def __init__(self, drives: Drives, period: float, patience: Patience) -> None:
+        self._drives, self._period, self._patience = drives, period, patience
+        self._misses: deque[float] = deque()
+        self.missed = 0
+        self.begin()
+
+    def begin(self) -> None:
+        """Look on from now; what came before does not count."""
+        self._short = [drive.short_frames for drive in self._drives.all]
+        self._seen = len(self._drives.emergencies)
+        self._started = time.monotonic()
+
+    def check(self, tick: Tick, expected: State | None, tension: bool = True) -> None:
+        """Look at a cycle after its exchange.
+
+        Args:
+            tick: of the cycle.
+            expected: state that every drive must be in; None while they are brought there.
+            tension: whether a tension above the limit counts.
+
+        Raises:
+            Stop: with the first cause found; those that name a culprit come first.
+        """
+        now = time.monotonic()
+        self._check_emergencies()
+        for number, drive in enumerate(self._drives.all):
+            if drive.short_frames > self._short[number]:
+                raise Stop(Cause.SHORT_FRAME, f"{drive.name} sent a status frame of the wrong length")
+            self._check_life(drive, now)
+            self._check_state(drive, expected)
+            if tension and drive.tension > drive.motor.tension_limit_n[1]:
+                limit = drive.motor.tension_limit_n[1]
+                raise Stop(Cause.TENSION, f"{drive.name} pulls {drive.tension:.1f} N, more than {limit:g} N")
+        self._check_deadlines(tick)
+
+    def _check_emergencies(self) -> None:
+        news = list(self._drives.emergencies)[self._seen :]
+        self._seen = len(self._drives.emergencies)
+        for emergency in news:
+            if emergency.code == 0x8611:
+                raise Stop(Cause.FOLLOWING_ERROR, f"drive {emergency.channel!r} does not follow its set-points")
+            if emergency.code:
+                raise Stop(Cause.EMERGENCY_MESSAGE, f"drive {emergency.channel!r} says 0x{emergency.code:04X}")
+
+    def _check_life(self, drive: Drive, now: float) -> None:
+        reading = drive.reading
+        last = self._started if reading is None else max(reading.time, self._started)
+        silent, quiet = now - last, now - max(drive.heartbeat, self._started)
+        if drive.nmt not in (None, NmtState.OPERATIONAL):
+            raise Stop(Cause.NODE_STATE, f"{drive.name} left OPERATIONAL (its heartbeat says {drive.nmt})")
+        if quiet > self._patience.heartbeat_s:
+            raise Stop(Cause.HEARTBEAT_LOST, f"{drive.name}: no heartbeat for {1e3 * quiet:.0f} ms")
+        if silent > self._patience.stale_cycles * self._period:
+            raise Stop(Cause.STALE_STATUS, f"{drive.name}: no status for {1e3 * silent:.0f} ms")
+
+    def _check_state(self, drive: Drive, expected: State | None) -> None:
+        if drive.reading is None:
+            return
+        state = drive.state
+        if state in (State.FAULT, State.FAULT_REACTION) and expected is not None:
+            raise Stop(Cause.DRIVE_STATE, f"{drive.name} is in {state.words}")
+        if expected is not None and state is not expected:
+            words = "an unknown state" if state is None else state.words
+            raise Stop(Cause.DRIVE_STATE, f"{drive.name} is in {words}, not in {expected.words}")
+        if expected is State.OPERATION_ENABLED and drive.reading.statusword & Status.FOLLOWING_ERROR:
+            raise Stop(Cause.FOLLOWING_ERROR, f"{drive.name} lags behind its set-point")
+
+    def _check_deadlines(self, tick: Tick) -> None:
+        if tick.missed:
+            self.missed += tick.missed
+            self._misses.extend([tick.time] * tick.missed)
+        while self._misses and self._misses[0] < tick.time - self._patience.misses_within_s:
+            self._misses.popleft()
+        if len(self._misses) > self._patience.misses:
+            seconds = self._patience.misses_within_s
+            raise Stop(Cause.DEADLINES, f"{len(self._misses)} deadlines missed within {seconds:g} s")

@@ -1,0 +1,92 @@
+"""Motors that wind the cables: from lengths to counts of an encoder, from torque to tension, and what a motor may do."""
+
+from __future__ import annotations
+
+import math
+
+from pydantic import Field, model_validator
+
+from rfdropo_bayes.robots.table import Name, Pair, Positive, Table
+
+
+class Motor(Table):
+    """The drive of one command channel: a motor with encoder, gear and drum, and its limits.
+
+    Lengths are cable wound up by the drum [m], pull > 0, from where homing put zero. Counts rise with the length where
+    ``sign`` is +1.
+
+    Attributes:
+        channel: command channel that it drives.
+        node: CANopen node of the drive, 1 to 127.
+        sign: +1 where counts rise as the cable is pulled, else -1.
+        drum_radius_m: radius at which the cable is wound.
+        gear: turns of the motor per turn of the drum.
+        counts_per_turn: of the encoder, per turn of the motor.
+        offset_counts: counts at length zero, used until homing has found them.
+        rated_torque_n_m: torque of the motor that the drive reports as 1000 per mille.
+        length_limit_m: least and greatest length.
+        rate_limit_m_s, acceleration_limit_m_s2: of the set-points.
+        tension_limit_n: least tension to hold, and the greatest, at which everything stops.
+        homing_tension_n: tension at which length zero is defined.
+    """
+
+    channel: Name
+    node: int = Field(ge=1, le=127)
+    sign: int
+    drum_radius_m: Positive
+    gear: Positive
+    counts_per_turn: Positive
+    offset_counts: int = 0
+    rated_torque_n_m: Positive
+    length_limit_m: Pair
+    rate_limit_m_s: Positive
+    acceleration_limit_m_s2: Positive
+    tension_limit_n: Pair
+    homing_tension_n: Positive
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Motor:
+        if self.sign not in (-1, 1):
+            raise ValueError(f"sign of {self.channel} is {self.sign}, neither 1 nor -1")
+        low, high = self.length_limit_m
+        if not low < high:
+            raise ValueError(f"length_limit_m of {self.channel} is empty")
+        if not 0.0 <= self.tension_limit_n[0] < self.tension_limit_n[1]:
+            raise ValueError(f"tension_limit_n of {self.channel} is not 0 <= least < greatest")
+        if not self.tension_limit_n[0] <= self.homing_tension_n <= self.tension_limit_n[1]:
+            raise ValueError(f"homing_tension_n of {self.channel} is outside its tension_limit_n")
+        if self.per_mille(self.tension_limit_n[1]) > 5000:
+            raise ValueError(f"the greatest tension of {self.channel} is more than five times the rated torque")
+        if max(abs(low), abs(high)) * self.counts_per_metre > 2**30:
+            raise ValueError(f"length_limit_m of {self.channel} does not fit into 32-bit counts")
+        return self
+
+    @property
+    def counts_per_metre(self) -> float:
+        """Counts of the encoder per metre of cable, without sign."""
+        return self.gear * self.counts_per_turn / (2.0 * math.pi * self.drum_radius_m)
+
+    def counts(self, length: float, offset: float) -> int:
+        """Counts at a length [m]: sign x length / (2 pi r) x gear x counts per turn + offset."""
+        return round(self.sign * length * self.counts_per_metre + offset)
+
+    def length(self, counts: float, offset: float) -> float:
+        """Length [m] at some counts."""
+        return self.sign * (counts - offset) / self.counts_per_metre
+
+    def angle(self, length: float) -> float:
+        """Angle of the drum [rad] at a length [m]."""
+        return length / self.drum_radius_m
+
+    def tension(self, per_mille: float) -> float:
+        """Cable tension [N] at a torque in per mille of the rated one; friction in motor and gear is left out."""
+        return self.sign * per_mille * 1e-3 * self.rated_torque_n_m * self.gear / self.drum_radius_m
+
+    def per_mille(self, tension: float) -> float:
+        """Torque in per mille of the rated one, without sign, that holds a tension [N]."""
+        return tension * self.drum_radius_m / (self.gear * self.rated_torque_n_m) * 1e3
+
+    @property
+    def stopping_time_s(self) -> float:
+        """Longest time a stop takes that keeps the limit on acceleration [s]."""
+        return self.rate_limit_m_s / self.acceleration_limit_m_s2
