@@ -28,7 +28,9 @@ def register(app: typer.Typer) -> None:
 def deploy(
     deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="the deployment file")],
     mode: Annotated[str, typer.Option(help="check, home, dry-run, shadow, run or replay")] = "dry-run",
-    out: Annotated[Path | None, typer.Option("--out", help="folder of the session; reports/<name>-<time> by default")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="folder of the session; reports/<name>-<time> by default")
+    ] = None,
     simulated: Annotated[bool, typer.Option(help="use simulated drives, whatever the mode")] = False,
     recording: Annotated[Path | None, typer.Option(help="what to replay: a session's folder, or a trajectory")] = None,
     quiet: Annotated[bool, typer.Option(help="no live view")] = False,
@@ -41,9 +43,7 @@ def deploy(
         raise InputError(f"unknown mode {mode!r}", where="--mode", remedy=f"choose one of {', '.join(Mode)}")
     folder = out or Path("reports") / f"{deployment.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     show = not quiet and sys.stdout.isatty() and mode != "check"
-    outcome = run_session(
-        deployment, mode, folder, simulated=simulated, recording=recording, show=show, keyboard=True
-    )
+    outcome = run_session(deployment, mode, folder, simulated=simulated, recording=recording, show=show, keyboard=True)
     for channel, found in outcome.drives.items() if mode == "check" else ():
         typer.echo(f"{channel}: " + ", ".join(f"{name} {value:#x}" for name, value in found.items()))
     typer.echo(f"{outcome.cause.word}{': ' if outcome.detail else ''}{outcome.detail}")

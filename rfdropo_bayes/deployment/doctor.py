@@ -36,7 +36,9 @@ def examine(bus: BusTable | None, rate_hz: float = 100.0, seconds: float = 5.0, 
     """
     problems: list[str] = []
     versions = {name: _version(name) for name in PACKAGES}
-    problems += [f"{name} is not installed: pip install 'rfdropo_bayes[deploy]'" for name, v in versions.items() if not v]
+    problems += [
+        f"{name} is not installed: pip install 'rfdropo_bayes[deploy]'" for name, v in versions.items() if not v
+    ]
     runs = [measure_jitter(1.0 / rate_hz, seconds) for _ in range(idle_runs)]
     jitter = {
         "rate_hz": rate_hz,
@@ -50,7 +52,9 @@ def examine(bus: BusTable | None, rate_hz: float = 100.0, seconds: float = 5.0, 
     if not jitter["real_time"]:
         problems.append("no real-time scheduling: allow SCHED_FIFO (ulimit -r 60, or CAP_SYS_NICE)")
     if jitter["missed"]:
-        problems.append(f"an idle loop misses {jitter['missed']} deadlines in {seconds:g} s: free this machine of other work")
+        problems.append(
+            f"an idle loop misses {jitter['missed']} deadlines in {seconds:g} s: free this machine of other work"
+        )
     found: dict[str, Any] = {}
     if bus is not None:
         try:

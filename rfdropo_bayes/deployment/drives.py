@@ -15,6 +15,7 @@ from typing import NamedTuple
 import can
 import canopen
 from canopen.pdo.base import PdoMap
+from canopen.sdo.exceptions import SdoError
 
 from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bus import LoggedNetwork
@@ -73,6 +74,7 @@ class Drive:
         self.controlword, self.target = int(Command.DISABLE_VOLTAGE), 0
         self.reading: Reading | None = None
         self.short_frames = 0
+        self.unanswered = 0  # cycles since the last status
         self.nmt: int | None = None
         self.heartbeat = 0.0  # time of the last one [s, monotonic]
         network.subscribe(objects.HEARTBEAT + motor.node, self._on_heartbeat)
@@ -118,7 +120,7 @@ class Drive:
         try:
             with self._sdo:
                 data = self.node.sdo.upload(index, subindex)
-        except (canopen.SdoError, can.CanError, OSError) as error:
+        except (SdoError, can.CanError, OSError) as error:
             raise InputError(f"cannot be read ({error})", where=where, remedy=_SDO_REMEDY) from None
         if 8 * len(data) < len(variable):
             raise InputError(
@@ -139,15 +141,19 @@ class Drive:
         try:
             with self._sdo:
                 self.node.sdo.download(index, subindex, variable.encode_raw(value))
-        except (canopen.SdoError, can.CanError, OSError) as error:
+        except (SdoError, can.CanError, OSError) as error:
             raise InputError(f"does not take {value} ({error})", where=where, remedy=_SDO_REMEDY) from None
         if read_back and variable.readable and (kept := self.read(index, subindex)) != value:
             raise InputError(f"keeps {kept} where {value} was written", where=where, remedy="look into its manual")
 
     # Set-up
 
-    def check(self, identity: Identity) -> dict[str, int]:
+    def check(self, identity: Identity, check_eds: bool = True) -> dict[str, int]:
         """Read who the drive is and whether it can do what is asked; nothing is written.
+
+        Args:
+            identity: what it must say of itself.
+            check_eds: whether vendor and product of its data sheet must be its own, too.
 
         Returns:
             Its identity, statusword, position, supported modes and rated torque.
@@ -155,22 +161,13 @@ class Drive:
         Raises:
             InputError: on silence, a wrong identity or type, no cyclic synchronous position, another rated torque.
         """
+        self._check_layout()
         kind = self.read(Object.DEVICE_TYPE)
         if kind & 0xFFFF != 402:
             raise InputError(
                 f"is no CiA 402 drive (device type 0x{kind:08X})", where=self.name, remedy="correct its node"
             )
-        found = {}
-        for subindex, (key, expected) in enumerate(identity._asdict().items(), start=1):
-            if not self.knows(Object.IDENTITY, subindex):
-                continue
-            found[key] = self.read(Object.IDENTITY, subindex)
-            if expected is not None and found[key] != expected:
-                raise InputError(
-                    f"{key} is 0x{found[key]:X}, not 0x{expected:X}",
-                    where=f"{self.name}, object 0x1018:{subindex}",
-                    remedy="this is another drive: correct the wiring, the node, or [drives]",
-                )
+        found = self._check_identity(identity, check_eds)
         if self.knows(Object.SUPPORTED_MODES):
             found["modes"] = self.read(Object.SUPPORTED_MODES)
             if not found["modes"] & objects.CSP_BIT:
@@ -186,6 +183,38 @@ class Drive:
                 )
         found["statusword"] = self.read(Object.STATUSWORD)
         found["position"] = self.read(Object.POSITION)
+        return found
+
+    def _check_layout(self) -> None:
+        """A data sheet in which the process data have other sizes is another drive's."""
+        for index, subindex, bits in (*objects.SETPOINT_MAP, *objects.STATUS_MAP):
+            variable = self.node.object_dictionary.get_variable(index, subindex)
+            if variable is None or len(variable) != bits:
+                size = "lacks it" if variable is None else f"gives it {len(variable)} bits"
+                raise InputError(
+                    f"has {bits} bits by CiA 402; the data sheet {size}",
+                    where=f"{self.name}, object 0x{index:04X}",
+                    remedy=_EDS_REMEDY,
+                )
+
+    def _check_identity(self, identity: Identity, check_eds: bool) -> dict[str, int]:
+        sheet = self.node.object_dictionary.device_information
+        stated = {"vendor": sheet.vendor_number, "product": sheet.product_number} if check_eds else {}
+        found = {}
+        for subindex, (key, expected) in enumerate(identity._asdict().items(), start=1):
+            if not self.knows(Object.IDENTITY, subindex):
+                continue
+            found[key] = self.read(Object.IDENTITY, subindex)
+            where = f"{self.name}, object 0x1018:{subindex}"
+            if expected is not None and found[key] != expected:
+                remedy = "this is another drive: correct the wiring, the node, or [drives]"
+                raise InputError(f"{key} is 0x{found[key]:X}, not 0x{expected:X}", where=where, remedy=remedy)
+            if stated.get(key) not in (None, found[key]):
+                raise InputError(
+                    f"{key} is 0x{found[key]:X}, that of the data sheet 0x{stated[key]:X}",
+                    where=where,
+                    remedy=f"{_EDS_REMEDY}, or set check_eds = false",
+                )
         return found
 
     def disable(self) -> bool:
@@ -276,7 +305,7 @@ class Drive:
                 pdo.cob_id, pdo.trans_type, pdo.enabled = cob, kind, True
                 pdo.save()
                 pdo.read()
-        except (canopen.SdoError, can.CanError, OSError, KeyError) as error:
+        except (SdoError, can.CanError, OSError, KeyError) as error:
             raise InputError(f"cannot be mapped ({error})", where=where, remedy=_SDO_REMEDY) from None
         found = [(variable.index, variable.subindex, variable.length) for variable in pdo.map]
         if found != wanted or pdo.cob_id != cob or pdo.trans_type != kind or not pdo.enabled:
@@ -318,8 +347,8 @@ class Guards(NamedTuple):
     """
 
     master_node: int = 127
-    master_timeout_s: float = 0.08
-    drive_heartbeat_s: float = 0.02
+    master_timeout_s: float = 0.06
+    drive_heartbeat_s: float = 0.015
     following_error_m: float = 0.005
     following_time_s: float = 0.05
 
@@ -398,7 +427,10 @@ class Drives:
             self._complete.clear()
             self.network.send_message(objects.SYNC, b"")
         self.send_heartbeat()
-        return self._complete.wait(timeout)
+        complete = self._complete.wait(timeout)
+        for drive in self.all:
+            drive.unanswered = drive.unanswered + 1 if drive.motor.node in self._awaited else 0
+        return complete
 
     def send_heartbeat(self) -> None:
         """The master's heartbeat, where it is due: four in the time that drives are patient."""

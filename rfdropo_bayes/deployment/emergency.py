@@ -9,6 +9,7 @@ import contextlib
 import os
 import select
 import signal
+import socket
 import sys
 import termios
 import threading
@@ -16,6 +17,7 @@ import time
 import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from rfdropo_bayes.deployment.clock import schedule_fifo
 
@@ -23,7 +25,8 @@ SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 POLL = 0.005  # [s]
 STOP_KEYS = b" \x1bqQ\n\r"
 
-Hook = Callable[[], bool]
+Hook = Callable[[], bool | str]
+"""Returns True, or a word for the log, while a button is pressed."""
 
 
 def file_hook(path: Path, pressed: str) -> Hook:
@@ -41,14 +44,39 @@ def file_hook(path: Path, pressed: str) -> Hook:
     return look
 
 
-@contextlib.contextmanager
-def signals_held() -> Iterator[None]:
-    """Keep the stop signals from this thread, and from those it starts, so that the emergency stop alone takes them."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+class StopSignals:
+    """Keeps SIGINT, SIGTERM and SIGHUP from ending the program, and tells the emergency stop that one has come.
+
+    The interpreter writes each signal to a socket from whichever thread the system gave it to, at once; the main thread, which
+    may be busy, is not asked. Outside the main thread Python cannot take signals: the program's own handlers then stay.
+    """
+
+    def __enter__(self) -> StopSignals:
+        self._theirs, self._ours = socket.socketpair()
+        self._theirs.setblocking(False)
+        self._ours.setblocking(False)
+        self._before: dict[signal.Signals, Any] = {}
+        if threading.current_thread() is threading.main_thread():
+            self._wakeup = signal.set_wakeup_fd(self._theirs.fileno(), warn_on_full_buffer=False)
+            for number in SIGNALS:
+                self._before[number] = signal.signal(number, lambda *_: None)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        if self._before:
+            signal.set_wakeup_fd(self._wakeup)
+        self._theirs.close()
+        self._ours.close()
+
+    def arrived(self) -> str:
+        """Name of a signal that has come; empty if none."""
+        try:
+            numbers = set(self._ours.recv(64)) & {int(number) for number in SIGNALS}
+        except BlockingIOError:
+            return ""
+        return f"signal {signal.Signals(min(numbers)).name}" if numbers else ""
 
 
 class EmergencyStop:
@@ -102,13 +130,9 @@ class EmergencyStop:
                 time.sleep(POLL)
 
     def _look(self) -> str:
-        with contextlib.suppress(InterruptedError):
-            got = signal.sigtimedwait(SIGNALS, 0)
-            if got is not None:
-                return f"signal {signal.Signals(got.si_signo).name}"
         for hook in self._hooks:
-            if hook():
-                return "button"
+            if found := hook():
+                return found if isinstance(found, str) else "button"
         if self._keyboard and select.select([sys.stdin], [], [], 0)[0]:
             key = os.read(sys.stdin.fileno(), 1)
             if key in [bytes([code]) for code in STOP_KEYS]:

@@ -87,7 +87,7 @@ class ControlLoop:
         self.set_points = SetPoints(self.motors, period, np.zeros(channels))
         self.command = np.zeros(channels)  # in force [m]
         self._raw, self._asked = np.zeros(channels), np.zeros(channels)
-        self.watch = Watch(drives, period, safety.patience())
+        self.watch = Watch(drives, safety.patience())
         self._clock: CycleClock
         self._wanted = State.SWITCH_ON_DISABLED
         self._expected: State | None = None
@@ -249,11 +249,11 @@ class ControlLoop:
             ramp = self._without_slack(previous + (self.command - previous) * (share + 1) / cycles)
             self.set_points.towards(goal, ramp)
             self.cycle(phase, acted=share == 0)
+            if source.sees_markers and (name := self.markers.lost(time.monotonic())):
+                raise Stop(Cause.MARKERS_LOST, f"marker {name!r} is lost")
 
     def _act(self, source: CommandSource, period: float) -> bool:
         now = time.monotonic()
-        if source.sees_markers and (name := self.markers.lost(now)):
-            raise Stop(Cause.MARKERS_LOST, f"marker {name!r} is lost")
         self.markers.act(now)
         unit = self.command / self.scale
         scene = Scene(self.markers.position, self.markers.velocity, unit, self._raw, self.lengths(), self.tensions())

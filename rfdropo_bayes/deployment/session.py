@@ -24,7 +24,7 @@ from rfdropo_bayes.deployment.causes import Cause, Stop
 from rfdropo_bayes.deployment.clock import schedule_fifo, steady_interpreter
 from rfdropo_bayes.deployment.display import session_table
 from rfdropo_bayes.deployment.drives import Drive, Drives
-from rfdropo_bayes.deployment.emergency import EmergencyStop, Hook, file_hook, signals_held
+from rfdropo_bayes.deployment.emergency import EmergencyStop, Hook, StopSignals, file_hook
 from rfdropo_bayes.deployment.homing import Homing, homing_motors, homing_result, load_homing
 from rfdropo_bayes.deployment.log import SCHEMA_VERSION, SESSION, SUMMARY, SessionLog, session_trajectory
 from rfdropo_bayes.deployment.loop import ControlLoop, Phase
@@ -110,7 +110,8 @@ def deploy(
     if not robot.motors:
         raise InputError("has no motors", where=f"robot {robot.name}", remedy="add [[motors]], one per channel")
     with contextlib.ExitStack() as stack:
-        stack.enter_context(signals_held())
+        signals = stack.enter_context(StopSignals())
+        hooks = (*hooks, signals.arrived)
         session = _Session(settings, mode, robot, Path(out), simulated or mode is Mode.DRY_RUN, stack)
         try:
             session.open(bus, sensor)
@@ -189,7 +190,7 @@ class _Session:
         ]
         self.drives = Drives(self.network, drives, guards)
         for drive in drives:
-            self.found[drive.motor.channel] = drive.check(identity.identity(drive.motor.channel))
+            self.found[drive.motor.channel] = drive.check(identity.identity(drive.motor.channel), identity.check_eds)
             self.log.event("checked", drive.name, **self.found[drive.motor.channel])
         if self.mode is Mode.HOME:
             for drive in drives:

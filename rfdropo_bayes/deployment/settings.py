@@ -28,6 +28,8 @@ class DrivesTable(_Table):
         eds: their electronic data sheet; that of the simulated drive by default.
         vendor, product, revision: what object 0x1018 must say; not asked where left out.
         serial: channel -> serial number.
+        check_eds: whether vendor and product in the data sheet must be those that the drive says; some makers leave them out
+            of step.
     """
 
     eds: str = str(SIMULATED_EDS)
@@ -35,6 +37,7 @@ class DrivesTable(_Table):
     product: int | None = None
     revision: int | None = None
     serial: dict[str, int] = {}
+    check_eds: bool = True
 
     def identity(self, channel: str) -> Identity:
         """What the drive of a channel must say of itself."""
@@ -57,7 +60,7 @@ class SafetyTable(_Table):
     """What is borne, and how the session starts and ends.
 
     Attributes:
-        misses, misses_within_s: so many deadlines may be missed by more than a cycle within this time.
+        misses, misses_within_s: so many deadlines missed by more than a cycle within this time end the session.
         stale_cycles: so many cycles may pass without a drive's status.
         heartbeat_s: drives and master each stop where the other's heartbeat is missing for so long.
         following_error_m, following_time_s: a drive faults where it lags so far behind for so long.
@@ -70,10 +73,10 @@ class SafetyTable(_Table):
         button_file, button_pressed: a file that shows a button, and its content while it is pressed.
     """
 
-    misses: int = Field(default=3, ge=0)
+    misses: int = Field(default=3, ge=1)
     misses_within_s: float = Field(default=1.0, gt=0.0)
     stale_cycles: int = Field(default=3, ge=1)
-    heartbeat_s: float = Field(default=0.08, ge=0.02)
+    heartbeat_s: float = Field(default=0.06, ge=0.02)
     following_error_m: float = Field(default=0.005, gt=0.0)
     following_time_s: float = Field(default=0.05, gt=0.0)
     enable_s: float = Field(default=2.0, gt=0.0)
@@ -86,7 +89,14 @@ class SafetyTable(_Table):
 
     def patience(self) -> Patience:
         """For the watch."""
-        return Patience(self.misses, self.misses_within_s, self.stale_cycles, self.heartbeat_s)
+        return Patience(
+            self.misses,
+            self.misses_within_s,
+            self.stale_cycles,
+            self.heartbeat_s,
+            self.following_error_m,
+            self.following_time_s,
+        )
 
     def guards(self) -> Guards:
         """For the drives."""

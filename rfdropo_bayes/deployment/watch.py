@@ -17,16 +17,19 @@ class Patience(NamedTuple):
     """How much is borne.
 
     Attributes:
-        misses: deadlines missed by more than a cycle within ``misses_within_s``; one more ends the session.
+        misses: so many deadlines missed by more than a cycle within ``misses_within_s`` end the session.
         misses_within_s: see above [s].
         stale_cycles: cycles without a TPDO of some drive.
         heartbeat_s: time without a drive's heartbeat [s].
+        following_error_m, following_time_s: lag behind a set-point [m], and for how long [s].
     """
 
     misses: int = 3
     misses_within_s: float = 1.0
     stale_cycles: int = 3
-    heartbeat_s: float = 0.08
+    heartbeat_s: float = 0.06
+    following_error_m: float = 0.005
+    following_time_s: float = 0.05
 
 
 class Watch:
@@ -34,12 +37,11 @@ class Watch:
 
     Args:
         drives: to look at.
-        period: of the cycle [s].
         patience: see there.
     """
 
-    def __init__(self, drives: Drives, period: float, patience: Patience) -> None:
-        self._drives, self._period, self._patience = drives, period, patience
+    def __init__(self, drives: Drives, patience: Patience) -> None:
+        self._drives, self._patience = drives, patience
         self._misses: deque[float] = deque()
         self.missed = 0
         self.begin()
@@ -49,6 +51,7 @@ class Watch:
         self._short = [drive.short_frames for drive in self._drives.all]
         self._seen = len(self._drives.emergencies)
         self._started = time.monotonic()
+        self._lagging: dict[int, float] = {}  # node -> since when
 
     def check(self, tick: Tick, expected: State | None, tension: bool = True) -> None:
         """Look at a cycle after its exchange.
@@ -68,6 +71,8 @@ class Watch:
                 raise Stop(Cause.SHORT_FRAME, f"{drive.name} sent a status frame of the wrong length")
             self._check_life(drive, now)
             self._check_state(drive, expected)
+            if expected is State.OPERATION_ENABLED:
+                self._check_lag(drive, now)
             if tension and drive.tension > drive.motor.tension_limit_n[1]:
                 limit = drive.motor.tension_limit_n[1]
                 raise Stop(Cause.TENSION, f"{drive.name} pulls {drive.tension:.1f} N, more than {limit:g} N")
@@ -83,15 +88,13 @@ class Watch:
                 raise Stop(Cause.EMERGENCY_MESSAGE, f"drive {emergency.channel!r} says 0x{emergency.code:04X}")
 
     def _check_life(self, drive: Drive, now: float) -> None:
-        reading = drive.reading
-        last = self._started if reading is None else max(reading.time, self._started)
-        silent, quiet = now - last, now - max(drive.heartbeat, self._started)
+        quiet = now - max(drive.heartbeat, self._started)
         if drive.nmt not in (None, NmtState.OPERATIONAL):
             raise Stop(Cause.NODE_STATE, f"{drive.name} left OPERATIONAL (its heartbeat says {drive.nmt})")
         if quiet > self._patience.heartbeat_s:
             raise Stop(Cause.HEARTBEAT_LOST, f"{drive.name}: no heartbeat for {1e3 * quiet:.0f} ms")
-        if silent > self._patience.stale_cycles * self._period:
-            raise Stop(Cause.STALE_STATUS, f"{drive.name}: no status for {1e3 * silent:.0f} ms")
+        if drive.unanswered > self._patience.stale_cycles:
+            raise Stop(Cause.STALE_STATUS, f"{drive.name}: no status for {drive.unanswered} cycles")
 
     def _check_state(self, drive: Drive, expected: State | None) -> None:
         if drive.reading is None:
@@ -105,12 +108,22 @@ class Watch:
         if expected is State.OPERATION_ENABLED and drive.reading.statusword & Status.FOLLOWING_ERROR:
             raise Stop(Cause.FOLLOWING_ERROR, f"{drive.name} lags behind its set-point")
 
+    def _check_lag(self, drive: Drive, now: float) -> None:
+        """A drive may repeat an old "operation enabled" for ever; that it does not move is what betrays it."""
+        if drive.reading is None:
+            return
+        lag = abs(drive.target - drive.reading.position) / drive.motor.counts_per_metre
+        if lag <= self._patience.following_error_m:
+            self._lagging.pop(drive.motor.node, None)
+        elif now - self._lagging.setdefault(drive.motor.node, now) > self._patience.following_time_s:
+            raise Stop(Cause.FOLLOWING_ERROR, f"{drive.name} is {1e3 * lag:.1f} mm behind its set-point")
+
     def _check_deadlines(self, tick: Tick) -> None:
         if tick.missed:
             self.missed += tick.missed
             self._misses.extend([tick.time] * tick.missed)
         while self._misses and self._misses[0] < tick.time - self._patience.misses_within_s:
             self._misses.popleft()
-        if len(self._misses) > self._patience.misses:
+        if len(self._misses) >= self._patience.misses:
             seconds = self._patience.misses_within_s
             raise Stop(Cause.DEADLINES, f"{len(self._misses)} deadlines missed within {seconds:g} s")
