@@ -212,7 +212,7 @@ class FaultyBus(can.BusABC):
 
 
 class FaultySensor:
-    """Markers that vanish, or take one and a half cycles to come, once ``armed``."""
+    """Markers that vanish, or take two and a half cycles to come, once ``armed``."""
 
     def __init__(self, inner: SimulatedMarkers, what: str) -> None:
         self._inner, self._what, self.armed = inner, what, False
@@ -221,7 +221,7 @@ class FaultySensor:
         """The newest frame; every marker lost where armed."""
         found = self._inner.latest()
         if self.armed and self._what == "slow":
-            time.sleep(0.015)
+            time.sleep(0.025)
             return found
         return found._replace(seen=np.zeros_like(found.seen)) if self.armed else found
 

@@ -50,13 +50,20 @@ class SetPoints:
         """
         wanted = ((goal if ramp is None else ramp) - self.length) / self.period
         distance = goal - self.length
-        step = self.acceleration_limit * self.period
-        # Largest rate from which steps of the acceleration limit still end at the goal: v^2 + a dt v = 2 a |distance|.
-        stopping = 0.5 * (np.sqrt(step**2 + 8.0 * self.acceleration_limit * np.abs(distance)) - step)
+        stopping = self._stopping_rate(np.abs(distance))
         fastest = np.minimum(self.rate_limit, rate_limit)
         upper = np.minimum(fastest, np.where(distance > 0.0, stopping, 0.0))
         lower = -np.minimum(fastest, np.where(distance < 0.0, stopping, 0.0))
         return self._step(np.clip(wanted, lower, upper))
+
+    def _stopping_rate(self, distance: Float[np.ndarray, " motor"]) -> Float[np.ndarray, " motor"]:
+        """Largest rate from which steps of the acceleration limit still end within a distance, this step included.
+
+        In units of a dt the rate is k + f, with 0 <= f < 1, and the way of all its steps a dt^2 (k + 1) (k / 2 + f).
+        """
+        steps = 2.0 * distance / (self.acceleration_limit * self.period**2)
+        whole = np.floor(0.5 * (np.sqrt(1.0 + 4.0 * steps) - 1.0))
+        return 0.5 * self.acceleration_limit * self.period * (whole + steps / (whole + 1.0))
 
     def halt(self) -> Float[np.ndarray, " motor"]:
         """The next set-points on the shortest way to rest."""

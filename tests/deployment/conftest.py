@@ -1,0 +1,77 @@
+"""Drives for tests: in this process, on a hub of their own, fed by a thread."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import pytest
+
+from rfdropo_bayes.deployment import objects
+from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork
+from rfdropo_bayes.deployment.drives import Drive, Drives, Guards
+from rfdropo_bayes.deployment.hub import Hub, HubBus
+from rfdropo_bayes.deployment.plant import SpringCables
+from rfdropo_bayes.deployment.simulation import SimulatedDrives, SimulationTable
+from rfdropo_bayes.robots import Robot, load_robot
+
+ROBOT = "motor_arm"
+
+
+class Rig:
+    """Simulated drives and a network that sees them."""
+
+    def __init__(self, channel: str, robot: Robot, **table: object) -> None:
+        self.robot, self.channel = robot, channel
+        bus = BusTable(interface="hub", channel=channel)
+        self._bus = HubBus(channel)
+        self.simulated = SimulatedDrives(robot, SimulationTable(ROBOT, bus, **table), self._bus, SpringCables(robot))
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+        self.network = LoggedNetwork(HubBus(channel))
+
+    def _serve(self) -> None:
+        with contextlib.suppress(can.CanError):
+            self.simulated.run(self._stop)
+
+    def drives(self, guards: Guards | None = None, eds: str = str(objects.SIMULATED_EDS)) -> Drives:
+        """The master's side."""
+        made = [Drive(self.network, motor, eds, motor.offset_counts) for motor in self.robot.motors]
+        return Drives(self.network, made, guards or Guards())
+
+    def close(self) -> None:
+        """Let go of threads and sockets."""
+        with contextlib.suppress(can.CanError, OSError):
+            self.network.disconnect()
+        self._stop.set()
+        self._thread.join(5.0)
+        self._bus.shutdown()
+
+
+@pytest.fixture(scope="session")
+def robot() -> Robot:
+    """A robot with four motors."""
+    return load_robot(ROBOT)
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[str]:
+    """Channel of a hub in a thread."""
+    server, done = Hub(str(tmp_path / "bus")), threading.Event()
+    thread = threading.Thread(target=server.serve, args=(done.is_set,), daemon=True)
+    thread.start()
+    yield server.channel
+    done.set()
+    thread.join(5.0)
+
+
+@pytest.fixture
+def rig(hub: str, robot: Robot) -> Iterator[Rig]:
+    """Four drives, found where length is zero."""
+    made = Rig(hub, robot)
+    yield made
+    made.close()

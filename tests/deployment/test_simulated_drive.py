@@ -1,0 +1,246 @@
+"""The simulated drive by itself, against what CiA 301 and CiA 402 ask of one."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from rfdropo_bayes.deployment import objects
+from rfdropo_bayes.deployment.cia402 import Command, State, Status, state_of
+from rfdropo_bayes.deployment.objects import EmergencyCode, Nmt, NmtState, Object
+from rfdropo_bayes.deployment.simulated_drive import SimulatedDrive, SimulatedFault
+
+NODE = 5
+
+
+class Bench:
+    """A drive without a bus: time passes when told, frames it sends are kept."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[int, bytes]] = []
+        self.drive = SimulatedDrive(NODE, lambda identifier, data: self.sent.append((identifier, bytes(data))))
+        self.now = 0.0
+        self.wait(0.05)
+
+    def wait(self, seconds: float) -> None:
+        for _ in range(max(1, round(seconds / 0.002))):
+            self.now += 0.002
+            self.drive.tick(self.now)
+
+    def take(self, identifier: int, data: bytes) -> list[tuple[int, bytes]]:
+        self.sent.clear()
+        self.drive.receive(identifier, data, self.now)
+        return list(self.sent)
+
+    def sdo(self, index: int, subindex: int = 0, value: int | None = None, size: int = 4) -> int:
+        """Expedited transfer, packed by hand from CiA 301, 7.2.4.3; returns the value, or the negative abort code."""
+        if value is None:
+            request = struct.pack("<BHB4x", 0x40, index, subindex)
+        else:
+            raw = (value & (1 << 8 * size) - 1).to_bytes(size, "little").ljust(4, b"\0")
+            request = struct.pack("<BHB4s", 0x23 | 4 - size << 2, index, subindex, raw)
+        ((identifier, answer),) = [row for row in self.take(0x600 + NODE, request) if row[0] == 0x580 + NODE]
+        if answer[0] == 0x80:
+            return -int.from_bytes(answer[4:], "little")
+        return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little")
+
+    def operational(self) -> None:
+        self.sdo(Object.MODE, value=8, size=1)
+        self.take(objects.NMT, bytes([Nmt.START, NODE]))
+
+    def cycle(self, controlword: int, target: int) -> tuple[int, int, int]:
+        self.take(objects.RPDO1 + NODE, objects.SETPOINT.pack(controlword, target))
+        self.now += 0.01
+        sent = self.take(objects.SYNC, b"")
+        return objects.STATUS.unpack(dict(sent)[objects.TPDO1 + NODE])
+
+    def enable(self, target: int = 0) -> None:
+        self.operational()
+        for word in (Command.SHUTDOWN, Command.SWITCH_ON, Command.ENABLE_OPERATION):
+            self.cycle(word, target)
+
+    @property
+    def state(self) -> State | None:
+        return state_of(self.drive.statusword())
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_it_boots_and_says_so(bench: Bench) -> None:
+    assert (objects.HEARTBEAT + NODE, bytes([NmtState.BOOT_UP])) in bench.sent
+    assert bench.drive.nmt is NmtState.PRE_OPERATIONAL
+
+
+def test_identity_and_types_are_those_of_the_data_sheet(bench: Bench) -> None:
+    assert bench.sdo(Object.DEVICE_TYPE) & 0xFFFF == 402
+    assert bench.sdo(Object.IDENTITY, 2) == 0x52464401
+    assert bench.sdo(Object.SUPPORTED_MODES) & objects.CSP_BIT
+
+
+@pytest.mark.parametrize(
+    ("index", "subindex", "value", "size", "abort"),
+    [
+        (0x5555, 0, None, 4, 0x06020000),  # no such object
+        (Object.IDENTITY, 9, None, 4, 0x06090011),  # no such subindex
+        (Object.STATUSWORD, 0, 1, 2, 0x06010002),  # read only
+        (Object.PRODUCER_HEARTBEAT, 0, 1, 4, 0x06070010),  # wrong length
+        (Object.ABORT_CONNECTION, 0, 9, 2, 0x06090030),  # out of range
+        (Object.RPDO_MAP, 0, 0, 1, 0x08000022),  # mapped anew while the PDO is on
+        (Object.RPDO, 1, 0x345, 4, 0x06090030),  # another identifier while the PDO is on
+    ],
+)
+def test_wrong_transfers_are_aborted_with_the_standards_code(bench, index, subindex, value, size, abort) -> None:
+    assert bench.sdo(index, subindex, value, size) == -abort
+
+
+def test_mapping_goes_in_the_standards_order_only(bench: Bench) -> None:
+    cob = bench.sdo(Object.RPDO, 1)
+    assert bench.sdo(Object.RPDO, 1, cob | objects.PDO_INVALID) >= 0
+    assert bench.sdo(Object.RPDO_MAP, 1, 0x60400010) == -0x08000022  # the count is not zero yet
+    assert bench.sdo(Object.RPDO_MAP, 0, 0, 1) >= 0
+    assert bench.sdo(Object.RPDO_MAP, 1, 0x60650020) == -0x06040041  # not mappable
+    assert bench.sdo(Object.RPDO_MAP, 1, 0x60400020) == -0x06040041  # 16 bits, not 32
+    assert bench.sdo(Object.RPDO_MAP, 1, 0x60400010) >= 0
+    assert bench.sdo(Object.RPDO_MAP, 2, 0x607A0020) >= 0
+    assert bench.sdo(Object.RPDO_MAP, 0, 2, 1) >= 0
+    assert bench.sdo(Object.RPDO, 1, cob) >= 0
+
+
+def test_no_pdo_before_operational_and_no_sdo_when_stopped(bench: Bench) -> None:
+    assert bench.take(objects.SYNC, b"") == []
+    bench.operational()
+    assert [identifier for identifier, _ in bench.take(objects.SYNC, b"")] == [objects.TPDO1 + NODE]
+    bench.take(objects.NMT, bytes([Nmt.STOP, 0]))
+    assert bench.take(0x600 + NODE, struct.pack("<BHB4x", 0x40, 0x1000, 0)) == []
+    assert bench.take(objects.SYNC, b"") == []
+
+
+def test_commands_to_other_nodes_are_left_alone(bench: Bench) -> None:
+    bench.take(objects.NMT, bytes([Nmt.START, NODE + 1]))
+    assert bench.drive.nmt is NmtState.PRE_OPERATIONAL
+
+
+def test_set_points_are_applied_on_sync_alone(bench: Bench) -> None:
+    bench.enable()
+    bench.take(objects.RPDO1 + NODE, objects.SETPOINT.pack(Command.ENABLE_OPERATION, 500))
+    bench.wait(0.05)
+    assert bench.drive.position == 0.0
+    bench.take(objects.SYNC, b"")
+    bench.wait(0.1)
+    assert bench.drive.position == pytest.approx(500, abs=1)
+
+
+def test_the_command_alone_needs_no_sync(bench: Bench) -> None:
+    bench.enable()
+    bench.take(objects.RPDO2 + NODE, objects.COMMAND.pack(Command.QUICK_STOP))
+    assert bench.state is State.QUICK_STOP_ACTIVE
+
+
+def test_position_follows_and_stops_at_the_drives_own_limits(bench: Bench) -> None:
+    bench.sdo(Object.POSITION_LIMIT, 1, -300)
+    bench.sdo(Object.POSITION_LIMIT, 2, 300)
+    bench.enable()
+    for _ in range(20):
+        word, position, _ = bench.cycle(Command.ENABLE_OPERATION, 5000 if bench.now < 1 else 0)
+    assert position == pytest.approx(300, abs=1)
+    assert word & Status.LIMIT_ACTIVE
+
+
+def test_speed_is_limited(bench: Bench) -> None:
+    bench.sdo(Object.MAX_MOTOR_SPEED, 0, 60)  # one turn of 2048 counts a second
+    bench.sdo(Object.FOLLOWING_WINDOW, 0, 10**6)
+    bench.enable()
+    positions = [bench.cycle(Command.ENABLE_OPERATION, 10**5)[1] for _ in range(20)]
+    steps = [after - before for before, after in zip(positions, positions[1:], strict=False)]
+    assert max(steps) <= 2048 * 0.01 + 1
+
+
+def test_an_unfollowed_set_point_faults(bench: Bench) -> None:
+    bench.enable()
+    bench.sdo(Object.SIMULATED_FAULT, 0, SimulatedFault.JAMMED, 1)
+    bench.sdo(Object.FOLLOWING_WINDOW, 0, 100)
+    bench.sdo(Object.FOLLOWING_TIMEOUT, 0, 30, 2)
+    seen = []
+    for _ in range(8):
+        bench.take(objects.RPDO1 + NODE, objects.SETPOINT.pack(Command.ENABLE_OPERATION, 1000))
+        bench.now += 0.01
+        seen += bench.take(objects.SYNC, b"")
+    codes = [objects.EMERGENCY.unpack(data)[0] for identifier, data in seen if identifier == objects.EMCY + NODE]
+    assert codes == [EmergencyCode.FOLLOWING_ERROR]
+    assert bench.state is State.FAULT
+
+
+def test_a_fault_needs_a_rising_edge_and_tells_its_end(bench: Bench) -> None:
+    bench.enable()
+    bench.sdo(Object.SIMULATED_FAULT, 0, SimulatedFault.OVER_CURRENT, 1)
+    assert bench.state is State.FAULT
+    assert bench.sdo(Object.ERROR_CODE) == EmergencyCode.OVER_CURRENT
+    bench.cycle(Command.ENABLE_OPERATION, 0)
+    assert bench.state is State.FAULT
+    sent = bench.take(objects.RPDO2 + NODE, objects.COMMAND.pack(Command.FAULT_RESET))
+    assert bench.state is State.SWITCH_ON_DISABLED
+    assert [objects.EMERGENCY.unpack(data)[0] for identifier, data in sent if identifier == objects.EMCY + NODE] == [0]
+
+
+@pytest.mark.parametrize(
+    ("option", "state"),
+    [(0, State.OPERATION_ENABLED), (1, State.FAULT), (2, State.SWITCH_ON_DISABLED), (3, State.QUICK_STOP_ACTIVE)],
+)
+def test_a_lost_master_is_answered_as_object_6007_says(bench: Bench, option: int, state: State) -> None:
+    bench.sdo(Object.ABORT_CONNECTION, 0, option, 2)
+    bench.sdo(Object.CONSUMER_HEARTBEAT, 1, 127 << 16 | 60)
+    bench.enable()
+    bench.wait(0.5)
+    assert bench.state is State.OPERATION_ENABLED  # guarded from the first heartbeat on
+    for _ in range(5):
+        bench.take(objects.HEARTBEAT + 127, bytes([5]))
+        bench.wait(0.04)
+    assert bench.state is State.OPERATION_ENABLED
+    bench.wait(0.03)
+    assert bench.state is state
+    codes = [objects.EMERGENCY.unpack(d)[0] for i, d in bench.sent if i == objects.EMCY + NODE]
+    assert EmergencyCode.HEARTBEAT_LOST in codes
+
+
+def test_a_lost_sync_is_noticed_after_one_and_a_half_cycles(bench: Bench) -> None:
+    bench.sdo(Object.ABORT_CONNECTION, 0, 3, 2)
+    bench.sdo(Object.CYCLE_PERIOD, 0, 10_000)
+    bench.enable()
+    bench.wait(0.012)
+    assert bench.state is State.OPERATION_ENABLED
+    bench.wait(0.006)
+    assert bench.state is State.QUICK_STOP_ACTIVE
+
+
+def test_a_short_set_point_is_refused_and_told(bench: Bench) -> None:
+    bench.enable()
+    ((identifier, data),) = bench.take(objects.RPDO1 + NODE, b"\x0f\x00\x01")
+    assert identifier == objects.EMCY + NODE
+    assert objects.EMERGENCY.unpack(data)[0] == EmergencyCode.PDO_SHORT
+
+
+def test_a_quick_stop_brakes_on_the_ramp(bench: Bench) -> None:
+    """From 100 counts a cycle at 1e5 counts/s2: v^2 / 2a = 500 counts, and no further."""
+    bench.sdo(Object.QUICK_STOP_DECELERATION, 0, 100_000)
+    bench.sdo(Object.QUICK_STOP_OPTION, 0, 6, 2)
+    bench.enable()
+    for number in range(30):
+        bench.cycle(Command.ENABLE_OPERATION, 100 * number)
+    start, speed = bench.drive.position, bench.drive.velocity
+    bench.take(objects.RPDO2 + NODE, objects.COMMAND.pack(Command.QUICK_STOP))
+    bench.wait(0.5)
+    assert bench.drive.velocity == 0.0
+    assert bench.drive.position - start == pytest.approx(speed**2 / 2e5, rel=0.1)
+
+
+def test_heartbeats_come_at_their_period(bench: Bench) -> None:
+    bench.sdo(Object.PRODUCER_HEARTBEAT, 0, 20, 2)
+    bench.sent.clear()
+    bench.wait(1.0)
+    beats = [data for identifier, data in bench.sent if identifier == objects.HEARTBEAT + NODE]
+    assert len(beats) == pytest.approx(50, abs=2)
+    assert set(beats) == {bytes([NmtState.PRE_OPERATIONAL])}
