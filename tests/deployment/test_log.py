@@ -1,0 +1,116 @@
+"""The journal of a session, and the recording made of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.deployment.log import EVENTS, JOURNAL, SessionLog, read_journal, session_trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots import Robot
+
+WRITER = """
+import sys, time
+from pathlib import Path
+from rfdropo_bayes.deployment.log import SessionLog
+from rfdropo_bayes.robots import load_robot
+log = SessionLog(Path(sys.argv[1]), load_robot("motor_arm"), {})
+for number in range(10**6):
+    log.record["time"] = number
+    log.write()
+    if number == 200:
+        print("going", flush=True)
+    time.sleep(0.001)
+"""
+
+
+def write(log: SessionLog, robot: Robot, cycles: int = 30) -> None:
+    for number in range(cycles):
+        record = log.record
+        record["time"], record["phase"], record["acted"] = 0.01 * number, 5, number % 10 == 0
+        record["command"] = 1e-3 * (number // 10 + 1)
+        record["raw"], record["asked"] = 1.0, 2.0
+        record["length"], record["tension"] = 1e-3 * number, 2.0 + 0.1 * number
+        record["fresh"] = number != 7
+        record["position"], record["seen"] = robot.marker_points(), number % 2 == 0
+        log.write()
+
+
+def test_a_session_becomes_a_recording(robot: Robot, tmp_path: Path) -> None:
+    log = SessionLog(tmp_path / "s", robot, {"mode": "run"})
+    write(log, robot)
+    log.close()
+    made = session_trajectory(tmp_path / "s")
+    made.save(tmp_path / "s.nc")
+    read = Trajectory.load(tmp_path / "s.nc")
+    assert read.sha256 == made.sha256
+    assert read.cable_names == robot.channel_names
+    assert read.settings["mode"] == "run"
+    np.testing.assert_allclose(read.command_time, [0.0, 0.1, 0.2])
+    np.testing.assert_allclose(read.command[:, 0], [1e-3, 2e-3, 3e-3])
+    np.testing.assert_allclose(read.motor_angle[:, 0], 1e-3 * np.arange(30) / 0.0093)
+    np.testing.assert_allclose(read.tension[:, 2], 2.0 + 0.1 * np.arange(30))
+    assert not read.dataset["tension_mask"].values[7].any()
+    assert read.position_mask[::2].all()
+    assert not read.position_mask[1::2].any()
+
+
+def test_a_session_without_markers_is_a_recording_of_tensions(robot: Robot, tmp_path: Path) -> None:
+    log = SessionLog(tmp_path / "s", robot, {})
+    for number in range(5):
+        log.record["time"] = number
+        log.write()
+    log.close()
+    assert session_trajectory(tmp_path / "s").settings["unseen"]
+
+
+def test_a_record_cut_short_is_left_out(robot: Robot, tmp_path: Path) -> None:
+    log = SessionLog(tmp_path / "s", robot, {})
+    write(log, robot)
+    log.close()
+    path = tmp_path / "s" / JOURNAL
+    path.write_bytes(path.read_bytes()[:-5])
+    assert len(read_journal(tmp_path / "s")[1]) == 29
+
+
+def test_a_killed_writer_loses_nothing(tmp_path: Path) -> None:
+    """SIGKILL, without any warning: every record written before is there."""
+    folder = tmp_path / "s"
+    process = subprocess.Popen([sys.executable, "-c", WRITER, str(folder)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "going\n"
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    time = read_journal(folder)[1]["time"]
+    assert len(time) > 200
+    np.testing.assert_array_equal(time, np.arange(len(time)))
+
+
+def test_a_folder_is_used_once(robot: Robot, tmp_path: Path) -> None:
+    SessionLog(tmp_path, robot, {}).close()
+    with pytest.raises(InputError, match="holds a session already"):
+        SessionLog(tmp_path, robot, {})
+
+
+def test_what_is_no_journal_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no journal"):
+        read_journal(tmp_path)
+    (tmp_path / JOURNAL).write_bytes(b"12 years a slave")
+    with pytest.raises(InputError, match="no journal"):
+        read_journal(tmp_path)
+
+
+def test_events_are_lines_with_times(robot: Robot, tmp_path: Path) -> None:
+    log = SessionLog(tmp_path, robot, {})
+    log.event("stop", "because", code=3)
+    log.close()
+    (line,) = [json.loads(text) for text in (tmp_path / EVENTS).read_text().splitlines()]
+    assert (line["event"], line["text"], line["code"]) == ("stop", "because", 3)
