@@ -58,15 +58,29 @@ def robot() -> Robot:
     return load_robot(ROBOT)
 
 
-@pytest.fixture
-def hub(tmp_path: Path) -> Iterator[str]:
-    """Channel of a hub in a thread."""
-    server, done = Hub(str(tmp_path / "bus")), threading.Event()
+@contextlib.contextmanager
+def serving(channel: str) -> Iterator[str]:
+    """A hub in a thread."""
+    server, done = Hub(channel), threading.Event()
     thread = threading.Thread(target=server.serve, args=(done.is_set,), daemon=True)
     thread.start()
     yield server.channel
     done.set()
     thread.join(5.0)
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[str]:
+    """Channel of a hub on a Unix socket."""
+    with serving(str(tmp_path / "bus")) as channel:
+        yield channel
+
+
+@pytest.fixture
+def tcp_hub() -> Iterator[str]:
+    """Channel of a hub on TCP."""
+    with serving("127.0.0.1:0") as channel:
+        yield channel
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from rfdropo_bayes.robots import Robot
 
 
 def linear_policy(
-    path: Path, robot: Robot, weight: np.ndarray, bias: np.ndarray, card: bool = True, **changes: Any
+    path: Path, robot: Robot, weight: np.ndarray, bias: np.ndarray, /, card: bool = True, **changes: Any
 ) -> Path:
     """action = observation @ weight + bias, observation as the card says; by default the command and the tip."""
     channels, tip = robot.channel_names, robot.marker_names[-1]

@@ -84,11 +84,11 @@ def test_a_record_cut_short_is_left_out(robot: Robot, tmp_path: Path) -> None:
 def test_a_killed_writer_loses_nothing(tmp_path: Path) -> None:
     """SIGKILL, without any warning: every record written before is there."""
     folder = tmp_path / "s"
-    process = subprocess.Popen([sys.executable, "-c", WRITER, str(folder)], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "going\n"
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    command = [sys.executable, "-c", WRITER, str(folder)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "going\n"
+        os.kill(process.pid, signal.SIGKILL)
     time = read_journal(folder)[1]["time"]
     assert len(time) > 200
     np.testing.assert_array_equal(time, np.arange(len(time)))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from policies import linear_policy
+from .policies import linear_policy
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.causes import Cause, Stop
@@ -21,7 +21,9 @@ INPUTS = 7
 def scene(robot: Robot, seed: int = 0) -> Scene:
     random = np.random.default_rng(seed)
     markers, channels = len(robot.marker_names), len(robot.channel_names)
-    return Scene(*[random.normal(size=(markers, 3)) for _ in range(2)], *[random.normal(size=channels) for _ in range(4)])
+    return Scene(
+        *[random.normal(size=(markers, 3)) for _ in range(2)], *[random.normal(size=channels) for _ in range(4)]
+    )
 
 
 def matrix(robot: Robot, seed: int = 1) -> np.ndarray:

@@ -74,7 +74,7 @@ function obey() {
     if (get(0x2f00) === 4) { // fault on request, as the simulated drive has it
         eds.getEntry(0x2f00).value = 0;
         set(0x6041, 0x0008);
-        device.emcy.write({ code: 0x2310 });
+        device.emcy.write(0x2310, Buffer.alloc(5)); // (its form with an object sends code 0)
     }
 }
 
