@@ -2,11 +2,11 @@
 
     python benchmarks/motor_faults.py [--case NAME] [--json FILE]
 
-Three processes a case: the drives, the session, and this one, which is an observer on the same bus. It reads statusword and
-position of every drive by SDO, some hundred times a second, whatever the session does. The fault is set off half a second
-into the policy's motion. "Safe" is the time from the fault until every drive that still lives is seen at rest and braked,
-faulted or without power, and stays so; where the session slows its set-points down instead, the drives hold enabled for a
-while before they brake. "Beyond" is how far any cable was seen outside the limits of its motor.
+Three processes a case: the drives, the session, and this one, which is an observer on the same bus. It reads statusword
+and position of every drive by SDO, some hundred times a second, whatever the session does. The fault is set off half a
+second into the policy's motion. "Safe" is the time from the fault until every drive that still lives is seen at rest
+and braked, faulted or without power, and stays so; where the session slows its set-points down instead, the drives hold
+enabled for a while before they brake. "Beyond" is how far any cable was seen outside the limits of its motor.
 
 Sessions that must be refused have no time: their drives are never powered.
 """
@@ -23,7 +23,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -92,7 +91,7 @@ CASES: dict[str, Case] = {
 
 
 class Row(NamedTuple):
-    """What was seen: seconds to safety (None for a refusal), the cause in the log, metres beyond a limit, right or wrong."""
+    """What was seen: seconds to safety (None for a refusal), cause in the log, metres beyond a limit, verdict."""
 
     case: str
     safe_s: float | None
@@ -113,7 +112,7 @@ class Observer:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def begin(self) -> None:
-        """Look on; not while the session configures the drives, since two SDO clients of one node disturb each other."""
+        """Look on, but not while the session configures: two SDO clients of one node disturb each other."""
         if not self._thread.is_alive():
             self._thread.start()
 
@@ -305,7 +304,7 @@ def write_policy(path: Path) -> None:
 
     robot = load_robot(ROBOT)
     channels, tip = robot.channel_names, robot.marker_names[-1]
-    names = tuple(f"command.{channel}" for channel in channels) + (f"marker.{tip}.z",)
+    names = (*(f"command.{channel}" for channel in channels), f"marker.{tip}.z")
     card = PolicyCard(
         robot=robot.name,
         rate_hz=10.0,
@@ -421,7 +420,8 @@ def table(rows: list[Row]) -> str:
         )
         cause = row.cause or "(killed)"
         lines.append(
-            f"| {row.case} | {safe} | {cause} | {row.states} | {1e3 * row.beyond_m:.2f} | {'ok' if row.passed else 'FAILED'} |"
+            f"| {row.case} | {safe} | {cause} | {row.states} | {1e3 * row.beyond_m:.2f} | "
+            f"{'ok' if row.passed else 'FAILED'} |"
         )
     return "\n".join(lines)
 

@@ -86,7 +86,7 @@ def doctor(
     deployment: Annotated[Path | None, typer.Argument(metavar="[DEPLOYMENT.toml]", help="whose bus to look at")] = None,
     seconds: Annotated[float, typer.Option(help="of each of five idle runs")] = 2.0,
 ) -> None:
-    """Say what this machine, its clock and its bus are fit for; prints JSON, ends with status 1 where something is wrong."""
+    """Say what this machine, its clock and its bus are fit for, as JSON; status 1 where something is wrong."""
     from rfdropo_bayes.deployment.doctor import examine
     from rfdropo_bayes.deployment.settings import load_deployment
 

@@ -41,11 +41,11 @@ def open_bus(table: BusTable) -> can.BusABC:
     """
     if table.interface == "hub":
         return HubBus(table.channel, **table.options)
-    bitrate = {} if table.bitrate is None else {"bitrate": table.bitrate}
-    # Over UDP a frame must not leave the machine: two laboratories in one network would drive each other's motors.
-    local = {"hop_limit": 0} if table.interface == "udp_multicast" else {}
+    options: dict[str, Any] = {} if table.bitrate is None else {"bitrate": table.bitrate}
+    if table.interface == "udp_multicast":  # no frame may leave the machine, to drive motors of others in the network
+        options["hop_limit"] = 0
     try:
-        return can.Bus(interface=table.interface, channel=table.channel, **bitrate, **(local | table.options))
+        return can.Bus(interface=table.interface, channel=table.channel, **(options | table.options))
     except Exception as error:  # each interface raises what its driver raises
         raise InputError(
             f"cannot be opened ({type(error).__name__}: {error})",
@@ -82,7 +82,8 @@ class LoggedNetwork(canopen.Network):
     def __init__(self, bus: can.BusABC, log: FrameLog | None = None) -> None:
         super().__init__(bus)
         self._log = log
-        self.listeners += [log] if log is not None else []
+        listeners: list[can.Listener] = [*self.listeners, *([log] if log is not None else [])]
+        self.listeners = listeners  # type: ignore[assignment]
         self.connect()
 
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:

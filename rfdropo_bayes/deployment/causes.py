@@ -8,8 +8,8 @@ from enum import Enum
 class Reaction(Enum):
     """How the drives come to rest.
 
-    ``RAMP`` slows the set-points down within the limits and holds; it needs drives and bus that work. ``QUICK_STOP`` lets
-    each drive brake on its own ramp and hold.
+    ``RAMP`` slows the set-points down within the limits and holds; it needs drives and bus that work. ``QUICK_STOP``
+    lets each drive brake on its own ramp and hold.
     """
 
     RAMP = "ramp"

@@ -1,7 +1,7 @@
 """The power-drive state machine of CiA 402 (IEC 61800-7-201, section 5): states, commands and transitions.
 
-Master and simulated drive share this table, so that neither can know a state that the other does not. Nothing here sends
-or receives: a master asks `controlword_towards`, a drive asks `obey`.
+Master and simulated drive share this table, so that neither can know a state that the other does not. Nothing here
+sends or receives: a master asks `controlword_towards`, a drive asks `obey`.
 """
 
 from __future__ import annotations
@@ -171,8 +171,8 @@ _KEEP = {
 def controlword_towards(state: State, target: State, previous: int) -> int:
     """Controlword that brings a drive one step nearer to a state, or keeps it there.
 
-    A drive in quick stop is brought to another state through SWITCH ON DISABLED: to go on moving from a stop is a decision
-    of its own (transition 16). A fault is reset only on the way to another state than FAULT.
+    A drive in quick stop is brought to another state through SWITCH ON DISABLED: to go on moving from a stop is a
+    decision of its own (transition 16). A fault is reset only on the way to another state than FAULT.
 
     Args:
         state: that the drive reports.

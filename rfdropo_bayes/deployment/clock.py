@@ -1,4 +1,4 @@
-"""The clock of the control loop: absolute deadlines, real-time scheduling where the system permits it, and its lateness."""
+"""The clock of the control loop: absolute deadlines, real-time scheduling where permitted, and its lateness."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Tick(NamedTuple):
 
 
 class CycleClock:
-    """Beats at ``start + number x period``. A late beat shifts no later one, and beats that have passed are left out."""
+    """Beats at ``start + number x period``. A late beat shifts no later one; beats that have passed are left out."""
 
     def __init__(self, period: float) -> None:
         self.period = period
@@ -53,7 +53,7 @@ class CycleClock:
 
 
 def schedule_fifo(thread: int = 0) -> bool:
-    """Give a thread of this process (this one by default) real-time priority; False where the system does not permit it."""
+    """Give a thread (this one by default) real-time priority; False where the system does not permit it."""
     try:
         os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except (OSError, AttributeError):

@@ -1,4 +1,4 @@
-"""What stands in the way of a session on this machine: versions, real-time scheduling, jitter of the clock, bus, drives."""
+"""What stands in the way of a session on this machine: versions, scheduling, jitter of the clock, bus, drives."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def examine(bus: BusTable | None, rate_hz: float = 100.0, seconds: float = 5.0, 
         idle_runs: how many.
 
     Returns:
-        Versions, processors and load, the median of the idle runs' lateness [s], and the drives found; what is wrong stands
-        under "problems".
+        Versions, processors and load, the median of the idle runs' lateness [s], and the drives found; what is wrong
+        stands under "problems".
     """
     problems: list[str] = []
     versions = {name: _version(name) for name in PACKAGES}

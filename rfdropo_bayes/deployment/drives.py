@@ -1,7 +1,7 @@
-"""The drives of a robot, seen from the master: set-up through SDOs with read-back, one exchange of process data per cycle.
+"""The drives of a robot, seen from the master: set-up by SDO with read-back, one exchange of process data a cycle.
 
-canopen carries the object dictionary and the SDOs. Process data, SYNC, heartbeats and emergencies are handled here, in the
-thread of the control loop, because each needs a time and a defined end where canopen's own threads have neither.
+canopen carries the object dictionary and the SDOs. Process data, SYNC, heartbeats and emergencies are handled here, in
+the thread of the control loop, because each needs a time and a defined end where canopen's own threads have neither.
 """
 
 from __future__ import annotations
@@ -326,7 +326,8 @@ class Drive:
         if len(data) != objects.STATUS.size:
             self.short_frames += 1
             return
-        self.reading = Reading(*objects.STATUS.unpack(data), time.monotonic())
+        statusword, position, torque = objects.STATUS.unpack(data)
+        self.reading = Reading(statusword, position, torque, time.monotonic())
         self.on_status(self)
 
     on_status: Callable[[Drive], None] = staticmethod(lambda drive: None)
@@ -442,8 +443,8 @@ class Drives:
     def quick_stop(self, patience: float = 0.02) -> list[str]:
         """Stop every drive at once, from any thread, whatever the control loop does; it stays stopped.
 
-        The controlword goes out in a PDO of its own that needs no SYNC. Where a frame cannot be sent, the others still are,
-        and the drive's own guard stops it.
+        The controlword goes out in a PDO of its own that needs no SYNC. Where a frame cannot be sent, the others still
+        are, and the drive's own guard stops it.
 
         Returns:
             What could not be sent.

@@ -1,4 +1,4 @@
-"""The emergency stop in software: a thread of its own that listens to a key, signals and a hook, and stops the drives itself.
+"""The emergency stop in software: a thread that listens to a key, signals and hooks, and stops the drives itself.
 
 It stands beside the hardware one, never in its place.
 """
@@ -47,8 +47,9 @@ def file_hook(path: Path, pressed: str) -> Hook:
 class StopSignals:
     """Keeps SIGINT, SIGTERM and SIGHUP from ending the program, and tells the emergency stop that one has come.
 
-    The interpreter writes each signal to a socket from whichever thread the system gave it to, at once; the main thread, which
-    may be busy, is not asked. Outside the main thread Python cannot take signals: the program's own handlers then stay.
+    The interpreter writes each signal to a socket from whichever thread the system gave it to, at once; the main
+    thread, which may be busy, is not asked. Outside the main thread Python cannot take signals: the program's own
+    handlers then stay.
     """
 
     def __enter__(self) -> StopSignals:

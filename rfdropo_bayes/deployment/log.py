@@ -1,7 +1,8 @@
 """The log of a session: a journal of every cycle that a crash cannot take back, and the recording made of it.
 
-Each cycle is one fixed-size record, handed to the operating system at once: if the program is killed, nothing is lost, and
-if the machine loses power, at most the last second. `session.nc` is written from the journal at the end, or after a crash.
+Each cycle is one fixed-size record, handed to the operating system at once: if the program is killed, nothing is lost,
+and if the machine loses power, at most the last second. `session.nc` is written from the journal at the end, or after a
+crash.
 """
 
 from __future__ import annotations
@@ -151,10 +152,10 @@ def read_journal(folder: Path) -> tuple[dict[str, Any], Shaped[np.ndarray, " cyc
 def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> Trajectory:
     """The recording of a session, from its journal.
 
-    Commands are those in force at the policy's rate, before the set-points' limits on rate and acceleration, after those on
-    length; drum angles [rad] are measured, tensions [N] come from the drives' torque. Where a drive was silent its last
-    value stands, and ``tension_mask`` is False. Statuswords, set-points and raw actions are kept beside, outside the hash:
-    they say how the session went, not what the robot did.
+    Commands are those in force at the policy's rate, before the set-points' limits on rate and acceleration, after
+    those on length; drum angles [rad] are measured, tensions [N] come from the drives' torque. Where a drive was silent
+    its last value stands, and ``tension_mask`` is False. Statuswords, set-points and raw actions are kept beside,
+    outside the hash: they say how the session went, not what the robot did.
 
     Args:
         folder: of the session.

@@ -257,8 +257,9 @@ class ControlLoop:
         self.markers.act(now)
         unit = self.command / self.scale
         scene = Scene(self.markers.position, self.markers.velocity, unit, self._raw, self.lengths(), self.tensions())
+        began = time.monotonic()
         act = source.act(scene)
-        self.act_times.append(time.monotonic() - now)
+        self.act_times.append(time.monotonic() - began)
         if act is None:
             return False
         if not np.all(np.isfinite(act.command)):

@@ -1,4 +1,4 @@
-"""What the drives pull on: the `Plant` protocol, cables as springs in closed form, and a plant in a process of its own."""
+"""What the drives pull on: the `Plant` protocol, cables as springs in closed form, a plant in its own process."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class SpringCables:
     """Each cable a spring under pretension; markers lean towards the cables that are pulled, without inertia.
 
     Tension is ``max(0, pretension + stiffness x length)``. The marker at height z above the base moves across by
-    ``lean x (z / z_tip)^2 x`` the sum of the pulls times the directions of their cables. Closed forms, so that tests know
-    every number; a simulated trunk takes its place where the motion matters.
+    ``lean x (z / z_tip)^2 x`` the sum of the pulls times the directions of their cables. Closed forms, so that tests
+    know every number; a simulated trunk takes its place where the motion matters.
 
     Args:
         robot: gives channels, cables and markers.

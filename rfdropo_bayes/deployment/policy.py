@@ -1,8 +1,8 @@
 """Where commands come from: a policy as an ONNX file with its card, or the commands of an earlier session.
 
-The card of a policy stands in the metadata of the ONNX file (`rfdropo.*`, JSON values): what it was made for and the layout
-of what goes in and comes out. Normalisation, clipping and scaling are baked into the graph. A policy is refused unless its
-card fits the robot and the session to the letter.
+The card of a policy stands in the metadata of the ONNX file (`rfdropo.*`, JSON values): what it was made for and the
+layout of what goes in and comes out. Normalisation, clipping and scaling are baked into the graph. A policy is refused
+unless its card fits the robot and the session to the letter.
 """
 
 from __future__ import annotations

@@ -39,8 +39,8 @@ from rfdropo_bayes.robots import Motor, Robot, load_robot
 class Mode(StrEnum):
     """What a session does.
 
-    ``CHECK`` reads and writes nothing; ``HOME`` finds length zero; ``DRY_RUN`` is ``RUN`` on simulated drives; ``SHADOW`` lets the
-    policy see and command while nothing moves; ``REPLAY`` sends the commands of a recording again.
+    ``CHECK`` reads and writes nothing; ``HOME`` finds length zero; ``DRY_RUN`` is ``RUN`` on simulated drives;
+    ``SHADOW`` lets the policy see and command while nothing moves; ``REPLAY`` sends the commands of a recording again.
     """
 
     CHECK = "check"
@@ -101,8 +101,8 @@ def deploy(
         bus, sensor, source: instead of those that the settings describe.
 
     Raises:
-        InputError: if anything does not fit: a drive's identity, data sheet or mapping, units, rates, the policy's card or
-            hash, the homing. Nothing has been enabled then, and the log says why.
+        InputError: if anything does not fit: a drive's identity, data sheet or mapping, units, rates, the policy's card
+            or hash, the homing. Nothing has been enabled then, and the log says why.
     """
     settings = load_deployment(Path(settings)) if isinstance(settings, Path | str) else settings
     mode = Mode(mode)
@@ -226,7 +226,7 @@ class _Session:
             cycles = self.settings.rate_hz / self.source.rate_hz
             if abs(cycles - round(cycles)) > 1e-6 or cycles < 1.0:
                 raise InputError(
-                    f"the policy acts at {self.source.rate_hz:g} Hz, which does not divide {self.settings.rate_hz:g} Hz",
+                    f"{self.source.rate_hz:g} Hz of the policy does not divide {self.settings.rate_hz:g} Hz",
                     where="rate_hz",
                     remedy="choose a multiple of the policy's rate",
                 )
@@ -348,6 +348,3 @@ def _figures(loop: ControlLoop, period: float) -> dict[str, Any]:
 
 def _at(values: np.ndarray, percent: float) -> float:
     return float(np.percentile(values, percent))
-
-
-__all__ = ["Mode", "Outcome", "deploy"]

@@ -32,7 +32,7 @@ class SetPoints:
         self.rate = np.zeros(len(motors))
 
     def clamp(self, length: Float[np.ndarray, " motor"]) -> Float[np.ndarray, " motor"]:
-        """The nearest lengths within the limits; where a motor stands outside them already, it may stay or come back."""
+        """The nearest lengths within the limits; a motor that stands outside them may stay or come back."""
         return np.clip(length, np.minimum(self.low, self.length), np.maximum(self.high, self.length))
 
     def towards(

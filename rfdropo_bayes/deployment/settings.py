@@ -28,8 +28,8 @@ class DrivesTable(_Table):
         eds: their electronic data sheet; that of the simulated drive by default.
         vendor, product, revision: what object 0x1018 must say; not asked where left out.
         serial: channel -> serial number.
-        check_eds: whether vendor and product in the data sheet must be those that the drive says; some makers leave them out
-            of step.
+        check_eds: whether vendor and product in the data sheet must be those that the drive says; some makers leave
+            them out of step.
     """
 
     eds: str = str(SIMULATED_EDS)

@@ -1,7 +1,8 @@
 """A CiA 402 drive in software: object dictionary, process data applied on SYNC, guards, motion, faults on request.
 
-The object dictionary and the SDO server are canopen's `LocalNode`; everything that it lacks (PDOs linked to the dictionary,
-NMT, SYNC, heartbeats both ways, emergencies) is here. One thread feeds it: `receive` for every frame, `tick` between.
+The object dictionary and the SDO server are canopen's `LocalNode`; everything that it lacks (PDOs linked to the
+dictionary, NMT, SYNC, heartbeats both ways, emergencies) is here. One thread feeds it: `receive` for every frame,
+`tick` between.
 """
 
 from __future__ import annotations
@@ -82,13 +83,12 @@ class SimulatedDrive:
 
     def _power_on(self, now: float) -> None:
         self.local = canopen.LocalNode(self.node, self._eds)
-        self.local.network = self.local.sdo.network = _Sender(self._send)
+        self.local.sdo.network = _Sender(self._send)  # type: ignore[assignment]
         self.local._write_callbacks.clear()  # LocalNode's own heartbeat runs in a thread that one send error ends
         self.local.add_write_callback(self._check_write)
         self.local.add_read_callback(self._read)
         for (index, subindex), value in self._values.items():
-            variable = self.local.object_dictionary.get_variable(index, subindex)
-            self.local.data_store.setdefault(index, {})[subindex] = variable.encode_raw(value)
+            self.local.data_store.setdefault(index, {})[subindex] = self._variable(index, subindex).encode_raw(value)
         self.nmt, self.boot_at = NmtState.BOOT_UP, now + _BOOT
         self.state, self.controlword, self.error_code = State.SWITCH_ON_DISABLED, 0, 0
         self.target = self.demand = round(self.position)
@@ -142,8 +142,14 @@ class SimulatedDrive:
         key = (int(index), subindex)
         if key not in self._settings:
             data = self.local.get_data(*key)
-            self._settings[key] = self.local.object_dictionary.get_variable(*key).decode_raw(data)
+            self._settings[key] = int(self._variable(*key).decode_raw(data))
         return self._settings[key]
+
+    def _variable(self, index: int, subindex: int) -> canopen.objectdictionary.ODVariable:
+        variable = self.local.object_dictionary.get_variable(index, subindex)
+        if variable is None:
+            raise KeyError(f"0x{index:04X}:{subindex} is not in the data sheet")
+        return variable
 
     def _manage(self, data: bytes, now: float) -> None:
         if len(data) < 2 or data[1] not in (0, self.node):
@@ -151,7 +157,7 @@ class SimulatedDrive:
         if data[0] in (Nmt.RESET_NODE, Nmt.RESET_COMMUNICATION):
             self._power_on(now)
             return
-        states = {
+        states: dict[int, NmtState] = {
             Nmt.START: NmtState.OPERATIONAL,
             Nmt.STOP: NmtState.STOPPED,
             Nmt.PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
@@ -367,7 +373,7 @@ class SimulatedDrive:
         before = self.velocity
         self.velocity = math.copysign(max(0.0, abs(before) - change), before)
         self.position += 0.5 * (before + self.velocity) * duration if self.velocity else 0.0
-        self.demand = self.position
+        self.demand = round(self.position)
 
 
 _LIVE: dict[int, Callable[[SimulatedDrive], int]] = {

@@ -26,7 +26,7 @@ from rfdropo_bayes.deployment.bus import BusTable, open_bus
 from rfdropo_bayes.deployment.clock import schedule_fifo, steady_interpreter
 from rfdropo_bayes.deployment.hub import Hub
 from rfdropo_bayes.deployment.objects import Object
-from rfdropo_bayes.deployment.plant import Plant, PlantProcess, PlantState, build_plant
+from rfdropo_bayes.deployment.plant import Plant, PlantProcess, build_plant
 from rfdropo_bayes.deployment.simulated_drive import SimulatedDrive
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot, load_robot
@@ -158,8 +158,9 @@ def serve(table: SimulationTable, ready: Path | None = None) -> None:
         stack.callback(bus.shutdown)
         robot = load_robot(table.robot)
         if table.own_process:
-            plant: Plant = PlantProcess(table.plant, robot, table.settings)
-            stack.callback(plant.close)
+            process = PlantProcess(table.plant, robot, table.settings)
+            stack.callback(process.close)
+            plant: Plant = process
         else:
             plant = build_plant(table.plant, robot, table.settings)
         drives = SimulatedDrives(robot, table, bus, plant)
@@ -241,6 +242,3 @@ def main(description: str, ready: str) -> None:
     except InputError as error:
         print(error, file=sys.stderr)
         sys.exit(2)
-
-
-__all__ = ["PlantState", "SimulatedDrives", "SimulationTable", "serve", "simulated_drives"]

@@ -1,4 +1,4 @@
-"""Robot descriptions: geometry, section profile, cables, motors, markers and parameters, read from TOML and validated."""
+"""Robot descriptions: geometry, cables, motors, markers and parameters, read from TOML and validated."""
 
 from rfdropo_bayes.robots.body import Body, PointMass
 from rfdropo_bayes.robots.cable import Cable, Channels

@@ -1,4 +1,4 @@
-"""Motors that wind the cables: from lengths to counts of an encoder, from torque to tension, and what a motor may do."""
+"""Motors that wind the cables: from length to counts, from torque to tension, and what a motor may do."""
 
 from __future__ import annotations
 

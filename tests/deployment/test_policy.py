@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from .policies import linear_policy
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.causes import Cause, Stop
 from rfdropo_bayes.deployment.policy import OnnxPolicy, RecordedCommands, Scene, observer
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
+
+from .policies import linear_policy
 
 INPUTS = 7
 

@@ -147,7 +147,8 @@ def test_springs_have_their_closed_form(robot: Robot) -> None:
     plant = SpringCables(robot, stiffness=100.0, pretension=1.0, lean=2.0)
     state = plant.advance(np.array([0.01, -0.02, 0.0, 0.0]), 0.01)
     np.testing.assert_allclose(state.tension, [2.0, 0.0, 1.0, 1.0])
-    # Cable "up" at 90 deg, "left" at 180 deg: the tip, at the full height, moves (-1)(-0.02) x 2 across and 0.01 x 2 up.
+    # Cable "up" at 90 deg, "left" at 180 deg: the tip, at the full height, moves (-1)(-0.02) x 2 across and 0.01 x 2
+    # up.
     np.testing.assert_allclose(state.position[-1] - robot.marker_points()[-1], [0.04, 0.02, 0.0], atol=1e-12)
 
 

@@ -205,7 +205,7 @@ def test_a_plant_may_live_in_a_process_of_its_own(dry_run, tmp_path: Path) -> No
 def test_a_policy_for_another_rate_is_refused_with_its_cause_in_the_log(robot: Robot, tmp_path: Path) -> None:
     policy = linear_policy(tmp_path / "p.onnx", robot, np.zeros((7, 4)), np.zeros(4), rate_hz=30.0)
     settings = Deployment(robot="motor_arm", policy=PolicyTable(file=str(policy)))
-    with pytest.raises(InputError, match="does not divide 100 Hz"):
+    with pytest.raises(InputError, match="30 Hz of the policy does not divide 100 Hz"):
         deploy(settings, "dry-run", tmp_path / "s")
     assert json.loads((tmp_path / "s" / "summary.json").read_text())["cause"] == "refused"
     assert "does not divide" in (tmp_path / "s" / "log.jsonl").read_text()
@@ -235,8 +235,19 @@ def test_bad_deployment_files_say_what_is_wrong(tmp_path: Path, text: str, messa
 
 def test_the_command_line_runs_a_dry_run(robot: Robot, tmp_path: Path) -> None:
     turning(tmp_path / "policy.onnx", robot)
-    text = "robot = 'motor_arm'\nduration_s = 0.5\n[policy]\nfile = 'policy.onnx'\n[safety]\nmisses = 50\nheartbeat_s = 1.0\n"
-    (tmp_path / "arm.toml").write_text(text + "stale_cycles = 30\nsettle_s = 0.1\nfollowing_error_m = 0.02\n")
+    text = """
+        robot = "motor_arm"
+        duration_s = 0.5
+        [policy]
+        file = "policy.onnx"
+        [safety]
+        misses = 50
+        heartbeat_s = 1.0
+        stale_cycles = 30
+        settle_s = 0.1
+        following_error_m = 0.02
+    """
+    (tmp_path / "arm.toml").write_text(text)
     command = [
         sys.executable,
         "-m",

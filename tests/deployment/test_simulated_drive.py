@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 
 import pytest
@@ -40,7 +41,7 @@ class Bench:
         else:
             raw = (value & (1 << 8 * size) - 1).to_bytes(size, "little").ljust(4, b"\0")
             request = struct.pack("<BHB4s", 0x23 | 4 - size << 2, index, subindex, raw)
-        ((identifier, answer),) = [row for row in self.take(0x600 + NODE, request) if row[0] == 0x580 + NODE]
+        ((_identifier, answer),) = [row for row in self.take(0x600 + NODE, request) if row[0] == 0x580 + NODE]
         if answer[0] == 0x80:
             return -int.from_bytes(answer[4:], "little")
         return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little")
@@ -155,7 +156,7 @@ def test_speed_is_limited(bench: Bench) -> None:
     bench.sdo(Object.FOLLOWING_WINDOW, 0, 10**6)
     bench.enable()
     positions = [bench.cycle(Command.ENABLE_OPERATION, 10**5)[1] for _ in range(20)]
-    steps = [after - before for before, after in zip(positions, positions[1:], strict=False)]
+    steps = [after - before for before, after in itertools.pairwise(positions)]
     assert max(steps) <= 2048 * 0.01 + 1
 
 
