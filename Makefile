@@ -17,7 +17,7 @@ ALL     = $(VENV)/all.stamp
 export OPENBLAS_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint format bench validate notebooks notebook-outputs reference demo-data clean
+.PHONY: help demo test test-all matrix lint format bench validate notebooks notebook-outputs reference demo-data clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-16s%s\n", $$1, $$2 }'
@@ -31,6 +31,9 @@ test: $(DEV) ## the tests that are not slow
 
 test-all: $(ALL) ## every test, the slow ones, the notebooks and those of optional packages too
 	$(PYTEST) -n $(WORKERS)
+
+matrix: $(DEV) ## every method and every command, on the demo, an own robot and a mesh body (minutes)
+	$(PYTEST) -n $(WORKERS) tests/workflow/test_matrix.py tests/workflow/test_commands_matrix.py
 
 lint: $(DEV) ## ruff, its formatter, and mypy
 	$(BIN)/ruff check .

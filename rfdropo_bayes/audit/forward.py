@@ -64,7 +64,7 @@ class Lanes:
     @property
     def difference(self) -> float | None:
         """Relative step of its derivatives; None where they are exact."""
-        engine = getattr(self.simulator, "engine", None)
+        engine: Any = getattr(self.simulator, "engine", None)
         if not hasattr(engine, "difference"):
             return None
         usual = FORWARD if getattr(engine, "one_sided", False) else DIFFERENCE[engine.precision]

@@ -14,35 +14,23 @@ class Motor(Table):
 
     Lengths are cable wound up by the drum [m], pull > 0, from where homing put zero. Counts rise with the length where
     ``sign`` is +1.
-
-    Attributes:
-        channel: command channel that it drives.
-        node: CANopen node of the drive, 1 to 127.
-        sign: +1 where counts rise as the cable is pulled, else -1.
-        drum_radius_m: radius at which the cable is wound.
-        gear: turns of the motor per turn of the drum.
-        counts_per_turn: of the encoder, per turn of the motor.
-        offset_counts: counts at length zero, used until homing has found them.
-        rated_torque_n_m: torque of the motor that the drive reports as 1000 per mille.
-        length_limit_m: least and greatest length.
-        rate_limit_m_s, acceleration_limit_m_s2: of the set-points.
-        tension_limit_n: least tension to hold, and the greatest, at which everything stops.
-        homing_tension_n: tension at which length zero is defined.
     """
 
-    channel: Name
-    node: int = Field(ge=1, le=127)
-    sign: int
-    drum_radius_m: Positive
-    gear: Positive
-    counts_per_turn: Positive
-    offset_counts: int = 0
-    rated_torque_n_m: Positive
-    length_limit_m: Pair
-    rate_limit_m_s: Positive
-    acceleration_limit_m_s2: Positive
-    tension_limit_n: Pair
-    homing_tension_n: Positive
+    channel: Name = Field(description="command channel that it drives")
+    node: int = Field(ge=1, le=127, description="CANopen node of the drive")
+    sign: int = Field(description="+1 where counts rise as the cable is pulled, else -1")
+    drum_radius_m: Positive = Field(description="radius at which the cable is wound")
+    gear: Positive = Field(description="turns of the motor per turn of the drum")
+    counts_per_turn: Positive = Field(description="counts of the encoder per turn of the motor")
+    offset_counts: int = Field(default=0, description="counts at length zero, used until homing has found them")
+    rated_torque_n_m: Positive = Field(description="torque of the motor that the drive reports as 1000 per mille")
+    length_limit_m: Pair = Field(description="least and greatest length of cable wound up")
+    rate_limit_m_s: Positive = Field(description="greatest rate of the set-points")
+    acceleration_limit_m_s2: Positive = Field(description="greatest acceleration of the set-points")
+    tension_limit_n: Pair = Field(
+        description="least tension to hold, and the greatest, at which everything stops",
+    )
+    homing_tension_n: Positive = Field(description="tension at which homing sets length zero")
 
     @model_validator(mode="after")
     def _consistent(self) -> Motor:
