@@ -33,7 +33,7 @@ test-all: $(ALL) ## every test, the slow ones, the notebooks and those of option
 	$(PYTEST) -n $(WORKERS)
 
 matrix: $(DEV) ## every method and every command, on the demo, an own robot and a mesh body (minutes)
-	$(PYTEST) -n $(WORKERS) tests/workflow/test_matrix.py tests/workflow/test_commands_matrix.py
+	$(PYTEST) -n $(WORKERS) --dist loadgroup tests/workflow/test_matrix.py tests/workflow/test_commands_matrix.py
 
 lint: $(DEV) ## ruff, its formatter, and mypy
 	$(BIN)/ruff check .

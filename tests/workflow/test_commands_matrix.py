@@ -128,7 +128,10 @@ def mesh(folder: Path, bar: Path) -> Bench:
     return Bench(path, QUICK, folder / "run", folder / "run_2.nc")
 
 
-@pytest.fixture(scope="module", params=["demo", "own", "mesh"])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in ("demo", "own", "mesh")],
+)
 def bench(request, tmp_path_factory, bar_mesh) -> Bench:
     folder = tmp_path_factory.mktemp(request.param)
     made = {"demo": demo, "own": own, "mesh": lambda f: mesh(f, bar_mesh)}[request.param](folder)
