@@ -34,6 +34,7 @@ from rfdropo_bayes.deployment.bus import BusTable
 from rfdropo_bayes.deployment.cia402 import State, state_of
 from rfdropo_bayes.deployment.hub import HubBus
 from rfdropo_bayes.deployment.objects import Object
+from rfdropo_bayes.deployment.policy import METADATA
 from rfdropo_bayes.deployment.sensors import Sighting, SimulatedMarkers
 from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, SafetyTable
@@ -41,6 +42,7 @@ from rfdropo_bayes.deployment.simulated_drive import SimulatedFault
 from rfdropo_bayes.deployment.simulation import SimulationTable, simulated_drives
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots.policy_layout import ObservationPart, PolicyLayout
 
 ROBOT = "motor_arm"
 ALLOWED = 0.1  # [s]
@@ -244,7 +246,7 @@ def session(name: str, channel: str, port: int, folder: Path) -> None:
 
         def _run(self, observation: np.ndarray) -> np.ndarray:
             now = time.monotonic()
-            if not self.started and hasattr(self, "_low"):
+            if not self.started and hasattr(self, "_input"):
                 self.started = now if np.any(observation) else 0.0
                 if self.started:
                     print("RUNNING", flush=True)
@@ -300,23 +302,21 @@ def write_policy(path: Path) -> None:
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-    from rfdropo_bayes.deployment.policy import PolicyCard
-
     robot = load_robot(ROBOT)
-    channels, tip = robot.channel_names, robot.marker_names[-1]
-    names = (*(f"command.{channel}" for channel in channels), f"marker.{tip}.z")
-    card = PolicyCard(
-        robot=robot.name,
-        rate_hz=10.0,
-        unit="m",
-        action="increment",
+    channels, markers = robot.channel_names, len(robot.marker_names)
+    layout = PolicyLayout(
+        task="circle",
+        period_s=0.1,
+        observation=(ObservationPart("commands", len(channels), "m"), ObservationPart("markers", 3 * markers, "m")),
         channels=channels,
-        observation=names,
-        low=(-5e-3,) * len(channels),
-        high=(5e-3,) * len(channels),
+        unit="m",
+        kind="continuous",
+        moves=((5e-3,) * len(channels),),
+        low=(-0.03,) * len(channels),
+        high=(0.03,) * len(channels),
     )
     turn = 0.4  # [rad] per act
-    weight = np.zeros((len(names), len(channels)))
+    weight = np.zeros((layout.size, len(channels)))
     for a, b in ((0, 2), (1, 3)):
         weight[[a, a, b, b], [a, b, a, b]] = [np.cos(turn) - 1, np.sin(turn), -np.sin(turn), np.cos(turn) - 1]
     weight[-1, 0] = weight[-1, 1] = 0.002 / robot.marker_points()[-1, 2]  # sets it off, and keeps it going
@@ -326,7 +326,7 @@ def write_policy(path: Path) -> None:
             helper.make_node("Clip", ["unclipped", "low", "high"], ["action"]),
         ],
         "circle",
-        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, [None, len(names)])],
+        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, [None, layout.size])],
         [helper.make_tensor_value_info("action", TensorProto.FLOAT, [None, len(channels)])],
         [
             numpy_helper.from_array(weight.astype(np.float32), "weight"),
@@ -335,7 +335,7 @@ def write_policy(path: Path) -> None:
         ],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    helper.set_model_props(model, card.metadata())
+    helper.set_model_props(model, {METADATA: layout.to_json()})
     onnx.save(model, str(path))
 
 

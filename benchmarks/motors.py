@@ -27,9 +27,10 @@ from rfdropo_bayes.deployment.clock import measure_jitter
 from rfdropo_bayes.deployment.drives import Drives
 from rfdropo_bayes.deployment.log import read_journal
 from rfdropo_bayes.deployment.loop import Phase
-from rfdropo_bayes.deployment.policy import PolicyCard
+from rfdropo_bayes.deployment.policy import METADATA
 from rfdropo_bayes.deployment.settings import Deployment, PolicyTable
 from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.robots.policy_layout import ObservationPart, PolicyLayout
 
 ROBOTS = ("motor_arm", "motor_trunk")
 PERIOD = 0.01  # [s]
@@ -43,17 +44,23 @@ def write_policy(path: Path, robot: Robot, width: int = 64) -> None:
     from onnx import TensorProto, helper, numpy_helper
 
     channels, half = robot.channel_names, len(robot.channel_names) // 2
-    names = tuple(f"command.{channel}" for channel in channels)
-    names += tuple(f"marker.{marker}.{axis}" for marker in robot.marker_names for axis in "xyz")
-    ends = {"low": (-0.01,) * len(channels), "high": (0.01,) * len(channels)}
-    card = PolicyCard(
-        robot=robot.name, rate_hz=10.0, unit="m", action="increment", channels=channels, observation=names, **ends
+    markers = len(robot.marker_names)
+    layout = PolicyLayout(
+        task="circles",
+        period_s=0.1,
+        observation=(ObservationPart("commands", len(channels), "m"), ObservationPart("markers", 3 * markers, "m")),
+        channels=channels,
+        unit="m",
+        kind="continuous",
+        moves=((0.01,) * len(channels),),
+        low=(-0.03,) * len(channels),
+        high=(0.03,) * len(channels),
     )
-    random, turn, circle = np.random.default_rng(0), 0.4, np.zeros((len(names), len(channels)))
+    random, turn, circle = np.random.default_rng(0), 0.4, np.zeros((layout.size, len(channels)))
     for one in range(half):
         rows, other = [one, one, one + half, one + half], one + half
         circle[rows, [one, other] * 2] = [np.cos(turn) - 1, np.sin(turn), -np.sin(turn), np.cos(turn) - 1]
-    sizes = (len(names), width, width, len(channels))
+    sizes = (layout.size, width, width, len(channels))
     arrays = {f"w{k}": random.normal(size=sizes[k : k + 2]) / np.sqrt(sizes[k]) for k in range(3)}
     arrays |= {"circle": circle, "scale": np.array(1e-4), "push": np.full(len(channels), 2e-3)}
     node = helper.make_node
@@ -69,11 +76,11 @@ def write_policy(path: Path, robot: Robot, width: int = 64) -> None:
         node("Add", ["pushed", "little"], ["action"]),
     ]
     values = [numpy_helper.from_array(array.astype(np.float32), name) for name, array in arrays.items()]
-    shapes = (("observation", len(names)), ("action", len(channels)))
+    shapes = (("observation", layout.size), ("action", len(channels)))
     ends_of_graph = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [None, size]) for name, size in shapes]
     graph = helper.make_graph(nodes, "circles", ends_of_graph[:1], ends_of_graph[1:], values)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    helper.set_model_props(model, card.metadata())
+    helper.set_model_props(model, {METADATA: layout.to_json()})
     onnx.save(model, str(path))
 
 

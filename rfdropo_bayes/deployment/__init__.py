@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from rfdropo_bayes.deployment.causes import Cause, Stop
     from rfdropo_bayes.deployment.log import session_trajectory
     from rfdropo_bayes.deployment.plant import Plant, PlantState
-    from rfdropo_bayes.deployment.policy import PolicyCard
     from rfdropo_bayes.deployment.session import Mode, Outcome, deploy
     from rfdropo_bayes.deployment.settings import Deployment, load_deployment
 
@@ -24,7 +23,6 @@ __all__ = [
     "Outcome",
     "Plant",
     "PlantState",
-    "PolicyCard",
     "Stop",
     "deploy",
     "load_deployment",
@@ -37,7 +35,6 @@ _HOMES = {
     "session_trajectory": "log",
     "Plant": "plant",
     "PlantState": "plant",
-    "PolicyCard": "policy",
     "Mode": "session",
     "Outcome": "session",
     "deploy": "session",

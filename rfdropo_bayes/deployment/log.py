@@ -154,7 +154,7 @@ def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> T
 
     Commands are those in force at the policy's rate, before the set-points' limits on rate and acceleration, after
     those on length; drum angles [rad] are measured, tensions [N] come from the drives' torque. Where a drive was silent
-    its last value stands, and ``tension_mask`` is False. Statuswords, set-points and raw actions are kept beside,
+    the tension is missing. Statuswords, set-points and raw actions are kept beside,
     outside the hash: they say how the session went, not what the robot did.
 
     Args:
@@ -188,14 +188,13 @@ def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> T
         command_unit=robot.command_unit,
         marker_names=robot.marker_names,
         cable_names=robot.channel_names,
-        tension=rows["tension"],
+        tension=np.where(rows["fresh"], rows["tension"], np.nan),
         motor_angle=rows["length"] / radius,
         provenance=f"session of {time.strftime('%Y-%m-%d %H:%M:%S', time.gmtime(header['wall_time']))} UTC",
         settings=header["facts"] | ({} if seen.any() else {"unseen": True}),
     )
     cycle, command = ("time", "cable"), ("command_time", "cable")
     beside = {
-        "tension_mask": xr.Variable(cycle, rows["fresh"]),
         "set_point": xr.Variable(cycle, rows["set_point"], {"unit": "m"}),
         "length": xr.Variable(cycle, rows["length"], {"unit": "m"}),
         "statusword": xr.Variable(cycle, rows["statusword"]),

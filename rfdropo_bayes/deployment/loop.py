@@ -253,10 +253,9 @@ class ControlLoop:
                 raise Stop(Cause.MARKERS_LOST, f"marker {name!r} is lost")
 
     def _act(self, source: CommandSource, period: float) -> bool:
-        now = time.monotonic()
-        self.markers.act(now)
+        self.markers.act()
         unit = self.command / self.scale
-        scene = Scene(self.markers.position, self.markers.velocity, unit, self._raw, self.lengths(), self.tensions())
+        scene = Scene(self.markers.position, self.markers.moved, unit, self.lengths(), self.tensions())
         began = time.monotonic()
         act = source.act(scene)
         self.act_times.append(time.monotonic() - began)

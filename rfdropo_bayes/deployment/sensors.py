@@ -253,7 +253,7 @@ def open_sensor(table: SensorTable, robot: Robot) -> MarkerSensor:
 
 
 class MarkerView:
-    """What the loop sees of a sensor: each marker's last good position, how old it is, and its velocity between acts.
+    """What the loop sees of a sensor: each marker's last good position, how old it is, and how far it moved.
 
     Args:
         sensor: that is asked.
@@ -264,11 +264,11 @@ class MarkerView:
     def __init__(self, sensor: MarkerSensor, table: SensorTable, names: tuple[str, ...]) -> None:
         self._sensor, self._table, self._names = sensor, table, names
         self.position = np.zeros((len(names), 3))
-        self.velocity = np.zeros((len(names), 3))
+        self.moved = np.zeros((len(names), 3))  # between the last two acts
         self.fresh = np.zeros(len(names), dtype=bool)
         self._last = np.full(len(names), -np.inf)  # time of the last good position
         self._number = 0
-        self._acted: tuple[float, np.ndarray] | None = None
+        self._acted: np.ndarray | None = None
 
     def update(self, now: float) -> None:
         """Look at the sensor once a cycle."""
@@ -284,8 +284,8 @@ class MarkerView:
         gone = np.flatnonzero(now - self._last > self._table.lost_s)
         return self._names[gone[0]] if gone.size else ""
 
-    def act(self, now: float) -> None:
-        """Note an act of the policy: velocities are differences between acts, as in training."""
-        if self._acted is not None and now > self._acted[0]:
-            self.velocity = (self.position - self._acted[1]) / (now - self._acted[0])
-        self._acted = (now, self.position.copy())
+    def act(self) -> None:
+        """Note an act of the policy: markers have moved since the one before."""
+        if self._acted is not None:
+            self.moved = self.position - self._acted
+        self._acted = self.position.copy()

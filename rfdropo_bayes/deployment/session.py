@@ -154,7 +154,9 @@ class _Session:
         """Before anything is opened: a policy that does not fit is refused without a drive having been touched."""
         settings = self.settings
         if settings.policy is not None and self.mode in (Mode.CHECK, Mode.RUN, Mode.DRY_RUN, Mode.SHADOW):
-            policy = OnnxPolicy(Path(settings.policy.file), self.robot, settings.goal, settings.policy.sha256)
+            policy = OnnxPolicy(
+                Path(settings.policy.file), self.robot, settings.goal, settings.policy.sha256, settings.policy.markers
+            )
             self._facts["policy_sha256"] = policy.sha256
             self.source = policy
 

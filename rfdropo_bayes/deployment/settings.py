@@ -49,11 +49,13 @@ class PolicyTable(_Table):
 
     Attributes:
         file: the ONNX file.
-        sha256: hash that it must have; `rfdropo deploy --mode check` prints the one it has.
+        sha256: hash that it must have; summary.json has the one that ran.
+        markers: those that it sees, where it does not see all of the robot's.
     """
 
     file: str
     sha256: str | None = None
+    markers: tuple[str, ...] | None = None
 
 
 class SafetyTable(_Table):
@@ -152,7 +154,7 @@ class Deployment(_Table):
         rate_hz: of the set-point loop.
         duration_s: of the policy.
         frames: file of CAN frames in the session's folder; .log is candump, .blf binary.
-        goal: values of the policy's "goal." inputs.
+        goal: x, y and z of the policy's goal [m].
         bus, drives, policy, sensor, safety, homing, simulation: see the tables.
     """
 

@@ -9,25 +9,29 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from rfdropo_bayes.deployment.policy import PolicyCard
+from rfdropo_bayes.deployment.policy import METADATA
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots.policy_layout import ObservationPart, PolicyLayout
 
 
 def linear_policy(
     path: Path, robot: Robot, weight: np.ndarray, bias: np.ndarray, /, card: bool = True, **changes: Any
 ) -> Path:
-    """action = observation @ weight + bias, observation as the card says; by default the command and the tip."""
-    channels, tip = robot.channel_names, robot.marker_names[-1]
-    names = tuple(f"command.{channel}" for channel in channels) + tuple(f"marker.{tip}.{axis}" for axis in "xyz")
+    """action = observation @ weight + bias; the observation is commands and markers by default."""
+    channels = robot.channel_names
     table = {
-        "robot": robot.name,
-        "rate_hz": 10.0,
+        "task": "test",
+        "period_s": 0.1,
         "unit": robot.command_unit,
-        "action": "increment",
+        "kind": "continuous",
         "channels": channels,
-        "observation": names,
-        "low": (-0.01,) * len(channels),
-        "high": (0.01,) * len(channels),
+        "observation": (
+            ObservationPart("commands", len(channels), robot.command_unit),
+            ObservationPart("markers", 3 * len(robot.marker_names), "m"),
+        ),
+        "moves": ((0.01,) * len(channels),),
+        "low": (-0.03,) * len(channels),
+        "high": (0.03,) * len(channels),
     }
     values = [numpy_helper.from_array(array.astype(np.float32), name) for array, name in ((weight, "w"), (bias, "b"))]
     graph = helper.make_graph(
@@ -42,6 +46,6 @@ def linear_policy(
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
     if card:
-        helper.set_model_props(model, PolicyCard(**(table | changes)).metadata())
+        helper.set_model_props(model, {METADATA: PolicyLayout(**(table | changes)).to_json()})
     onnx.save(model, str(path))
     return path

@@ -10,59 +10,67 @@ import pytest
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.causes import Cause, Stop
-from rfdropo_bayes.deployment.policy import OnnxPolicy, RecordedCommands, Scene, observer
+from rfdropo_bayes.deployment.policy import OnnxPolicy, RecordedCommands, Scene
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots.policy_layout import ObservationPart
 
 from .policies import linear_policy
 
-INPUTS = 7
+INPUTS = 16  # four commands, four markers
 
 
 def scene(robot: Robot, seed: int = 0) -> Scene:
     random = np.random.default_rng(seed)
     markers, channels = len(robot.marker_names), len(robot.channel_names)
-    return Scene(
-        *[random.normal(size=(markers, 3)) for _ in range(2)], *[random.normal(size=channels) for _ in range(4)]
-    )
+    motion = [random.normal(size=(markers, 3)) for _ in range(2)]
+    command, length, tension = (1e-3 * random.normal(size=channels) for _ in range(3))
+    return Scene(*motion, command, length, tension)
 
 
 def matrix(robot: Robot, seed: int = 1) -> np.ndarray:
     return 1e-4 * np.random.default_rng(seed).normal(size=(INPUTS, len(robot.channel_names)))
 
 
-def test_every_feature_finds_its_value(robot: Robot) -> None:
-    names = ["marker.m2.y", "velocity.m4.z", "command.left", "action.down", "length.right", "tension.up", "goal.x"]
-    seen = scene(robot)
-    expected = [
-        seen.position[1, 1], seen.velocity[3, 2], seen.command[1], seen.action[2], seen.length[3], seen.tension[0], 0.7,
-    ]  # fmt: skip
-    np.testing.assert_allclose(observer(names, robot, {"x": 0.7})(seen), np.float32(expected))
-
-
-@pytest.mark.parametrize(
-    "name", ["marker.m9.x", "marker.m1.w", "command.nobody", "goal.unknown", "weather", "tension.up.x", "goal"]
-)
-def test_an_unknown_feature_is_refused(robot: Robot, name: str) -> None:
-    with pytest.raises(InputError, match="not known here"):
-        observer([name], robot, {"x": 0.0})
-
-
 def test_a_policy_acts_as_its_matrix_says(robot: Robot, tmp_path: Path) -> None:
     weight, bias, seen = matrix(robot), np.full(4, 1e-3), scene(robot)
     policy = OnnxPolicy(linear_policy(tmp_path / "p.onnx", robot, weight, bias), robot, {})
     act = policy.act(seen)
-    expected = np.concatenate([seen.command, seen.position[-1]]) @ weight + bias
+    expected = np.concatenate([seen.command, seen.position.ravel()]) @ weight + bias
     np.testing.assert_allclose(act.raw, expected, atol=1e-7)
     np.testing.assert_allclose(act.command, seen.command + expected, atol=1e-7)
+    assert policy.rate_hz == pytest.approx(10.0)
 
 
-def test_outputs_are_sorted_to_the_robots_channels(robot: Robot, tmp_path: Path) -> None:
-    backwards = robot.channel_names[::-1]
-    path = linear_policy(
-        tmp_path / "p.onnx", robot, np.zeros((INPUTS, 4)), np.array([1, 2, 3, 4]) * 1e-3, channels=backwards
+def test_every_part_finds_its_values(robot: Robot, tmp_path: Path) -> None:
+    """One policy that copies a chosen input to its outputs, for every part; markers only those that are named."""
+    names = ("lengths", "goal", "moved", "tensions", "markers", "commands")
+    sizes = {"goal": 3, "moved": 6, "markers": 6}
+    parts = tuple(ObservationPart(name, sizes.get(name, 4), "-") for name in names)
+    seen = scene(robot)
+    chosen = [3, 1]
+    expected = np.concatenate(
+        [
+            seen.length,
+            [0.1, 0.2, 0.3],
+            seen.moved[chosen].ravel(),
+            seen.tension,
+            seen.position[chosen].ravel(),
+            seen.command,
+        ]
     )
-    np.testing.assert_allclose(OnnxPolicy(path, robot, {}).act(scene(robot)).raw, [4e-3, 3e-3, 2e-3, 1e-3], atol=1e-9)
+    for column, value in enumerate(expected):
+        weight = np.zeros((len(expected), 4))
+        weight[column] = 1e-3
+        path = linear_policy(tmp_path / "p.onnx", robot, weight, np.zeros(4), observation=parts)
+        goal = {"x": 0.1, "y": 0.2, "z": 0.3}
+        policy = OnnxPolicy(path, robot, goal, markers=[robot.marker_names[k] for k in chosen])
+        np.testing.assert_allclose(policy.act(seen).raw, 1e-3 * value, atol=1e-9)
+
+
+def test_commands_end_at_the_limits_of_the_layout(robot: Robot, tmp_path: Path) -> None:
+    path = linear_policy(tmp_path / "p.onnx", robot, np.zeros((INPUTS, 4)), np.full(4, 9e-3), high=(0.001,) * 4)
+    np.testing.assert_allclose(OnnxPolicy(path, robot, {}).act(scene(robot)).command, 0.001)
 
 
 @pytest.mark.parametrize(("value", "cause"), [(np.nan, Cause.ACTION_NOT_FINITE), (0.5, Cause.ACTION_OUTSIDE)])
@@ -77,29 +85,26 @@ def test_outputs_that_cannot_be_meant_end_the_session(robot: Robot, tmp_path: Pa
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"robot": "trunk_sofa"}, "was made for robot 'trunk_sofa'"),
         ({"unit": "rad"}, "acts in rad"),
         ({"channels": ("a", "b", "c", "d")}, "drives a, b, c, d"),
-        ({"observation": ("command.up",)}, "its card lists 1 observations"),
-        ({"low": (0.0,)}, "do not fit its channels"),
-        ({"high": (-0.01,) * 4}, "do not fit its channels"),
-        ({"rate_hz": -1.0}, "greater than 0"),
+        ({"channels": ("right", "down", "left", "up")}, "drives right, down, left, up"),
+        ({"observation": (ObservationPart("commands", 16, "m"),)}, "wants 16 numbers of 'commands'"),
+        ({"observation": (ObservationPart("markers", 16, "m"),)}, "wants 16 numbers of 'markers'; here there are 12"),
+        ({"observation": (ObservationPart("object", 16, "m"),)}, "wants 'object', which nothing here measures"),
+        ({"observation": (ObservationPart("goal", 3, "m"),)}, "wants a goal"),
+        ({"observation": (ObservationPart("commands", 4, "m"),)}, "takes .* of width 16, its layout 4"),
     ],
 )
-def test_cards_that_do_not_fit_are_refused(robot: Robot, tmp_path: Path, changes: dict, message: str) -> None:
-    path = tmp_path / "p.onnx"
-    if "rate_hz" in changes:
-        import onnx
-
-        linear_policy(path, robot, matrix(robot), np.zeros(4))
-        model = onnx.load(str(path))
-        for entry in model.metadata_props:
-            entry.value = "-1.0" if entry.key == "rfdropo.rate_hz" else entry.value
-        onnx.save(model, str(path))
-    else:
-        linear_policy(path, robot, matrix(robot), np.zeros(4), **changes)
+def test_layouts_that_do_not_fit_are_refused(robot: Robot, tmp_path: Path, changes: dict, message: str) -> None:
+    path = linear_policy(tmp_path / "p.onnx", robot, matrix(robot), np.zeros(4), **changes)
     with pytest.raises(InputError, match=message):
         OnnxPolicy(path, robot, {})
+
+
+def test_an_unknown_marker_is_refused(robot: Robot, tmp_path: Path) -> None:
+    path = linear_policy(tmp_path / "p.onnx", robot, matrix(robot), np.zeros(4))
+    with pytest.raises(InputError, match="no marker 'm9'"):
+        OnnxPolicy(path, robot, {}, markers=["m9"])
 
 
 def test_the_hash_must_be_the_one_that_was_meant(robot: Robot, tmp_path: Path) -> None:
@@ -118,7 +123,7 @@ def test_files_that_are_no_policies_are_refused(robot: Robot, tmp_path: Path) ->
     with pytest.raises(InputError, match="is no ONNX model"):
         OnnxPolicy(path, robot, {})
     linear_policy(path, robot, matrix(robot), np.zeros(4), card=False)
-    with pytest.raises(InputError, match="no card"):
+    with pytest.raises(InputError, match="no layout"):
         OnnxPolicy(path, robot, {})
 
 

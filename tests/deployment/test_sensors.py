@@ -79,14 +79,14 @@ def test_positions_that_are_no_numbers_are_lost() -> None:
     assert np.all(np.isfinite(view.position))
 
 
-def test_velocity_is_between_acts() -> None:
+def test_motion_is_between_acts() -> None:
     sensor = Scripted()
     view = MarkerView(sensor, SensorTable(), NAMES)
     for number in range(3):
         sensor.show(10.0 + 0.1 * number, 0.03 * number)
         view.update(10.0 + 0.1 * number)
-        view.act(10.0 + 0.1 * number)
-    np.testing.assert_allclose(view.velocity, 0.3)
+        view.act()
+    np.testing.assert_allclose(view.moved, 0.03)
 
 
 def test_no_sensor_sees_nothing() -> None:

@@ -41,7 +41,7 @@ PATIENT = SafetyTable(
 
 def turning(path: Path, robot: Robot, gain: float = 0.004) -> Path:
     """A policy that turns the command, pushed by the tip's height: cables go round in circles of some millimetres."""
-    weight, turn = np.zeros((7, 4)), 0.5
+    weight, turn = np.zeros((16, 4)), 0.5
     for a, b in ((0, 2), (1, 3)):
         weight[[a, a, b, b], [a, b, a, b]] = [np.cos(turn) - 1, np.sin(turn), -np.sin(turn), np.cos(turn) - 1]
     weight[-1, :2] = gain / robot.marker_points()[-1, 2]
@@ -203,7 +203,7 @@ def test_a_plant_may_live_in_a_process_of_its_own(dry_run, tmp_path: Path) -> No
 
 
 def test_a_policy_for_another_rate_is_refused_with_its_cause_in_the_log(robot: Robot, tmp_path: Path) -> None:
-    policy = linear_policy(tmp_path / "p.onnx", robot, np.zeros((7, 4)), np.zeros(4), rate_hz=30.0)
+    policy = linear_policy(tmp_path / "p.onnx", robot, np.zeros((16, 4)), np.zeros(4), period_s=1 / 30)
     settings = Deployment(robot="motor_arm", policy=PolicyTable(file=str(policy)))
     with pytest.raises(InputError, match="30 Hz of the policy does not divide 100 Hz"):
         deploy(settings, "dry-run", tmp_path / "s")
