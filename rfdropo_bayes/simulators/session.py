@@ -7,7 +7,7 @@ between two calls. Its state is plain arrays with one row a lane.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
@@ -121,14 +121,15 @@ class Session:
         self._check_mechanisms(simulator.mechanisms)
         self.bodies: BodyLanes = simulator.body_lanes(lanes)
         self._specs = {spec.name: spec for spec in simulator.parameters}
-        self._values = {name: jnp.full(lanes, spec.nominal) for name, spec in self._specs.items()}
+        self._table = np.tile([spec.nominal for spec in self._specs.values()], (lanes, 1))
+        self._values = jnp.asarray(self._table)
         command = self.robot.command
         kept = math.ceil((command.ramp_s + command.dead_time_s) / self.period + WHOLE) + 2
         channels = len(self.robot.channel_names)
         self._past = _Past(np.full((lanes, kept), -np.inf), np.zeros((lanes, kept, channels)), np.zeros(lanes, int))
         self._started = np.zeros(lanes, bool)
         self._drives = self._first_drives(self._values, np.zeros((lanes, channels)))
-        self._cameras = self._first_cameras(self._values, np.zeros((lanes, len(self.robot.marker_names), 3)))[0]
+        self._cameras = self._first_look(self._values, np.zeros((lanes, len(self.robot.marker_names), 3)))[0]
 
     @property
     def time(self) -> Float[np.ndarray, " lane"]:
@@ -143,7 +144,7 @@ class Session:
     @property
     def parameters(self) -> dict[str, Float[np.ndarray, " lane"]]:
         """Values of all parameters in every lane."""
-        return {name: np.array(value) for name, value in self._values.items()}
+        return {name: self._table[:, i].copy() for i, name in enumerate(self._specs)}
 
     def reset(
         self,
@@ -183,7 +184,7 @@ class Session:
         )
         position = np.zeros((self.lanes, *found.position.shape[1:]))
         position[rows] = found.position
-        cameras, seen = self._first_cameras(self._values, position)
+        cameras, seen = self._first_look(self._values, position)
         self._cameras = _chosen(chosen, cameras, self._cameras)
         self._started |= chosen
         return Observation(np.asarray(seen)[rows], found.tension, None, status_of(found), first.copy())
@@ -215,10 +216,9 @@ class Session:
 
     def save(self) -> dict[str, np.ndarray]:
         """A copy of the state: arrays by name, one row a lane."""
-        values = np.stack([np.asarray(value) for value in self._values.values()], axis=1)
         return {
             "started": self._started.copy(),
-            "parameters": values,
+            "parameters": self._table.copy(),
             "command_time": self._past.given.copy(),
             "command": self._past.value.copy(),
             "periods": self._past.periods.copy(),
@@ -246,7 +246,7 @@ class Session:
                 part[chosen] = state[name]
         self.bodies.restore(chosen, state["bodies"])
         self._started = mine["started"]
-        self._values = {name: jnp.asarray(mine["parameters"][:, i]) for i, name in enumerate(self._values)}
+        self._table, self._values = mine["parameters"], jnp.asarray(mine["parameters"])
         self._past = _Past(mine["command_time"], mine["command"], mine["periods"])
         self._drives, self._cameras = (
             lanes_like(self._drives, mine["drives"]),
@@ -277,10 +277,16 @@ class Session:
         for mechanism in self.simulator.mechanisms:
             if hasattr(mechanism, "check_steps"):
                 mechanism.check_steps({spec.name: given[spec.name] for spec in mechanism.parameters})
-        for name, value in given.items():
-            whole = np.array(self._values[name])
-            whole[rows] = value
-            self._values[name] = jnp.asarray(whole)
+        self._table[rows] = np.stack([given[name] for name in self._specs], axis=1)
+        self._values = jnp.asarray(self._table)
+
+    def _by_lane(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """A function of one lane's values by name, for all lanes' table of values."""
+
+        def of_table(row: Float[Array, " parameter"], *others: Any) -> Any:
+            return function(dict(zip(self._specs, row, strict=True)), *others)
+
+        return jax.jit(jax.vmap(of_table))
 
     def _sent(self, commands: Float[np.ndarray, "lane channel"]) -> Float[np.ndarray, "lane step channel"]:
         """What the drives carry out in every step of the period, ramps and dead time included."""
@@ -307,7 +313,7 @@ class Session:
             cables, encoders = (tuple(m.begin(values, command, interval) for m in chain) for chain in chains)
             return _Drives(cables, encoders, self.simulator.unwound(values, command))
 
-        return jax.jit(jax.vmap(first))
+        return self._by_lane(first)
 
     @cached_property
     def _move_drives(self) -> Any:
@@ -331,7 +337,7 @@ class Session:
             after, (displacement, angle) = jax.lax.scan(one, drives, commands)
             return after, displacement, angle[-1]
 
-        return jax.jit(jax.vmap(move))
+        return self._by_lane(move)
 
     @cached_property
     def _bodies_of(self) -> Any:
@@ -340,7 +346,7 @@ class Session:
         def of(values: Values, wound: Wound) -> tuple[Material, Float[Array, " cable"]]:
             return self.simulator.material(values), wound.level + self.simulator.pretension(values)
 
-        return jax.jit(jax.vmap(of))
+        return self._by_lane(of)
 
     @property
     def _camera_chain(self) -> list[Any]:
@@ -364,29 +370,27 @@ class Session:
             offset = jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])
             return tuple(after), position + offset
 
-        return jax.jit(jax.vmap(look))
+        return self._by_lane(look)
 
     @cached_property
-    def _first_cameras(self) -> Any:
-        """Cameras of all lanes after the first observation, and what they see of it."""
+    def _first_look(self) -> Any:
+        """As `_look`, for first observations."""
         chain = self._camera_chain
 
-        def first(values: Values, position: Float[Array, "marker 3"]) -> tuple[Any, ...]:
-            memories = []
+        def first(
+            values: Values, position: Float[Array, "marker 3"]
+        ) -> tuple[tuple[Any, ...], Float[Array, "marker 3"]]:
+            memories, shown = [], position
             for mechanism in chain:
-                stepped = isinstance(mechanism, SteppedMechanism)
-                memories.append(mechanism.begin(values, position, self.period) if stepped else ())
-                if stepped:
-                    position = mechanism.advance(values, memories[-1], position, jnp.zeros(()))[1]
+                if isinstance(mechanism, SteppedMechanism):
+                    memory = mechanism.begin(values, shown, self.period)
+                    memory, shown = mechanism.advance(values, memory, shown, jnp.zeros(()))
                 else:
-                    position = mechanism.sense(values, position[None])[0]
-            return tuple(memories)
+                    memory, shown = (), mechanism.sense(values, shown[None])[0]
+                memories.append(memory)
+            return tuple(memories), shown + jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])
 
-        def shown(values: Values, position: Float[Array, "lane marker 3"]) -> tuple[Any, Float[Array, "lane marker 3"]]:
-            memories = jax.vmap(first)(values, position)
-            return self._look(values, memories, position, jnp.zeros(self.lanes))
-
-        return jax.jit(shown)
+        return self._by_lane(first)
 
 
 def status_of(found: LaneMotion) -> Int[np.ndarray, " lane"]:
