@@ -238,7 +238,7 @@ class RecordedCommands:
     Args:
         recording: of an earlier session, or any trajectory of this robot.
         robot: that is to be driven.
-        rate_hz: how often the command in force is looked up.
+        rate_hz: of the commands; each stays in force for a whole number of periods.
 
     Raises:
         InputError: if channels or unit do not fit.
@@ -255,8 +255,12 @@ class RecordedCommands:
                 remedy="replay it on the robot it was recorded on",
             )
         self.rate_hz, self.start = rate_hz, np.array(recording.initial_command)
-        end = max(float(recording.time[-1]), float(recording.command_time[-1]) + 1.0 / rate_hz)
-        self._commands = recording.command_at(np.arange(0.0, end, 1.0 / rate_hz))
+        times = np.append(recording.command_time, max(recording.time[-1], recording.command_time[-1] + 1.0 / rate_hz))
+        before = round(float(times[0]) * rate_hz)
+        # Each command for whole periods: a beat that its session missed must not turn into a command twice or never.
+        periods = np.maximum(1, np.round(np.diff(times) * rate_hz)).astype(int)
+        commands = np.concatenate([recording.initial_command[None], recording.command])
+        self._commands = np.repeat(commands, np.append(before, periods), axis=0)
         self._next = 0
 
     def act(self, scene: Scene) -> Act | None:
