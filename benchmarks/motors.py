@@ -34,7 +34,7 @@ from rfdropo_bayes.robots.policy_layout import ObservationPart, PolicyLayout
 
 ROBOTS = ("motor_arm", "motor_trunk")
 PERIOD = 0.01  # [s]
-IDLE_RUNS, IDLE_SECONDS = 5, 4.0
+IDLE_RUNS, IDLE_SECONDS = 5, 2.0
 PERCENTILES = (50, 99, 100)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -84,7 +85,10 @@ class LoggedNetwork(canopen.Network):
         self._log = log
         listeners: list[can.Listener] = [*self.listeners, *([log] if log is not None else [])]
         self.listeners = listeners  # type: ignore[assignment]
+        before = set(threading.enumerate())
         self.connect()
+        self.receivers = set(threading.enumerate()) - before
+        """Threads that python-can receives with; they need the control loop's priority."""
 
     def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
         """Send a frame.

@@ -182,8 +182,8 @@ class _Session:
         opened = open_bus(bus_table) if bus is None else bus
         self.network = LoggedNetwork(opened, self.log.frames)
         self._stack.callback(self._leave)
-        for thread in threading.enumerate():
-            if thread.name.startswith("can.notifier") and thread.native_id is not None:
+        for thread in self.network.receivers:
+            if thread.native_id is not None:
                 schedule_fifo(thread.native_id)
         guards = settings.safety.guards()
         motors = self._motors()
