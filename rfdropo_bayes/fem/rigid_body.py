@@ -23,6 +23,7 @@ class Cube(NamedTuple):
     mass: Float[Array, ""]  # [kg]
     side: Float[Array, ""]  # [m]
     gyration_radius: Float[Array, ""]  # root of the moment of inertia per mass, about any axis [m]
+    friction: Float[Array, ""]  # Coulomb's coefficient on whatever it touches
 
 
 class CubeState(NamedTuple):

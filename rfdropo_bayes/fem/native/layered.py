@@ -20,18 +20,29 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
 from rfdropo_bayes.fem.equilibrium import ITERATIONS
 from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.native.constraint_problem import SETTLED, Problem, problem_storage
+from rfdropo_bayes.fem.native.contact_records import (
+    MISSED,
+    PushOutput,
+    Touch,
+    cube_rows,
+    pairs_of,
+    scene_tables,
+    touch_storage,
+)
 from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, has_friction, law_rows
 from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
-from rfdropo_bayes.fem.native.layered_friction import compile_rollout as compile_friction_rollout
+from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, Storage, compile_rollout, storage
-from rfdropo_bayes.fem.native.section_modes import layered_tables
+from rfdropo_bayes.fem.native.section_modes import border_panels, layered_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
-from rfdropo_bayes.fem.native.slip_records import Friction, friction_storage, runs_of
+from rfdropo_bayes.fem.native.slip_records import KINDS, Friction, friction_storage, runs_of
+from rfdropo_bayes.fem.pushing import PushScene
 
 Precision = Literal["float64", "float32"]
-# Tolerance of the tension problem and relative compliance added to every cable, as far as the precision resolves them;
+# When a step's impulses are found and what counts as a missed contact, as far as the precision resolves them;
 # refinements of every step's linear solution.
-_NUMERICS = {"float64": (1e-12, 0.0, 0), "float32": (1e-6, 1e-6, 1)}
+_NUMERICS = {name: (SETTLED[name], MISSED[name], number) for name, number in (("float64", 0), ("float32", 1))}
 
 
 class NativeRollout(NamedTuple):
@@ -43,20 +54,15 @@ class NativeRollout(NamedTuple):
     position: Float[np.ndarray, "batch rows points 3"]  # [m]
     tension: Float[np.ndarray, "batch rows cables"]  # [N]
     diverged: Bool[np.ndarray, " batch"]
-    cables_converged: Bool[np.ndarray, " batch"]
+    converged: Bool[np.ndarray, " batch"]  # whether the impulses of every step's constraints were found
     residual: Float[np.ndarray, " batch"]  # relative force out of balance in the initial equilibrium; 0 without one
+    pose: Float[np.ndarray, "batch rows 7"] | None = None  # of the cube: centre [m], unit quaternion (x, y, z, w)
 
 
 @cache
 def _kernel() -> Callable:
     """The rollout kernel."""
     return compile_rollout(kernel_sources("layered_rollout"))
-
-
-@cache
-def _friction_kernel() -> Callable:
-    """The rollout kernel of bodies whose cables rub."""
-    return compile_friction_rollout(kernel_sources("layered_friction"))
 
 
 def available_threads() -> int:
@@ -74,6 +80,7 @@ class NativeLayered:
         precision: of all arithmetic; parameters, commands and results are float64 in any case.
         threads: lane blocks computed at the same time; None for all processors this process may use.
         lanes: samples side by side; None for as many as a vector register holds.
+        scene: what the body pushes a cube on; None for a body that touches nothing.
 
     Raises:
         InputError: unknown precision, or a number of threads or lanes that makes no sense.
@@ -88,6 +95,7 @@ class NativeLayered:
         precision: Precision = "float64",
         threads: int | None = None,
         lanes: int | None = None,
+        scene: PushScene | None = None,
     ) -> None:
         if precision not in _NUMERICS:
             raise InputError(f"precision {precision!r}", remedy=f"use one of {', '.join(_NUMERICS)}")
@@ -100,6 +108,8 @@ class NativeLayered:
         self.points = len(points.node)
         self._tables = layered_tables(system, points, self.dtype.type)
         self._runs = runs_of(system.cables)
+        numbers, shape = np.arange(system.body.nodes), np.asarray(self._tables.shape, dtype=float)
+        self._scene = None if scene is None else scene_tables(scene, shape, numbers, self.dtype.type)
         self._token = lane_token(self.lanes)
         self._local = threading.local()
 
@@ -113,6 +123,7 @@ class NativeLayered:
         tension: Float[np.ndarray, "*batch cables"] | None = None,
         steps: int | None = None,
         stride: int = 1,
+        cube: tuple[Float[np.ndarray, "*batch 13"], Float[np.ndarray, "*batch 4"]] | None = None,
     ) -> NativeRollout:
         """Roll out a batch.
 
@@ -126,22 +137,36 @@ class NativeLayered:
             tension: initial cable tensions [N], where the first tension problem is started; None means zero.
             steps: compute only so many steps.
             stride: record every so many steps.
+            cube: of an engine with a scene: centre [m], unit quaternion (x, y, z, w), velocity [m/s] and spin [rad/s]
+                at the start; mass [kg], side [m], radius of gyration [m] and coefficient of friction.
 
         Raises:
-            InputError: shapes that do not fit.
+            InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
         """
         state = {"start": start, "position": position, "tension": tension}
         batch, schedule, output = self._inputs(material, displacement, state, steps, stride)
-        rubs = has_friction(material.effects)
-        kernel, tables, token = _friction_kernel() if rubs else _kernel(), self._tables, self._token
+        if (cube is None) != (self._scene is None):
+            raise InputError("a scene without a cube, or a cube without a scene", where="rollout")
+        rubs, kernel = has_friction(material.effects), _kernel()
+        runs = self._runs if rubs else None
+        cubes = poses = None
+        if cube is not None:
+            cubes = cube_rows(*cube, batch.count, self.dtype)
+            poses = PushOutput(np.zeros((batch.count, output.records, 7)))
 
         def block(first: int) -> None:
-            friction = (self._runs, self._friction()) if rubs else ()
-            kernel(tables, batch, *self._storage(), *friction, schedule, output, first, token)
+            samples, factors, work = self._storage()
+            rows, problem = self._rows(rubs)
+            kernel(
+                self._tables, runs, self._scene, batch, cubes, samples, factors, work,
+                self._friction() if rubs else None, self._touch(), rows, problem, schedule, output, poses, first,
+                self._token,
+            )  # fmt: skip
 
         in_blocks(block, batch.count, self.lanes, self.threads)
-        codes = output.diverged.view(bool), output.cables_converged.view(bool)
-        return NativeRollout(output.position, output.tension, *codes, output.residual)
+        codes = output.diverged.view(bool), output.converged.view(bool)
+        pose = None if poses is None else poses.pose
+        return NativeRollout(output.position, output.tension, *codes, output.residual, pose)
 
     def _inputs(
         self,
@@ -222,8 +247,31 @@ class NativeLayered:
     def _friction(self) -> Friction:
         """Friction of the calling thread."""
         if not hasattr(self._local, "friction"):
-            self._local.friction = friction_storage(self._tables, self._runs, self.lanes, self.dtype.type)
+            self._local.friction = friction_storage(self._runs, self.lanes, self.dtype.type)
         return self._local.friction
+
+    def _touch(self) -> Touch | None:
+        """Contacts of the calling thread."""
+        if self._scene is None:
+            return None
+        if not hasattr(self._local, "touch"):
+            self._local.touch = touch_storage(self._scene.spheres, self.lanes, self.dtype.type)
+        return self._local.touch
+
+    def _rows(self, rubs: bool) -> tuple[Rows, Problem]:
+        """Border rows and constraints of the calling thread, with friction of the cables or without."""
+        kept = self._local.__dict__.setdefault("rows", {})
+        if rubs not in kept:
+            tables, runs = self._tables, KINDS * self._runs.count if rubs else 0
+            pairs = 0 if self._scene is None else pairs_of(self._scene.spheres)
+            kept[rubs] = (
+                row_storage(
+                    3 * tables.stations * tables.modes, (runs + 2) // 3 + pairs, border_panels(tables.cables),
+                    self.lanes, self.dtype.type,
+                ),
+                problem_storage(tables.cables + runs, pairs, self.lanes, self.dtype.type),
+            )  # fmt: skip
+        return kept[rubs]
 
 
 def in_blocks(block: Callable[[int], None], count: int, lanes: int, threads: int) -> None:
