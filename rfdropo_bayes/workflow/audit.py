@@ -31,7 +31,7 @@ from rfdropo_bayes.report.audit_page import render_audit
 from rfdropo_bayes.report.summary import combined_hash
 from rfdropo_bayes.robots import Robot, outline
 from rfdropo_bayes.simulators.commands import Commands
-from rfdropo_bayes.simulators.compiled import CompiledEngine, effects_costly
+from rfdropo_bayes.simulators.engine import effects_costly
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, obstacle
 from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -260,15 +260,16 @@ def _lanes(
 
 def _brisk(simulator: RobotSimulator, marker_index: np.ndarray) -> Lanes:
     """Lanes with one-sided differences where there are any: they are exact enough for climbs and scores."""
-    if isinstance(simulator, TrunkSimulator) and isinstance(simulator.engine, CompiledEngine):
-        quick = replace(simulator, engine=replace(simulator.engine, one_sided=True))
+    if isinstance(simulator, TrunkSimulator) and simulator.engine.backend.name == "numba":
+        engine = simulator.engine
+        quick = replace(simulator, engine=replace(engine, backend=engine.backend._replace(one_sided=True)))
         return Lanes(quick, marker_index, slope_rollouts=2)
     return Lanes(simulator, marker_index)
 
 
 def _costly(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
-    """Whether a mechanism acts on the body in a way that slows the compiled engine down, or that it does not know."""
-    if not isinstance(mechanism, BodyMechanism) or not isinstance(simulator.engine, CompiledEngine):
+    """Whether a mechanism acts on the body in a way that slows the compiled engine down."""
+    if not isinstance(mechanism, BodyMechanism) or simulator.engine.backend.name != "numba":
         return False
     values = simulator.complete({})
     plain = replace(simulator, mechanisms=()).material(values)
