@@ -16,7 +16,8 @@ import solids
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.contact import contact_frame, solve_constraints
+from rfdropo_bayes.fem.constraints import Contacts, solve_constraints
+from rfdropo_bayes.fem.pushing import contact_frame
 from rfdropo_bayes.fem.rigid_body import (
     CORNERS,
     Cube,
@@ -214,20 +215,22 @@ def benchmarks() -> Iterator[Reference]:
 
 def sliding() -> Iterator[Reference]:
     """A cube of 35 mm and 50 g on a tilted plate."""
-    cube = Cube(jnp.asarray(0.05), jnp.asarray(0.035), solid_gyration_radius(0.035))
+    side = jnp.asarray(0.035)
     up, time_step, count = jnp.array([0.0, 1.0, 0.0]), 0.01, 50
     frame = contact_frame(jnp.tile(up, (8, 1)))
 
     @jax.jit
     def speed(angle: float, friction: float) -> jax.Array:
         gravity = GRAVITY * jnp.array([jnp.sin(angle), -jnp.cos(angle), 0.0])
+        cube = Cube(jnp.asarray(0.05), side, solid_gyration_radius(side), friction)
 
         def step(state, _):
             arm = (CORNERS * cube.side) @ rotation_matrix(state.orientation).T
             rows = jnp.concatenate([frame, jnp.cross(arm[:, None, :], frame)], axis=2).reshape(24, 6)
             twist, mass = free_twist(state, gravity, 0.0, time_step), inverse_inertia(cube)
-            gap = jnp.zeros((8, 3)).at[:, 0].set((state.position[1] + arm[:, 1]) / time_step).ravel()
-            found = solve_constraints((rows * mass) @ rows.T, rows @ twist + gap, 0, friction, jnp.zeros(0))
+            contacts = Contacts((state.position[1] + arm[:, 1]) / time_step, friction)
+            nothing = jnp.zeros(0)
+            found = solve_constraints((rows * mass) @ rows.T, rows @ twist, nothing, time_step, contacts=contacts)
             return moved(state, twist + mass * (rows.T @ found.contact.ravel()), time_step), None
 
         start = cube_at(jnp.array([0.0, 0.0175, 0.0]), 0.0, up)

@@ -37,10 +37,11 @@ import peers
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.simulators.engine import Engine
 from rfdropo_bayes.simulators.protocol import Result
-from rfdropo_bayes.simulators.trunk import Assembly, Discretisation, Engine
+from rfdropo_bayes.simulators.trunk import Assembly
 from rfdropo_bayes.workflow.assembly import build_simulator
-from rfdropo_bayes.workflow.engines import build_engine
+from rfdropo_bayes.workflow.engines import backend
 from rfdropo_bayes.workflow.experiment import Experiment, SimulatorTable
 
 SOLVES = 100
@@ -142,7 +143,7 @@ def bar_material(young_modulus: jax.Array, density: jax.Array, **changes: Any) -
 
 def bar_engine(case: Case, from_equilibrium: bool) -> Engine:
     """The engine of a case, for the bar."""
-    return build_engine(case.table, bar(), Discretisation(TIME_STEP), from_equilibrium)
+    return Engine(bar(), TIME_STEP, backend(case.table, True), from_equilibrium)
 
 
 def bar_rollouts(case: Case) -> tuple[Run, Values]:

@@ -2,7 +2,8 @@
 
     python benchmarks/stepping.py [--lanes N [N ...]] [--seconds S] [--json FILE]
 
-The trunk of TrunkReach goes through commands, drives, body and cameras, with parameters that differ from lane to lane.
+The trunk of TrunkReach, and that of TrunkPush which presses on its cube, go through commands, drives, body and cameras,
+with parameters that differ from lane to lane.
 "Whole" is the compiled engine's batch of 100-solve rollouts of the same lanes. Rates are those of the clock on the wall
 and of processor time, which a busy machine leaves as it is. Memory is that of all lanes' state. Then what it costs to
 start all lanes anew, from rest, from an equilibrium, and from one found before.
@@ -23,6 +24,7 @@ import numpy as np
 from rfdropo_bayes.fem.native.layered import available_threads
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators import Commands
+from rfdropo_bayes.simulators.pushing import PushSimulator
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 from rfdropo_bayes.workflow.assembly import build_simulator
 from rfdropo_bayes.workflow.experiment import Experiment
@@ -34,6 +36,7 @@ class Row(NamedTuple):
     """One line of the table."""
 
     what: str
+    scene: str
     precision: str
     threads: int
     lanes: int
@@ -42,23 +45,29 @@ class Row(NamedTuple):
     kib_per_lane: float | None
 
 
-def simulator(precision: str, threads: int | None, state: str = "rest") -> TrunkSimulator:
-    """The trunk of the paper on the compiled engine."""
-    table = {"robot": ROBOT, "simulator": {"engine": "numba", "precision": precision, "threads": threads}}
+def simulator(
+    precision: str, threads: int | None, state: str = "rest", *, push: bool = False
+) -> TrunkSimulator | PushSimulator:
+    """The trunk of the paper on the compiled engine, alone or with its cube."""
+    options = {"engine": "numba", "precision": precision, "threads": threads, "push": push}
+    table = {"robot": ROBOT, "simulator": options}
     robot = load_robot(ROBOT).model_copy(update={"initial_state": state})
     built = build_simulator(Experiment.model_validate(table), robot)
-    assert isinstance(built, TrunkSimulator)
+    assert isinstance(built, TrunkSimulator | PushSimulator)
     return built
 
 
-def drawn(lanes: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def drawn(lanes: int, push: bool = False) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Parameters and commands [m] of every lane: one of eight cables moves 5 mm in each period."""
     random = np.random.default_rng(0)
     values = {"young_modulus": random.uniform(2e6, 7e6, lanes), "trunk_mass": random.uniform(0.1, 1.0, lanes)}
     moves = np.zeros((lanes, ACTIONS, 8))
     cable, sign = random.integers(8, size=(lanes, ACTIONS)), random.choice([-0.005, 0.005], (lanes, ACTIONS))
     np.put_along_axis(moves, cable[..., None], sign[..., None], axis=2)
-    return values, np.clip(np.cumsum(moves, axis=1), 0.0, 0.04)
+    commands = np.clip(np.cumsum(moves, axis=1), 0.0, 0.04)
+    if push:  # the lower cables bring the trunk onto the cube
+        commands[..., [2, 6]] = np.linspace(0.01, 0.04, ACTIONS)[:, None]
+    return values, commands
 
 
 def rate(run: Callable[[], Any], solves: int, seconds: float) -> tuple[float, float]:
@@ -73,9 +82,9 @@ def rate(run: Callable[[], Any], solves: int, seconds: float) -> tuple[float, fl
     return wall, cpu
 
 
-def sessions(model: TrunkSimulator, lanes: int, seconds: float) -> tuple[float, float, float]:
+def sessions(model: TrunkSimulator | PushSimulator, lanes: int, seconds: float) -> tuple[float, float, float]:
     """Rates and memory [KiB per lane] of a session."""
-    values, commands = drawn(lanes)
+    values, commands = drawn(lanes, isinstance(model, PushSimulator))
     session = model.session(lanes, PERIOD)
     session.reset(np.arange(lanes), values)
 
@@ -86,9 +95,9 @@ def sessions(model: TrunkSimulator, lanes: int, seconds: float) -> tuple[float, 
     return *rate(act, lanes * ACTIONS * SOLVES, seconds), session.nbytes / lanes / 1024
 
 
-def whole(model: TrunkSimulator, lanes: int, seconds: float) -> tuple[float, float]:
+def whole(model: TrunkSimulator | PushSimulator, lanes: int, seconds: float) -> tuple[float, float]:
     """Rates of whole rollouts of the same commands."""
-    values, commands = drawn(lanes)
+    values, commands = drawn(lanes, isinstance(model, PushSimulator))
     clock = PERIOD * np.arange(ACTIONS + 1)
     grid = [model.commands(clock[:-1], rows, np.zeros(8), clock) for rows in commands]
     stacked = Commands(*(np.stack(parts) for parts in zip(*grid, strict=True)))
@@ -120,21 +129,22 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="also write the rows here")
     chosen = parser.parse_args()
     rows = []
-    for precision in ("float32", "float64"):
-        for threads in (1, None):
-            model = simulator(precision, threads)
-            used = threads or available_threads()
-            for lanes in chosen.lanes:
-                wall, cpu, memory = sessions(model, lanes, chosen.seconds)
-                rows.append(Row("session", precision, used, lanes, wall, cpu, memory))
-                rows.append(Row("whole", precision, used, lanes, *whole(model, lanes, chosen.seconds), None))
-    print(
-        "| | precision | threads | lanes | solves/s | solves per CPU s | KiB per lane |\n|---|---|---|---|---|---|---|"
-    )
+    for push in (False, True):
+        scene = "push" if push else "reach"
+        for precision in ("float32", "float64"):
+            for threads in sorted({1, available_threads()}):
+                model = simulator(precision, threads, push=push)
+                for lanes in chosen.lanes:
+                    wall, cpu, memory = sessions(model, lanes, chosen.seconds)
+                    rows.append(Row("session", scene, precision, threads, lanes, wall, cpu, memory))
+                    wall, cpu = whole(model, lanes, chosen.seconds)
+                    rows.append(Row("whole", scene, precision, threads, lanes, wall, cpu, None))
+    print("| | scene | precision | threads | lanes | solves/s | solves per CPU s | KiB per lane |")
+    print("|---|---|---|---|---|---|---|---|")
     for row in rows:
         memory = "" if row.kib_per_lane is None else f"{row.kib_per_lane:.1f}"
         speed = f"{row.per_second:,.0f} | {row.per_cpu_second:,.0f}"
-        print(f"| {row.what} | {row.precision} | {row.threads} | {row.lanes} | {speed} | {memory} |")
+        print(f"| {row.what} | {row.scene} | {row.precision} | {row.threads} | {row.lanes} | {speed} | {memory} |")
     print("\n| start | ms |\n|---|---|")
     print("\n".join(starts(max(chosen.lanes))))
     if chosen.json:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -65,16 +64,17 @@ class Lanes:
     def difference(self) -> float | None:
         """Relative step of its derivatives; None where they are exact."""
         engine: Any = getattr(self.simulator, "engine", None)
-        if not hasattr(engine, "difference"):
+        backend = getattr(engine, "backend", None)
+        if backend is None or backend.name != "numba":
             return None
-        usual = FORWARD if getattr(engine, "one_sided", False) else DIFFERENCE[engine.precision]
-        return engine.difference or usual
+        usual = FORWARD if backend.one_sided else DIFFERENCE[backend.precision]
+        return backend.difference or usual
 
     def with_difference(self, step: float) -> Lanes:
         """The same with central differences over another step."""
         simulator: Any = self.simulator
-        changed = replace(simulator, engine=replace(simulator.engine, difference=step))
-        return Lanes(changed, self.marker_index, self.width)
+        backend = simulator.engine.backend._replace(difference=step)
+        return Lanes(simulator.with_backend(backend), self.marker_index, self.width)
 
     @cached_property
     def _rolled(self) -> Any:

@@ -12,7 +12,8 @@ from rfdropo_bayes.envs.tasks import task_named
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.robots import Robot, load_robot
-from rfdropo_bayes.simulators.compiled import CompiledEngine
+from rfdropo_bayes.simulators.engine import Backend, Engine
+from rfdropo_bayes.simulators.pushing import pushing
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
@@ -38,11 +39,11 @@ def trunk_simulator(
     """
     discretisation = Discretisation(time_step or robot.time_step_s)
     assembly = assemble(robot, discretisation)
-    engine = CompiledEngine(
-        assembly, discretisation.time_step, robot.initial_state == "equilibrium", precision, threads
-    )
+    backend = Backend("numba", precision, threads)
+    engine = Engine(assembly, discretisation.time_step, backend, robot.initial_state == "equilibrium")
     found = mechanisms_named(list(mechanisms), robot, folder=folder)
-    return TrunkSimulator(robot, engine, assembly, discretisation, found)
+    trunk = TrunkSimulator(robot, engine, assembly, discretisation, found)
+    return pushing(trunk) if push else trunk
 
 
 def make_episodes(

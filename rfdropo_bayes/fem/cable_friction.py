@@ -5,9 +5,9 @@ slides away. Coulomb: D = F z. Capstan: D = mu theta (T_j + T_j+1) / 2 z, with t
 shape; for full sliding that is (2 - mu theta) / (2 + mu theta), the exponential to third order in mu theta of a guide.
 
 z in [-1, 1] is the share of the friction that is mobilised: a Prandtl element, dz = slip / PRESLIDING until it slides.
-It sticks at rest and holds its force there. The end of a step is implicit in z, by a few exchanges between what sticks
-and what slides. Guides next to each other share one z, in at most ``RUNS`` runs a cable; the slip of a run is weighted
-as its friction is, which makes the condensed problem symmetric and the friction dissipate.
+It sticks at rest and holds its force there. The end of a step is implicit in z, see ``fem.constraints``. Guides next to
+each other share one z, in at most ``RUNS`` runs a cable; the slip of a run is weighted as its friction is, which makes
+the condensed problem symmetric and the friction dissipate.
 """
 
 from __future__ import annotations
@@ -16,18 +16,15 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from rfdropo_bayes.fem.cables import CableLayout, Tensions, unilateral_tensions
+from rfdropo_bayes.fem.cables import CableLayout
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
 
 RUNS = 4
 """Runs of neighbouring guides of a cable that slide as one, at most."""
 PRESLIDING = 1e-4
 """Slip [m] that mobilises all of the friction."""
-EXCHANGES = 3
-"""Exchanges between sticking and sliding runs in a step."""
 FADING = 0.1
 """Coulomb's friction fades where the tension [N] falls below this: a slack cable presses on nothing."""
 STRAIGHT = 1e-6
@@ -118,48 +115,6 @@ def slip_problem(
         drop=coefficient[:, None, None] * jnp.sum(weight, axis=2),
         mobilised=mobilised.ravel(),
     )
-
-
-def tensions_with_friction(
-    compliance: Float[Array, "n n"],
-    slack: Float[Array, " cables"],
-    slip: Slip,
-    free_slip: Float[Array, " runs"],
-    previous: Float[Array, " cables"],
-    time_step: Scalar,
-) -> tuple[Tensions, Float[Array, " runs"]]:
-    """Impulses of the cables' drives and of the friction at the end of a step.
-
-    Args:
-        compliance: of cables, then runs: velocity along one row per impulse along another.
-        slack: velocity [m/s] left to every cable without any impulse.
-        slip: friction of the step.
-        free_slip: slip [m] of every run during the step without any impulse.
-        previous: impulses of the cables, which start the active set.
-        time_step: [s].
-
-    Returns:
-        the cables' impulses [N s], and the mobilised friction of every run.
-    """
-    cables, runs = len(slack), len(free_slip)
-    drives, across, among = compliance[:cables, :cables], compliance[:cables, cables:], compliance[cables:, cables:]
-    impulse = time_step * slip.strength
-    trial = slip.mobilised + lax.stop_gradient(free_slip) / PRESLIDING
-
-    for _ in range(EXCHANGES):
-        sticking = jnp.abs(lax.stop_gradient(trial)) < 1.0
-        follows = jnp.where(sticking, time_step / PRESLIDING, 0.0)
-        fixed = jnp.where(sticking, slip.mobilised + free_slip / PRESLIDING, jnp.sign(lax.stop_gradient(trial)))
-        # z = fixed + follows * (across' t - among (impulse z)): linear in the cables' impulses t.
-        matrix = jnp.eye(runs) + follows[:, None] * among * impulse[None, :]
-        solved = jnp.linalg.solve(matrix, jnp.concatenate([fixed[:, None], follows[:, None] * across.T], axis=1))
-        held, answer = impulse * solved[:, 0], impulse[:, None] * solved[:, 1:]
-        previous = unilateral_tensions(drives - across @ answer, slack - across @ held, previous).tension
-        share = solved[:, 0] + solved[:, 1:] @ previous
-        motion = free_slip + time_step * (across.T @ previous - among @ (impulse * share))
-        trial = slip.mobilised + motion / PRESLIDING
-    share = jnp.clip(share, -1.0, 1.0)
-    return unilateral_tensions(drives, slack - across @ (impulse * share), previous), share
 
 
 def slipped(

@@ -22,13 +22,15 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem import corotational, layered
 from rfdropo_bayes.fem.bending_law import Sections, moments, sections
-from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, multiply
-from rfdropo_bayes.fem.cable_friction import Slip, slip_problem, slipped, start_slip
+from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, multiply, solve
+from rfdropo_bayes.fem.cable_friction import slip_problem, slipped, start_slip
 from rfdropo_bayes.fem.cable_twist import twist_stiffening
 from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian
+from rfdropo_bayes.fem.constrained_step import Pull, Solve, constrained_step, meet
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
 from rfdropo_bayes.fem.layered import LayeredBody
-from rfdropo_bayes.fem.pulling import CableSolution, Pull, constrained_increment
+from rfdropo_bayes.fem.pushing import PushScene, unchanged
+from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.surroundings import SectionLoad, section_load
 from rfdropo_bayes.fem.tension_stiffening import lateral_stiffening, layer_tension
 
@@ -85,13 +87,14 @@ class State(NamedTuple):
     velocity: Float[Array, "nodes 3"]  # [m/s]
     tension: Float[Array, " cables"]  # [N]
     memory: Memory = Memory()  # of the effects; see ``remembering``
+    cube: CubeState | None = None  # that the body pushes
 
 
 class StepInfo(NamedTuple):
     """How a step went."""
 
     diverged: Bool[Array, ""]  # the step was not finite, or left the body's surroundings, and was not taken
-    cables_converged: Bool[Array, ""]
+    converged: Bool[Array, ""]  # whether the impulses of all constraints were found
 
 
 def material(
@@ -343,45 +346,56 @@ def step(
     displacement: Float[Array, " cables"],
     time_step: Scalar,
     external_force: Float[Array, "nodes 3"] | float = 0.0,
+    scene: PushScene | None = None,
+    cube: Cube | None = None,
 ) -> tuple[State, StepInfo]:
     """One implicit Euler step to the commanded cable displacements [m] (pull > 0) at its end.
 
-    ``external_force`` [N] acts on the nodes throughout the step. A step that is not finite leaves the body where it
-    was, at rest and without tension, and says so: a batch goes on. Where the material has effects with a memory, the
-    state comes from ``remembering``.
+    ``external_force`` [N] acts on the nodes throughout the step. With a ``scene`` and a ``cube`` the body touches them;
+    the state says where the cube is. A step that is not finite leaves everything where it was, at rest and without
+    tension, and says so: a batch goes on. Where the material has effects with a memory, the state comes from
+    ``remembering``.
     """
     matrix, right, memory = linearised(system, prepared, state, time_step, external_force)
-    solution, slip = _pulled(system, prepared, state, matrix, right, displacement, time_step)
-    velocity = state.velocity + solution.increment
-    tension = solution.tension / time_step
-    if slip is not None:
-        share, segment = slipped(system.cables, slip, solution.mobilised, tension)
-        memory = memory._replace(slip=share, segment=segment)
-    moved = State(state.position + time_step * velocity, velocity, tension, memory)
-    return accept(system, prepared, state, moved, solution.converged)
-
-
-def _pulled(
-    system: System,
-    prepared: Prepared,
-    state: State,
-    matrix: BlockTridiagonal,
-    right: Float[Array, "nodes 3"],
-    displacement: Float[Array, " cables"],
-    time_step: Scalar,
-) -> tuple[CableSolution, Slip | None]:
-    """The velocity's increment with the cables at their commanded displacements at the end of the step."""
-    length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, state.position)
-    moving = jnp.einsum("cni,ni->c", jacobian, state.velocity)
-    slack = (prepared.rest_length - displacement - length) / time_step - moving
-    compliance = prepared.effects.cable_compliance
-    give = 0.0 if compliance is None else compliance / time_step**2
-    pull = Pull(jacobian, slack, state.tension * time_step, give)
+    push = None
+    if scene is not None and cube is not None and state.cube is not None:
+        push = meet(scene, cube, state.cube, state.position, prepared.gravity, prepared.rayleigh_mass, time_step)
     slip = None
     mobilised, segment = state.memory.slip, state.memory.segment
     if mobilised is not None and segment is not None:
         slip = slip_problem(system.cables, prepared.effects, mobilised, segment, prepared.guides, state.position)
-    return constrained_increment(system.clamped_stations, matrix, right, pull, slip, state.velocity, time_step), slip
+    pull = _pull(system, prepared, state, displacement, time_step)
+    found = constrained_step(free_solve(system, matrix), right, state.velocity, pull, time_step, slip, push)
+    velocity, tension = state.velocity + found.increment, found.impulses.cable / time_step
+    if slip is not None:
+        share, segment = slipped(system.cables, slip, found.impulses.share, tension)
+        memory = memory._replace(slip=share, segment=segment)
+    moved = State(state.position + time_step * velocity, velocity, tension, memory, found.cube)
+    return accept(system, prepared, state, moved, found.converged)
+
+
+def free_solve(system: System, matrix: BlockTridiagonal) -> Solve:
+    """Solutions of the matrix's system at the stations that are free."""
+    held, stations = system.clamped_stations, len(system.body.station)
+
+    def solved(fields: Float[Array, "columns nodes 3"]) -> Float[Array, "columns nodes 3"]:
+        columns = jnp.moveaxis(fields.reshape(len(fields), stations, -1)[:, held:], 0, 2)
+        solution = solve(BlockTridiagonal(matrix.diagonal[held:], matrix.lower[held:]), columns)
+        full = jnp.concatenate([jnp.zeros((held, *solution.shape[1:])), solution])
+        return jnp.moveaxis(full, 2, 0).reshape(fields.shape)
+
+    return solved
+
+
+def _pull(
+    system: System, prepared: Prepared, state: State, displacement: Float[Array, " cables"], time_step: Scalar
+) -> Pull:
+    """The cables of a step to their commanded displacements."""
+    length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, state.position)
+    compliance = prepared.effects.cable_compliance
+    give = 0.0 if compliance is None else compliance / time_step**2
+    slack = (prepared.rest_length - displacement - length) / time_step
+    return Pull(jacobian, slack, state.tension * time_step, give)
 
 
 def accept(
@@ -391,6 +405,10 @@ def accept(
     reach = LOST * (system.body.station[-1] - system.body.station[0])
     away = jnp.max(jnp.abs(layered.layer_positions(system.body, moved.position) - prepared.rest))
     fine = (away < reach) & jnp.all(jnp.isfinite(moved.velocity)) & jnp.all(jnp.isfinite(moved.tension))
+    cube = None
+    if state.cube is not None and moved.cube is not None:
+        fine = fine & jnp.all(jnp.isfinite(moved.cube.position))
+        cube = unchanged(state.cube, moved.cube, fine)
     stopped = State(state.position, jnp.zeros_like(state.velocity), jnp.zeros_like(state.tension), state.memory)
-    kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), moved, stopped)
-    return kept, StepInfo(diverged=~fine, cables_converged=converged | ~fine)
+    kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), moved._replace(cube=None), stopped)
+    return kept._replace(cube=cube), StepInfo(diverged=~fine, converged=converged | ~fine)

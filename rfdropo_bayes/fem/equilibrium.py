@@ -13,19 +13,20 @@ from rfdropo_bayes.fem import corotational
 from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal
 from rfdropo_bayes.fem.cable_twist import twist_stiffening
 from rfdropo_bayes.fem.cables import lengths_and_jacobian
+from rfdropo_bayes.fem.constrained_step import Pull, constrained_step
 from rfdropo_bayes.fem.dynamics import (
     Prepared,
     State,
     System,
     accept,
     frames_and_displacements,
+    free_solve,
     resistance,
     section_means,
     shared,
     state_at_rest,
     with_section_matrix,
 )
-from rfdropo_bayes.fem.pulling import Pull, constrained_increment
 from rfdropo_bayes.fem.surroundings import section_load
 from rfdropo_bayes.fem.tension_stiffening import lateral_stiffening, layer_tension
 
@@ -101,8 +102,9 @@ def static_equilibrium(
         forces = _forces(system, prepared, current)
         slack = prepared.rest_length - displacement - forces.length
         pull = Pull(forces.jacobian, slack, current.tension, give)
-        solution = constrained_increment(system.clamped_stations, forces.tangent, forces.body + load, pull)
-        increment, tension, converged = solution.increment, solution.tension, solution.converged
+        still = jnp.zeros_like(current.position)
+        found = constrained_step(free_solve(system, forces.tangent), forces.body + load, still, pull, 1.0)
+        increment, tension, converged = found.increment, found.impulses.cable, found.converged
         now, before = lax.stop_gradient((increment, current.increment))
         along = jnp.sum(now * before)
         opposed = along < -0.3 * jnp.sqrt(jnp.sum(now**2) * jnp.sum(before**2))
@@ -119,5 +121,5 @@ def static_equilibrium(
     residual = jnp.max(jnp.abs(unbalanced)) / jnp.maximum(loads, 1e-300)
     moved = State(last.position, jnp.zeros_like(last.position), last.tension)
     state, info = accept(system, prepared, start, moved, solved[-1])
-    converged = (residual < TOLERANCE) & info.cables_converged & ~info.diverged
+    converged = (residual < TOLERANCE) & info.converged & ~info.diverged
     return state, EquilibriumInfo(residual, converged, info.diverged)

@@ -1,9 +1,9 @@
-"""A trunk that pushes a cube on a plate: where they touch, and what the contacts do to a step of the body.
+"""A trunk that pushes a cube on a plate: where they touch, and what a contact's rows are.
 
-Points of the trunk's surface are tested against the cube and the plate, corners of the cube against the plate. The
-surface is cut into bands along the axis; each offers its nearest point, and the nearest bands make the contacts of the
-step: their number is fixed, so that a step has one shape, and far ones exert nothing. Surfaces keep the contact
-distance from each other, which rounds the cube's edges by as much (SOFA's LocalMinDistance).
+The trunk's surface is a chain of spheres along its centre line, with the radii of its section profile. A sphere meets
+the cube or the plate along the line to its centre, so that normals and gaps are continuous functions of the positions;
+corners of the cube meet the plate. Surfaces keep the contact distance from each other (SOFA's LocalMinDistance).
+Normal impulses act at a sphere's centre, friction on its surface, which turns with the material around the centre.
 """
 
 from __future__ import annotations
@@ -15,190 +15,180 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.contact import contact_frame, distance_to_box, solve_constraints
-from rfdropo_bayes.fem.layered import PointMap, point_positions
-from rfdropo_bayes.fem.rigid_body import CORNERS, Cube, CubeState, inverse_inertia, moved, rotation_matrix
+from rfdropo_bayes.fem.constraints import APART
+from rfdropo_bayes.fem.layered import LayeredBody, attach, centre_gradient
+from rfdropo_bayes.fem.rigid_body import CORNERS, Cube, CubeState, rotation_matrix
 
 Scalar = Float[Array, ""] | float
 
-RESTING, PUSHING, LYING = 4, 8, 6
-"""Contacts of a step: corners of the cube on the plate, the trunk on the cube, the trunk on the plate."""
 ALARM = 0.005
 """[m] Surfaces further apart than this, beyond the contact distance, do not see each other in a step."""
+NEAREST = 24
+"""Spheres that the reference engine looks at, nearest to the cube and to the plate: more than ever come near them."""
+SPHERES_PER_METRE = 230.0
+"""Spheres along the axis: 4.3 mm apart, a third of the trunk's radius, so that the chain is smooth to 0.2 mm."""
 
-RIGID = 1e-12
-"""Share of the largest compliance below which a contact counts as one of two parts that cannot move."""
+FITTED = 24
+"""Nodes of a mesh that a sphere follows: about two rings of SOFA's trunk."""
+
+
+class Spheres(NamedTuple):
+    """Spheres along a body's centre line, bound to its nodes; NumPy arrays, fixed for a simulation."""
+
+    node: Int[np.ndarray, "spheres width"]
+    centre: Float[np.ndarray, "spheres width"]  # weights of the nodes' positions
+    gradient: Float[np.ndarray, "spheres width 3"]  # and for the deformation gradient around the centre [1/m]
+    radius: Float[np.ndarray, " spheres"]  # [m]
 
 
 class PushScene(NamedTuple):
     """What does not change between rollouts; static, never traced."""
 
-    surface: PointMap  # points of the trunk that can touch
-    band: Int[np.ndarray, "bands width"]  # points of each band along the axis; short bands repeat their first
+    spheres: Spheres
     plate_normal: Float[np.ndarray, "3"]  # unit vector out of the plate
     plate_height: float  # of the plate's top along its normal [m]
     contact_distance: float  # [m]
 
 
 class Touch(NamedTuple):
-    """The contacts of one step: `RESTING`, then `PUSHING`, then `LYING`."""
+    """The contacts of one step: the cube's corners on the plate, the trunk on the cube, the trunk on the plate."""
 
     gap: Float[Array, " contacts"]  # distance less the contact distance [m]
     frame: Float[Array, "contacts 3 3"]  # rows: normal, two tangents
-    arm: Float[Array, "contacts 3"]  # from the cube's centre to the contact [m]
-    trunk_node: Int[Array, "trunk_contacts 8"]  # of the trunk's point, for the contacts that it takes part in
-    trunk_weight: Float[Array, "trunk_contacts 8"]
-
-
-class Pushed(NamedTuple):
-    """What contacts and cables made of a step."""
-
-    change: Float[Array, " dofs"]  # of the body's velocity [m/s]
-    cable: Float[Array, " cables"]  # impulses [N s]
-    cube: CubeState
-    converged: Bool[Array, ""]
-    cables_converged: Bool[Array, ""]
-
-
-class PushStatus(NamedTuple):
-    """How the steps of a rollout went."""
-
-    diverged: Bool[Array, ""]
-    cables_converged: Bool[Array, ""]
-    contacts_converged: Bool[Array, ""]
-
-    @classmethod
-    def fine(cls) -> PushStatus:
-        """Before the first step."""
-        return cls(jnp.array(False), jnp.array(True), jnp.array(True))
-
-    def joined(self, other: PushStatus) -> PushStatus:
-        """Of both stretches together."""
-        return PushStatus(
-            self.diverged | other.diverged,
-            self.cables_converged & other.cables_converged,
-            self.contacts_converged & other.contacts_converged,
-        )
-
-
-class PushRollout(NamedTuple):
-    """Recorded motion; a diverged rollout stays finite, but its rows from then on mean nothing."""
-
-    position: Float[Array, "rows points 3"]  # [m]
-    tension: Float[Array, "rows cables"]  # [N]
-    pose: Float[Array, "rows 7"]  # of the cube: centre [m] and unit quaternion (x, y, z, w)
-    status: PushStatus
+    on_cube: Float[Array, "contacts 3 6"]  # relative velocity by the cube's velocity and spin
+    trunk_node: Int[Array, "trunk_contacts width"]  # of the contacts that the trunk takes part in
+    trunk_weight: Float[Array, "trunk_contacts 3 width"]  # of its nodes in each row
 
 
 def push_scene(
-    surface: PointMap,
-    height: Float[np.ndarray, " points"],
-    bands: int,
-    *,
-    plate_normal: Float[np.ndarray, "3"],
-    plate_height: float,
-    contact_distance: float,
+    spheres: Spheres, *, plate_normal: Float[np.ndarray, "3"], plate_height: float, contact_distance: float
 ) -> PushScene:
-    """Scene of a body whose surface points lie at these heights along its axis [m], cut into equal bands.
-
-    Raises:
-        InputError: fewer occupied bands than contacts between trunk and cube.
-    """
-    edges = np.linspace(np.min(height), np.max(height), bands + 1)
-    place = np.clip(np.searchsorted(edges, height, side="right") - 1, 0, bands - 1)
-    members = [np.flatnonzero(place == index) for index in np.unique(place)]
-    if len(members) < max(PUSHING, LYING):
-        raise InputError(f"the body's surface has points in {len(members)} bands only", where="push")
-    width = max(len(member) for member in members)
-    band = np.stack([np.concatenate([member, np.repeat(member[:1], width - len(member))]) for member in members])
+    """Scene of a body with these spheres before a plate of any normal."""
     normal = np.asarray(plate_normal, float)
-    return PushScene(surface, band, normal / np.linalg.norm(normal), float(plate_height), float(contact_distance))
+    return PushScene(spheres, normal / np.linalg.norm(normal), float(plate_height), float(contact_distance))
 
 
-def _nearest(scene: PushScene, gap: Float[Array, " points"], count: int) -> Int[Array, " contacts"]:
-    """The nearest point of each of the nearest bands, in ascending order, which rounding does not change."""
-    banded = gap[scene.band]
-    chosen = jnp.argmin(banded, axis=1)
-    best = jnp.take_along_axis(banded, chosen[:, None], axis=1)[:, 0]
-    band = lax.top_k(-lax.stop_gradient(best), count)[1]
-    return jnp.sort(jnp.asarray(scene.band)[band, chosen[band]])
+def sphere_heights(start: float, tip: float, tip_radius: float) -> Float[np.ndarray, " spheres"]:
+    """Heights of the spheres' centres along the axis [m]; the last one touches the tip's plane from inside."""
+    count = max(2, round(SPHERES_PER_METRE * (tip - start)))
+    return np.linspace(start, tip - tip_radius, count)
+
+
+def layered_spheres(body: LayeredBody) -> Spheres:
+    """Spheres of a layered body with the mean half width of its sections."""
+    half = body.half_width.mean(axis=1)
+    height = sphere_heights(float(body.station[0]), float(body.station[-1]), float(half[-1]))
+    points = np.stack([0.0 * height, 0.0 * height, height], axis=1)
+    centre, section = attach(body, points), body.section_nodes
+    layer = np.clip(np.searchsorted(body.station, height, side="right") - 1, 0, len(body.station) - 2)
+    node = layer[:, None] * section + np.arange(2 * section)
+    weight = np.zeros(node.shape)
+    for sphere, (nodes, weights) in enumerate(zip(*centre, strict=True)):
+        np.add.at(weight[sphere], nodes - node[sphere, 0], weights)
+    return Spheres(node, weight, centre_gradient(body)[layer], np.interp(height, body.station, half))
+
+
+def mesh_spheres(
+    rest: Float[np.ndarray, "nodes 3"], station: Float[np.ndarray, " stations"], radius: Float[np.ndarray, " stations"]
+) -> Spheres:
+    """Spheres of a mesh along the z axis, whose outline has these radii [m] at these heights [m].
+
+    A sphere's centre and the deformation around it are those of the affine motion that fits the nodes around its height
+    best.
+    """
+    height = sphere_heights(float(station[0]), float(station[-1]), float(radius[-1]))
+    node = np.sort(np.argsort(np.abs(rest[:, 2] - height[:, None]), axis=1)[:, :FITTED], axis=1)
+    place = rest[node] - np.stack([0.0 * height, 0.0 * height, height], axis=1)[:, None]
+    fit = np.linalg.pinv(np.concatenate([np.ones((*place.shape[:2], 1)), place], axis=2))
+    return Spheres(node, fit[:, 0], np.swapaxes(fit[:, 1:], 1, 2), np.interp(height, station, radius))
+
+
+def contact_frame(normal: Float[Array, "contacts 3"]) -> Float[Array, "contacts 3 3"]:
+    """Rows: the normal, and two tangents; the first is across the axis that the normal is furthest from."""
+    axis = jnp.eye(3)[jnp.argmin(jnp.abs(normal), axis=1)]
+    first = jnp.cross(normal, axis)
+    first = first / jnp.linalg.norm(first, axis=1, keepdims=True)
+    return jnp.stack([normal, first, jnp.cross(normal, first)], axis=1)
+
+
+def distance_to_box(
+    points: Float[Array, "points 3"], centre: Float[Array, "3"], turn: Float[Array, "3 3"], side: Scalar
+) -> tuple[Float[Array, " points"], Float[Array, "points 3"]]:
+    """Signed distance [m] of points to a cube's surface, negative inside, and its gradient: the outward normal.
+
+    Inside, the nearest face counts.
+    """
+    local = (points - centre) @ turn
+    beyond = jnp.abs(local) - 0.5 * side
+    outside = jnp.maximum(beyond, 0.0)
+    square = jnp.sum(outside**2, axis=1)
+    far = square > 0.0
+    length = jnp.sqrt(jnp.where(far, square, 1.0))
+    deepest = jnp.eye(3)[jnp.argmax(beyond, axis=1)]
+    direction = jnp.where(far[:, None], outside / length[:, None], deepest) * jnp.where(local < 0.0, -1.0, 1.0)
+    return jnp.where(far, length, jnp.max(beyond, axis=1)), direction @ turn.T
+
+
+def _nearest(gap: Float[Array, " spheres"]) -> Int[Array, " contacts"]:
+    """The nearest spheres, in ascending order, which rounding does not change."""
+    return jnp.sort(lax.top_k(-lax.stop_gradient(gap), min(NEAREST, len(gap)))[1])
+
+
+def _trunk_weights(
+    spheres: Spheres, chosen: Int[Array, " contacts"], normal: Float[Array, "contacts 3"], position: Array
+) -> tuple[Array, Array]:
+    """Nodes of the chosen spheres, and their weights in the rows of a contact with this normal."""
+    node = jnp.asarray(spheres.node)[chosen]
+    centre, gradient = jnp.asarray(spheres.centre)[chosen], jnp.asarray(spheres.gradient)[chosen]
+    deformation = jnp.einsum("cki,ckj->cij", position[node], gradient)
+    place = jnp.linalg.solve(deformation, normal[..., None])[..., 0]
+    rubbing = centre - jnp.asarray(spheres.radius)[chosen, None] * jnp.einsum("ckj,cj->ck", gradient, place)
+    return node, jnp.stack([centre, rubbing, rubbing], axis=1)
 
 
 def find_contacts(scene: PushScene, cube: Cube, state: CubeState, position: Float[Array, "nodes 3"]) -> Touch:
     """Contacts at the start of a step, from the positions of the body's nodes [m]."""
-    turn, up = rotation_matrix(state.orientation), jnp.asarray(scene.plate_normal)
+    spheres, up = scene.spheres, jnp.asarray(scene.plate_normal)
+    turn, radius = rotation_matrix(state.orientation), jnp.asarray(spheres.radius)
     corner = cube.side * CORNERS @ turn.T
     clearance = corner @ up + state.position @ up - scene.plate_height
-    lowest = jnp.sort(lax.top_k(-lax.stop_gradient(clearance), RESTING)[1])
-    points = point_positions(scene.surface, position)
-    distance, normal = distance_to_box(points, state.position, turn, cube.side)
-    height = points @ up - scene.plate_height
-    pushing, lying = _nearest(scene, distance, PUSHING), _nearest(scene, height, LYING)
-    both = jnp.concatenate([pushing, lying])
-    # A contact on the cube lies on its surface, below the trunk's point.
-    arm = points[pushing] - distance[pushing, None] * normal[pushing] - state.position
+    centre = jnp.einsum("sk,ski->si", spheres.centre, position[spheres.node])
+    distance, outward = distance_to_box(centre, state.position, turn, cube.side)
+    height = centre @ up - scene.plate_height
+    pushing, lying = _nearest(distance - radius), _nearest(height - radius)
+    normal = jnp.concatenate([outward[pushing], jnp.tile(up, (len(lying), 1))])
+    frame = contact_frame(jnp.concatenate([jnp.tile(up, (len(corner), 1)), normal]))
+    # A contact on the cube lies on its surface, below the sphere's centre.
+    arm = centre[pushing] - distance[pushing, None] * outward[pushing] - state.position
+    arm = jnp.concatenate([corner, arm, jnp.zeros((len(lying), 3))])
+    sign = np.repeat([1.0, -1.0, 0.0], [len(corner), len(pushing), len(lying)])
+    chosen = jnp.concatenate([pushing, lying])
+    gap = jnp.concatenate([clearance, (distance - radius)[pushing], (height - radius)[lying]])
     return Touch(
-        gap=jnp.concatenate([clearance[lowest], distance[pushing], height[lying]]) - scene.contact_distance,
-        frame=contact_frame(jnp.concatenate([jnp.tile(up, (RESTING, 1)), normal[pushing], jnp.tile(up, (LYING, 1))])),
-        arm=jnp.concatenate([corner[lowest], arm, jnp.zeros((LYING, 3))]),
-        trunk_node=jnp.asarray(scene.surface.node)[both],
-        trunk_weight=jnp.asarray(scene.surface.weight)[both],
+        gap - scene.contact_distance,
+        frame,
+        sign[:, None, None] * jnp.concatenate([frame, jnp.cross(arm[:, None, :], frame)], axis=2),
+        *_trunk_weights(spheres, chosen, normal, position),
     )
 
 
+def opening_rates(touch: Touch, time_step: Scalar) -> Float[Array, " contacts"]:
+    """Gaps over the time step [m/s]; those that are too far to touch in it stay open whatever happens."""
+    return jnp.where(touch.gap < ALARM, touch.gap / time_step, APART)
+
+
 def trunk_rows(touch: Touch, nodes: int) -> Float[Array, "rows nodes 3"]:
-    """Derivatives of the contacts' relative velocities with respect to the velocities of the body's nodes."""
-    frame = touch.frame[RESTING:]
-    count = len(frame)
-    weight = jnp.zeros((count, nodes)).at[jnp.arange(count)[:, None], touch.trunk_node].add(touch.trunk_weight)
-    return jnp.einsum("cn,cri->crni", weight, frame).reshape(3 * count, nodes, 3)
+    """Derivatives of the contacts' relative velocities with respect to the velocities of the body's nodes; zero for the
+    contacts between cube and plate."""
+    count, corners = len(touch.trunk_node), len(touch.gap) - len(touch.trunk_node)
+    weight = jnp.zeros((count, 3, nodes))
+    place = jnp.arange(count)[:, None, None], jnp.arange(3)[:, None], touch.trunk_node[:, None, :]
+    weight = weight.at[place].add(touch.trunk_weight)
+    rows = jnp.einsum("crn,cri->crni", weight, touch.frame[corners:]).reshape(3 * count, nodes, 3)
+    return jnp.concatenate([jnp.zeros((3 * corners, nodes, 3)), rows])
 
 
-def cube_rows(touch: Touch) -> Float[Array, "rows 6"]:
-    """Derivatives of the contacts' relative velocities with respect to the cube's velocity and spin."""
-    rows = jnp.concatenate([touch.frame, jnp.cross(touch.arm[:, None, :], touch.frame)], axis=2)
-    sign = np.concatenate([np.ones(RESTING), -np.ones(PUSHING), np.zeros(LYING)])
-    return (jnp.asarray(sign)[:, None, None] * rows).reshape(-1, 6)
-
-
-def push(
-    touch: Touch,
-    cube: Cube,
-    state: CubeState,
-    friction: Scalar,
-    twist: Float[Array, "6"],
-    rows: Float[Array, "dofs rows"],
-    response: Float[Array, "dofs rows"],
-    velocity: Float[Array, " dofs"],
-    cable_rate: Float[Array, " cables"],
-    previous: Float[Array, " cables"],
-    time_step: Scalar,
-) -> Pushed:
-    """Let the contacts and cables of a step act.
-
-    Args:
-        twist: of the cube at the end of the step without contacts.
-        rows: -dl/dx of the cables, then `trunk_rows`, over the free degrees of freedom of the body.
-        response: A^-1 times these, A the matrix of the implicit step.
-        velocity: of the body at the end of the step without contacts and cables [m/s].
-        cable_rate: rate at which each cable's commanded length lies above its length at that velocity [m/s].
-        previous: impulses of the cables in the step before [N s].
-    """
-    cables, resting = len(cable_rate), 3 * RESTING
-    on_cube, mass = cube_rows(touch), inverse_inertia(cube)
-    compliance = jnp.zeros((cables + len(on_cube),) * 2)
-    trunk = np.concatenate([np.arange(cables), np.arange(cables + resting, cables + len(on_cube))])
-    compliance = compliance.at[np.ix_(trunk, trunk)].add(rows.T @ response)
-    compliance = compliance.at[cables:, cables:].add((on_cube * mass) @ on_cube.T)
-    rate = jnp.concatenate([jnp.zeros(resting), rows[:, cables:].T @ velocity]) + on_cube @ twist
-    size = jnp.diagonal(compliance)[cables::3]
-    # Between the plate and a held part of the body nothing can give way, and there is nothing to solve.
-    near = (touch.gap < ALARM) & (size > RIGID * jnp.max(size))
-    opening = jnp.where(near, touch.gap / time_step, 1e6)
-    rate = rate + jnp.zeros((len(touch.gap), 3)).at[:, 0].set(opening).ravel()
-    found = solve_constraints(compliance, jnp.concatenate([cable_rate, rate]), cables, friction, previous)
-    contact = found.contact.ravel()
-    change = response @ jnp.concatenate([found.cable, contact[resting:]])
-    after = moved(state, twist + mass * (on_cube.T @ contact), time_step)
-    return Pushed(change, found.cable, after, found.converged, found.cables_converged)
+def unchanged(cube: CubeState, moved: CubeState, taken: Bool[Array, ""]) -> CubeState:
+    """The cube after a step that was taken, or where it was, at rest."""
+    stopped = cube._replace(velocity=jnp.zeros(3), spin=jnp.zeros(3))
+    return CubeState(*(jnp.where(taken, new, old) for new, old in zip(moved, stopped, strict=True)))

@@ -23,6 +23,7 @@ class Cube(NamedTuple):
     mass: Float[Array, ""]  # [kg]
     side: Float[Array, ""]  # [m]
     gyration_radius: Float[Array, ""]  # root of the moment of inertia per mass, about any axis [m]
+    friction: Float[Array, ""]  # Coulomb's coefficient on whatever it touches
 
 
 class CubeState(NamedTuple):
@@ -36,7 +37,7 @@ class CubeState(NamedTuple):
 
 def solid_gyration_radius(side: Scalar) -> Float[Array, ""]:
     """Radius of gyration [m] of a homogeneous cube, a / sqrt(6)."""
-    return jnp.asarray(side) / np.sqrt(6.0)
+    return jnp.asarray(side) * (1.0 / np.sqrt(6.0))  # XLA rounds a quotient in one way where it folds constants
 
 
 def cube_at(position: Float[Array, "3"], yaw: Scalar, axis: Float[Array, "3"] | Float[np.ndarray, "3"]) -> CubeState:

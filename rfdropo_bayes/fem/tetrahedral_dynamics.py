@@ -10,17 +10,21 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem import levels as level_systems
-from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian, unilateral_tensions
+from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian
+from rfdropo_bayes.fem.constrained_step import Pull, constrained_step, meet
 from rfdropo_bayes.fem.drives import DriveLimits
-from rfdropo_bayes.fem.dynamics import LOST
+from rfdropo_bayes.fem.dynamics import LOST, StepInfo
 from rfdropo_bayes.fem.layered import PointMap, point_positions
 from rfdropo_bayes.fem.levels import LevelMatrix, Levels, node_levels
+from rfdropo_bayes.fem.pushing import PushScene, unchanged
+from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.tetrahedra import (
     TetrahedralBody,
     element_rotations,
@@ -60,13 +64,7 @@ class TetrahedralState(NamedTuple):
     velocity: Float[Array, "nodes 3"]  # [m/s]
     tension: Float[Array, " cables"]  # [N]
     measured: Float[Array, " cables"]  # [m]
-
-
-class TetrahedralInfo(NamedTuple):
-    """How a step went."""
-
-    diverged: Bool[Array, ""]
-    cables_converged: Bool[Array, ""]
+    cube: CubeState | None = None  # that the body pushes
 
 
 class TetrahedralRollout(NamedTuple):
@@ -76,7 +74,8 @@ class TetrahedralRollout(NamedTuple):
     tension: Float[Array, "rows cables"]  # [N]
     state: TetrahedralState
     diverged: Bool[Array, ""]
-    cables_converged: Bool[Array, ""]
+    converged: Bool[Array, ""]
+    pose: Float[Array, "rows 7"] | None = None  # of the cube: centre [m] and unit quaternion (x, y, z, w)
 
 
 def tetrahedral_system(body: TetrahedralBody, cables: CableLayout, limits: DriveLimits) -> TetrahedralSystem:
@@ -122,36 +121,47 @@ def step(
     state: TetrahedralState,
     displacement: Float[Array, " cables"],
     time_step: float,
-) -> tuple[TetrahedralState, TetrahedralInfo]:
-    """One implicit Euler step to the commanded cable displacements [m]."""
+    scene: PushScene | None = None,
+    cube: Cube | None = None,
+) -> tuple[TetrahedralState, StepInfo]:
+    """One implicit Euler step to the commanded cable displacements [m]; with ``scene`` and ``cube`` as in
+    ``fem.dynamics.step``."""
     levels = system.levels
     matrix, right = linearised(system, material, state, time_step)
     length, jacobian = lengths_and_jacobian(system.cables, jnp.asarray(system.guides), state.position)
     shortening = jnp.asarray(system.rest_length) - length
-    target = system.limits.apply(displacement, state.measured)
-    columns = jnp.concatenate([right[None], jacobian])[:, levels.order].reshape(1 + len(length), -1).T
-    solution = level_systems.solve(matrix, columns)
-    growth = jnp.einsum("cni,ni->c", jacobian, state.velocity) + columns[:, 1:].T @ solution[:, 0]
-    compliance = time_step**2 * columns[:, 1:].T @ solution[:, 1:]
-    tension, converged = jnp.zeros(0), jnp.array(True)
-    if len(length):
-        tension, converged = unilateral_tensions(compliance, shortening - time_step * growth - target, state.tension)
-    change = solution[:, 0] - time_step * solution[:, 1:] @ tension
-    velocity = state.velocity.at[levels.order].add(change.reshape(-1, 3))
-    moved = TetrahedralState(state.position + time_step * velocity, velocity, tension, shortening)
-    return accept(system, state, moved, converged)
+    slack = (shortening - system.limits.apply(displacement, state.measured)) / time_step
+
+    def solved(fields: Float[Array, "columns nodes 3"]) -> Float[Array, "columns nodes 3"]:
+        columns = fields[:, levels.order].reshape(len(fields), -1).T
+        solution = level_systems.solve(matrix, columns).T.reshape(len(fields), -1, 3)
+        return jnp.zeros_like(fields).at[:, levels.order].set(solution)
+
+    push = None
+    if scene is not None and cube is not None and state.cube is not None:
+        push = meet(scene, cube, state.cube, state.position, material.gravity, material.rayleigh_mass, time_step)
+    pull = Pull(jacobian, slack, state.tension * time_step)
+    found = constrained_step(solved, right, state.velocity, pull, time_step, push=push)
+    velocity = state.velocity + found.increment
+    tension = found.impulses.cable / time_step
+    moved = TetrahedralState(state.position + time_step * velocity, velocity, tension, shortening, found.cube)
+    return accept(system, state, moved, found.converged)
 
 
 def accept(
     system: TetrahedralSystem, state: TetrahedralState, moved: TetrahedralState, converged: Bool[Array, ""]
-) -> tuple[TetrahedralState, TetrahedralInfo]:
+) -> tuple[TetrahedralState, StepInfo]:
     """The new state if it is finite and near the body, else the old one at rest."""
     reach = LOST * float(np.ptp(system.body.rest, axis=0).max())
     away = jnp.max(jnp.abs(moved.position - system.body.rest))
     fine = (away < reach) & jnp.all(jnp.isfinite(moved.velocity)) & jnp.all(jnp.isfinite(moved.tension))
-    stopped = state._replace(velocity=jnp.zeros_like(state.velocity), tension=jnp.zeros_like(state.tension))
-    kept = TetrahedralState(*(jnp.where(fine, new, old) for new, old in zip(moved, stopped, strict=True)))
-    return kept, TetrahedralInfo(~fine, converged | ~fine)
+    cube = None
+    if state.cube is not None and moved.cube is not None:
+        fine = fine & jnp.all(jnp.isfinite(moved.cube.position))
+        cube = unchanged(state.cube, moved.cube, fine)
+    stopped = state._replace(velocity=jnp.zeros_like(state.velocity), tension=jnp.zeros_like(state.tension), cube=None)
+    kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), moved._replace(cube=None), stopped)
+    return kept._replace(cube=cube), StepInfo(~fine, converged | ~fine)
 
 
 def simulate(
@@ -161,19 +171,22 @@ def simulate(
     displacement: Float[Array, "rows substeps cables"],
     time_step: float,
     points: PointMap,
+    scene: PushScene | None = None,
+    cube: Cube | None = None,
 ) -> TetrahedralRollout:
     """Rollout through the commanded cable displacements [m] of every step, recorded at the end of every row."""
 
     def one(carry, commanded):
         state, info = carry
-        state, new = step(system, material, state, commanded, time_step)
-        info = TetrahedralInfo(info.diverged | new.diverged, info.cables_converged & new.cables_converged)
-        return (state, info), None
+        state, new = step(system, material, state, commanded, time_step, scene, cube)
+        return (state, StepInfo(info.diverged | new.diverged, info.converged & new.converged)), None
 
     def row(carry, commands):
         carry, _ = lax.scan(one, carry, commands)
-        return carry, (point_positions(points, carry[0].position), carry[0].tension)
+        state = carry[0]
+        pose = None if state.cube is None else jnp.concatenate([state.cube.position, state.cube.orientation])
+        return carry, (point_positions(points, state.position), state.tension, pose)
 
-    start = state, TetrahedralInfo(jnp.array(False), jnp.array(True))
-    (state, info), (position, tension) = lax.scan(row, start, displacement)
-    return TetrahedralRollout(position, tension, state, info.diverged, info.cables_converged)
+    start = state, StepInfo(jnp.array(False), jnp.array(True))
+    (state, info), (position, tension, pose) = lax.scan(row, start, displacement)
+    return TetrahedralRollout(position, tension, state, info.diverged, info.converged, pose)

@@ -17,7 +17,6 @@ class CoulombFriction:
     name = "coulomb_friction"
     stage = "body"
     bodies = ("layered",)
-    beside_cube = False
     cause = "cables that rub in their guides, sheaths or seals with a force that does not depend on tension"
     remedy = "pull a slack cable through the body with a spring scale; lubricate or line the guides"
     parameters = (
@@ -43,7 +42,6 @@ class CapstanFriction:
     name = "capstan_friction"
     stage = "body"
     bodies = ("layered",)
-    beside_cube = False
     cause = "friction of cables pressed against their guides where the body bends"
     remedy = "measure the tension at both ends of a cable over a known bend; lubricate or line the guides"
     parameters = (
@@ -69,7 +67,6 @@ class CableCompliance:
     name = "cable_compliance"
     stage = "body"
     bodies = ("layered",)
-    beside_cube = False
     cause = "stretch of the cables, of their anchorage and of the transmission under load"
     remedy = "hang a known weight on each cable and measure its stretch; use stiffer cable"
     parameters = (

@@ -36,8 +36,8 @@ class Mechanism(Protocol):
         cause: one line on the physical cause.
         remedy: one line on what a lab would do about it.
 
-    Three more may be left out, where a mechanism runs everywhere: ``bodies`` and ``engines``, those of `BODIES` and
-    `ENGINES` on which it runs, and ``beside_cube``, False where it does not run with a cube before the trunk.
+    Two more may be left out, where a mechanism runs everywhere: ``bodies`` and ``engines``, those of `BODIES` and
+    `ENGINES` on which it runs.
     """
 
     name: str
@@ -165,14 +165,12 @@ def engines_of(mechanism: Mechanism | type) -> tuple[str, ...]:
     return tuple(getattr(mechanism, "engines", ENGINES))
 
 
-def obstacle(mechanism: Mechanism, body: str, engine: str, cube: bool) -> str | None:
-    """Why a mechanism does not run on a body, on an engine, or beside a cube; None where it runs."""
+def obstacle(mechanism: Mechanism, body: str, engine: str) -> str | None:
+    """Why a mechanism does not run on a body or on an engine; None where it runs."""
     if body not in bodies_of(mechanism):
         return f"it acts on {' and '.join(bodies_of(mechanism))} bodies only"
     if engine not in engines_of(mechanism):
         return f"it runs on the engine {' or '.join(engines_of(mechanism))} only"
-    if cube and not getattr(mechanism, "beside_cube", True):
-        return "it cannot be combined with a cube"
     return None
 
 

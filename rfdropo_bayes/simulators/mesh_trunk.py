@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import jax.numpy as jnp
@@ -15,10 +15,10 @@ from rfdropo_bayes.fem import LayeredBody, Material
 from rfdropo_bayes.fem.balance import Balance, tetrahedral_balance
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.commands import Commands, animated_on_grid, commands_on_grid, observed_at, sample
+from rfdropo_bayes.simulators.commands import Commands, animated_on_grid, commands_on_grid
+from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms
 from rfdropo_bayes.simulators.mesh_body import MeshAssembly, TetrahedraTable
-from rfdropo_bayes.simulators.mesh_engines import MeshEngine
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values, every_node, sampled
 from rfdropo_bayes.simulators.trunk import refined_body
@@ -41,7 +41,7 @@ class MeshTrunkSimulator(RobotSimulator):
     """
 
     robot: Robot
-    engine: MeshEngine
+    engine: Engine
     assembly: MeshAssembly
     options: TetrahedraTable
     time_step: float
@@ -49,6 +49,10 @@ class MeshTrunkSimulator(RobotSimulator):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mechanisms", check_mechanisms(self.mechanisms))
+
+    def with_backend(self, backend: Backend) -> MeshTrunkSimulator:
+        """The same, computed by another backend."""
+        return replace(self, engine=replace(self.engine, backend=backend))
 
     @property
     def lanes(self) -> int:
@@ -99,22 +103,20 @@ class MeshTrunkSimulator(RobotSimulator):
         """
         values = self.complete(parameters)
         steps = self.steps_seen(values, commands, self.time_step, steps)
-        motion = self.engine.motion(self.material(values), self.displacements(values, commands), steps)
-        status = jnp.where(
-            motion.diverged,
-            int(Result.DIVERGED),
-            jnp.where(motion.cables_converged, int(Result.OK), int(Result.CABLE_LIMIT)),
-        )
-        position = self.measured(values, sample(motion.position, commands), observed_at(commands, self.time_step))
-        angle = self.driven(values, commands, self.time_step)
-        return Observation(position, sample(motion.tension, commands), None, status, angle)
+        motion = self.engine.motion(*self.inputs(values, commands), steps)
+        return self.observation(values, commands, motion, Result.CABLE_LIMIT)
+
+    def inputs(self, values: Values, commands: Commands) -> tuple[TetrahedralMaterial, Array, Array]:
+        """As `TrunkSimulator.inputs`."""
+        displacement = self.displacements(values, commands)
+        return self.material(values), jnp.zeros_like(displacement[0]), displacement
 
     def balance(self, parameters: Values, commands: Commands) -> Balance:
         """See `RobotSimulator.balance`."""
         values = self.complete(parameters)
-        material, displacement = self.material(values), self.displacements(values, commands)
+        material, start, displacement = self.inputs(values, commands)
         nodes = every_node(len(self.assembly.system.body.rest))
-        motion = self.engine.recording(nodes).motion(material, displacement, None)
+        motion = self.engine.recording(nodes).motion(material, start, displacement)
         return self.balance_of(material, motion.position, motion.tension, commands)
 
     def balance_of(

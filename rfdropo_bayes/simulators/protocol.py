@@ -32,7 +32,7 @@ _REMEDIES = {
     Result.OK: "",
     Result.DIVERGED: "shorten the time step or narrow the priors of stiffness, mass and damping",
     Result.CABLE_LIMIT: "the cables could not reach their commanded lengths: check limits and initial displacements",
-    Result.CONTACT_NOT_CONVERGED: "raise the number of contact iterations or shorten the time step",
+    Result.CONTACT_NOT_CONVERGED: "shorten the time step: the contacts of a step were not solved",
     Result.NOT_IN_EQUILIBRIUM: "the initial pose was not found: check gravity, stiffness and initial displacements",
 }
 

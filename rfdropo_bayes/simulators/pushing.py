@@ -5,76 +5,29 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.balance import Balance
-from rfdropo_bayes.fem.layered import LayeredBody, PointMap, rest_positions
-from rfdropo_bayes.fem.pushing import PushScene, push_scene
-from rfdropo_bayes.fem.rigid_body import Cube, CubeState, cube_at, solid_gyration_radius
+from rfdropo_bayes.fem.layered import LayeredBody, rest_positions
+from rfdropo_bayes.fem.pushing import PushScene, layered_spheres, mesh_spheres, push_scene
+from rfdropo_bayes.fem.rigid_body import Cube, cube_at, solid_gyration_radius
+from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
 from rfdropo_bayes.robots import PushScene as PushTable
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
+from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.engine import Backend, CubeInputs, Engine
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values, every_node
-from rfdropo_bayes.simulators.trunk import EQUILIBRIUM_TOLERANCE, TrunkSimulator
-
-BANDS_PER_METRE = 230.0
-"""Bands of the surface along the axis that each may touch once: about four to a vertebra of the trunk."""
-
-
-class CubeInputs(NamedTuple):
-    """The cube of one rollout."""
-
-    cube: Cube
-    friction: Float[Array, ""]
-    start: CubeState
-
-
-class PushMotion(NamedTuple):
-    """What an engine returns: rows are time steps, row 0 is the initial state."""
-
-    position: Float[Array, "row marker 3"]
-    tension: Float[Array, "row cable"]
-    pose: Float[Array, "row 7"]  # of the cube: centre [m] and unit quaternion (x, y, z, w)
-    diverged: Bool[Array, ""]
-    cables_converged: Bool[Array, ""]
-    contacts_converged: Bool[Array, ""]
-    imbalance: Float[Array, ""]  # relative unbalanced force of the initial equilibrium; 0 for a start at rest
-
-
-class PushEngine(Protocol):
-    """Computes the motion of a trunk and a cube.
-
-    Attributes:
-        lanes: how many rollouts it likes to be given at once.
-    """
-
-    lanes: ClassVar[int]
-
-    @property
-    def trunk(self) -> TrunkSimulator | MeshTrunkSimulator:
-        """The trunk without cube: its body, commands and material."""
-
-    @property
-    def time_step(self) -> float:
-        """Time step of the simulation [s]."""
-
-    def describe(self) -> dict[str, object]:
-        """Name and precision, for the record."""
-
-    def motion(self, values: Values, commands: Commands, cube: CubeInputs) -> PushMotion:
-        """Roll out with these parameters of the trunk."""
-
-    def recording(self, points: PointMap) -> PushEngine:
-        """The same engine in double precision, recording these points of the body in place of the markers."""
+from rfdropo_bayes.simulators.session import Session
+from rfdropo_bayes.simulators.trunk import TrunkSimulator
 
 
 def push_table(robot: Robot) -> PushTable:
@@ -90,36 +43,39 @@ def push_table(robot: Robot) -> PushTable:
     return robot.push
 
 
-def bands_along(length: float) -> int:
-    """Number of bands of a surface of that length [m]."""
-    return round(BANDS_PER_METRE * length)
-
-
 def plate_normal(robot: Robot) -> Float[np.ndarray, "3"]:
     """Unit vector against gravity, out of the plate."""
     return -robot.gravity / np.linalg.norm(robot.gravity)
 
 
-def scene_of(robot: Robot, surface: PointMap, rest: Float[np.ndarray, "nodes 3"]) -> PushScene:
-    """Cube and plate of a robot whose surface points are bound to nodes at ``rest`` [m]."""
+def scene_of(robot: Robot, body: LayeredBody | TetrahedralBody) -> PushScene:
+    """Cube and plate of a robot, before its body; its section profile without notches is the body's outline.
+
+    Raises:
+        InputError: the robot has no cube.
+    """
     table = push_table(robot)
-    height = np.einsum("pk,pk->p", surface.weight, rest[surface.node, 2])
+    if isinstance(body, LayeredBody):
+        spheres = layered_spheres(body)
+    else:
+        half = np.asarray(robot.body.half_width_m, float).mean(axis=1)
+        spheres = mesh_spheres(body.rest, np.asarray(robot.body.station_m, float), half)
     return push_scene(
-        surface,
-        height,
-        bands_along(float(np.ptp(height))),
+        spheres,
         plate_normal=plate_normal(robot),
         plate_height=table.plate_height_m,
         contact_distance=table.contact_distance_m,
     )
 
 
-Trunk = TypeVar("Trunk", TrunkSimulator, MeshTrunkSimulator)
+def pushing(trunk: TrunkSimulator | MeshTrunkSimulator) -> PushSimulator:
+    """A trunk with the cube and the plate of its robot before it.
 
-
-def with_markers(trunk: Trunk, points: PointMap) -> Trunk:
-    """The trunk with other recorded points."""
-    return replace(trunk, assembly=trunk.assembly._replace(markers=points))
+    Raises:
+        InputError: a robot without a cube.
+    """
+    scene = scene_of(trunk.robot, trunk.assembly.system.body)
+    return PushSimulator(replace(trunk, engine=replace(trunk.engine, scene=scene)))
 
 
 def rest_nodes(trunk: TrunkSimulator | MeshTrunkSimulator) -> Float[np.ndarray, "nodes 3"]:
@@ -133,16 +89,16 @@ class PushSimulator(RobotSimulator):
     """A trunk and a cube on a plate, behind the `Simulator` protocol; the cube starts at rest where it is put.
 
     Attributes:
-        engine: what computes the motion of both, and the trunk without cube, whose commands, material and measurement
-            are these.
+        trunk: whose engine has a scene (see `pushing`); its commands, material and measurement are these.
     """
 
-    engine: PushEngine
+    trunk: TrunkSimulator | MeshTrunkSimulator
+    unsolved: ClassVar[Result] = Result.CONTACT_NOT_CONVERGED
 
     @property
-    def trunk(self) -> TrunkSimulator | MeshTrunkSimulator:
-        """The trunk without cube."""
-        return self.engine.trunk
+    def engine(self) -> Engine:
+        """That of the trunk."""
+        return self.trunk.engine
 
     @property
     def robot(self) -> Robot:  # type: ignore[override]
@@ -154,15 +110,24 @@ class PushSimulator(RobotSimulator):
         """Those of the trunk."""
         return self.trunk.mechanisms
 
+    def with_backend(self, backend: Backend) -> PushSimulator:
+        """The same, computed by another backend."""
+        return replace(self, trunk=self.trunk.with_backend(backend))
+
     @property
     def lanes(self) -> int:
-        """Those of the engine."""
-        return self.engine.lanes
+        """Those of the trunk."""
+        return self.trunk.lanes
+
+    @property
+    def time_step(self) -> float:  # type: ignore[override]
+        """That of the trunk."""
+        return self.trunk.time_step
 
     @property
     def description(self) -> dict[str, object]:
-        """As the trunk's, with the engine that computes the contacts."""
-        return {**self.trunk.description, **self.engine.describe(), "object": "cube"}
+        """As the trunk's."""
+        return {**self.trunk.description, "object": "cube"}
 
     @cached_property
     def parameters(self) -> tuple[ParameterSpec, ...]:  # type: ignore[override]
@@ -182,13 +147,25 @@ class PushSimulator(RobotSimulator):
         """Recorded commands on the trunk's clock."""
         return self.trunk.commands(time, value, initial, observation_time)
 
+    def session(self, lanes: int, period: float) -> Session:
+        """So many trunks and cubes that are commanded one control period [s] at a time; see `Session`."""
+        return Session(self, lanes, period)
+
+    def body_inputs(self, values: Values) -> tuple[Any, CubeInputs]:
+        """See `SteppedSimulator`."""
+        return self.trunk.material({spec.name: values[spec.name] for spec in self.trunk.parameters}), self.cube(values)
+
     def cube(self, values: Values) -> CubeInputs:
         """The cube for these values."""
         side = jnp.asarray(values["cube_side"], float)
         centre = jnp.stack([jnp.asarray(values[f"cube_{axis}"], float) for axis in "xyz"])
         return CubeInputs(
-            Cube(jnp.asarray(values["cube_mass"], float), side, solid_gyration_radius(side)),
-            jnp.asarray(values["friction"], float),
+            Cube(
+                jnp.asarray(values["cube_mass"], float),
+                side,
+                solid_gyration_radius(side),
+                jnp.asarray(values["friction"], float),
+            ),
             cube_at(centre, values["cube_yaw"], plate_normal(self.robot)),
         )
 
@@ -217,37 +194,21 @@ class PushSimulator(RobotSimulator):
         """See `RobotSimulator.balance`; the energies are those of the trunk."""
         values = self.complete(parameters)
         own = {spec.name: values[spec.name] for spec in self.trunk.parameters}
-        nodes = len(rest_nodes(self.trunk))
-        motion = self.engine.recording(every_node(nodes)).motion(own, commands, self.cube(values))
-        material: Any = self.trunk.material(own)
-        return self.trunk.balance_of(material, motion.position, motion.tension, commands)
+        inputs: Any = self.trunk.inputs(own, commands)
+        engine = self.trunk.engine.recording(every_node(len(rest_nodes(self.trunk))))
+        motion = engine.motion(*inputs, cube=self.cube(values))
+        return self.trunk.balance_of(inputs[0], motion.position, motion.tension, commands)
 
     def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
-        """Simulate from the initial state to the last observation; all steps are computed, whatever ``steps`` says.
+        """Simulate from the initial state to the last observation, or ``steps`` time steps; see
+        `TrunkSimulator.rollout`.
 
         Raises:
             InputError: a name that is not a parameter of this simulator.
         """
         values = self.complete(parameters)
         own = {spec.name: values[spec.name] for spec in self.trunk.parameters}
-        motion = self.engine.motion(own, commands, self.cube(values))
-        status = jnp.where(
-            motion.diverged,
-            int(Result.DIVERGED),
-            jnp.where(
-                ~motion.cables_converged,
-                int(Result.CABLE_LIMIT),
-                jnp.where(
-                    motion.imbalance > EQUILIBRIUM_TOLERANCE,
-                    int(Result.NOT_IN_EQUILIBRIUM),
-                    jnp.where(motion.contacts_converged, int(Result.OK), int(Result.CONTACT_NOT_CONVERGED)),
-                ),
-            ),
-        )
-        pose = sample(motion.pose, commands)
-        pose = pose.at[:, 3:].divide(jnp.linalg.norm(pose[:, 3:], axis=1, keepdims=True))
-        position = self.trunk.measured(
-            own, sample(motion.position, commands), observed_at(commands, self.engine.time_step)
-        )
-        angle = self.trunk.driven(own, commands, self.engine.time_step)
-        return Observation(position, sample(motion.tension, commands), pose, status, angle)
+        inputs: Any = self.trunk.inputs(own, commands)
+        steps = self.trunk.steps_seen(own, commands, self.time_step, steps)
+        motion = self.trunk.engine.motion(*inputs, steps, self.cube(values))
+        return self.trunk.observation(own, commands, motion, self.unsolved)

@@ -16,6 +16,7 @@ from rfdropo_bayes.fem.balance import Balance
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
+from rfdropo_bayes.simulators.engine import Motion
 from rfdropo_bayes.simulators.mechanisms import (
     ActuationMechanism,
     Mechanism,
@@ -25,12 +26,12 @@ from rfdropo_bayes.simulators.mechanisms import (
     inside_drive,
 )
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
-from rfdropo_bayes.simulators.protocol import Observation
+from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Values = Mapping[str, Float[Array, ""]]
 
 EQUILIBRIUM_TOLERANCE = 1e-3
-"""A static equilibrium counts as found when the unbalanced force is below this share of the largest force."""
+"""Static equilibrium counts as found when the unbalanced force is below this share of the largest force."""
 
 
 def every_node(count: int) -> PointMap:
@@ -56,10 +57,12 @@ class RobotSimulator:
     Attributes:
         robot: what is simulated.
         mechanisms: extensions, applied in the order given within each stage.
+        time_step: of the simulation [s].
     """
 
     robot: Robot
     mechanisms: Sequence[Mechanism]
+    time_step: float
 
     @property
     def lanes(self) -> int:
@@ -95,6 +98,22 @@ class RobotSimulator:
             InputError: a name that is not a parameter of this simulator, or cables with friction.
         """
         raise NotImplementedError
+
+    def observation(self, values: Values, commands: Commands, motion: Motion, unsolved: Result) -> Observation:
+        """What a motion shows; ``unsolved`` says how a rollout ended whose constraints were not all solved."""
+        cases = (
+            (motion.diverged, Result.DIVERGED),
+            (motion.imbalance > EQUILIBRIUM_TOLERANCE, Result.NOT_IN_EQUILIBRIUM),
+            (~motion.converged, unsolved),
+        )
+        status = jnp.select([case for case, _ in cases], [int(code) for _, code in cases], int(Result.OK))
+        position = self.measured(values, sample(motion.position, commands), observed_at(commands, self.time_step))
+        pose = None
+        if motion.pose is not None:
+            pose = sample(motion.pose, commands)
+            pose = pose.at[:, 3:].divide(jnp.linalg.norm(pose[:, 3:], axis=1, keepdims=True))
+        angle = self.driven(values, commands, self.time_step)
+        return Observation(position, sample(motion.tension, commands), pose, status, angle)
 
     @cached_property
     def parameters(self) -> tuple[ParameterSpec, ...]:

@@ -18,7 +18,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import Material
+from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneMotion, body_lanes, flat_lanes, lanes_like
 from rfdropo_bayes.simulators.commands import carried_out
+from rfdropo_bayes.simulators.engine import CubeInputs, Engine
 from rfdropo_bayes.simulators.mechanisms import (
     ActuationMechanism,
     Mechanism,
@@ -35,50 +37,25 @@ WHOLE = 1e-6
 """How far a control period may be from a whole number of time steps, in time steps."""
 
 
-class LaneMotion(NamedTuple):
-    """Where the bodies of some lanes are."""
-
-    position: Float[np.ndarray, "lane marker 3"]
-    tension: Float[np.ndarray, "lane cable"]
-    diverged: Bool[np.ndarray, " lane"]  # since the lane was started
-    imbalance: Float[np.ndarray, " lane"]  # relative unbalanced force of its initial equilibrium
-    cables_converged: Bool[np.ndarray, " lane"]  # since the lane was started
-
-
-class BodyLanes(Protocol):
-    """The bodies of a session's lanes."""
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of their parameters and state."""
-
-    def reset(
-        self, rows: Int[np.ndarray, " row"], material: Material, start: Float[np.ndarray, "row cable"]
-    ) -> LaneMotion:
-        """Start some lanes anew; the material has one entry per row. Returns the motion of these rows."""
-
-    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> LaneMotion:
-        """Take steps to the cable displacements [m] at their ends."""
-
-    def save(self) -> Float[np.ndarray, "lane values"]:
-        """A copy of the state, one row a lane."""
-
-    def restore(self, rows: Int[np.ndarray, " row"], state: Float[np.ndarray, "row values"]) -> None:
-        """Set lanes to rows of a saved state."""
-
-
 class SteppedSimulator(Protocol):
-    """A simulator that sessions can be made of."""
+    """A simulator that sessions can be made of: a `RobotSimulator` of a layered body.
+
+    Attributes:
+        unsolved: how a rollout ends whose constraints were not all solved.
+    """
+
+    unsolved: Result
 
     @property
     def time_step(self) -> float:
         """Of the simulation [s]."""
 
-    def body_lanes(self, count: int) -> BodyLanes:
-        """Bodies for so many lanes."""
+    @property
+    def engine(self) -> Engine:
+        """What moves the body."""
 
-    def material(self, values: Values) -> Material:
-        """Material of the body for these values."""
+    def body_inputs(self, values: Values) -> tuple[Material, CubeInputs | None]:
+        """Material of the body, and the cube before it, for these values."""
 
 
 class _Drives(NamedTuple):
@@ -119,7 +96,7 @@ class Session:
                 remedy=f"give a multiple of {simulator.time_step:g} s",
             )
         self._check_mechanisms(simulator.mechanisms)
-        self.bodies: BodyLanes = simulator.body_lanes(lanes)
+        self.bodies: BodyLanes = body_lanes(simulator.engine, lanes)
         self._specs = {spec.name: spec for spec in simulator.parameters}
         self._table = np.tile([spec.nominal for spec in self._specs.values()], (lanes, 1))
         self._values = jnp.asarray(self._table)
@@ -178,16 +155,14 @@ class Session:
         chosen = np.zeros(self.lanes, bool)
         chosen[rows] = True
         self._drives = _chosen(chosen, fresh, self._drives)
-        material, start = self._bodies_of(self._values, fresh.wound)
-        found = self.bodies.reset(
-            rows, jax.tree.map(lambda part: np.asarray(part)[rows], material), np.asarray(start)[rows]
-        )
+        inputs = self._bodies_of(self._values, fresh.wound)
+        found = self.bodies.reset(rows, *jax.tree.map(lambda part: np.asarray(part)[rows], inputs))
         position = np.zeros((self.lanes, *found.position.shape[1:]))
         position[rows] = found.position
         cameras, seen = self._first_look(self._values, position)
         self._cameras = _chosen(chosen, cameras, self._cameras)
         self._started |= chosen
-        return Observation(np.asarray(seen)[rows], found.tension, None, status_of(found), first.copy())
+        return self._observation(found, np.asarray(seen)[rows], first.copy())
 
     def act(self, commands: Float[np.ndarray, "lane channel"]) -> Observation:
         """Let all lanes run for one control period with these commands [m or rad], in force from its start.
@@ -212,7 +187,7 @@ class Session:
         found = self.bodies.advance(np.asarray(displacement))
         now = self.simulator.time_step * (self.steps * self._past.periods)
         self._cameras, seen = self._look(self._values, self._cameras, found.position, now)
-        return Observation(np.asarray(seen), found.tension, None, status_of(found), np.asarray(angle))
+        return self._observation(found, np.asarray(seen), np.asarray(angle))
 
     def save(self) -> dict[str, np.ndarray]:
         """A copy of the state: arrays by name, one row a lane."""
@@ -341,10 +316,11 @@ class Session:
 
     @cached_property
     def _bodies_of(self) -> Any:
-        """Material of all lanes, and the displacements [m] that their initial states belong to."""
+        """Material of all lanes, displacements [m] that their initial states belong to, and cubes."""
 
-        def of(values: Values, wound: Wound) -> tuple[Material, Float[Array, " cable"]]:
-            return self.simulator.material(values), wound.level + self.simulator.pretension(values)
+        def of(values: Values, wound: Wound) -> tuple[Material, Float[Array, " cable"], CubeInputs | None]:
+            material, cube = self.simulator.body_inputs(values)
+            return material, wound.level + self.simulator.pretension(values), cube
 
         return self._by_lane(of)
 
@@ -392,31 +368,19 @@ class Session:
 
         return self._by_lane(first)
 
-
-def status_of(found: LaneMotion) -> Int[np.ndarray, " lane"]:
-    """How the rollouts of some lanes stand: a `Result` value each."""
-    cases = found.diverged, found.imbalance > EQUILIBRIUM_TOLERANCE, ~found.cables_converged
-    codes = Result.DIVERGED, Result.NOT_IN_EQUILIBRIUM, Result.CABLE_LIMIT
-    return np.select(cases, [int(code) for code in codes], int(Result.OK))
+    def _observation(self, found: LaneMotion, position: np.ndarray, angle: np.ndarray) -> Observation:
+        cases = found.diverged, found.imbalance > EQUILIBRIUM_TOLERANCE, ~found.converged
+        codes = Result.DIVERGED, Result.NOT_IN_EQUILIBRIUM, self.simulator.unsolved
+        status = np.select(cases, [int(code) for code in codes], int(Result.OK))
+        pose = found.pose
+        if pose is not None:
+            pose = np.concatenate(
+                [pose[:, :3], pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)], axis=1
+            )
+        return Observation(position, found.tension, pose, status, angle)
 
 
 @jax.jit
 def _chosen(rows: Bool[Array, " lane"], new: Any, old: Any) -> Any:
     """Some lanes of one tree of arrays, the others of another."""
     return jax.tree.map(lambda n, o: jnp.where(rows.reshape(-1, *(1,) * (n.ndim - 1)), n, o), new, old)
-
-
-def flat_lanes(tree: Any, count: int) -> Float[np.ndarray, "lane values"]:
-    """All leaves of a tree, one row a lane; whole numbers as floats."""
-    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(tree)]
-    rows = [leaf.reshape(len(leaf), -1) for leaf in leaves]
-    return np.concatenate([np.zeros((count, 0)), *rows], axis=1)
-
-
-def lanes_like(tree: Any, flat: Float[np.ndarray, "lane values"]) -> Any:
-    """The inverse of `flat_lanes`, with the shapes and types of a tree."""
-    leaves, structure = jax.tree.flatten(tree)
-    ends = np.cumsum([leaf[0].size for leaf in leaves])[:-1]
-    parts = np.split(flat, ends, axis=1)[: len(leaves)]
-    like = [jnp.asarray(p.reshape(leaf.shape), leaf.dtype) for p, leaf in zip(parts, leaves, strict=True)]
-    return jax.tree.unflatten(structure, like)

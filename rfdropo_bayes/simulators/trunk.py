@@ -3,59 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import ClassVar, NamedTuple, Protocol
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, cable_layout, prepare, profile_body
 from rfdropo_bayes.fem.balance import Balance, layered_balance
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
+from rfdropo_bayes.simulators.commands import Commands, commands_on_grid
+from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms
 from rfdropo_bayes.simulators.protocol import Observation, Result
-from rfdropo_bayes.simulators.robot_simulator import EQUILIBRIUM_TOLERANCE, RobotSimulator, Values, every_node, sampled
-from rfdropo_bayes.simulators.session import BodyLanes, Session
-
-
-class Motion(NamedTuple):
-    """What an engine returns: rows are time steps, row 0 is the initial state."""
-
-    position: Float[Array, "row marker 3"]
-    tension: Float[Array, "row cable"]
-    diverged: Bool[Array, ""]
-    imbalance: Float[Array, ""]  # relative unbalanced force of the initial equilibrium; 0 for a start at rest
-    cables_converged: Bool[Array, ""]  # whether the tensions of every step were found
-
-
-class Engine(Protocol):
-    """Computes the motion of a layered body under given cable displacements.
-
-    Attributes:
-        lanes: how many rollouts it likes to be given at once.
-    """
-
-    lanes: ClassVar[int]
-
-    def describe(self) -> dict[str, object]:
-        """Name and precision, for the record."""
-
-    def motion(
-        self,
-        material: Material,
-        start: Float[Array, " cable"],
-        displacement: Float[Array, "step cable"],
-        steps: Int[Array, ""] | None,
-    ) -> Motion:
-        """Roll out from the initial state; ``steps`` limits the steps computed, later rows hold no meaning."""
-
-    def recording(self, points: PointMap) -> Engine:
-        """The same engine in double precision, recording these points of the body in place of the markers."""
-
-    def body_lanes(self, count: int) -> BodyLanes:
-        """Bodies that go on from one control period to the next."""
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values, every_node, sampled
+from rfdropo_bayes.simulators.session import Session
 
 
 @dataclass(frozen=True)
@@ -123,14 +86,24 @@ class TrunkSimulator(RobotSimulator):
     assembly: Assembly
     discretisation: Discretisation
     mechanisms: Sequence[Mechanism] = field(default_factory=tuple)
+    unsolved: ClassVar[Result] = Result.CABLE_LIMIT
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mechanisms", check_mechanisms(self.mechanisms))
+
+    def with_backend(self, backend: Backend) -> TrunkSimulator:
+        """The same, computed by another backend."""
+        return replace(self, engine=replace(self.engine, backend=backend))
 
     @property
     def lanes(self) -> int:
         """Those of the engine."""
         return self.engine.lanes
+
+    @property
+    def time_step(self) -> float:  # type: ignore[override]
+        """That of the discretisation."""
+        return self.discretisation.time_step
 
     @property
     def description(self) -> dict[str, object]:
@@ -163,18 +136,13 @@ class TrunkSimulator(RobotSimulator):
             dead_time=self.robot.command.dead_time_s,
         )
 
-    @property
-    def time_step(self) -> float:
-        """Of the simulation [s]."""
-        return self.discretisation.time_step
-
     def session(self, lanes: int, period: float) -> Session:
         """So many trunks that are commanded one control period [s] at a time; see `Session`."""
         return Session(self, lanes, period)
 
-    def body_lanes(self, count: int) -> BodyLanes:
+    def body_inputs(self, values: Values) -> tuple[Material, None]:
         """See `SteppedSimulator`."""
-        return self.engine.body_lanes(count)
+        return self.material(values), None
 
     def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
         """Simulate from the initial state to the last observation.
@@ -189,26 +157,20 @@ class TrunkSimulator(RobotSimulator):
             InputError: a name that is not a parameter of this simulator.
         """
         values = self.complete(parameters)
-        time_step = self.discretisation.time_step
-        start, displacement = self.wound(values, commands, time_step)
-        steps = self.steps_seen(values, commands, time_step, steps)
-        motion = self.engine.motion(self.material(values), start, displacement, steps)
-        cases = (
-            (motion.diverged, Result.DIVERGED),
-            (motion.imbalance > EQUILIBRIUM_TOLERANCE, Result.NOT_IN_EQUILIBRIUM),
-            (~motion.cables_converged, Result.CABLE_LIMIT),
-        )
-        status = jnp.select([case for case, _ in cases], [int(code) for _, code in cases], int(Result.OK))
-        position = self.measured(values, sample(motion.position, commands), observed_at(commands, time_step))
-        angle = self.driven(values, commands, time_step)
-        return Observation(position, sample(motion.tension, commands), None, status, angle)
+        steps = self.steps_seen(values, commands, self.time_step, steps)
+        motion = self.engine.motion(*self.inputs(values, commands), steps)
+        return self.observation(values, commands, motion, self.unsolved)
+
+    def inputs(self, values: Values, commands: Commands) -> tuple[Material, Array, Array]:
+        """What the engine moves the body by: material, and cable displacements before the first and at each step."""
+        return self.material(values), *self.wound(values, commands, self.time_step)
 
     def balance(self, parameters: Values, commands: Commands) -> Balance:
         """See `RobotSimulator.balance`."""
         values = self.complete(parameters)
-        start, displacement = self.wound(values, commands, self.discretisation.time_step)
-        material, system = self.material(values), self.assembly.system
-        motion = self.engine.recording(every_node(system.body.nodes)).motion(material, start, displacement, None)
+        material, start, displacement = self.inputs(values, commands)
+        nodes = every_node(self.assembly.system.body.nodes)
+        motion = self.engine.recording(nodes).motion(material, start, displacement)
         return self.balance_of(material, motion.position, motion.tension, commands)
 
     def balance_of(

@@ -20,12 +20,14 @@ from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.robots import Robot, load_robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
+from rfdropo_bayes.simulators.engine import Engine
 from rfdropo_bayes.simulators.mesh_body import assemble_mesh
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
+from rfdropo_bayes.simulators.pushing import pushing
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
-from rfdropo_bayes.workflow.engines import build_engine, build_mesh_engine, build_push_simulator
+from rfdropo_bayes.workflow.engines import backend
 from rfdropo_bayes.workflow.experiment import Experiment, ModelTable, matching
 
 Entry = TypeVar("Entry")
@@ -40,23 +42,23 @@ def find_robot(experiment: Experiment, folder: Path) -> Robot:
 def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path()) -> RobotSimulator:
     """Robot, body, engine and mechanisms; ``folder`` is that of the experiment file, for the mesh of a body."""
     table = experiment.simulator
-    if table.push:
-        alone = experiment.model_copy(update={"simulator": table.model_copy(update={"push": False})})
-        return build_push_simulator(table, build_simulator(alone, robot, folder))
     if table.drives == "direct":
         robot = robot.without_command_timing()
     time_step = table.time_step or robot.time_step_s
     mechanisms = mechanisms_named(experiment.model.mechanisms, robot, folder=folder)
+    trunk: TrunkSimulator | MeshTrunkSimulator
     if table.body == "tetrahedra" and table.tetrahedra is not None:
         options = table.tetrahedra
         mesh = read_tetrahedra(find_data_file(options.mesh, folder), options.unit)
         bound = assemble_mesh(robot, mesh, options)
-        engine = build_mesh_engine(table, bound, time_step)
-        return MeshTrunkSimulator(robot, engine, bound, options, time_step, mechanisms)
-    discretisation = Discretisation(time_step, table.nodes_across, table.refine)
-    assembly = assemble(robot, discretisation)
-    layered = build_engine(table, assembly, discretisation, robot.initial_state == "equilibrium")
-    return TrunkSimulator(robot, layered, assembly, discretisation, mechanisms)
+        engine = Engine(bound, time_step, backend(table, False))
+        trunk = MeshTrunkSimulator(robot, engine, bound, options, time_step, mechanisms)
+    else:
+        discretisation = Discretisation(time_step, table.nodes_across, table.refine)
+        assembly = assemble(robot, discretisation)
+        engine = Engine(assembly, time_step, backend(table, True), robot.initial_state == "equilibrium")
+        trunk = TrunkSimulator(robot, engine, assembly, discretisation, mechanisms)
+    return pushing(trunk) if table.push else trunk
 
 
 def measurement_specs(table: ModelTable) -> tuple[ParameterSpec, ...]:

@@ -32,7 +32,7 @@ from rfdropo_bayes.report.audit_page import render_audit
 from rfdropo_bayes.report.summary import combined_hash
 from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.simulators.commands import Commands
-from rfdropo_bayes.simulators.compiled import CompiledEngine, effects_costly
+from rfdropo_bayes.simulators.engine import effects_costly
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, obstacle
 from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -212,7 +212,7 @@ def obstacles(
     for name in names:
         (mechanism,) = mechanisms_named([name], robot, folder=folder, where="[audit] candidates")
         table = experiment.simulator
-        why = obstacle(mechanism, table.body, engine, table.push)
+        why = obstacle(mechanism, table.body, engine)
         if why is None and name not in REGISTRY:
             why = _refusal(build_simulator(_with(experiment, [name]), robot, folder), commands)
         if why is not None:
@@ -262,15 +262,15 @@ def _lanes(
 
 def _brisk(simulator: RobotSimulator, marker_index: np.ndarray) -> Lanes:
     """Lanes with one-sided differences where there are any: they are exact enough for climbs and scores."""
-    if isinstance(simulator, TrunkSimulator) and isinstance(simulator.engine, CompiledEngine):
-        quick = replace(simulator, engine=replace(simulator.engine, one_sided=True))
+    if isinstance(simulator, TrunkSimulator) and simulator.engine.backend.name == "numba":
+        quick = simulator.with_backend(simulator.engine.backend._replace(one_sided=True))
         return Lanes(quick, marker_index, slope_rollouts=2)
     return Lanes(simulator, marker_index)
 
 
 def _costly(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
-    """Whether a mechanism acts on the body in a way that slows the compiled engine down, or that it does not know."""
-    if not isinstance(mechanism, BodyMechanism) or not isinstance(simulator.engine, CompiledEngine):
+    """Whether a mechanism acts on the body in a way that slows the compiled engine down."""
+    if not isinstance(mechanism, BodyMechanism) or simulator.engine.backend.name != "numba":
         return False
     values = simulator.complete({})
     plain = replace(simulator, mechanisms=()).material(values)

@@ -67,8 +67,7 @@ def where_it_runs(mechanism: Mechanism) -> str:
     """Bodies and engines that simulate a mechanism, in words."""
     bodies, engines = bodies_of(mechanism), engines_of(mechanism)
     words = "every body" if set(bodies) == set(BODIES) else f"{' and '.join(bodies)} bodies"
-    words += ", every engine" if set(engines) == set(ENGINES) else f", engine {' or '.join(engines)}"
-    return words if getattr(mechanism, "beside_cube", True) else f"{words}, without a cube"
+    return words + (", every engine" if set(engines) == set(ENGINES) else f", engine {' or '.join(engines)}")
 
 
 def prior_text(prior: Mapping[str, Any]) -> str:

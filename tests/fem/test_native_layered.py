@@ -110,7 +110,7 @@ def test_agrees_with_reference(nodes_across, precision):
     np.testing.assert_allclose(found.tension, tension, rtol=0.0, atol=1e5 * AGREEMENT[precision])
     assert not np.any(diverged)
     assert not found.diverged.any()
-    assert found.cables_converged.all()
+    assert found.converged.all()
     assert not found.residual.any()
 
 
@@ -236,7 +236,7 @@ def test_cables_that_share_a_route():
 
     for precision, atol in AGREEMENT.items():
         found = NativeLayered(system, points, TIME_STEP, precision=precision, threads=1).rollout(material, displacement)
-        assert found.cables_converged.all()
+        assert found.converged.all()
         assert not found.diverged.any()
         np.testing.assert_allclose(found.position[:, 1:], expected(material, displacement), rtol=0.0, atol=atol)
 

@@ -58,7 +58,7 @@ class Scene:
         engine = TetrahedralEngine(self.body, self.cables, self.limits, self.points, dtype=dtype, threads=1)
         result = engine.rollouts(values, command.reshape(-1, 8), time_step=TIME_STEP, stride=STEPS)
         assert not result.diverged.any()
-        assert result.cables_converged.all()
+        assert result.converged.all()
         return result.position[0]
 
 

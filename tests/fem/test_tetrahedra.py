@@ -193,7 +193,7 @@ def test_both_engines_give_the_same_numbers(frames, limits):
     assert (fast.tension > 0.0).any()
     assert (fast.tension == 0.0).any()
     assert not fast.diverged.any()
-    assert fast.cables_converged.all()
+    assert fast.converged.all()
     np.testing.assert_allclose(fast.position, slow.position, atol=1e-9)
     np.testing.assert_allclose(fast.tension, slow.tension, atol=1e-5)
 

@@ -10,8 +10,8 @@ import pytest
 from rfdropo_bayes.fem import Material
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism
-from rfdropo_bayes.simulators.reference import ReferenceEngine
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
 BODY = sorted(name for name, kind in REGISTRY.items() if isinstance(kind(), BodyMechanism))
@@ -25,7 +25,7 @@ def simulator(*names: str) -> TrunkSimulator:
     robot = load_robot("smooth_arm")
     discretisation = Discretisation(0.02)
     assembly = assemble(robot, discretisation)
-    engine = ReferenceEngine(assembly, 0.02, True)
+    engine = Engine(assembly, 0.02, Backend("jax"), from_equilibrium=True)
     return TrunkSimulator(robot, engine, assembly, discretisation, tuple(REGISTRY[name]() for name in names))
 
 

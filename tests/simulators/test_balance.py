@@ -11,13 +11,10 @@ import pytest
 
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
-from rfdropo_bayes.simulators.compiled import CompiledEngine
-from rfdropo_bayes.simulators.compiled_push import CompiledMeshPushEngine
+from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
-from rfdropo_bayes.simulators.mesh_engines import CompiledMeshEngine
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
-from rfdropo_bayes.simulators.pushing import PushSimulator
-from rfdropo_bayes.simulators.reference import ReferenceEngine
+from rfdropo_bayes.simulators.pushing import pushing
 from rfdropo_bayes.simulators.robot_simulator import every_node
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
@@ -31,7 +28,8 @@ SOFT = {"young_modulus": jnp.asarray(2e5), "rayleigh_mass": jnp.asarray(0.3)}
 def trunk(bar_mesh) -> MeshTrunkSimulator:
     options = TetrahedraTable(mesh="bar.vtk", unit="mm", clamp_height=0.02)
     assembly = assemble_mesh(ROBOT, read_tetrahedra(bar_mesh, "mm"), options)
-    return MeshTrunkSimulator(ROBOT, CompiledMeshEngine(assembly, TIME_STEP, "float32"), assembly, options, TIME_STEP)
+    engine = Engine(assembly, TIME_STEP, Backend(precision="float32"))
+    return MeshTrunkSimulator(ROBOT, engine, assembly, options, TIME_STEP)
 
 
 def every_step(simulator, rows: int):
@@ -69,14 +67,14 @@ def test_the_base_of_a_mesh_holds_what_moves_it(trunk):
 @pytest.mark.slow
 def test_what_the_cube_is_pushed_by_pushes_the_trunk_back(trunk):
     """Without friction only the trunk moves a cube along the plate."""
-    pushing = PushSimulator(CompiledMeshPushEngine(trunk))
-    commands = every_step(pushing, 50)
+    beside = pushing(trunk)
+    commands = every_step(beside, 50)
     height = PLATE + 0.0175 + 0.005
     values = SOFT | {"friction": jnp.asarray(0.0), "cube_x": jnp.asarray(-0.02), "cube_y": jnp.asarray(height)}
-    found, seen = pushing.balance(values, commands), pushing.rollout(values, commands)
+    found, seen = beside.balance(values, commands), beside.rollout(values, commands)
     velocity = np.diff(np.asarray(seen.object_pose)[:, :3], axis=0, prepend=np.asarray(seen.object_pose)[:1, :3])
     velocity /= TIME_STEP
-    mass = float(pushing.complete({})["cube_mass"])
+    mass = float(beside.complete({})["cube_mass"])
     pushed = mass * (velocity[1:] - velocity[:-1] / (1.0 + 0.3 * TIME_STEP)) / TIME_STEP
     along = np.asarray(found.contact_force)[1:, [0, 2]]
     assert np.abs(along).max() > 0.01
@@ -88,8 +86,8 @@ def test_what_the_cube_is_pushed_by_pushes_the_trunk_back(trunk):
 def test_both_engines_balance_alike():
     robot, discretisation = load_robot("smooth_arm"), Discretisation(TIME_STEP)
     assembly = assemble(robot, discretisation)
-    fast = TrunkSimulator(robot, CompiledEngine(assembly, TIME_STEP, True), assembly, discretisation)
-    slow = replace(fast, engine=ReferenceEngine(assembly, TIME_STEP, True))
+    fast = TrunkSimulator(robot, Engine(assembly, TIME_STEP, from_equilibrium=True), assembly, discretisation)
+    slow = replace(fast, engine=replace(fast.engine, backend=Backend("jax")))
     channels = len(robot.channel_names)
     value = 2e-3 * np.outer(np.arange(4), np.arange(channels) % 2)
     commands = fast.commands(0.05 * np.arange(4), value, np.zeros(channels), 0.05 * np.arange(5))

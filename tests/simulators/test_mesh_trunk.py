@@ -15,9 +15,9 @@ from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators import Result, Simulator
 from rfdropo_bayes.simulators.commands import animated_on_grid
+from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.mechanisms import bodies_of, obstacle
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
-from rfdropo_bayes.simulators.mesh_engines import CompiledMeshEngine, ReferenceMeshEngine
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
 
 TIME_STEP = 0.01
@@ -35,10 +35,10 @@ def table(**options) -> TetrahedraTable:
     return TetrahedraTable(**{"mesh": "bar.vtk", "unit": "mm", "clamp_height": 0.02, "marker_cables": LONG} | options)
 
 
-def trunk(mesh, *, engine=CompiledMeshEngine, robot=ROBOT, mechanisms=(), precision=None, **options):
+def trunk(mesh, *, engine="numba", robot=ROBOT, mechanisms=(), precision="float64", **options):
     chosen = table(**options)
     assembly = assemble_mesh(robot, mesh, chosen)
-    made = engine(assembly, TIME_STEP, *([precision] if precision else []))
+    made = Engine(assembly, TIME_STEP, Backend(engine, precision))
     return MeshTrunkSimulator(robot, made, assembly, chosen, TIME_STEP, mechanisms_named(mechanisms))
 
 
@@ -75,7 +75,7 @@ def test_markers_start_at_the_mean_of_the_guides_and_the_first_stays(sofa):
 
 
 def test_both_engines_give_the_same_numbers(mesh, sofa):
-    reference = trunk(mesh, engine=ReferenceMeshEngine, **SOFA)
+    reference = trunk(mesh, engine="jax", **SOFA)
     commands = pulls(sofa, 3)
     values = {"young_modulus": jnp.asarray(2e6), "poisson_ratio": jnp.asarray(0.3), "offset_x": jnp.asarray(2e-3)}
     slow, fast = jax.jit(reference.rollout)(values, commands), sofa.rollout(values, commands)
@@ -204,6 +204,6 @@ def test_every_mechanism_says_whether_it_runs_on_a_mesh(sofa, name):
     if "tetrahedra" in bodies_of(mechanism):
         jax.eval_shape(lambda commands: simulator.rollout({}, commands), pulls(sofa))
     else:
-        assert obstacle(mechanism, "tetrahedra", "numba", False) is not None
+        assert obstacle(mechanism, "tetrahedra", "numba") is not None
         with pytest.raises(InputError, match="layered bodies only"):
             jax.eval_shape(lambda commands: simulator.rollout({}, commands), pulls(sofa))

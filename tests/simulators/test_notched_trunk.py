@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 from rfdropo_bayes import fem
 from rfdropo_bayes.fem import corotational
 from rfdropo_bayes.robots import load_robot
-from rfdropo_bayes.simulators.reference import ReferenceEngine
+from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
 # Linear sag [m] at the last notch-free station under gravity across the axis, and the first two bending modes [Hz], of
@@ -35,7 +35,7 @@ def dense(matrix, free: int) -> np.ndarray:
 def test_sag_and_modes_are_those_of_the_solid(refine):
     robot, discretisation = load_robot("trunk_sofa"), Discretisation(0.01, refine=refine)
     assembly = assemble(robot, discretisation)
-    trunk = TrunkSimulator(robot, ReferenceEngine(assembly, 0.01, False), assembly, discretisation)
+    trunk = TrunkSimulator(robot, Engine(assembly, 0.01, Backend("jax")), assembly, discretisation)
     system = assembly.system
 
     @jax.jit

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.robots import load_robot
-from rfdropo_bayes.simulators.compiled import CompiledEngine
+from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 from rfdropo_bayes.workflow.assembly import build_simulator
@@ -19,7 +19,7 @@ def test_a_notched_trunk_between_opposed_cables_stays_whole():
     """Eight random walks of up to 40 mm, each cable on its own, on light and heavy, soft and stiff trunks."""
     robot, discretisation = load_robot("trunk_sofa"), Discretisation(0.01)
     assembly = assemble(robot, discretisation)
-    trunk = TrunkSimulator(robot, CompiledEngine(assembly, 0.01, False, threads=1), assembly, discretisation)
+    trunk = TrunkSimulator(robot, Engine(assembly, 0.01, Backend(threads=1)), assembly, discretisation)
     clock = np.arange(0.0, 3.0, 0.05)
     pull = 0.003 * np.cumsum(np.random.default_rng(0).normal(size=(len(clock), 8)), axis=0)
     commands = trunk.commands(clock, pull, np.zeros(8), np.arange(0.1, 3.0, 0.1))

@@ -11,9 +11,9 @@ import pytest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.robots import load_robot
-from rfdropo_bayes.simulators.compiled import CompiledEngine
+from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.protocol import Result
-from rfdropo_bayes.simulators.reference import ReferenceEngine
+from rfdropo_bayes.simulators.pushing import pushing
 from rfdropo_bayes.simulators.session import Session
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
@@ -37,11 +37,8 @@ def simulator(engine: str, precision: str = "float64", mechanisms: tuple[str, ..
     robot = robot.model_copy(update={"command": timing, "initial_state": state})
     discretisation = Discretisation(robot.time_step_s)
     assembly = assemble(robot, discretisation)
-    settled = state == "equilibrium"
-    if engine == "jax":
-        computed = ReferenceEngine(assembly, robot.time_step_s, settled)
-    else:
-        computed = CompiledEngine(assembly, robot.time_step_s, settled, precision)
+    backend = Backend(engine, precision)
+    computed = Engine(assembly, robot.time_step_s, backend, state == "equilibrium")
     return TrunkSimulator(robot, computed, assembly, discretisation, mechanisms_named(mechanisms, robot))
 
 
@@ -104,6 +101,38 @@ def test_a_session_is_a_rollout_bit_for_bit(precision, state):
             compared += 1
     assert compared == LANES * PERIODS
     assert np.ptp(whole.position, axis=1).max() > 0.02
+
+
+PUSHED = {"cube_x": 0.012, "cube_z": 0.15, "cube_mass": 0.05, "friction": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("engine", "precision", "tolerance"),
+    [
+        ("numba", "float64", 0.0),
+        ("numba", "float32", 0.0),
+        pytest.param("jax", "float64", 1e-9, marks=pytest.mark.slow),
+    ],
+)
+def test_a_cube_is_pushed_as_in_a_rollout(engine, precision, tolerance):
+    """Pose, velocity and warm starts of every lane's contacts are its own."""
+    model, compiled = pushing(simulator(engine, precision)), pushing(simulator("numba", precision))
+    parameters, commands = drawn({name: PUSHED[name] for name in ("cube_mass", "friction")})
+    down = np.zeros(8)
+    down[[2, 6]] = 0.02  # the cables below
+    commands = np.clip(0.2 * commands, 0.0, 0.03) + down * np.linspace(0.3, 2.0, PERIODS)[:, None]
+    commands[..., 6] = np.minimum(commands[..., 6], 0.04)
+    parameters |= {"cube_x": np.full(LANES, PUSHED["cube_x"]), "cube_z": np.full(LANES, PUSHED["cube_z"])}
+    whole = rollouts(compiled, parameters, commands)
+    way = np.linalg.norm(whole.object_pose[:, -1, :3] - whole.object_pose[:, 0, :3], axis=-1)
+    assert way.min() > 1e-3, "nothing was pushed"
+    for _, seen in run(model, parameters, commands):
+        for lane, (row, now) in enumerate(seen):
+            np.testing.assert_allclose(now.position, whole.position[lane, row], rtol=0.0, atol=tolerance)
+            np.testing.assert_allclose(
+                now.object_pose, whole.object_pose[lane, row], rtol=0.0, atol=10 * tolerance + 1e-15
+            )
+            assert now.status == whole.status[lane] == Result.OK
 
 
 @pytest.mark.parametrize(("engine", "tolerance"), [("numba", 1e-13), pytest.param("jax", 1e-9, marks=pytest.mark.slow)])

@@ -134,11 +134,12 @@ def extend_border(pivot, coupling, extra, first, top, tiles, panels, token):
 
 
 @kernel
-def condense_rows(target, rows, panels, others, other_panels, first, top, size, token):
-    """``target`` = minus the products of border rows and others, in tiles; both are zero above the station ``top``."""
+def condense_rows(target, rows, panels, others, other_panels, symmetric, first, top, size, token):
+    """``target`` = minus the products of border rows and others, in tiles, or the lower half of these; both are zero
+    above the station ``top``."""
     zero, panel = fill(0.0, target, token), 3 * size
     for i in range(panels):
-        for j in range(other_panels):
+        for j in range(i + 1 if symmetric else other_panels):
             t = 9 * (i * other_panels + j)
             for k in range(9):
                 store(target, t + k, zero)

@@ -1,55 +1,127 @@
-"""Cubes of a lane block: from the start of a rollout, through the contacts and the motion of a step, to the record."""
+"""Cubes of a lane block: their part of a step's constraints, their motion, and the record."""
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.native.contact_records import CUBE_STATE, CUBE_VALUES
-from rfdropo_bayes.fem.native.contact_rows import (
-    free_cube,
-    list_lying,
-    list_pushing,
-    move_cube,
-    place_resting,
-    turn_cube,
-)
-from rfdropo_bayes.fem.native.contact_search import search
-from rfdropo_bayes.fem.native.layered_rollout import fill_lanes
-from rfdropo_bayes.fem.native.simd import kernel
+import math
+
+from rfdropo_bayes.fem.constraints import APART
+from rfdropo_bayes.fem.native.contact_geometry import cube_row, kind_of
+from rfdropo_bayes.fem.native.contact_records import CORNERS, CUBE_STATE, CUBE_VALUES
+from rfdropo_bayes.fem.native.fields import fill_lanes
+from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, store, where_greater
 
 
 @kernel
-def find_candidates(scene, position, gravity, drag, touch, time_step, token):
-    """The cube's contacts, and the trunk's candidates, from positions; returns how many candidates there are."""
-    lanes = len(token)
-    for lane in range(lanes):
-        turn_cube(touch, lane, lanes)
-        free_cube(touch, gravity, drag, time_step, lane, lanes)
-        place_resting(scene, touch, time_step, lane, lanes)
-    search(scene, position, touch, token)
-    for lane in range(lanes):
-        list_pushing(scene, touch, position, lane, lanes)
-        list_lying(scene, touch, position, lane, lanes)
-    return touch.count[0] + touch.count[1]
-
-
-@kernel
-def take_cube_step(touch, accepted, lost, time_step, lane, lanes):
-    """Move the cube on where the body's step was taken, else stop it; marks lanes where that leads nowhere."""
-    fine = accepted[lane] > 0.0 and move_cube(touch, time_step, lane, lanes)
-    if not fine:
-        for i in range(6):
-            touch.cube[(7 + i) * lanes + lane] = 0.0
-        lost[lane] = 1.0
-    elif touch.stuck[lane] > 0.0:
-        touch.failed[lane] = 1.0
-
-
-@kernel
-def start_cubes(cubes, count, touch, first, token):
+def start_cubes(scene, cubes, count, touch, first, token):
     """Cubes of a lane block at the start."""
     fill_lanes(cubes.state, CUBE_STATE, 0, CUBE_STATE, first, count, touch.cube, token)
     fill_lanes(cubes.values, CUBE_VALUES, 0, CUBE_VALUES, first, count, touch.values, token)
-    for lane in range(len(token)):
-        touch.failed[lane] = 0.0
+    for i in range(3 * (CORNERS + 2 * scene.spheres)):
+        store(touch.memory, i, fill(0.0, touch.cube, token))
+
+
+@kernel
+def add_cube(touch, p, lines, contacts, time_step, token):
+    """Add the cube to the problem of a step: W, the velocities without impulses, openings, and where to start."""
+    zero, one, n = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token), lines + 3 * contacts
+    light = one / load(touch.values, 0, token)
+    gyration = load(touch.values, 2, token)
+    nimble = light / (gyration * gyration)
+    store(p.friction, 0, load(touch.values, 3, token))
+    for c in range(contacts):
+        slot = touch.contact[c]
+        kind, chosen = kind_of(touch, slot), load(touch.chosen, slot, token)
+        opening = load(touch.gap, slot, token) * (1.0 / time_step)
+        store(p.opening, c, where_greater(chosen, zero, opening, one * APART))
+        for r in range(3):
+            i = lines + 3 * c + r
+            row = cube_row(touch, slot, r, kind, token)
+            rate = load(p.free, i, token)
+            for k, value in enumerate(row):
+                store(touch.on_cube, 18 * c + 6 * r + k, value)
+                rate = fma(value, load(touch.twist, k, token), rate)
+            store(p.free, i, where_greater(chosen, zero, rate, zero))  # others' contacts are no measure of a lane's
+            remembered = load(touch.memory, 3 * touch.pair[slot] + r, token)
+            store(p.impulse, i, where_greater(chosen, zero, remembered, zero))
+    for i in range(3 * contacts):
+        for j in range(i + 1):
+            value, turning = zero, zero
+            for k in range(3):
+                value = fma(load(touch.on_cube, 6 * i + k, token), load(touch.on_cube, 6 * j + k, token), value)
+                t, s = 6 * i + 3 + k, 6 * j + 3 + k
+                turning = fma(load(touch.on_cube, t, token), load(touch.on_cube, s, token), turning)
+            t, s = (lines + i) * n + lines + j, (lines + j) * n + lines + i
+            value = load(p.matrix, t, token) + fma(nimble, turning, light * value)
+            store(p.matrix, t, value)
+            store(p.matrix, s, value)
+
+
+@kernel
+def stop_cube(touch, p, lines, contacts, token):
+    """The cube's twist ``after`` the contacts' impulses."""
+    light = fill(1.0, touch.cube, token) / load(touch.values, 0, token)
+    gyration = load(touch.values, 2, token)
+    for k in range(6):
+        total = fill(0.0, touch.cube, token)
+        for i in range(3 * contacts):
+            total = fma(load(touch.on_cube, 6 * i + k, token), load(p.impulse, lines + i, token), total)
+        share = light if k < 3 else light / (gyration * gyration)
+        store(touch.after, k, fma(share, total, load(touch.twist, k, token)))
+
+
+@kernel
+def remember_impulses(scene, touch, p, lines, contacts, accepted, token):
+    """Keep the impulses of a step that was taken, where the next one starts."""
+    zero, taken = fill(0.0, touch.cube, token), load(accepted, 0, token)
+    for i in range(3 * (CORNERS + 2 * scene.spheres)):
+        store(touch.memory, i, zero)
+    for c in range(contacts):
+        for r in range(3):
+            impulse = where_greater(taken, zero, load(p.impulse, lines + 3 * c + r, token), zero)
+            store(touch.memory, 3 * touch.pair[touch.contact[c]] + r, impulse)
+
+
+@kernel
+def _move_cube(touch, time_step, lane, lanes):
+    """Let the cube move on with ``after``; see ``fem.rigid_body.moved``. Returns False if that leads nowhere."""
+    wx, wy, wz = (
+        0.5 * time_step * touch.after[3 * lanes + lane],
+        0.5 * time_step * touch.after[4 * lanes + lane],
+        0.5 * time_step * touch.after[5 * lanes + lane],
+    )
+    square = wx * wx + wy * wy + wz * wz
+    angle = math.sqrt(square)
+    share = math.sin(angle) / angle if square > 0.0 else 1.0
+    scalar, wx, wy, wz = math.cos(angle), share * wx, share * wy, share * wz
+    x, y = touch.cube[3 * lanes + lane], touch.cube[4 * lanes + lane]
+    z, w = touch.cube[5 * lanes + lane], touch.cube[6 * lanes + lane]
+    qx = scalar * x + w * wx + wy * z - wz * y
+    qy = scalar * y + w * wy + wz * x - wx * z
+    qz = scalar * z + w * wz + wx * y - wy * x
+    qw = scalar * w - wx * x - wy * y - wz * z
+    length = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
+    px = touch.cube[lane] + time_step * touch.after[lane]
+    py = touch.cube[lanes + lane] + time_step * touch.after[lanes + lane]
+    pz = touch.cube[2 * lanes + lane] + time_step * touch.after[2 * lanes + lane]
+    if not math.isfinite(px + py + pz + length):
+        return False
+    touch.cube[lane], touch.cube[lanes + lane], touch.cube[2 * lanes + lane] = px, py, pz
+    touch.cube[3 * lanes + lane], touch.cube[4 * lanes + lane] = qx / length, qy / length
+    touch.cube[5 * lanes + lane], touch.cube[6 * lanes + lane] = qz / length, qw / length
+    for i in range(6):
+        touch.cube[(7 + i) * lanes + lane] = touch.after[i * lanes + lane]
+    return True
+
+
+@kernel
+def take_cube_step(touch, accepted, lost, time_step, token):
+    """Move the cube on where the body's step was taken, else stop it; marks lanes where that leads nowhere."""
+    lanes = len(token)
+    for lane in range(lanes):
+        if not (accepted[lane] > 0.0 and _move_cube(touch, time_step, lane, lanes)):
+            for i in range(6):
+                touch.cube[(7 + i) * lanes + lane] = 0.0
+            lost[lane] = 1.0
 
 
 @kernel
@@ -60,10 +132,3 @@ def record_cubes(touch, poses, records, row, first, count, token):
         at = 7 * ((first + lane) * records + row)
         for k in range(7):
             poses.pose[at + k] = touch.cube[k * lanes + lane]
-
-
-@kernel
-def finish_cubes(touch, poses, first, count, token):
-    """Write the result codes of the lanes that belong to the batch."""
-    for lane in range(min(len(token), count - first)):
-        poses.converged[first + lane] = 0 if touch.failed[lane] > 0.0 else 1

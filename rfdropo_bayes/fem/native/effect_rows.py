@@ -32,20 +32,6 @@ from rfdropo_bayes.fem.native.layered_effects import (
     WALL,
 )
 
-COMPILED_EFFECTS = frozenset(
-    {
-        "bending",
-        "viscoelasticity",
-        "softening_rate",
-        "drag",
-        "wall",
-        "cable_compliance",
-        "coulomb_friction",
-        "capstan_friction",
-    }
-)
-"""Names of the effects that the kernels know."""
-
 
 def has_friction(effects: BodyEffects) -> bool:
     """Whether cables rub in their guides."""

@@ -21,19 +21,31 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
 from rfdropo_bayes.fem.equilibrium import ITERATIONS
 from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.native.constraint_problem import SETTLED, Problem, problem_storage
+from rfdropo_bayes.fem.native.contact_records import (
+    MISSED,
+    Cubes,
+    PushOutput,
+    Touch,
+    cube_rows,
+    pairs_of,
+    scene_tables,
+    touch_storage,
+)
 from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, has_friction, law_rows
 from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
-from rfdropo_bayes.fem.native.layered_friction import compile_rollout as compile_friction_rollout
+from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
 from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, Storage, compile_rollout, storage
-from rfdropo_bayes.fem.native.section_modes import layered_tables
+from rfdropo_bayes.fem.native.section_modes import border_panels, layered_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
-from rfdropo_bayes.fem.native.slip_records import Friction, friction_storage, runs_of
+from rfdropo_bayes.fem.native.slip_records import KINDS, Friction, friction_storage, runs_of
+from rfdropo_bayes.fem.pushing import PushScene
 
 Precision = Literal["float64", "float32"]
-# Tolerance of the tension problem and relative compliance added to every cable, as far as the precision resolves them;
+# When a step's impulses are found and what counts as a missed contact, as far as the precision resolves them;
 # refinements of every step's linear solution.
-_NUMERICS = {"float64": (1e-12, 0.0, 0), "float32": (1e-6, 1e-6, 1)}
+_NUMERICS = {name: (SETTLED[name], MISSED[name], number) for name, number in (("float64", 0), ("float32", 1))}
 
 
 class NativeRollout(NamedTuple):
@@ -45,26 +57,46 @@ class NativeRollout(NamedTuple):
     position: Float[np.ndarray, "batch rows points 3"]  # [m]
     tension: Float[np.ndarray, "batch rows cables"]  # [N]
     diverged: Bool[np.ndarray, " batch"]
-    cables_converged: Bool[np.ndarray, " batch"]
+    converged: Bool[np.ndarray, " batch"]  # whether the impulses of every step's constraints were found
     residual: Float[np.ndarray, " batch"]  # relative force out of balance in the initial equilibrium; 0 without one
+    pose: Float[np.ndarray, "batch rows 7"] | None = None  # of the cube: centre [m], unit quaternion (x, y, z, w)
 
     @classmethod
-    def of(cls, output: Output) -> NativeRollout:
-        """What the kernels have written."""
-        codes = output.diverged.view(bool), output.cables_converged.view(bool)
-        return cls(output.position, output.tension, *codes, output.residual)
+    def of(cls, run: Run) -> NativeRollout:
+        """What a run has recorded."""
+        output = run.output
+        assert output is not None
+        codes = output.diverged.view(bool), output.converged.view(bool)
+        pose = None if run.poses is None else run.poses.pose
+        return cls(output.position, output.tension, *codes, output.residual, pose)
+
+
+class Run(NamedTuple):
+    """Rollouts of a batch: what they are computed from, how they run, and what they record."""
+
+    batch: Batch
+    cubes: Cubes | None
+    schedule: Schedule
+    output: Output | None = None
+    poses: PushOutput | None = None
+
+
+class Records(NamedTuple):
+    """What a lane block works on; None where cables do not rub, and where there is no cube."""
+
+    samples: Samples
+    factors: Factors
+    work: Work
+    friction: Friction | None
+    touch: Touch | None
+    rows: Rows
+    problem: Problem
 
 
 @cache
 def _kernel() -> Callable:
     """The rollout kernel."""
     return compile_rollout(kernel_sources("layered_rollout"))
-
-
-@cache
-def _friction_kernel() -> Callable:
-    """The rollout kernel of bodies whose cables rub."""
-    return compile_friction_rollout(kernel_sources("layered_friction"))
 
 
 def available_threads() -> int:
@@ -82,6 +114,7 @@ class NativeLayered:
         precision: of all arithmetic; parameters, commands and results are float64 in any case.
         threads: lane blocks computed at the same time; None for all processors this process may use.
         lanes: samples side by side; None for as many as a vector register holds.
+        scene: what the body pushes a cube on; None for a body that touches nothing.
 
     Raises:
         InputError: unknown precision, or a number of threads or lanes that makes no sense.
@@ -96,6 +129,7 @@ class NativeLayered:
         precision: Precision = "float64",
         threads: int | None = None,
         lanes: int | None = None,
+        scene: PushScene | None = None,
     ) -> None:
         if precision not in _NUMERICS:
             raise InputError(f"precision {precision!r}", remedy=f"use one of {', '.join(_NUMERICS)}")
@@ -108,6 +142,8 @@ class NativeLayered:
         self.points = len(points.node)
         self.tables = layered_tables(system, points, self.dtype.type)
         self._runs = runs_of(system.cables)
+        numbers, shape = np.arange(system.body.nodes), np.asarray(self.tables.shape, dtype=float)
+        self._scene = None if scene is None else scene_tables(scene, shape, numbers, self.dtype.type)
         self._token = lane_token(self.lanes)
         self._local = threading.local()
 
@@ -121,6 +157,7 @@ class NativeLayered:
         tension: Float[np.ndarray, "*batch cables"] | None = None,
         steps: int | None = None,
         stride: int = 1,
+        cube: tuple[Float[np.ndarray, "*batch 13"], Float[np.ndarray, "*batch 4"]] | None = None,
     ) -> NativeRollout:
         """Roll out a batch.
 
@@ -134,40 +171,39 @@ class NativeLayered:
             tension: initial cable tensions [N], where the first tension problem is started; None means zero.
             steps: compute only so many steps.
             stride: record every so many steps.
+            cube: of an engine with a scene: centre [m], unit quaternion (x, y, z, w), velocity [m/s] and spin [rad/s]
+                at the start; mass [kg], side [m], radius of gyration [m] and coefficient of friction.
 
         Raises:
-            InputError: shapes that do not fit.
+            InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
         """
         state = {"start": start, "position": position, "tension": tension}
-        batch, schedule, output = self.inputs(material, displacement, state, steps, stride)
+        run = self.run_of(material, displacement, state, steps, stride, cube)
         rubs = has_friction(material.effects)
+        in_blocks(
+            lambda first: self.run_block(run, self.records(rubs), first), run.batch.count, self.lanes, self.threads
+        )
+        return NativeRollout.of(run)
 
-        def block(first: int) -> None:
-            self.run_block(batch, self.records(rubs), schedule, output, first)
-
-        in_blocks(block, batch.count, self.lanes, self.threads)
-        return NativeRollout.of(output)
-
-    def records(self, rubs: bool) -> tuple[Samples, Factors, Work] | tuple[Samples, Factors, Work, Friction]:
+    def records(self, rubs: bool) -> Records:
         """What a block works on in the calling thread; ``rubs``: with friction of the cables."""
-        return (*self._storage(), self._friction()) if rubs else self._storage()
+        return Records(*self._storage(), self._friction() if rubs else None, self._touch(), *self._rows(rubs))
 
-    def run_block(
-        self, batch: Batch, records: tuple[NamedTuple, ...], schedule: Schedule, output: Output, first: int
-    ) -> None:
+    def run_block(self, run: Run, records: Records, first: int) -> None:
         """Run one lane block, whose first rollout is ``first``, on `records`."""
-        friction = (self._runs, *records[3:]) if len(records) > 3 else ()
-        kernel = _friction_kernel() if friction else _kernel()
-        kernel(self.tables, batch, *records[:3], *friction, schedule, output, first, self._token)
+        runs = None if records.friction is None else self._runs
+        batch, cubes, schedule, output, poses = run
+        _kernel()(self.tables, runs, self._scene, batch, cubes, *records, schedule, output, poses, first, self._token)
 
-    def inputs(
+    def run_of(
         self,
         material: Material,
         displacement: np.ndarray,
         given: Mapping[str, np.ndarray | None],
         steps: int | None,
         stride: int,
-    ) -> tuple[Batch, Schedule, Output]:
+        cube: tuple[np.ndarray, np.ndarray] | None,
+    ) -> Run:
         """What the kernels read and write; ``given`` holds the states that `rollout` takes, by name."""
         displacement = np.asarray(displacement, dtype=float)
         cables = self.tables.cables
@@ -181,12 +217,26 @@ class NativeLayered:
         }
         batch = self._batch(material, state)
         steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
-        schedule = self.schedule(steps, stride)._replace(static_iterations=0 if given["start"] is None else ITERATIONS)
-        return batch, schedule, empty_output(batch.count, 1 + steps // stride, self.points, cables)
+        if (cube is None) != (self._scene is None):
+            raise InputError("a scene without a cube, or a cube without a scene", where="rollout")
+        cubes = None if cube is None else cube_rows(*cube, batch.count, self.dtype)
+        settling = 0 if given["start"] is None else ITERATIONS
+        schedule = Schedule(self.time_step, steps, int(stride), settling, *_NUMERICS[self.precision])
+        return self.with_output(Run(batch, cubes, schedule))
 
-    def schedule(self, steps: int, stride: int) -> Schedule:
-        """How so many steps run, from the undeformed body."""
-        return Schedule(self.time_step, steps, int(stride), 0, *_NUMERICS[self.precision])
+    def with_output(self, run: Run) -> Run:
+        """The same run with room for what it records."""
+        count, records = run.batch.count, 1 + run.schedule.steps // run.schedule.stride
+        output = Output(
+            np.zeros((count, records, self.points, 3)),
+            np.zeros((count, records, self.tables.cables)),
+            np.zeros(count, dtype=np.uint8),
+            np.zeros(count, dtype=np.uint8),
+            np.zeros(count),
+            records,
+        )
+        poses = None if self._scene is None else PushOutput(np.zeros((count, records, 7)))
+        return run._replace(output=output, poses=poses)
 
     def _modes(self, position: np.ndarray | None) -> np.ndarray:
         """Node positions as section modes, one row a rollout."""
@@ -242,8 +292,31 @@ class NativeLayered:
     def _friction(self) -> Friction:
         """Friction of the calling thread."""
         if not hasattr(self._local, "friction"):
-            self._local.friction = friction_storage(self.tables, self._runs, self.lanes, self.dtype.type)
+            self._local.friction = friction_storage(self._runs, self.lanes, self.dtype.type)
         return self._local.friction
+
+    def _touch(self) -> Touch | None:
+        """Contacts of the calling thread."""
+        if self._scene is None:
+            return None
+        if not hasattr(self._local, "touch"):
+            self._local.touch = touch_storage(self._scene.spheres, self.lanes, self.dtype.type)
+        return self._local.touch
+
+    def _rows(self, rubs: bool) -> tuple[Rows, Problem]:
+        """Border rows and constraints of the calling thread, with friction of the cables or without."""
+        kept = self._local.__dict__.setdefault("rows", {})
+        if rubs not in kept:
+            tables, runs = self.tables, KINDS * self._runs.count if rubs else 0
+            pairs = 0 if self._scene is None else pairs_of(self._scene.spheres)
+            kept[rubs] = (
+                row_storage(
+                    3 * tables.stations * tables.modes, (runs + 2) // 3 + pairs, border_panels(tables.cables),
+                    self.lanes, self.dtype.type,
+                ),
+                problem_storage(tables.cables + runs, pairs, self.lanes, self.dtype.type),
+            )  # fmt: skip
+        return kept[rubs]
 
 
 @cache
@@ -273,14 +346,3 @@ def _cable_rows(values: np.ndarray | None, cables: int, name: str) -> Float[np.n
     if rows.ndim not in (1, 2) or rows.shape[-1] != cables:
         raise InputError(f"{name} has shape {rows.shape} for {cables} cables", where="rollout")
     return rows.reshape(-1, cables)
-
-
-def empty_output(count: int, records: int, points: int, cables: int) -> Output:
-    return Output(
-        np.zeros((count, records, points, 3)),
-        np.zeros((count, records, cables)),
-        np.zeros(count, dtype=np.uint8),
-        np.zeros(count, dtype=np.uint8),
-        np.zeros(count),
-        records,
-    )

@@ -8,6 +8,7 @@ only, held in ``factors``. ``tables``, ``samples``, ``factors`` and ``work`` are
 
 from __future__ import annotations
 
+from rfdropo_bayes.fem.native.fields import clear
 from rfdropo_bayes.fem.native.layered_effects import (
     BENDING,
     BRANCH,
@@ -22,14 +23,6 @@ from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store
 from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral, resist_twist
 
 POLAR_ITERATIONS = 6
-
-
-@kernel
-def clear(rows, first, last, token):
-    """Zero the rows from first to last."""
-    zero = fill(0.0, rows, token)
-    for i in range(first, last):
-        store(rows, i, zero)
 
 
 @kernel

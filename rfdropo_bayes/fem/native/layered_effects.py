@@ -224,12 +224,3 @@ def subtract_surroundings_product(tables, samples, change, field, work, token):
         store(field, row, fnma(push, nx, fnma(drag, x, load(field, row, token))))
         store(field, row + 1, fnma(push, ny, fnma(drag, y, load(field, row + 1, token))))
         store(field, row + 2, fnma(drag, load(change, row + 2, token), load(field, row + 2, token)))
-
-
-@kernel
-def stretch_cables(cables, panels, factors, work, token):
-    """Add the compliance of the cables to the condensed matrix, which holds its negative."""
-    give = load(factors.give, 0, token)
-    for c in range(1, cables + 1):
-        t = 9 * (c // 3 * panels + c // 3) + 4 * (c % 3)
-        store(work.condensed, t, load(work.condensed, t, token) - give)

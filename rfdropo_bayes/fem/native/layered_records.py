@@ -37,7 +37,7 @@ class Factors(NamedTuple):
     fluid: Float[np.ndarray, "1 lanes"]  # of the fluid's drag, there and in the matrix
     branch: Float[np.ndarray, "1 lanes"]  # of the elastic force of the Prony branch
     share: Float[np.ndarray, "1 lanes"]  # of its strain that its dashpot follows
-    give: Float[np.ndarray, "1 lanes"]  # of the cables, as the tension problem counts it
+    give: Float[np.ndarray, "1 lanes"]  # of a cable's length per impulse, over the time step
 
 
 class Work(NamedTuple):
@@ -59,16 +59,12 @@ class Work(NamedTuple):
     reaction: Float[np.ndarray, "layer_values lanes"]
     pull: Float[np.ndarray, "guides3 lanes"]  # of a cable with unit tension on the body
     slack: Float[np.ndarray, "cables lanes"]
-    scale: Float[np.ndarray, "cables lanes"]
-    compliance: Float[np.ndarray, "cables2 lanes"]
-    active: Float[np.ndarray, "cables lanes"]
     tension: Float[np.ndarray, "cables lanes"]
-    pivoting: Float[np.ndarray, "scratch lanes"]
     commanded: Float[np.ndarray, "cables lanes"]
-    unsolved: Float[np.ndarray, "1 lanes"]  # 1 where the tensions were not found
+    unsolved: Float[np.ndarray, "1 lanes"]  # 1 where the impulses of the last step were not found
     accepted: Float[np.ndarray, "1 lanes"]  # 1 where the last step was taken
     lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken
-    failed: Float[np.ndarray, "1 lanes"]  # 1 once tensions were not found
+    failed: Float[np.ndarray, "1 lanes"]  # 1 once impulses were not found
     points: Float[np.ndarray, "point_values lanes"]
     before: Float[np.ndarray, "values lanes"]  # static iteration: the increment before
     relaxation: Float[np.ndarray, "1 lanes"]

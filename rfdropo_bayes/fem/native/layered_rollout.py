@@ -8,7 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from rfdropo_bayes.fem.native.layered_assembly import clear, layer_frame
+from rfdropo_bayes.fem.native.cube_motion import record_cubes, start_cubes
+from rfdropo_bayes.fem.native.fields import clear, fill_lanes, point
+from rfdropo_bayes.fem.native.layered_assembly import layer_frame
+from rfdropo_bayes.fem.native.layered_constraints import constrained_step
 from rfdropo_bayes.fem.native.layered_effects import (
     BRANCH,
     DECAY,
@@ -22,9 +25,10 @@ from rfdropo_bayes.fem.native.layered_effects import (
 )
 from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
-from rfdropo_bayes.fem.native.layered_step import point, refine_increment, solve_increment, take_step
+from rfdropo_bayes.fem.native.layered_step import solve_increment
 from rfdropo_bayes.fem.native.section_modes import LayeredTables, border_panels
 from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store, whole
+from rfdropo_bayes.fem.native.slip_rows import start_slip
 
 
 class Batch(NamedTuple):
@@ -57,7 +61,7 @@ class Output(NamedTuple):
     position: Float[np.ndarray, "batch records points 3"]
     tension: Float[np.ndarray, "batch records cables"]
     diverged: UInt8[np.ndarray, " batch"]
-    cables_converged: UInt8[np.ndarray, " batch"]
+    converged: UInt8[np.ndarray, " batch"]  # 0 where the impulses of a step were not found
     residual: Float[np.ndarray, " batch"]
     records: int
 
@@ -69,8 +73,8 @@ class Schedule(NamedTuple):
     steps: int
     stride: int  # steps from one recorded row to the next
     static_iterations: int  # 0 leaves out the equilibrium
-    tolerance: float  # relative, of the tension problem
-    regularisation: float  # relative compliance of every cable
+    settled: float  # relative change of the velocities that ends the iterations of a step
+    missed: float  # [m/s] velocity at which surfaces may meet that were not taken to
     refinements: int  # of every step's linear solution
     resumed: int = 0  # 1 goes on from the state in ``Work`` instead of starting anew
 
@@ -122,11 +126,7 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         reaction=rows(2 * size),
         pull=rows(3 * (len(tables.guide_first) - 1)),
         slack=rows(cables),
-        scale=rows(cables),
-        compliance=rows(cables * cables),
-        active=rows(cables),
         tension=rows(cables),
-        pivoting=rows(cables * (cables + 1)),
         commanded=rows(cables),
         points=rows(3 * tables.points),
         before=rows(stations * size),
@@ -139,16 +139,6 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
         **{name: rows(1) for name in ("unsolved", "accepted", "lost", "failed", "relaxation", "imbalance", "softness")},
     )
     return Storage(samples, Factors(*(rows(1) for _ in Factors._fields)), work)
-
-
-@kernel
-def fill_lanes(source, pitch, offset, width, first, count, target, token):
-    """Spread rows of a batch, ``pitch`` apart, over lanes; lanes beyond the batch repeat its last row."""
-    lanes = len(token)
-    for lane in range(lanes):
-        row = min(first + lane, count - 1) * pitch + offset
-        for i in range(width):
-            target[i * lanes + lane] = source[row + i]
 
 
 @kernel
@@ -253,12 +243,12 @@ def finish_rollouts(work, output, first, count, token):
     """Write the result codes of the lanes that belong to the batch."""
     for lane in range(min(len(token), count - first)):
         output.diverged[first + lane] = 1 if work.lost[lane] > 0.0 else 0
-        output.cables_converged[first + lane] = 0 if work.failed[lane] > 0.0 else 1
+        output.converged[first + lane] = 0 if work.failed[lane] > 0.0 else 1
         output.residual[first + lane] = work.imbalance[lane]
 
 
 @kernel
-def settle(tables, batch, samples, factors, work, schedule, first, token):
+def settle(tables, batch, samples, factors, work, p, schedule, first, token):
     """Parameters and initial state of a block's rollouts: as given, or in equilibrium; none where they go on."""
     if schedule.resumed:
         return
@@ -267,7 +257,7 @@ def settle(tables, batch, samples, factors, work, schedule, first, token):
         start_settling(tables, samples, factors, work, token)
         fill_lanes(batch.start, batch.start_pitch, 0, tables.cables, first, batch.count, work.commanded, token)
         for _ in range(schedule.static_iterations):
-            solve_increment(tables, samples, factors, work, 1.0, schedule, token)
+            solve_increment(tables, samples, factors, work, p, 1.0, schedule, token)
             take_increment(tables, work, token)
         finish_settling(tables, samples, factors, work, token)
     _relax_branches(tables, samples, factors, work, token)
@@ -288,21 +278,42 @@ def begin_step(tables, batch, samples, factors, work, schedule, output, step, fi
 
 def compile_rollout(sources: str) -> Callable:
     """The kernel of one lane block; ``sources``, a digest of the kernels' sources, is part of the key it is cached
-    under."""
+    under.
+
+    ``runs`` with ``friction``, and ``scene`` with ``cubes``, ``touch`` and ``poses``, are None where cables do not rub
+    and where there is no cube: what is None is no part of the kernel that is compiled.
+    """
 
     @whole
-    def rollout(tables, batch, samples, factors, work, schedule, output, first, token):
+    def rollout(
+        tables, runs, scene, batch, cubes, samples, factors, work, friction, touch, rows, problem, schedule, output,
+        poses, first, token,
+    ):  # fmt: skip
         _ = sources
-        tables, batch, output = addresses(tables), addresses(batch), addresses(output)
-        samples, factors, work = addresses(samples), addresses(factors), addresses(work)
-        settle(tables, batch, samples, factors, work, schedule, first, token)
+        body, given, record = addresses(tables), addresses(batch), addresses(output)
+        material, factor, state = addresses(samples), addresses(factors), addresses(work)
+        extra, p = addresses(rows), addresses(problem)
+        rubbing = None if runs is None else addresses(runs)
+        slips = None if runs is None else addresses(friction)
+        around = None if scene is None else addresses(scene)
+        meeting = None if scene is None else addresses(touch)
+        settle(body, given, material, factor, state, p, schedule, first, token)
+        if runs is not None and not schedule.resumed:
+            start_slip(body, rubbing, slips, state, token)
+        if scene is not None and not schedule.resumed:
+            start_cubes(around, addresses(cubes), given.count, meeting, first, token)
         step = 0
-        while begin_step(tables, batch, samples, factors, work, schedule, output, step, first, token):
-            solve_increment(tables, samples, factors, work, 1.0 / schedule.time_step, schedule, token)
-            for _ in range(schedule.refinements):
-                refine_increment(tables, samples, factors, work, token)
-            take_step(tables, work, schedule.time_step, token)
+        while begin_step(body, given, material, factor, state, schedule, record, step, first, token):
+            if scene is not None and step % schedule.stride == 0:
+                record_cubes(
+                    meeting, addresses(poses), record.records, step // schedule.stride, first, given.count, token
+                )
+            constrained_step(body, rubbing, around, material, factor, state, slips, meeting, extra, p, schedule, token)
             step += 1
-        finish_rollouts(work, output, first, batch.count, token)
+        if scene is not None and schedule.steps % schedule.stride == 0:
+            record_cubes(
+                meeting, addresses(poses), record.records, schedule.steps // schedule.stride, first, given.count, token
+            )
+        finish_rollouts(state, record, first, given.count, token)
 
     return rollout

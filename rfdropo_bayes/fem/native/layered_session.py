@@ -15,16 +15,17 @@ from jaxtyping import Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import Material
+from rfdropo_bayes.fem.native.contact_records import Cubes
 from rfdropo_bayes.fem.native.effect_rows import has_friction
-from rfdropo_bayes.fem.native.layered import NativeLayered, NativeRollout, empty_output, in_blocks
+from rfdropo_bayes.fem.native.layered import NativeLayered, NativeRollout, Records, Run, in_blocks
 from rfdropo_bayes.fem.native.layered_records import Samples
-from rfdropo_bayes.fem.native.layered_rollout import Batch, Schedule
 from rfdropo_bayes.fem.native.simd import aligned_zeros
 
 KEPT = {
-    "Samples": tuple(name for name in Samples._fields if name != "present"),
-    "Work": ("position", "velocity", "tension", "branch", "softness", "lost", "failed", "imbalance"),
-    "Friction": ("mobilised", "segment"),
+    "samples": tuple(name for name in Samples._fields if name != "present"),
+    "work": ("position", "velocity", "tension", "branch", "softness", "lost", "failed", "imbalance"),
+    "friction": ("mobilised", "segment"),
+    "touch": ("cube", "values", "memory"),
 }
 """Fields of the kernels' records that outlive a step."""
 GIVEN = ("moduli", "density", "damping", "gravity", "layer_scale", "point_mass", "law", "effects", "start")
@@ -33,32 +34,22 @@ REMEMBERED = 2**26
 """Most memory for equilibria that were found before [bytes]."""
 
 
-class _Lane(NamedTuple):
-    """State of a lane, or of several, and what it shows of it, in the order of `NativeRollout`."""
-
-    state: Float[np.ndarray, "*lane values"]
-    position: Float[np.ndarray, "*lane 1 points 3"]
-    tension: Float[np.ndarray, "*lane 1 cables"]
-    diverged: Bool[np.ndarray, "*lane"]
-    cables_converged: Bool[np.ndarray, "*lane"]
-    residual: Float[np.ndarray, "*lane"]
-
-
 class _Place(NamedTuple):
     """Where a field of a record lies in a lane's memory."""
 
-    record: int
+    record: str
     name: str
     first: int
     last: int
 
 
-def _places(records: tuple[NamedTuple, ...]) -> list[_Place]:
+def _places(records: Records) -> list[_Place]:
     places, last = [], 0
-    for index, record in enumerate(records):
-        for name in KEPT.get(type(record).__name__, ()):
-            first, last = last, last + len(getattr(record, name))
-            places.append(_Place(index, name, first, last))
+    for record, names in KEPT.items():
+        if getattr(records, record) is not None:
+            for name in names:
+                first, last = last, last + len(getattr(getattr(records, record), name))
+                places.append(_Place(record, name, first, last))
     return places
 
 
@@ -81,7 +72,7 @@ class LayeredSession:
             raise InputError(f"{count} lanes", remedy="use at least one")
         self.engine, self.count = engine, int(count)
         self.memory = np.zeros((0, 0, engine.lanes), engine.dtype)
-        self._batch: Batch | None = None  # of the lanes that were started first
+        self._run: Run | None = None  # of the lane that was started first
         self._rubs = False
         self._places: list[_Place] = []
         self._local = threading.local()
@@ -93,7 +84,12 @@ class LayeredSession:
         return self.memory.nbytes
 
     def reset(
-        self, rows: Int[np.ndarray, " row"], material: Material, *, start: Float[np.ndarray, "row cables"] | None = None
+        self,
+        rows: Int[np.ndarray, " row"],
+        material: Material,
+        *,
+        start: Float[np.ndarray, "row cables"] | None = None,
+        cube: tuple[Float[np.ndarray, "row 13"], Float[np.ndarray, "row 4"]] | None = None,
     ) -> NativeRollout:
         """Start some lanes anew; the others do not notice.
 
@@ -102,6 +98,7 @@ class LayeredSession:
             material: fields with one entry per row.
             start: cable displacements [m] whose static equilibrium is the initial state; None starts undeformed. An
                 equilibrium that was found before is not computed again.
+            cube: of an engine with a scene, as in `NativeLayered.rollout`.
 
         Returns:
             The initial state, as a rollout of one row.
@@ -111,19 +108,22 @@ class LayeredSession:
         """
         rows = np.asarray(rows, dtype=np.intp)
         still = np.zeros((len(rows), 1, self.engine.tables.cables))
-        given = {"start": start, "position": None, "tension": None}
-        batch, schedule, _ = self.engine.inputs(material, still, given, 0, 1)
-        self._admit(batch, has_friction(material.effects))
-        keys = [b"".join(_row(getattr(batch, name), row).tobytes() for name in GIVEN) for row in range(len(rows))]
-        known = self._equilibria if schedule.static_iterations > 0 else OrderedDict()
+        run = self.engine.run_of(material, still, {"start": start, "position": None, "tension": None}, 0, 1, cube)
+        self._admit(run, has_friction(material.effects))
+        settles = run.schedule.static_iterations > 0
+        keys = [b"".join(_row(getattr(run.batch, n), row).tobytes() for n in GIVEN) for row in range(len(rows))]
+        known = self._equilibria if settles else OrderedDict()
         first = {key: row for row, key in reversed(list(enumerate(keys))) if key not in known}
-        fresh = self._settled(_taken(batch, list(first.values())), schedule)
+        fresh = self._settled(_taken(run, list(first.values())))
         found = {key: known[key] for key in keys if key in known}
         found |= {key: _Lane(*(part[row] for part in fresh)) for row, key in enumerate(first)}
         self._remember(known, found)
         lanes = _Lane(*(np.stack(parts) for parts in zip(*(found[key] for key in keys), strict=True)))
+        pose = None
+        if run.cubes is not None:
+            lanes, pose = self._with_cubes(lanes, run.cubes), np.asarray(run.cubes.state[:, None, :7], float)
         self.memory[rows // self.engine.lanes, :, rows % self.engine.lanes] = lanes.state
-        return NativeRollout(*lanes[1:])
+        return NativeRollout(*lanes[1:], pose)
 
     def advance(self, displacement: Float[np.ndarray, "lane steps cables"], *, stride: int = 1) -> NativeRollout:
         """Take steps to the cable displacements [m] at their ends; recorded before the first, and every ``stride``.
@@ -132,22 +132,21 @@ class LayeredSession:
             InputError: a session that was not started, or displacements of another shape.
         """
         engine = self.engine
-        if self._batch is None:
+        if self._run is None:
             raise InputError("a session that was not started", remedy="reset all lanes first")
         if displacement.ndim != 3 or displacement.shape[::2] != (self.count, engine.tables.cables):
             expected = f"({self.count}, steps, {engine.tables.cables})"
             raise InputError(f"displacement has shape {displacement.shape}, expected {expected}", where="advance")
-        steps = displacement.shape[1]
         moves = np.ascontiguousarray(displacement, dtype=engine.dtype).reshape(self.count, -1)
-        batch = self._batch._replace(displacement=moves, displacement_pitch=moves.shape[1], count=self.count)
-        schedule = engine.schedule(steps, stride)._replace(resumed=1)
-        output = empty_output(self.count, 1 + steps // stride, engine.points, engine.tables.cables)
+        batch = self._run.batch._replace(displacement=moves, displacement_pitch=moves.shape[1], count=self.count)
+        schedule = self._run.schedule._replace(steps=displacement.shape[1], stride=stride, resumed=1)
+        run = engine.with_output(self._run._replace(batch=batch, schedule=schedule))
 
         def block(first: int) -> None:
-            engine.run_block(batch, self._records(first // engine.lanes), schedule, output, first)
+            engine.run_block(run, self._records(first // engine.lanes), first)
 
         in_blocks(block, self.count, engine.lanes, engine.threads)
-        return NativeRollout.of(output)
+        return NativeRollout.of(run)
 
     def save(self) -> Float[np.ndarray, "lane values"]:
         """A copy of parameters and state, one row a lane."""
@@ -167,36 +166,44 @@ class LayeredSession:
             )
         self.memory[rows // self.engine.lanes, :, rows % self.engine.lanes] = state
 
-    def _admit(self, batch: Batch, rubs: bool) -> None:
+    def _admit(self, run: Run, rubs: bool) -> None:
         """Lay out the memory for the effects that the first lanes have; later lanes must have the same."""
-        if self._batch is None:
-            records = self.engine.records(rubs)
-            self._places, self._rubs = _places(records), rubs
+        if self._run is None:
+            self._places, self._rubs = _places(self.engine.records(rubs)), rubs
             blocks = -(-self.count // self.engine.lanes)
             self.memory = aligned_zeros((blocks, self._places[-1].last, self.engine.lanes), self.engine.dtype)
-            self._batch = _taken(batch, [0])
-        elif rubs != self._rubs or not np.array_equal(batch.present, self._batch.present):
+            self._run = _taken(run, [0])
+        elif rubs != self._rubs or not np.array_equal(run.batch.present, self._run.batch.present):
             raise InputError(
                 "a lane whose body has other effects than the lanes before",
                 where="reset",
                 remedy="give every lane the same mechanisms; a null value switches one off",
             )
 
-    def _settled(self, batch: Batch, schedule: Schedule) -> _Lane:
+    def _settled(self, run: Run) -> _Lane:
         """The initial states of a batch."""
-        engine = self.engine
-        output = empty_output(batch.count, 1, engine.points, engine.tables.cables)
-        state = np.zeros((batch.count, self.memory.shape[1]), engine.dtype)
+        engine, count = self.engine, run.batch.count
+        run = engine.with_output(run)
+        state = np.zeros((count, self.memory.shape[1]), engine.dtype)
 
         def block(first: int) -> None:
             records = engine.records(self._rubs)
-            engine.run_block(batch, records, schedule, output, first)
+            engine.run_block(run, records, first)
             there = state[first : first + engine.lanes]
             for place in self._places:
-                there[:, place.first : place.last] = getattr(records[place.record], place.name).T[: len(there)]
+                part = getattr(getattr(records, place.record), place.name)
+                there[:, place.first : place.last] = part.T[: len(there)]
 
-        in_blocks(block, batch.count, engine.lanes, engine.threads)
-        return _Lane(state, *NativeRollout.of(output))
+        in_blocks(block, count, engine.lanes, engine.threads)
+        return _Lane(state, *NativeRollout.of(run)[:5])
+
+    def _with_cubes(self, lanes: _Lane, cubes: Cubes) -> _Lane:
+        """Lanes with cubes at the start: those of a body that was settled before may have been others."""
+        fields = {"cube": cubes.state, "values": cubes.values, "memory": 0.0}
+        for place in self._places:
+            if place.record == "touch":
+                lanes.state[:, place.first : place.last] = fields[place.name]
+        return lanes
 
     def _remember(self, known: OrderedDict[bytes, _Lane], found: dict[bytes, _Lane]) -> None:
         """Keep what was found last, as far as the memory set aside for it goes."""
@@ -207,20 +214,32 @@ class LayeredSession:
         while len(known) > most:
             known.popitem(last=False)
 
-    def _records(self, block: int) -> tuple[NamedTuple, ...]:
+    def _records(self, block: int) -> Records:
         """Scratch of the calling thread around the memory of a block."""
         if not hasattr(self._local, "records"):
             self._local.records = {}
         if block not in self._local.records:
-            records = list(self.engine.records(self._rubs))
-            for index, record in enumerate(records):
-                own = {p.name: self.memory[block, p.first : p.last] for p in self._places if p.record == index}
-                records[index] = record._replace(**own)
+            assert self._run is not None
+            records = self.engine.records(self._rubs)
+            own: dict[str, dict[str, np.ndarray]] = {place.record: {} for place in self._places}
+            for place in self._places:
+                own[place.record][place.name] = self.memory[block, place.first : place.last]
             # What is present is the same for all blocks, and no lane's own.
-            assert self._batch is not None
-            records[0] = records[0]._replace(present=self._batch.present)
-            self._local.records[block] = tuple(records)
+            own["samples"]["present"] = self._run.batch.present
+            parts = {name: getattr(records, name)._replace(**fields) for name, fields in own.items()}
+            self._local.records[block] = records._replace(**parts)
         return self._local.records[block]
+
+
+class _Lane(NamedTuple):
+    """State of a lane, or of several, and what it shows of it, in the order of `NativeRollout`."""
+
+    state: Float[np.ndarray, "*lane values"]
+    position: Float[np.ndarray, "*lane 1 points 3"]
+    tension: Float[np.ndarray, "*lane 1 cables"]
+    diverged: Bool[np.ndarray, "*lane"]
+    converged: Bool[np.ndarray, "*lane"]
+    residual: Float[np.ndarray, "*lane"]
 
 
 def _row(values: np.ndarray, row: int) -> np.ndarray:
@@ -228,10 +247,12 @@ def _row(values: np.ndarray, row: int) -> np.ndarray:
     return values[row if len(values) > 1 else 0]
 
 
-def _taken(batch: Batch, rows: list[int]) -> Batch:
-    """Rows of a batch; fields of which one row serves all stay."""
+def _taken(run: Run, rows: list[int]) -> Run:
+    """Rows of a run; fields of which one row serves all stay."""
+    batch, cubes = run.batch, run.cubes
     fields = {
         name: value[rows] for name, value in batch._asdict().items() if name in GIVEN and len(value) == batch.count
     }
     pitch = batch.start.shape[1] if len(fields.get("start", ())) > 1 else 0
-    return batch._replace(**fields, start_pitch=pitch, count=len(rows))
+    cubes = None if cubes is None else Cubes(*(part[rows] for part in cubes))
+    return run._replace(batch=batch._replace(**fields, start_pitch=pitch, count=len(rows)), cubes=cubes)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from rfdropo_bayes.fem.equilibrium import LONGEST_STEP, SMALLEST_RELAXATION
-from rfdropo_bayes.fem.native.layered_assembly import add_layer_force, clear, layer_frame, start_loads
+from rfdropo_bayes.fem.native.fields import clear
+from rfdropo_bayes.fem.native.layered_assembly import add_layer_force, layer_frame, start_loads
 from rfdropo_bayes.fem.native.layered_effects import GIVE, SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.layered_step import gather_cables, near
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_root, store, where_greater

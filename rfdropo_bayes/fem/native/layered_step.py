@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from rfdropo_bayes.fem.native.chain_cholesky import combine_border, eliminate, substitute_back, substitute_forward
-from rfdropo_bayes.fem.native.complementarity import solve_unilateral
+from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
+from rfdropo_bayes.fem.native.fields import clear, point
 from rfdropo_bayes.fem.native.layered_assembly import (
     add_layer_mass,
     add_station_mass,
     assemble_layer,
-    clear,
     start_loads,
     subtract_tangent_product,
 )
-from rfdropo_bayes.fem.native.layered_effects import SURROUNDED, add_surroundings, stretch_cables
+from rfdropo_bayes.fem.native.layered_effects import SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, square_root, store, where_greater
 from rfdropo_bayes.fem.native.tension_stiffening import (
     resist_lateral,
@@ -24,18 +24,6 @@ from rfdropo_bayes.fem.native.tension_stiffening import (
 
 LARGEST = 1e30
 """Tensions beyond this [N] are not finite."""
-
-
-@kernel
-def point(first, place, weight, p, field, token):
-    """Point p of a sparse list."""
-    x, y, z = fill(0.0, field, token), fill(0.0, field, token), fill(0.0, field, token)
-    for k in range(first[p], first[p + 1]):
-        row, w = place[k], fill(weight[k], field, token)
-        x = fma(load(field, row, token), w, x)
-        y = fma(load(field, row + 1, token), w, y)
-        z = fma(load(field, row + 2, token), w, z)
-    return x, y, z
 
 
 @kernel
@@ -101,64 +89,41 @@ def _condensed_entry(condensed, i, j, panels, token):
 
 
 @kernel
-def scale_problem(cables, panels, work, regularisation, token):
-    """Tension problem with unit diagonal; a cable that no motion of the body can shorten takes no part."""
-    one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
-    largest = zero
+def start_problem(tables, factors, work, p, n, rate, token):
+    """The cables' part of a problem of ``n`` rows: their tensions before, W, and the velocities without impulses."""
+    cables, panels = tables.cables, (tables.cables + 3) // 3
+    give = load(factors.give, 0, token)
     for c in range(cables):
-        diagonal = _condensed_entry(work.condensed, c + 1, c + 1, panels, token)
-        largest = where_greater(diagonal, largest, diagonal, largest)
-    for c in range(cables):
-        diagonal = _condensed_entry(work.condensed, c + 1, c + 1, panels, token)
-        usable = where_greater(diagonal, 1e-12 * largest, one, zero)
-        scale = usable / square_root(where_greater(usable, zero, diagonal, one))
-        store(work.scale, c, scale)
-        remaining = load(work.slack, c, token) - _condensed_entry(work.condensed, c + 1, 0, panels, token)
-        store(work.slack, c, remaining * scale)
+        store(p.impulse, c, load(work.tension, c, token) * (1.0 / rate))
+        store(p.free, c, load(work.slack, c, token) - _condensed_entry(work.condensed, c + 1, 0, panels, token))
         for d in range(c + 1):
-            value = _condensed_entry(work.condensed, c + 1, d + 1, panels, token) * scale * load(work.scale, d, token)
-            if c == d:
-                value = value + regularisation
-            store(work.compliance, c * cables + d, value)
-            store(work.compliance, d * cables + c, value)
-        store(work.active, c, usable * where_greater(load(work.tension, c, token), zero, one, zero))
+            value = _condensed_entry(work.condensed, c + 1, d + 1, panels, token)
+            store(p.matrix, c * n + d, value + give if c == d else value)
+            store(p.matrix, d * n + c, load(p.matrix, c * n + d, token))
 
 
 @kernel
-def find_tensions(cables, work, tolerance, token):
-    """Unilateral tensions of the scaled problem; leaves failed lanes in ``unsolved``."""
-    found = solve_unilateral(
-        work.compliance, work.slack, cables, tolerance, work.active, work.pivoting, work.tension, token
-    )
-    mark_unsolved(cables, work, found, token)
-
-
-@kernel
-def mark_unsolved(cables, work, found, token):
-    """Lanes whose tensions were not found, in ``unsolved``."""
-    one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
-    unsolved = zero
-    if not found:
-        for c in range(cables):
-            unsolved = where_greater(load(work.pivoting, cables * cables + c, token), zero, one, unsolved)
-    store(work.unsolved, 0, unsolved)
-
-
-@kernel
-def weigh_border(cables, work, rate, token):
-    """Tensions [N] from those of the scaled problem, and the weights of the border rows in ``weight``."""
+def weigh_border(cables, work, p, token):
+    """The weights of the border rows in ``weight``, and lanes left unsolved."""
     zero = fill(0.0, work.weight, token)
     store(work.weight, 0, fill(1.0, work.weight, token))
+    store(work.unsolved, 0, load(p.going, 0, token))
     for c in range(cables):
-        impulse = load(work.scale, c, token) * load(work.tension, c, token)
+        impulse = load(p.impulse, c, token)
         impulse = where_greater(zero, impulse, zero, impulse)
         store(work.weight, c + 1, -impulse)
-        store(work.tension, c, impulse * rate)
 
 
 @kernel
-def condense_increment(tables, samples, factors, work, rate, schedule, token):
-    """Assemble and eliminate the matrix station by station, and set up the problem of the tensions."""
+def take_tensions(cables, work, rate, token):
+    """Tensions [N] from the impulses in ``weight``."""
+    for c in range(cables):
+        store(work.tension, c, -rate * load(work.weight, c + 1, token))
+
+
+@kernel
+def condense_increment(tables, samples, factors, work, rate, token):
+    """Assemble and eliminate the matrix station by station."""
     tiles, stations, cables, held = tables.modes, tables.stations, tables.cables, tables.held
     size, panels = 3 * tiles, (cables + 3) // 3
     frame, block = 3 * panels * size, 3 * tiles * size
@@ -188,8 +153,6 @@ def condense_increment(tables, samples, factors, work, rate, schedule, token):
             t = station * frame + 3 * k
             store(work.border, t, load(work.border, t, token) + load(work.field, station * size + k, token))
         eliminate(work.pivot, work.coupling, work.border, work.condensed, station, last, tiles, panels, token)
-    stretch_cables(cables, panels, factors, work, token)
-    scale_problem(cables, panels, work, schedule.regularisation, token)
 
 
 @kernel
@@ -201,17 +164,20 @@ def weigh_rows(tables, work, token):
 
 @kernel
 def substitute_increment(tables, work, token):
-    """``solution`` = A^-1 times the weighted sum of the border rows."""
-    weigh_rows(tables, work, token)
+    """``solution`` = A^-1 times what it is."""
     substitute_back(work.pivot, work.coupling, work.solution, tables.held, tables.stations, tables.modes, token)
 
 
 @kernel
-def solve_increment(tables, samples, factors, work, rate, schedule, token):
-    """``solution`` = A^-1 (r - J' T) and the tensions."""
-    condense_increment(tables, samples, factors, work, rate, schedule, token)
-    find_tensions(tables.cables, work, schedule.tolerance, token)
-    weigh_border(tables.cables, work, rate, token)
+def solve_increment(tables, samples, factors, work, p, rate, schedule, token):
+    """``solution`` = A^-1 (r - J' T) and the tensions, of a body that nothing but cables holds."""
+    condense_increment(tables, samples, factors, work, rate, token)
+    start_problem(tables, factors, work, p, tables.cables, rate, token)
+    soften(p, tables.cables, 0, 0, 1.0, token)
+    solve_problem(p, tables.cables, 0, 0, schedule.settled, token)
+    weigh_border(tables.cables, work, p, token)
+    take_tensions(tables.cables, work, rate, token)
+    weigh_rows(tables, work, token)
     substitute_increment(tables, work, token)
 
 

@@ -9,7 +9,6 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.fem.cable_friction import run_members
 from rfdropo_bayes.fem.cables import CableLayout
-from rfdropo_bayes.fem.native.section_modes import LayeredTables, border_panels
 from rfdropo_bayes.fem.native.simd import aligned_zeros
 
 KINDS = 2
@@ -36,20 +35,6 @@ class Friction(NamedTuple):
     weight: Float[np.ndarray, "kinds_guides lanes"]  # friction of every guide per coefficient [N]
     whole: Float[np.ndarray, "rows lanes"]  # its sum over a run
     strength: Float[np.ndarray, "rows lanes"]  # impulse [N s] if all of it is mobilised
-    slip: Float[np.ndarray, "rows lanes"]  # in the step without impulses [m]
-    trial: Float[np.ndarray, "rows lanes"]  # share at the end of the step, unless it slides
-    share: Float[np.ndarray, "rows lanes"]  # at the end of the step
-    impulse: Float[np.ndarray, "rows lanes"]
-    border: Float[np.ndarray, "values lanes"]  # minus the derivative of the slip, laid out as the body's border
-    own: Float[np.ndarray, "tiles lanes"]
-    across: Float[np.ndarray, "tiles lanes"]
-    among: Float[np.ndarray, "rows2 lanes"]  # compliance of the runs
-    factor: Float[np.ndarray, "rows2 lanes"]
-    root: Float[np.ndarray, "rows lanes"]  # of what an impulse makes of itself where the run sticks, else 0
-    answer: Float[np.ndarray, "rows_cables lanes"]  # impulse of a run per tension of a cable
-    pull: Float[np.ndarray, "rows_cables lanes"]  # compliance of runs and cables
-    reduced: Float[np.ndarray, "cables2 lanes"]
-    offset: Float[np.ndarray, "cables lanes"]
     lost: Float[np.ndarray, "guides lanes"]  # impulse that a cable has lost before and at a guide
 
 
@@ -66,15 +51,11 @@ def runs_of(layout: CableLayout) -> Runs:
     return Runs(cable, first, last, len(runs), int(first_guide[-1]))
 
 
-def friction_storage(tables: LayeredTables, runs: Runs, lanes: int, dtype: type) -> Friction:
+def friction_storage(runs: Runs, lanes: int, dtype: type) -> Friction:
     """Zeroed, aligned storage of one lane block."""
-    rows, cables = KINDS * runs.count, tables.cables
-    panels, others = (rows + 2) // 3, border_panels(cables)
+    rows = KINDS * runs.count
     sizes = {
         "mobilised": rows, "segment": runs.guides, "direction": 3 * runs.guides, "weight": KINDS * runs.guides,
-        "whole": rows, "strength": rows, "slip": rows, "trial": rows, "share": rows, "impulse": rows,
-        "border": 9 * tables.stations * panels * tables.modes, "own": 9 * panels**2, "across": 9 * panels * others,
-        "among": rows**2, "factor": rows**2, "root": rows, "answer": rows * cables, "pull": rows * cables,
-        "reduced": cables**2, "offset": cables, "lost": runs.guides,
+        "whole": rows, "strength": rows, "lost": runs.guides,
     }  # fmt: skip
     return Friction(**{name: aligned_zeros((max(size, 1), lanes), dtype) for name, size in sizes.items()})

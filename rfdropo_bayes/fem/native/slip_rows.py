@@ -1,13 +1,12 @@
-"""Rows of cable friction in SIMD lanes: what ``fem.cable_friction.slip_problem`` makes of the shape of a body."""
+"""Cable friction in SIMD lanes: what ``fem.cable_friction`` makes of the shape of a body and of a step."""
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.cable_friction import FADING, STRAIGHT
-from rfdropo_bayes.fem.native.chain_cholesky import condense_rows, extend_border
-from rfdropo_bayes.fem.native.layered_assembly import clear
+from rfdropo_bayes.fem.cable_friction import FADING, PRESLIDING, STRAIGHT
+from rfdropo_bayes.fem.native.fields import clear, point
 from rfdropo_bayes.fem.native.layered_effects import CAPSTAN, COULOMB, FRICTION
-from rfdropo_bayes.fem.native.layered_step import point
-from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.slip_records import KINDS
 
 
 @kernel
@@ -59,10 +58,9 @@ def _weigh_guides(runs, friction, kinds, kind, token):
 
 
 @kernel
-def _pull_guide(tables, friction, g, row, panels, x, y, z, work, token):
+def _pull_guide(tables, g, border, row, panels, x, y, z, work, token):
     """Add a pull on a guide to a border row; returns it times the guide's velocity."""
-    border, size = friction.border, 3 * tables.modes
-    moving = fill(0.0, border, token)
+    size, moving = 3 * tables.modes, fill(0.0, border, token)
     for k in range(tables.guide_first[g], tables.guide_first[g + 1]):
         place, weight = tables.guide_place[k], fill(tables.guide_weight[k], border, token)
         t = ((place // size * panels + row // 3) * size + place % size) * 3 + row % 3
@@ -75,9 +73,9 @@ def _pull_guide(tables, friction, g, row, panels, x, y, z, work, token):
 
 
 @kernel
-def _gather_run(tables, runs, friction, r, kind, panels, work, token):
+def _gather_run(tables, runs, friction, r, kind, border, panels, work, token):
     """Border row of a run; returns how fast the guides move along it."""
-    zero, one = fill(0.0, friction.border, token), fill(1.0, friction.border, token)
+    zero, one = fill(0.0, border, token), fill(1.0, border, token)
     row, whole = kind * runs.count + r, zero
     for g in range(runs.first[r], runs.last[r]):
         whole = whole + load(friction.weight, kind * runs.guides + g, token)
@@ -97,39 +95,91 @@ def _gather_run(tables, runs, friction, r, kind, panels, work, token):
             x = x - beyond * load(friction.direction, 3 * g + 3, token)
             y = y - beyond * load(friction.direction, 3 * g + 4, token)
             z = z - beyond * load(friction.direction, 3 * g + 5, token)
-        moving = moving + _pull_guide(tables, friction, g, row, panels, x, y, z, work, token)
+        moving = moving + _pull_guide(tables, g, border, row, panels, x, y, z, work, token)
         before = beyond
     return moving
 
 
 @kernel
-def gather_slip(tables, runs, samples, friction, work, time_step, token):
-    """Rows, strength and free slip of all runs, condensed with the factor of the step; returns how many there are."""
-    modes, held, stations, cables = tables.modes, tables.held, tables.stations, tables.cables
+def gather_slip(tables, runs, samples, friction, border, panels, p, work, time_step, token):
+    """Border rows of all runs, and their part of a step's problem."""
     kinds, kind = kinds_present(samples)
-    rows, others, size = kinds * runs.count, (cables + 3) // 3, 3 * modes
-    panels = (rows + 2) // 3
-    clear(friction.border, 0, 9 * stations * panels * modes, token)
     _find_directions(tables, work, friction, token)
     _weigh_guides(runs, friction, kinds, kind, token)
     for k in range(kinds):
         coefficient = time_step * load(samples.effects, COULOMB if kind + k == 0 else CAPSTAN, token)
         for r in range(runs.count):
             row = k * runs.count + r
-            store(friction.slip, row, -time_step * _gather_run(tables, runs, friction, r, k, panels, work, token))
-            store(friction.strength, row, coefficient * load(friction.whole, row, token))
-    extend_border(work.pivot, work.coupling, friction.border, held, stations - 1, modes, panels, token)
-    condense_rows(friction.own, friction.border, panels, friction.border, panels, held, stations - 1, size, token)
-    condense_rows(friction.across, friction.border, panels, work.border, others, held, stations - 1, size, token)
+            line = tables.cables + row
+            store(p.free, line, _gather_run(tables, runs, friction, r, k, border, panels, work, token))
+            limit, mobilised = coefficient * load(friction.whole, row, token), load(friction.mobilised, row, token)
+            store(p.limit, line, limit)
+            store(p.trial, line, mobilised)
+            store(p.impulse, line, limit * mobilised)
+
+
+@kernel
+def start_slip(tables, runs, friction, work, token):
+    """Friction that is not mobilised yet, tensions the same all along a cable."""
+    clear(friction.mobilised, 0, KINDS * runs.count, token)
+    for c in range(tables.cables):
+        for g in range(tables.cable_first[c], tables.cable_first[c + 1]):
+            store(friction.segment, g, load(work.tension, c, token))
+
+
+@kernel
+def sum_losses(tables, runs, samples, friction, p, token):
+    """``lost``: what every cable has lost before and at each of its guides."""
+    kinds, _ = kinds_present(samples)
+    zero, one = fill(0.0, friction.lost, token), fill(1.0, friction.lost, token)
+    for g in range(runs.guides):
+        store(friction.lost, g, zero)
+    for k in range(kinds):
+        for r in range(runs.count):
+            row = k * runs.count + r
+            whole = load(friction.whole, row, token)
+            share = load(p.impulse, tables.cables + row, token) / where_greater(whole, zero, whole, one)
+            for g in range(runs.first[r], runs.last[r]):
+                weight = load(friction.weight, k * runs.guides + g, token)
+                store(friction.lost, g, fma(weight, share, load(friction.lost, g, token)))
+    for c in range(tables.cables):
+        before = zero
+        for g in range(tables.cable_first[c], tables.cable_first[c + 1]):
+            before = before + load(friction.lost, g, token)
+            store(friction.lost, g, before)
+
+
+@kernel
+def add_friction(tables, friction, field, token):
+    """Add the impulses on the guides to a field."""
+    for c in range(tables.cables):
+        before, tied = fill(0.0, friction.lost, token), tables.cable_first[c + 1] - 1
+        for g in range(tables.cable_first[c], tied + 1):
+            after = load(friction.lost, g, token)
+            for k in range(tables.guide_first[g], tables.guide_first[g + 1]):
+                weight = tables.guide_weight[k]
+                for i in range(3):
+                    row = tables.guide_place[k] + i
+                    push = before * load(friction.direction, 3 * g + i, token)
+                    if g < tied:
+                        push = fnma(after, load(friction.direction, 3 * g + 3 + i, token), push)
+                    store(field, row, fma(push, weight, load(field, row, token)))
+            before = after
+
+
+@kernel
+def remember_slip(tables, friction, p, work, rows, time_step, token):
+    """Friction mobilised and tensions along the cables after a step that was taken."""
+    zero, one, accepted = fill(0.0, work.tension, token), fill(1.0, work.tension, token), load(work.accepted, 0, token)
     for i in range(rows):
-        t = 9 * (i // 3 * others) + i % 3
-        moved = load(friction.across, t, token)
-        store(friction.slip, i, load(friction.slip, i, token) + time_step * moved)
-        for c in range(cables):
-            entry = load(friction.across, t + 9 * ((c + 1) // 3) + 3 * ((c + 1) % 3), token)
-            store(friction.pull, i * cables + c, -(entry * load(work.scale, c, token)))
-        for j in range(i + 1):
-            entry = -load(friction.own, 9 * (i // 3 * panels + j // 3) + 3 * (j % 3) + i % 3, token)
-            store(friction.among, i * rows + j, entry)
-            store(friction.among, j * rows + i, entry)
-    return rows
+        line, before = tables.cables + i, load(friction.mobilised, i, token)
+        share = fnma(load(p.velocity, line, token), time_step / PRESLIDING, before)
+        share = where_greater(share, one, one, share)
+        share = where_greater(-one, share, -one, share)
+        store(friction.mobilised, i, where_greater(accepted, zero, share, before))
+    for c in range(tables.cables):
+        left = load(work.tension, c, token)
+        for g in range(tables.cable_first[c], tables.cable_first[c + 1]):
+            tension = where_greater(left, zero, left, zero)
+            store(friction.segment, g, where_greater(accepted, zero, tension, load(friction.segment, g, token)))
+            left = load(work.tension, c, token) - load(friction.lost, g, token) * (1.0 / time_step)

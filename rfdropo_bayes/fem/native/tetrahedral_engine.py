@@ -11,20 +11,29 @@ import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Bool, Float, Int
 
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.cables import CableLayout
 from rfdropo_bayes.fem.drives import DriveLimits
 from rfdropo_bayes.fem.dynamics import LOST, POISSON_LIMIT
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
+from rfdropo_bayes.fem.native.constraint_problem import SETTLED, Problem, problem_storage
+from rfdropo_bayes.fem.native.contact_records import (
+    PushOutput,
+    Touch,
+    cube_rows,
+    pairs_of,
+    scene_tables,
+    touch_storage,
+)
 from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
 from rfdropo_bayes.fem.native.layered import available_threads
+from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
 from rfdropo_bayes.fem.native.tetrahedral import Mesh, Samples, Work
+from rfdropo_bayes.fem.pushing import PushScene
 from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
-
-# Tolerance of the tension problem, as far as the precision resolves it.
-_TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
 
 
 class Rollouts(NamedTuple):
@@ -33,7 +42,8 @@ class Rollouts(NamedTuple):
     position: Float[np.ndarray, "samples rows points 3"]  # [m]
     tension: Float[np.ndarray, "samples rows cables"]  # [N]
     diverged: Bool[np.ndarray, " samples"]
-    cables_converged: Bool[np.ndarray, " samples"]
+    converged: Bool[np.ndarray, " samples"]  # whether the impulses of every step's constraints were found
+    pose: Float[np.ndarray, "samples rows 7"] | None = None  # of the cube: centre [m], unit quaternion (x, y, z, w)
 
 
 class TetrahedralEngine:
@@ -43,6 +53,7 @@ class TetrahedralEngine:
         dtype: ``numpy.float64`` or ``numpy.float32``.
         lanes: samples side by side; by default as many as this machine's vector registers hold.
         threads: lane blocks at a time; results do not depend on it.
+        scene: what the body pushes a cube on; None for a body that touches nothing.
     """
 
     def __init__(
@@ -55,6 +66,7 @@ class TetrahedralEngine:
         dtype: type = np.float64,
         lanes: int | None = None,
         threads: int | None = None,
+        scene: PushScene | None = None,
     ) -> None:
         self.body, self.dtype, self.points = body, np.dtype(dtype), points
         self._kernel = _kernel()  # here, so that threads do not make one each
@@ -70,6 +82,7 @@ class TetrahedralEngine:
         self._cables = _cables(cables, limits, body, self._number, self.dtype)
         self._nodes = np.ascontiguousarray(self._number[points.node], dtype=np.int32)
         self._weights = np.ascontiguousarray(points.weight, dtype=self.dtype)
+        self._scene = None if scene is None else scene_tables(scene, np.ones((1, 1)), self._number, self.dtype.type)
 
     def rollouts(
         self,
@@ -78,38 +91,26 @@ class TetrahedralEngine:
         *,
         time_step: float,
         stride: int = 1,
+        cube: tuple[Float[np.ndarray, "*samples 13"], Float[np.ndarray, "*samples 4"]] | None = None,
     ) -> Rollouts:
         """Rollouts from rest through the commanded displacements [m] of every step, recorded every ``stride`` steps.
 
         ``parameters`` holds, with a leading axis of samples: ``young_modulus`` [Pa], ``poisson_ratio``, ``node_mass``
         (nodes) [kg], ``rayleigh_mass`` [1/s], ``rayleigh_stiffness`` [s], ``gravity`` (3) [m/s2], and optionally
-        ``stiffness_scale`` (elements).
+        ``stiffness_scale`` (elements). ``cube`` as in ``NativeLayered.rollout``.
+
+        Raises:
+            InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
         """
         samples = len(parameters["young_modulus"])
         commands = np.broadcast_to(commands, (samples, *commands.shape[-2:]))
 
-        def kernel_of(lane: Int[np.ndarray, " lanes"]) -> Callable:
-            return self._roll
-
-        return self._rolled(kernel_of, parameters, commands, time_step, stride)
-
-    def _roll(self, displacement, inputs, work, schedule, output) -> None:
-        """Rollouts of a lane block without contacts."""
-        self._kernel(
-            self._pattern, self._mesh, self._cables, self._rest, displacement, inputs, work, schedule, output,
-            lane_token(self.lanes),
-        )  # fmt: skip
-
-    def _rolled(
-        self,
-        kernel_of: Callable[[Int[np.ndarray, " lanes"]], Callable],
-        parameters: Mapping[str, np.ndarray],
-        commands: Float[np.ndarray, "samples steps cables"],
-        time_step: float,
-        stride: int,
-    ) -> Rollouts:
-        """Rollouts of all lane blocks; ``kernel_of`` the samples of a block is what computes them."""
-        samples = len(commands)
+        if (cube is None) != (self._scene is None):
+            raise InputError("a scene without a cube, or a cube without a scene", where="rollouts")
+        cubes = poses = None
+        if cube is not None:
+            cubes = cube_rows(*cube, samples, self.dtype)
+            poses = PushOutput(np.zeros((samples, 1 + commands.shape[1] // stride, 7)))
         chunks = [np.arange(first, first + self.lanes) for first in range(0, samples, self.lanes)]
         rows, points = commands.shape[1] // stride, len(self._nodes)
         result = Rollouts(
@@ -117,36 +118,50 @@ class TetrahedralEngine:
             np.empty((samples, rows, commands.shape[2])),
             np.zeros(samples, dtype=bool),
             np.ones(samples, dtype=bool),
+            None if poses is None else poses.pose,
         )
 
         def run(chunk: Int[np.ndarray, " lanes"]) -> None:
             lane, kept = np.minimum(chunk, samples - 1), chunk[chunk < samples]
-            self._run(kernel_of(chunk), lane, kept, parameters, commands, time_step, stride, result)
+            inputs = self._samples({name: np.asarray(value)[lane] for name, value in parameters.items()})
+            displacement, work, output = self._lanes_last(commands[lane]), self._work(), self._output(rows)
+            single = self.dtype.itemsize == 4
+            schedule = kernels.Schedule(float(time_step), stride, SETTLED[self.dtype.name], self._reach, single)
+            self._kernel(
+                self._pattern, self._mesh, self._cables, self._scene, self._rest, displacement, cubes, inputs, work,
+                *self._constraints(), schedule, output, poses, int(chunk[0]), samples, lane_token(self.lanes),
+            )  # fmt: skip
+            count = len(kept)
+            result.position[kept] = np.moveaxis(output.position, 3, 0)[:count]
+            result.tension[kept] = np.moveaxis(output.tension, 2, 0)[:count]
+            result.diverged[kept] = work.lost[0, :count] > 0.0
+            result.converged[kept] = ~(work.unsolved[0, :count] > 0.0)
 
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(run, chunks))
         return result
 
-    def _run(self, kernel, lane, kept, parameters, commands, time_step, stride, result: Rollouts) -> None:
-        """One lane block: samples ``lane`` (the last one repeated to fill the lanes), of which ``kept`` are wanted."""
-        inputs = self._samples({name: np.asarray(value)[lane] for name, value in parameters.items()})
-        displacement = self._lanes_last(commands[lane])
-        work = self._work()
-        rows = displacement.shape[0] // stride
-        output = kernels.Output(
+    def _output(self, rows: int) -> kernels.Output:
+        """What a lane block records."""
+        return kernels.Output(
             self._nodes,
             self._weights,
             aligned_zeros((rows, len(self._nodes), 3, self.lanes), self.dtype),
-            aligned_zeros((rows, displacement.shape[1], self.lanes), self.dtype),
+            aligned_zeros((rows, len(self._cables.limit), self.lanes), self.dtype),
         )
-        single = self.dtype.itemsize == 4
-        schedule = kernels.Schedule(float(time_step), stride, _TOLERANCE[self.dtype.name], self._reach, single)
-        kernel(displacement, inputs, work, schedule, output)
-        count = len(kept)
-        result.position[kept] = np.moveaxis(output.position, 3, 0)[:count]
-        result.tension[kept] = np.moveaxis(output.tension, 2, 0)[:count]
-        result.diverged[kept] = work.lost[0, :count] > 0.0
-        result.cables_converged[kept] = ~(work.unsolved[0, :count] > 0.0)
+
+    def _constraints(self) -> tuple[Touch | None, Rows, Problem, Int[np.ndarray, " free"]]:
+        """Contacts, their rows, the problem of a step, and the nodes that contacts reach, of one lane block."""
+        cables, kind, free, spheres = len(self._cables.limit), self.dtype.type, self._mesh.free, 0
+        if self._scene is not None:
+            spheres = self._scene.spheres
+        pairs = pairs_of(spheres) if spheres else 0
+        return (
+            touch_storage(spheres, self.lanes, kind) if spheres else None,
+            row_storage(3 * free, 2 * spheres, self._pattern.border, self.lanes, kind),
+            problem_storage(cables, pairs, self.lanes, kind),
+            np.zeros(free, dtype=np.int64),
+        )
 
     def _lanes_last(self, values: np.ndarray) -> np.ndarray:
         """Aligned copy in the engine's precision with the sample axis last."""
@@ -175,9 +190,9 @@ class TetrahedralEngine:
         sizes = {
             "position": 3 * nodes, "velocity": 3 * nodes, "force": 3 * nodes, "pivot": 6 * nodes,
             "lower": 9 * len(self._pattern.row) + 9, "solution": 3 * free, "condensed": rows * rows, "weight": rows,
-            "compliance": cables**2, "slack": cables, "active": cables, "tension": cables, "measured": cables,
+            "slack": cables, "tension": cables, "measured": cables,
             "load": 9 * self._pattern.border * free,
-            "target": cables, "change": cables, "pivoting": cables * (cables + 1), "accepted": 1, "lost": 1,
+            "target": cables, "accepted": 1, "lost": 1,
             "unsolved": 1, "axes": 9, "turned": 12,
         }  # fmt: skip
         work = Work(**{name: aligned_zeros((size, self.lanes), self.dtype) for name, size in sizes.items()})

@@ -19,9 +19,20 @@ from rfdropo_bayes.fem.native.block_cholesky import (
     factor,
     forward_substitute,
 )
-from rfdropo_bayes.fem.native.complementarity import solve_for_active, solve_unilateral
-from rfdropo_bayes.fem.native.simd import fill, fma, load, mesh_kernel, mesh_part, square_root, store, where_greater
-from rfdropo_bayes.fem.native.tetrahedral import assemble, clear, elastic_forces
+from rfdropo_bayes.fem.native.cube_motion import record_cubes, remember_impulses, start_cubes, take_cube_step
+from rfdropo_bayes.fem.native.simd import (
+    addresses,
+    fill,
+    fma,
+    load,
+    mesh_part,
+    square_root,
+    store,
+    where_greater,
+    whole,
+)
+from rfdropo_bayes.fem.native.tetrahedral import assemble, elastic_forces
+from rfdropo_bayes.fem.native.tetrahedral_constraints import add_forces, hold, hold_again
 
 LARGEST = 1e12
 """[N] A tension beyond means that the rollout has diverged."""
@@ -44,7 +55,7 @@ class Schedule(NamedTuple):
 
     time_step: float
     stride: int  # steps between recorded rows
-    tolerance: float  # of the tension problem
+    settled: float  # relative change of the velocities that ends the iterations of a step
     reach: float  # largest distance of a node from its place at rest [m]
     refined: bool  # solve every step twice
 
@@ -132,34 +143,11 @@ def gather_cables(pattern, mesh, cables, work, time_step, token):
 
 
 @mesh_part
-def substitute(pattern, mesh, work, pull, count, time_step, token):
-    """Add A^-1 (border row 0 + h sum pull_i J_i) to the velocity."""
-    clear(work.weight, token)
-    store(work.weight, 0, fill(1.0, work.weight, token))
-    for i in range(count):
-        store(work.weight, i + 1, time_step * load(pull, i, token))
+def substitute(pattern, mesh, work, token):
+    """Add A^-1 times the weighted border rows to the velocity."""
     back_substitute(pattern, work.pivot, work.lower, work.weight, work.solution, token)
     for i in range(3 * mesh.free):
         store(work.velocity, i, load(work.velocity, i, token) + load(work.solution, i, token))
-
-
-@mesh_part
-def find_tensions(count, work, tolerance, token):
-    """Unilateral tensions; lanes without a solution are marked in ``unsolved``."""
-    found = solve_unilateral(
-        work.compliance, work.slack, count, tolerance, work.active, work.pivoting, work.tension, token
-    )
-    mark_unsolved(count, work, found, token)
-
-
-@mesh_part
-def mark_unsolved(count, work, found, token):
-    """Mark lanes whose tensions were not found in ``unsolved``."""
-    one, zero = fill(1.0, work.weight, token), fill(0.0, work.weight, token)
-    if not found:
-        for c in range(count):
-            bad = load(work.pivoting, count * count + c, token)
-            store(work.unsolved, 0, where_greater(bad, zero, one, load(work.unsolved, 0, token)))
 
 
 @mesh_part
@@ -193,19 +181,6 @@ def unbalance(pattern, mesh, samples, work, count, time_step, token):
 
 
 @mesh_part
-def correct(pattern, mesh, work, count, time_step, token):
-    """Solve once more, for what the step's solution leaves unbalanced; which cables pull stays as it is."""
-    forward_substitute(pattern, work.pivot, work.lower, token)
-    for i in range(count):
-        free = load(work.slack, i, token) + time_step * condensed_entry(pattern, work.lower, i + 1, 0, token)
-        store(work.slack, i, free)
-    solve_for_active(work.compliance, work.slack, work.active, count, work.pivoting, work.change, token)
-    for i in range(count):
-        store(work.tension, i, load(work.tension, i, token) + load(work.change, i, token))
-    substitute(pattern, mesh, work, work.change, count, time_step, token)
-
-
-@mesh_part
 def accept(rest, count, work, schedule, token):
     """Take the step x += h v; in the lanes where it is lost, stay in place at rest without tension."""
     one, zero = fill(1.0, work.position, token), fill(0.0, work.position, token)
@@ -236,26 +211,9 @@ def condense_step(pattern, mesh, cables, commanded, samples, work, schedule, tok
         _keep_border(pattern, work, token)
     factor(pattern, work.pivot, work.lower, token)
     condense(pattern, work.lower, work.condensed, token)
-    square = time_step * time_step
     for i in range(count):
-        free = load(work.slack, i, token) + time_step * load(work.condensed, (i + 1) * rows, token)
-        store(work.slack, i, free)
-        for j in range(count):
-            store(work.compliance, i * count + j, square * load(work.condensed, (i + 1) * rows + j + 1, token))
-
-
-@mesh_part
-def solve_step(pattern, mesh, cables, rest, commanded, samples, work, schedule, token):
-    """One implicit Euler step; marks lanes that diverge in ``lost``, and those whose tensions were not found in
-    ``unsolved``."""
-    count, time_step = len(cables.limit), schedule.time_step
-    condense_step(pattern, mesh, cables, commanded, samples, work, schedule, token)
-    find_tensions(count, work, schedule.tolerance, token)
-    substitute(pattern, mesh, work, work.tension, count, time_step, token)
-    if schedule.refined:
-        unbalance(pattern, mesh, samples, work, count, time_step, token)
-        correct(pattern, mesh, work, count, time_step, token)
-    accept(rest, count, work, schedule, token)
+        free = load(work.slack, i, token) * (1.0 / time_step)
+        store(work.slack, i, free + load(work.condensed, (i + 1) * rows, token))
 
 
 @mesh_part
@@ -275,15 +233,49 @@ def compile_rollout(sources: str) -> Callable:
     under.
 
     It steps through ``commands`` (steps, cables, lanes) and records after every ``schedule.stride`` steps; ``rest`` are
-    the nodes' coordinates at rest.
+    the nodes' coordinates at rest. ``scene``, ``cubes``, ``touch`` and ``poses`` are None where there is no cube.
     """
 
-    @mesh_kernel
-    def rollout(pattern, mesh, cables, rest, commands, samples, work, schedule, output, token):
+    @whole
+    def rollout(
+        pattern, mesh, cables, scene, rest, commands, cubes, samples, work, touch, rows, problem, reached, schedule,
+        output, poses, first, count, token,
+    ):  # fmt: skip
         _ = sources
+        bare, bare_pattern, bare_samples = addresses(work), addresses(pattern), addresses(samples)
+        extra, p, contacts = addresses(rows), addresses(problem), 0
+        around = None if scene is None else addresses(scene)
+        meeting = None if scene is None else addresses(touch)
+        drives, records = len(cables.limit), 1 + commands.shape[0] // schedule.stride
+        if scene is not None:
+            start_cubes(around, addresses(cubes), count, meeting, first, token)
+            record_cubes(meeting, addresses(poses), records, 0, first, count, token)
         for step in range(commands.shape[0]):
-            solve_step(pattern, mesh, cables, rest, commands[step], samples, work, schedule, token)
+            condense_step(pattern, mesh, cables, commands[step], samples, work, schedule, token)
+            contacts = hold(
+                bare_pattern, around, bare_samples, meeting, bare, extra, p, reached, drives, mesh.free, schedule, token
+            )
+            substitute(pattern, mesh, work, token)
+            if schedule.refined:
+                unbalance(pattern, mesh, samples, work, drives, schedule.time_step, token)
+                if scene is not None:
+                    add_forces(bare_pattern, around, meeting, bare, p, drives, contacts, mesh.free, token)
+                forward_substitute(pattern, work.pivot, work.lower, token)
+                for i in range(drives):
+                    free = load(work.slack, i, token) * (1.0 / schedule.time_step)
+                    store(work.slack, i, free + condensed_entry(pattern, work.lower, i + 1, 0, token))
+                hold_again(
+                    bare_pattern, around, meeting, bare, extra, p, reached, drives, contacts, mesh.free, schedule, token
+                )
+                substitute(pattern, mesh, work, token)
+            accept(rest, drives, work, schedule, token)
+            if scene is not None:
+                remember_impulses(around, meeting, p, drives, contacts, bare.accepted, token)
+                take_cube_step(meeting, bare.accepted, bare.lost, schedule.time_step, token)
             if (step + 1) % schedule.stride == 0:
-                record_body(work, output, (step + 1) // schedule.stride - 1, token)
+                row = (step + 1) // schedule.stride
+                record_body(work, output, row - 1, token)
+                if scene is not None:
+                    record_cubes(meeting, addresses(poses), records, row, first, count, token)
 
     return rollout

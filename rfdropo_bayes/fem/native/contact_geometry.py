@@ -1,0 +1,333 @@
+"""The contacts of a step in SIMD lanes: their gaps, frames and rows, as ``fem.pushing.find_contacts`` finds them.
+
+Lanes share the pairs that they look at. A pair is a candidate where it is near in any lane, and a contact where any
+lane has chosen it; in the other lanes it stays open.
+"""
+
+from __future__ import annotations
+
+from rfdropo_bayes.fem.constraints import APART
+from rfdropo_bayes.fem.native.contact_records import CORNERS
+from rfdropo_bayes.fem.native.fields import point
+from rfdropo_bayes.fem.native.simd import any_greater, fill, fma, fnma, kernel, load, square_root, store, where_greater
+from rfdropo_bayes.fem.pushing import ALARM
+
+EAGER = 0.02
+"""[m/s] A candidate is a contact from the start if it would open more slowly than this; it saves solves, no more."""
+
+
+@kernel
+def _size(value, zero):
+    return where_greater(value, zero, value, -value)
+
+
+@kernel
+def _column(array, first, step, token):
+    """Three rows of an array."""
+    return load(array, first, token), load(array, first + step, token), load(array, first + 2 * step, token)
+
+
+@kernel
+def _dot(a, b, c, x, y, z):
+    return fma(a, x, fma(b, y, c * z))
+
+
+@kernel
+def turn_cube(touch, token):
+    """Matrix of the cube's orientation."""
+    x, y, z = _column(touch.cube, 3, 1, token)
+    w, one = load(touch.cube, 6, token), fill(1.0, touch.cube, token)
+    store(touch.turn, 0, one - 2.0 * fma(y, y, z * z))
+    store(touch.turn, 1, 2.0 * fma(x, y, -z * w))
+    store(touch.turn, 2, 2.0 * fma(x, z, y * w))
+    store(touch.turn, 3, 2.0 * fma(x, y, z * w))
+    store(touch.turn, 4, one - 2.0 * fma(x, x, z * z))
+    store(touch.turn, 5, 2.0 * fma(y, z, -x * w))
+    store(touch.turn, 6, 2.0 * fma(x, z, -y * w))
+    store(touch.turn, 7, 2.0 * fma(y, z, x * w))
+    store(touch.turn, 8, one - 2.0 * fma(x, x, y * y))
+
+
+@kernel
+def free_cube(touch, gravity, drag, time_step, token):
+    """Twist of the cube at the end of a step without contacts; see ``fem.rigid_body.free_twist``."""
+    one = fill(1.0, touch.cube, token)
+    shrink = one / fma(load(drag, 0, token), time_step, one)
+    for i in range(3):
+        velocity = fma(load(gravity, i, token), time_step, load(touch.cube, 7 + i, token))
+        store(touch.twist, i, velocity * shrink)
+        store(touch.twist, 3 + i, load(touch.cube, 10 + i, token) * shrink)
+
+
+@kernel
+def _height(scene, x, y, z):
+    """Height of a point above the plate."""
+    return fma(x, scene.up[0], fma(y, scene.up[1], z * scene.up[2])) - scene.height
+
+
+@kernel
+def _place_frame(touch, slot, x, y, z, token):
+    """A normal, and two tangents; the first is across the axis that the normal is furthest from."""
+    zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
+    ax, ay, az = _size(x, zero), _size(y, zero), _size(z, zero)
+    first = where_greater(ax, ay, zero, where_greater(ax, az, zero, one))
+    second = (one - first) * where_greater(ay, az, zero, one)
+    third = one - first - second
+    tx, ty, tz = fnma(second, z, third * y), fnma(third, x, first * z), fnma(first, y, second * x)
+    scale = one / square_root(_dot(tx, ty, tz, tx, ty, tz))
+    tx, ty, tz = tx * scale, ty * scale, tz * scale
+    f = 9 * slot
+    store(touch.frame, f, x)
+    store(touch.frame, f + 1, y)
+    store(touch.frame, f + 2, z)
+    store(touch.frame, f + 3, tx)
+    store(touch.frame, f + 4, ty)
+    store(touch.frame, f + 5, tz)
+    store(touch.frame, f + 6, fnma(z, ty, y * tz))
+    store(touch.frame, f + 7, fnma(x, tz, z * tx))
+    store(touch.frame, f + 8, fnma(y, tx, x * ty))
+
+
+@kernel
+def _list(touch, slot, pair, gap, x, y, z, token):
+    """Write a candidate: its gap, and its place from the cube's centre."""
+    touch.pair[slot] = pair
+    store(touch.gap, slot, gap)
+    store(touch.arm, 3 * slot, x)
+    store(touch.arm, 3 * slot + 1, y)
+    store(touch.arm, 3 * slot + 2, z)
+
+
+@kernel
+def _list_corners(scene, touch, token):
+    """The cube's corners that are near the plate in any lane; returns how many."""
+    one, zero = fill(1.0, touch.cube, token), fill(0.0, touch.cube, token)
+    half, slot = 0.5 * load(touch.values, 1, token), 0
+    cx, cy, cz = _column(touch.cube, 0, 1, token)
+    level = _height(scene, cx, cy, cz) - scene.distance
+    for corner in range(CORNERS):
+        x = half * (-1.0 if corner // 4 == 0 else 1.0)
+        y = half * (-1.0 if corner // 2 % 2 == 0 else 1.0)
+        z = half * (-1.0 if corner % 2 == 0 else 1.0)
+        ax, bx, dx = _column(touch.turn, 0, 1, token)
+        ay, by, dy = _column(touch.turn, 3, 1, token)
+        az, bz, dz = _column(touch.turn, 6, 1, token)
+        ax, ay, az = _dot(ax, bx, dx, x, y, z), _dot(ay, by, dy, x, y, z), _dot(az, bz, dz, x, y, z)
+        gap = level + fma(ax, scene.up[0], fma(ay, scene.up[1], az * scene.up[2]))
+        if any_greater(one * ALARM, gap):
+            _list(touch, slot, corner, gap, ax, ay, az, token)
+            _place_frame(touch, slot, zero + scene.up[0], zero + scene.up[1], zero + scene.up[2], token)
+            slot += 1
+    return slot
+
+
+@kernel
+def _box_distance(touch, x, y, z, token):
+    """Signed distance of a point, given from the cube's centre, to the cube, and the outward normal there."""
+    zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
+    half, square, deepest = 0.5 * load(touch.values, 1, token), zero, zero - APART
+    nx, ny, nz, mx, my, mz = zero, zero, zero, zero, zero, zero
+    for j in range(3):
+        ux, uy, uz = _column(touch.turn, j, 3, token)
+        local = _dot(x, y, z, ux, uy, uz)
+        sign = where_greater(zero, local, -one, one)
+        beyond = fma(sign, local, -half)
+        outside = where_greater(beyond, zero, beyond, zero)
+        square = fma(outside, outside, square)
+        outside = outside * sign
+        nx, ny, nz = fma(outside, ux, nx), fma(outside, uy, ny), fma(outside, uz, nz)
+        mx = where_greater(beyond, deepest, sign * ux, mx)
+        my = where_greater(beyond, deepest, sign * uy, my)
+        mz = where_greater(beyond, deepest, sign * uz, mz)
+        deepest = where_greater(beyond, deepest, beyond, deepest)
+    length = square_root(where_greater(square, zero, square, one))
+    scale = one / length
+    nx = where_greater(square, zero, nx * scale, mx)
+    ny = where_greater(square, zero, ny * scale, my)
+    nz = where_greater(square, zero, nz * scale, mz)
+    return where_greater(square, zero, length, deepest), nx, ny, nz
+
+
+@kernel
+def _place_offset(scene, touch, slot, sphere, position, token):
+    """Where the sphere touches, from its centre in the body at rest: -radius F^-1 n with the deformation gradient F."""
+    zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
+    a, b, c, d, e, f, g, h, i = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for k in range(scene.first[sphere], scene.first[sphere + 1]):
+        x, y, z = _column(position, scene.place[k], 1, token)
+        u, v, w = scene.gradient[3 * k], scene.gradient[3 * k + 1], scene.gradient[3 * k + 2]
+        a, b, c = fma(x, u, a), fma(x, v, b), fma(x, w, c)
+        d, e, f = fma(y, u, d), fma(y, v, e), fma(y, w, f)
+        g, h, i = fma(z, u, g), fma(z, v, h), fma(z, w, i)
+    ca, cb, cc = fnma(f, h, e * i), fnma(d, i, f * g), fnma(e, g, d * h)
+    scale = (-scene.radius[sphere] * one) / _dot(a, b, c, ca, cb, cc)
+    x, y, z = _column(touch.frame, 9 * slot, 1, token)
+    store(touch.offset, 3 * slot, scale * _dot(ca, fnma(b, i, c * h), fnma(c, e, b * f), x, y, z))
+    store(touch.offset, 3 * slot + 1, scale * _dot(cb, fnma(c, g, a * i), fnma(a, f, c * d), x, y, z))
+    store(touch.offset, 3 * slot + 2, scale * _dot(cc, fnma(a, h, b * g), fnma(b, d, a * e), x, y, z))
+
+
+@kernel
+def _list_pushing(scene, touch, position, slot, token):
+    """The spheres that are near the cube in any lane; returns the next free slot."""
+    near, (cx, cy, cz) = fill(ALARM, touch.cube, token), _column(touch.cube, 0, 1, token)
+    for sphere in range(scene.spheres):
+        x, y, z = point(scene.first, scene.place, scene.centre, sphere, position, token)
+        store(touch.middle, 3 * sphere, x)
+        store(touch.middle, 3 * sphere + 1, y)
+        store(touch.middle, 3 * sphere + 2, z)
+        x, y, z = x - cx, y - cy, z - cz
+        distance, nx, ny, nz = _box_distance(touch, x, y, z, token)
+        gap = distance - (scene.radius[sphere] + scene.distance)
+        if any_greater(near, gap):
+            # The contact lies on the cube, below the sphere's centre.
+            x, y, z = fnma(distance, nx, x), fnma(distance, ny, y), fnma(distance, nz, z)
+            _list(touch, slot, CORNERS + sphere, gap, x, y, z, token)
+            _place_frame(touch, slot, nx, ny, nz, token)
+            _place_offset(scene, touch, slot, sphere, position, token)
+            slot += 1
+    return slot
+
+
+@kernel
+def _list_lying(scene, touch, position, slot, token):
+    """The spheres that are near the plate in any lane; returns the next free slot."""
+    near, zero = fill(ALARM, touch.cube, token), fill(0.0, touch.cube, token)
+    for sphere in range(scene.spheres):
+        x, y, z = _column(touch.middle, 3 * sphere, 1, token)
+        gap = _height(scene, x, y, z) - (scene.radius[sphere] + scene.distance)
+        if any_greater(near, gap):
+            _list(touch, slot, CORNERS + scene.spheres + sphere, gap, zero, zero, zero, token)
+            _place_frame(touch, slot, zero + scene.up[0], zero + scene.up[1], zero + scene.up[2], token)
+            _place_offset(scene, touch, slot, sphere, position, token)
+            slot += 1
+    return slot
+
+
+@kernel
+def sphere_of(scene, pair):
+    """The sphere of a pair that has one."""
+    return (pair - CORNERS) % scene.spheres
+
+
+@kernel
+def weights(scene, touch, slot, k, token):
+    """Weights of a sphere's entry in the normal row of a candidate and in its tangents."""
+    centre, one = scene.centre[k], fill(1.0, touch.cube, token)
+    x, y, z = _column(touch.offset, 3 * slot, 1, token)
+    around = fma(x, scene.gradient[3 * k], fma(y, scene.gradient[3 * k + 1], z * scene.gradient[3 * k + 2]))
+    return centre * one, around + centre
+
+
+@kernel
+def cube_row(touch, slot, r, kind, token):
+    """Derivative of a candidate's relative velocity along row r by the cube's twist; zero between trunk and plate."""
+    sign = 1.0 if kind == 0 else -1.0 if kind == 1 else 0.0
+    x, y, z = _column(touch.frame, 9 * slot + 3 * r, 1, token)
+    ax, ay, az = _column(touch.arm, 3 * slot, 1, token)
+    x, y, z = sign * x, sign * y, sign * z
+    return x, y, z, fnma(az, y, ay * z), fnma(ax, z, az * x), fnma(ay, x, ax * y)
+
+
+@kernel
+def kind_of(touch, slot):
+    """0: corner and plate, 1: sphere and cube, 2: sphere and plate."""
+    return 0 if slot < touch.count[0] else 1 if slot < touch.count[0] + touch.count[1] else 2
+
+
+@kernel
+def trunk_velocity(scene, touch, slot, kind, field, token):
+    """What a velocity field of the body adds to a candidate's relative velocity."""
+    zero = fill(0.0, touch.cube, token)
+    u, v, w, x, y, z = zero, zero, zero, zero, zero, zero
+    if kind == 0:
+        return zero, zero, zero
+    sphere = sphere_of(scene, touch.pair[slot])
+    for k in range(scene.first[sphere], scene.first[sphere + 1]):
+        centre, around = weights(scene, touch, slot, k, token)
+        a, b, c = _column(field, scene.place[k], 1, token)
+        u, v, w = fma(a, centre, u), fma(b, centre, v), fma(c, centre, w)
+        x, y, z = fma(a, around, x), fma(b, around, y), fma(c, around, z)
+    nx, ny, nz = _column(touch.frame, 9 * slot, 1, token)
+    sx, sy, sz = _column(touch.frame, 9 * slot + 3, 1, token)
+    tx, ty, tz = _column(touch.frame, 9 * slot + 6, 1, token)
+    return _dot(nx, ny, nz, u, v, w), _dot(sx, sy, sz, x, y, z), _dot(tx, ty, tz, x, y, z)
+
+
+@kernel
+def cube_velocity(touch, slot, kind, r, twist, first, token):
+    """What the cube's twist, at rows from ``first`` on, adds to a candidate's relative velocity along row r."""
+    a, b, c, d, e, f = cube_row(touch, slot, r, kind, token)
+    x, y, z = _column(twist, first, 1, token)
+    u, v, w = _column(twist, first + 3, 1, token)
+    return _dot(a, b, c, x, y, z) + _dot(d, e, f, u, v, w)
+
+
+@kernel
+def _closing(touch, slot, u, v, w, time_step, token):
+    """Velocity at which a candidate presses, given its relative velocity, friction included; see `fem.constraints`."""
+    sliding = square_root(fma(v, v, w * w))
+    pressed = fma(load(touch.values, 3, token), sliding, -u)
+    return pressed - load(touch.gap, slot, token) * (1.0 / time_step)
+
+
+@kernel
+def find_candidates(scene, position, velocity, gravity, drag, touch, time_step, token):
+    """The candidates of a step, and which of them the velocities of its start would close."""
+    zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
+    turn_cube(touch, token)
+    free_cube(touch, gravity, drag, time_step, token)
+    corners = _list_corners(scene, touch, token)
+    pushing = _list_pushing(scene, touch, position, corners, token)
+    last = _list_lying(scene, touch, position, pushing, token)
+    touch.count[0], touch.count[1], touch.count[2] = corners, pushing - corners, last - pushing
+    for slot in range(last):
+        kind = kind_of(touch, slot)
+        u, v, w = trunk_velocity(scene, touch, slot, kind, velocity, token)
+        u = u + cube_velocity(touch, slot, kind, 0, touch.cube, 7, token)
+        v = v + cube_velocity(touch, slot, kind, 1, touch.cube, 7, token)
+        w = w + cube_velocity(touch, slot, kind, 2, touch.cube, 7, token)
+        near = where_greater(one * ALARM, load(touch.gap, slot, token), one, zero)
+        closing = where_greater(_closing(touch, slot, u, v, w, time_step, token), -EAGER * one, near, zero)
+        store(touch.chosen, slot, closing)
+
+
+@kernel
+def choose_all(touch, token):
+    """Choose all candidates."""
+    zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
+    for slot in range(touch.count[0] + touch.count[1] + touch.count[2]):
+        store(touch.chosen, slot, where_greater(one * ALARM, load(touch.gap, slot, token), one, zero))
+
+
+@kernel
+def list_contacts(touch, token):
+    """List the candidates that any lane has chosen; returns how many, and how many of these the trunk takes part in."""
+    zero, contacts, corners = fill(0.0, touch.cube, token), 0, 0
+    for slot in range(touch.count[0] + touch.count[1] + touch.count[2]):
+        if any_greater(load(touch.chosen, slot, token), zero):
+            touch.contact[contacts] = slot
+            contacts += 1
+            if kind_of(touch, slot) == 0:
+                corners += 1
+    touch.count[3] = corners
+    return contacts
+
+
+@kernel
+def add_missed(scene, touch, velocity, increment, time_step, missed, token):
+    """Choose the candidates that a step's solution closes; returns whether there are any."""
+    zero, one, found = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token), False
+    for slot in range(touch.count[0] + touch.count[1] + touch.count[2]):
+        chosen, kind = load(touch.chosen, slot, token), kind_of(touch, slot)
+        u, v, w = trunk_velocity(scene, touch, slot, kind, velocity, token)
+        x, y, z = trunk_velocity(scene, touch, slot, kind, increment, token)
+        u = u + x + cube_velocity(touch, slot, kind, 0, touch.after, 0, token)
+        v = v + y + cube_velocity(touch, slot, kind, 1, touch.after, 0, token)
+        w = w + z + cube_velocity(touch, slot, kind, 2, touch.after, 0, token)
+        near = where_greater(one * ALARM, load(touch.gap, slot, token), one - chosen, zero)
+        near = where_greater(_closing(touch, slot, u, v, w, time_step, token), missed * one, near, zero)
+        if any_greater(near, zero):
+            found = True
+            store(touch.chosen, slot, chosen + near)
+    return found

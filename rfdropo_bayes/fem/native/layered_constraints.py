@@ -1,0 +1,227 @@
+"""A step of a layered body in SIMD lanes with everything that holds it: cables, slip at their guides, and contacts.
+
+Slip and contacts are further border rows of the factor that the step has already. What is None is not there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.fem.native.chain_cholesky import condense_rows, extend_border
+from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
+from rfdropo_bayes.fem.native.contact_geometry import (
+    add_missed,
+    find_candidates,
+    kind_of,
+    list_contacts,
+    sphere_of,
+    trunk_velocity,
+    weights,
+)
+from rfdropo_bayes.fem.native.cube_motion import add_cube, remember_impulses, stop_cube, take_cube_step
+from rfdropo_bayes.fem.native.fields import clear
+from rfdropo_bayes.fem.native.layered_step import (
+    condense_increment,
+    refine_increment,
+    start_problem,
+    substitute_increment,
+    take_step,
+    take_tensions,
+    weigh_border,
+    weigh_rows,
+)
+from rfdropo_bayes.fem.native.simd import aligned_zeros, fill, fma, kernel, load, store
+from rfdropo_bayes.fem.native.slip_rows import add_friction, gather_slip, kinds_present, remember_slip, sum_losses
+
+
+class Rows(NamedTuple):
+    """Border rows of slip, then of contacts, three to a panel; laid out as the engine's own border is."""
+
+    border: Float[np.ndarray, "values lanes"]
+    own: Float[np.ndarray, "tiles lanes"]  # minus their condensed products
+    across: Float[np.ndarray, "tiles lanes"]  # and those with the engine's border
+
+
+def row_storage(station_values: int, panels: int, others: int, lanes: int, dtype: type) -> Rows:
+    """Zeroed, aligned storage of one lane block: ``panels`` beside ``others`` of the engine, each with so many values
+    over all stations."""
+    sizes = 3 * station_values * panels, 9 * panels**2, 9 * panels * others
+    return Rows(*(aligned_zeros((max(size, 1), lanes), dtype) for size in sizes))
+
+
+@kernel
+def _contact_panel(scene, touch, slot, border, panel, panels, size, token):
+    """Border rows of a contact of the trunk."""
+    sphere = sphere_of(scene, touch.pair[slot])
+    for k in range(scene.first[sphere], scene.first[sphere + 1]):
+        centre, around = weights(scene, touch, slot, k, token)
+        row = scene.place[k]
+        t = ((row // size * panels + panel) * size + row % size) * 3
+        for i in range(3):
+            for r in range(3):
+                share = centre if r == 0 else around
+                value = load(touch.frame, 9 * slot + 3 * r + i, token)
+                store(border, t + 3 * i + r, fma(share, value, load(border, t + 3 * i + r, token)))
+
+
+@kernel
+def _top_station(scene, touch, contacts, size):
+    """The topmost station that a contact reaches."""
+    top = 0
+    for c in range(touch.count[3], contacts):
+        sphere = sphere_of(scene, touch.pair[touch.contact[c]])
+        top = max(top, scene.place[scene.first[sphere + 1] - 1] // size)
+    return top
+
+
+@kernel
+def _gather_contacts(tables, scene, touch, rows, p, lines, contacts, first, panels, velocity, token):
+    """Border rows of the contacts from panel ``first`` on, and what the body's velocity adds to the problem."""
+    size = 3 * tables.modes
+    for c in range(contacts):
+        slot, i = touch.contact[c], lines + 3 * c
+        u, v, w = trunk_velocity(scene, touch, slot, kind_of(touch, slot), velocity, token)
+        store(p.free, i, u)
+        store(p.free, i + 1, v)
+        store(p.free, i + 2, w)
+        if c >= touch.count[3]:
+            _contact_panel(scene, touch, slot, rows.border, first + c - touch.count[3], panels, size, token)
+
+
+@kernel
+def _row_of(i, slips, corners, lines, cables):
+    """Row of the problem that row i of the extra border is; negative for one that fills a panel."""
+    slip_rows = (slips + 2) // 3 * 3
+    if i >= slip_rows:
+        return lines + 3 * corners + i - slip_rows
+    return cables + i if i < slips else -1
+
+
+@kernel
+def _condense(tables, rows, work, p, n, panels, slips, corners, top, token):
+    """Add the extra rows to the problem: their products with each other, the cables and the right-hand side."""
+    held, size, cables, others = tables.held, 3 * tables.modes, tables.cables, (tables.cables + 3) // 3
+    lines = cables + slips
+    extend_border(work.pivot, work.coupling, rows.border, held, top, tables.modes, panels, token)
+    condense_rows(rows.own, rows.border, panels, rows.border, panels, True, held, top, size, token)
+    condense_rows(rows.across, rows.border, panels, work.border, others, False, held, top, size, token)
+    for i in range(3 * panels):
+        row = _row_of(i, slips, corners, lines, cables)
+        if row < 0:
+            continue
+        t = 9 * (i // 3 * others) + i % 3
+        store(p.free, row, load(p.free, row, token) - load(rows.across, t, token))
+        for c in range(cables):
+            value = load(rows.across, t + 9 * ((c + 1) // 3) + 3 * ((c + 1) % 3), token)
+            store(p.matrix, row * n + c, value)
+            store(p.matrix, c * n + row, value)
+        for j in range(i + 1):
+            column = _row_of(j, slips, corners, lines, cables)
+            if column >= 0:
+                value = -load(rows.own, 9 * (i // 3 * panels + j // 3) + 3 * (j % 3) + i % 3, token)
+                store(p.matrix, row * n + column, value)
+                store(p.matrix, column * n + row, value)
+
+
+@kernel
+def _hold(tables, runs, scene, samples, factors, work, friction, touch, rows, p, slips, contacts, schedule, token):
+    """Impulses of all constraints, and the solution of the step with them."""
+    time_step, cables, size = schedule.time_step, tables.cables, 3 * tables.modes
+    lines, slip_panels, corners, top = cables + slips, (slips + 2) // 3, 0, 0
+    n, rate = lines + 3 * contacts, 1.0 / time_step
+    clear(p.matrix, 0, n * n, token)
+    start_problem(tables, factors, work, p, n, rate, token)
+    if scene is not None:
+        corners, top = touch.count[3], _top_station(scene, touch, contacts, size)
+    panels = slip_panels + contacts - corners
+    if runs is not None:
+        top = tables.stations - 1
+    if runs is not None or scene is not None:
+        clear(rows.border, 0, 3 * (top + 1) * panels * size if panels > 0 else 0, token)
+        if runs is not None:
+            gather_slip(tables, runs, samples, friction, rows.border, panels, p, work, time_step, token)
+        if scene is not None:
+            velocity = work.velocity
+            _gather_contacts(tables, scene, touch, rows, p, lines, contacts, slip_panels, panels, velocity, token)
+        if panels > 0:
+            _condense(tables, rows, work, p, n, panels, slips, corners, top, token)
+        if scene is not None:
+            add_cube(touch, p, lines, contacts, time_step, token)
+    soften(p, cables, slips, contacts, time_step, token)
+    solve_problem(p, cables, slips, contacts, schedule.settled, token)
+    weigh_border(cables, work, p, token)
+    weigh_rows(tables, work, token)
+    if panels > 0:
+        _add_rows(tables, rows, work, p, panels, slips, corners, top, token)
+    substitute_increment(tables, work, token)
+
+
+@kernel
+def _add_rows(tables, rows, work, p, panels, slips, corners, top, token):
+    """Add the impulses of the extra rows to what the back substitution starts from."""
+    size, cables = 3 * tables.modes, tables.cables
+    for station in range(tables.held, top + 1):
+        for c in range(size):
+            value = load(work.solution, station * size + c, token)
+            for i in range(3 * panels):
+                row = _row_of(i, slips, corners, cables + slips, cables)
+                if row >= 0:
+                    t = ((station * panels + i // 3) * size + c) * 3 + i % 3
+                    value = fma(load(p.impulse, row, token), load(rows.border, t, token), value)
+            store(work.solution, station * size + c, value)
+
+
+@kernel
+def _add_forces(scene, touch, p, lines, contacts, field, token):
+    """Add the contacts' impulses to a field."""
+    for c in range(touch.count[3], contacts):
+        slot, i = touch.contact[c], lines + 3 * c
+        sphere = sphere_of(scene, touch.pair[slot])
+        for k in range(scene.first[sphere], scene.first[sphere + 1]):
+            centre, around = weights(scene, touch, slot, k, token)
+            for j in range(3):
+                push = fill(0.0, field, token)
+                for r in range(3):
+                    impulse = load(p.impulse, i + r, token) * (centre if r == 0 else around)
+                    push = fma(impulse, load(touch.frame, 9 * slot + 3 * r + j, token), push)
+                row = scene.place[k] + j
+                store(field, row, load(field, row, token) + push)
+
+
+@kernel
+def constrained_step(tables, runs, scene, samples, factors, work, friction, touch, rows, p, schedule, token):
+    """One implicit Euler step of a body, its cables' friction and its cube."""
+    time_step, slips, contacts = schedule.time_step, 0, 0
+    condense_increment(tables, samples, factors, work, 1.0 / time_step, token)
+    if runs is not None:
+        slips = kinds_present(samples)[0] * runs.count
+    if scene is not None:
+        find_candidates(scene, work.position, work.velocity, samples.gravity, samples.damping, touch, time_step, token)
+    again = True
+    while again:
+        again = False
+        if scene is not None:
+            contacts = list_contacts(touch, token)
+        _hold(tables, runs, scene, samples, factors, work, friction, touch, rows, p, slips, contacts, schedule, token)
+        if scene is not None:
+            stop_cube(touch, p, tables.cables + slips, contacts, token)
+            again = add_missed(scene, touch, work.velocity, work.solution, time_step, schedule.missed, token)
+    take_tensions(tables.cables, work, 1.0 / time_step, token)
+    if runs is not None:
+        sum_losses(tables, runs, samples, friction, p, token)
+    if schedule.refinements > 0:
+        if runs is not None:
+            add_friction(tables, friction, work.field, token)
+        if scene is not None:
+            _add_forces(scene, touch, p, tables.cables + slips, contacts, work.field, token)
+    for _ in range(schedule.refinements):
+        refine_increment(tables, samples, factors, work, token)
+    take_step(tables, work, time_step, token)
+    if runs is not None:
+        remember_slip(tables, friction, p, work, slips, time_step, token)
+    if scene is not None:
+        remember_impulses(scene, touch, p, tables.cables + slips, contacts, work.accepted, token)
+        take_cube_step(touch, work.accepted, work.lost, time_step, token)

@@ -1,0 +1,201 @@
+"""Cables and contacts of a step of a tetrahedral body in SIMD lanes, between its factorisation and its substitution.
+
+Border row 0 of the factor is the right-hand side, the following ones are -dl/dx of the cables. Contacts are further
+rows. A body without a cube has no scene: what is None is not there.
+"""
+
+from __future__ import annotations
+
+from rfdropo_bayes.fem.native.block_cholesky import condense_rows, extend_border
+from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
+from rfdropo_bayes.fem.native.contact_geometry import (
+    choose_all,
+    cube_velocity,
+    find_candidates,
+    kind_of,
+    list_contacts,
+    sphere_of,
+    trunk_velocity,
+    weights,
+)
+from rfdropo_bayes.fem.native.cube_motion import add_cube, stop_cube
+from rfdropo_bayes.fem.native.fields import clear
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store
+
+
+@kernel
+def _gather_contacts(scene, touch, work, rows, p, reached, cables, contacts, free, token):
+    """Border rows of the contacts and the columns that they reach; the body's velocity along them."""
+    panels = contacts - touch.count[3]
+    clear(rows.border, 0, 9 * panels * free, token)
+    for node in range(free):
+        reached[node] = 0
+    for c in range(contacts):
+        slot, i = touch.contact[c], cables + 3 * c
+        u, v, w = trunk_velocity(scene, touch, slot, kind_of(touch, slot), work.velocity, token)
+        store(p.free, i, u)
+        store(p.free, i + 1, v)
+        store(p.free, i + 2, w)
+        if c < touch.count[3]:
+            continue
+        sphere = sphere_of(scene, touch.pair[slot])
+        for k in range(scene.first[sphere], scene.first[sphere + 1]):
+            node = scene.place[k] // 3
+            if node >= free:
+                continue
+            reached[node] = 1
+            centre, around = weights(scene, touch, slot, k, token)
+            t = 9 * (panels * node + c - touch.count[3])
+            for r in range(3):
+                share = centre if r == 0 else around
+                for j in range(3):
+                    value = fma(
+                        share, load(touch.frame, 9 * slot + 3 * r + j, token), load(rows.border, t + 3 * r + j, token)
+                    )
+                    store(rows.border, t + 3 * r + j, value)
+
+
+@kernel
+def _across(pattern, touch, work, rows, p, reached, cables, contacts, free, token):
+    """Products of the contacts' rows with the engine's border; add those with the right-hand side to ``free``."""
+    corners, others = touch.count[3], pattern.border
+    panels = contacts - corners
+    condense_rows(pattern, rows.across, rows.border, panels, work.lower, others, False, reached, free, token)
+    for i in range(3 * panels):
+        row = cables + 3 * corners + i
+        moved = load(rows.across, 9 * (i // 3 * others) + i % 3, token)
+        store(p.free, row, load(p.free, row, token) + moved)
+
+
+@kernel
+def _condense(pattern, touch, work, rows, p, n, reached, cables, contacts, free, token):
+    """Add the contacts of the trunk to the problem."""
+    first, others = cables + 3 * touch.count[3], pattern.border
+    panels = contacts - touch.count[3]
+    extend_border(pattern, work.pivot, work.lower, rows.border, panels, reached, free, token)
+    condense_rows(pattern, rows.own, rows.border, panels, rows.border, panels, True, reached, free, token)
+    _across(pattern, touch, work, rows, p, reached, cables, contacts, free, token)
+    for i in range(3 * panels):
+        t, row = 9 * (i // 3 * others) + i % 3, first + i
+        for c in range(cables):
+            value = load(rows.across, t + 9 * ((c + 1) // 3) + 3 * ((c + 1) % 3), token)
+            store(p.matrix, row * n + c, value)
+            store(p.matrix, c * n + row, value)
+        for j in range(i + 1):
+            value = load(rows.own, 9 * (i // 3 * panels + j // 3) + 3 * (j % 3) + i % 3, token)
+            store(p.matrix, row * n + first + j, value)
+            store(p.matrix, (first + j) * n + row, value)
+
+
+@kernel
+def _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, time_step, token):
+    """Weights of the border rows by the change of the impulses since ``before``, and the tensions."""
+    store(work.weight, 0, fill(1.0, work.weight, token))
+    for i in range(cables + 1, 3 * pattern.border):
+        store(work.weight, i, fill(0.0, work.weight, token))
+    for c in range(cables):
+        store(work.weight, c + 1, load(p.impulse, c, token) - load(p.before, c, token))
+        store(work.tension, c, load(p.impulse, c, token) * (1.0 / time_step))
+    if scene is not None:
+        first = cables + 3 * touch.count[3]
+        panels = contacts - touch.count[3]
+        for column in range(free if panels > 0 else 0):
+            if reached[column] == 0:
+                continue
+            t = 9 * (pattern.first[column + 1] - pattern.border)
+            for m in range(3):
+                value = load(work.lower, t + m, token)
+                for i in range(3 * panels):
+                    row = load(rows.border, 9 * panels * column + 3 * i + m, token)
+                    change = load(p.impulse, first + i, token) - load(p.before, first + i, token)
+                    value = fma(change, row, value)
+                store(work.lower, t + m, value)
+
+
+@kernel
+def hold(pattern, scene, samples, touch, work, rows, p, reached, cables, free, schedule, token):
+    """Impulses of all constraints of a step, and the weights of its substitution; returns how many contacts it has.
+
+    ``work.slack`` holds the velocities of the cables' rows without impulses, ``work.condensed`` their products.
+    """
+    time_step, contacts, border = schedule.time_step, 0, 3 * pattern.border
+    if scene is not None:
+        drag = samples.rayleigh_mass
+        find_candidates(scene, work.position, work.velocity, samples.gravity, drag, touch, time_step, token)
+        choose_all(touch, token)
+        contacts = list_contacts(touch, token)
+    n = cables + 3 * contacts
+    clear(p.matrix, 0, n * n, token)
+    clear(p.before, 0, n, token)
+    for i in range(cables):
+        store(p.free, i, load(work.slack, i, token))
+        store(p.impulse, i, load(work.tension, i, token) * time_step)
+        for j in range(cables):
+            store(p.matrix, i * n + j, load(work.condensed, (i + 1) * border + j + 1, token))
+    if scene is not None:
+        _gather_contacts(scene, touch, work, rows, p, reached, cables, contacts, free, token)
+        if contacts > touch.count[3]:
+            _condense(pattern, touch, work, rows, p, n, reached, cables, contacts, free, token)
+        add_cube(touch, p, cables, contacts, time_step, token)
+    soften(p, cables, 0, contacts, time_step, token)
+    solve_problem(p, cables, 0, contacts, schedule.settled, token)
+    _mark(work, p, token)
+    _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, time_step, token)
+    if scene is not None:
+        stop_cube(touch, p, cables, contacts, token)
+    return contacts
+
+
+@kernel
+def _mark(work, p, token):
+    """Lanes whose impulses were not found stay marked."""
+    store(work.unsolved, 0, load(work.unsolved, 0, token) + load(p.going, 0, token))
+
+
+@kernel
+def add_forces(pattern, scene, touch, work, p, cables, contacts, free, token):
+    """Add the contacts' impulses to border row 0 before its elimination."""
+    for c in range(touch.count[3], contacts):
+        slot = touch.contact[c]
+        sphere = sphere_of(scene, touch.pair[slot])
+        for k in range(scene.first[sphere], scene.first[sphere + 1]):
+            node = scene.place[k] // 3
+            if node >= free:
+                continue
+            centre, around = weights(scene, touch, slot, k, token)
+            t = 9 * (pattern.first[node + 1] - pattern.border)
+            for j in range(3):
+                value = load(work.lower, t + j, token)
+                for r in range(3):
+                    impulse = load(p.impulse, cables + 3 * c + r, token) * (centre if r == 0 else around)
+                    value = fma(impulse, load(touch.frame, 9 * slot + 3 * r + j, token), value)
+                store(work.lower, t + j, value)
+
+
+@kernel
+def hold_again(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, schedule, token):
+    """As `hold`, for what a step's solution has left: the change of the impulses since it was found."""
+    n = cables + 3 * contacts
+    for i in range(cables):
+        store(p.free, i, load(work.slack, i, token))
+    if scene is not None:
+        for c in range(contacts):
+            slot, i = touch.contact[c], cables + 3 * c
+            kind = kind_of(touch, slot)
+            u, v, w = trunk_velocity(scene, touch, slot, kind, work.velocity, token)
+            store(p.free, i, u + cube_velocity(touch, slot, kind, 0, touch.after, 0, token))
+            store(p.free, i + 1, v + cube_velocity(touch, slot, kind, 1, touch.after, 0, token))
+            store(p.free, i + 2, w + cube_velocity(touch, slot, kind, 2, touch.after, 0, token))
+        if contacts > touch.count[3]:
+            _across(pattern, touch, work, rows, p, reached, cables, contacts, free, token)
+    for i in range(n):
+        value = load(p.free, i, token)
+        for j in range(n):
+            value = fnma(load(p.matrix, i * n + j, token), load(p.impulse, j, token), value)
+        store(p.free, i, value)
+        store(p.before, i, load(p.impulse, i, token))
+    solve_problem(p, cables, 0, contacts, schedule.settled, token)
+    _mark(work, p, token)
+    _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, schedule.time_step, token)
+    if scene is not None:
+        stop_cube(touch, p, cables, contacts, token)

@@ -1,0 +1,220 @@
+"""The bodies of a session in an engine: lanes that go on from the state in which they were left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem import Material, point_positions, prepare, state_at_rest
+from rfdropo_bayes.fem import static_equilibrium as find_equilibrium
+from rfdropo_bayes.fem.dynamics import Prepared, State, remembering, step
+from rfdropo_bayes.fem.native.layered import NativeRollout
+from rfdropo_bayes.fem.native.layered_session import LayeredSession
+from rfdropo_bayes.fem.rigid_body import Cube
+from rfdropo_bayes.simulators.engine import CubeInputs, Engine, cube_arrays
+
+
+class LaneMotion(NamedTuple):
+    """Where the bodies of some lanes are."""
+
+    position: Float[np.ndarray, "lane marker 3"]
+    tension: Float[np.ndarray, "lane cable"]
+    diverged: Bool[np.ndarray, " lane"]  # since the lane was started
+    imbalance: Float[np.ndarray, " lane"]  # relative unbalanced force of its initial equilibrium
+    converged: Bool[np.ndarray, " lane"]  # whether the impulses of all constraints were found since then
+    pose: Float[np.ndarray, "lane 7"] | None  # of the cube: centre [m] and quaternion (x, y, z, w)
+
+
+class BodyLanes(Protocol):
+    """The bodies of a session's lanes."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of their parameters and state."""
+
+    def reset(
+        self,
+        rows: Int[np.ndarray, " row"],
+        material: Material,
+        start: Float[np.ndarray, "row cable"],
+        cube: CubeInputs | None,
+    ) -> LaneMotion:
+        """Start some lanes anew; material and cube have one entry per row. Returns the motion of these rows."""
+
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> LaneMotion:
+        """Take steps to the cable displacements [m] at their ends."""
+
+    def save(self) -> Float[np.ndarray, "lane values"]:
+        """A copy of the state, one row a lane."""
+
+    def restore(self, rows: Int[np.ndarray, " row"], state: Float[np.ndarray, "row values"]) -> None:
+        """Set lanes to rows of a saved state."""
+
+
+def body_lanes(engine: Engine, count: int) -> BodyLanes:
+    """Bodies for so many lanes.
+
+    Raises:
+        InputError: an engine whose body is not made of layers.
+    """
+    if not engine.layered:
+        raise InputError("a body of tetrahedra does not step", where="a session", remedy="use a layered body")
+    return ReferenceLanes(engine, count) if engine.backend.name == "jax" else CompiledLanes(engine, count)
+
+
+class CompiledLanes:
+    """Bodies in the compiled engine: see `BodyLanes`."""
+
+    def __init__(self, engine: Engine, count: int) -> None:
+        self._session, self._from_equilibrium = LayeredSession(engine.native, count), engine.from_equilibrium
+        self.save, self.restore = self._session.save, self._session.restore
+
+    @property
+    def nbytes(self) -> int:
+        """See `BodyLanes`."""
+        return self._session.nbytes
+
+    def reset(
+        self,
+        rows: Int[np.ndarray, " row"],
+        material: Material,
+        start: Float[np.ndarray, "row cable"],
+        cube: CubeInputs | None,
+    ) -> LaneMotion:
+        """See `BodyLanes`."""
+        solid = None if cube is None else cube_arrays(cube)
+        begin = start if self._from_equilibrium else None
+        return _last(self._session.reset(rows, material, start=begin, cube=solid))
+
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> LaneMotion:
+        """See `BodyLanes`."""
+        return _last(self._session.advance(displacement, stride=displacement.shape[1]))
+
+
+def _last(found: NativeRollout) -> LaneMotion:
+    """The last recorded row."""
+    pose = None if found.pose is None else found.pose[:, -1]
+    last = found.position[:, -1], found.tension[:, -1]
+    return LaneMotion(*last, found.diverged, found.residual, found.converged, pose)
+
+
+class _Lane(NamedTuple):
+    """One body of a session."""
+
+    prepared: Prepared
+    state: State
+    diverged: Bool[Array, ""]
+    imbalance: Float[Array, ""]
+    converged: Bool[Array, ""]
+    cube: Cube | None
+
+
+class ReferenceLanes:
+    """Bodies in the reference engine: see `BodyLanes`."""
+
+    def __init__(self, engine: Engine, count: int) -> None:
+        self._engine, self._count = engine, count
+        self._system: Any = engine.body.system
+        self._lanes: _Lane | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """See `BodyLanes`."""
+        return sum(leaf.nbytes for leaf in jax.tree.leaves(self._lanes))
+
+    def reset(
+        self,
+        rows: Int[np.ndarray, " row"],
+        material: Material,
+        start: Float[np.ndarray, "row cable"],
+        cube: CubeInputs | None,
+    ) -> LaneMotion:
+        """See `BodyLanes`. All lanes are computed, so that one program serves any number of rows."""
+        spread = np.zeros(self._count, int)
+        spread[rows] = np.arange(len(rows))
+        fresh = self._first(*jax.tree.map(lambda part: jnp.asarray(part)[spread], (material, start, cube)))
+        if self._lanes is None:
+            self._lanes = fresh
+        elif str(jax.tree.structure(fresh)) != str(jax.tree.structure(self._lanes)):
+            raise InputError("a lane whose body has other effects than the lanes before", where="reset")
+        self._lanes = jax.tree.map(lambda new, old: old.at[rows].set(new[rows]), fresh, self._lanes)
+        return LaneMotion(*(None if part is None else part[rows] for part in self._shown()))
+
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> LaneMotion:
+        """See `BodyLanes`."""
+        self._lanes = self._moved(self._lanes, jnp.asarray(displacement))
+        return self._shown()
+
+    def save(self) -> Float[np.ndarray, "lane values"]:
+        """See `BodyLanes`."""
+        return flat_lanes(self._lanes, self._count)
+
+    def restore(self, rows: Int[np.ndarray, " row"], state: Float[np.ndarray, "row values"]) -> None:
+        """See `BodyLanes`."""
+        whole = self.save()
+        whole[rows] = state
+        self._lanes = lanes_like(self._lanes, whole)
+
+    def _shown(self) -> LaneMotion:
+        assert self._lanes is not None
+        lanes, markers = self._lanes, self._engine.body.markers
+        position = jax.vmap(lambda nodes: point_positions(markers, nodes))(lanes.state.position)
+        shown = position, lanes.state.tension, lanes.diverged, lanes.imbalance, lanes.converged
+        cube, pose = lanes.state.cube, None
+        if cube is not None:
+            pose = np.concatenate([cube.position, cube.orientation], axis=1)
+        return LaneMotion(*map(np.asarray, shown), pose)
+
+    @cached_property
+    def _first(self) -> Callable[[Material, Array, CubeInputs | None], _Lane]:
+        system = self._system
+
+        def first(material: Material, start: Float[Array, " cable"], cube: CubeInputs | None) -> _Lane:
+            prepared, imbalance = prepare(system, material), jnp.zeros(())
+            state = state_at_rest(system)
+            if self._engine.from_equilibrium:
+                state, found = find_equilibrium(system, prepared, start)
+                imbalance = found.residual
+            state = remembering(system, prepared, state)
+            solid, place = (None, None) if cube is None else cube
+            return _Lane(prepared, state._replace(cube=place), jnp.array(False), imbalance, jnp.array(True), solid)
+
+        return jax.jit(jax.vmap(first))
+
+    @cached_property
+    def _moved(self) -> Callable[[_Lane | None, Array], _Lane]:
+        system, time_step = self._system, self._engine.time_step
+
+        def moved(lane: _Lane, displacement: Float[Array, "step cable"]) -> _Lane:
+            def one(before: _Lane, command: Float[Array, " cable"]) -> tuple[_Lane, None]:
+                around = 0.0, self._engine.scene, before.cube
+                state, info = step(system, before.prepared, before.state, command, time_step, *around)
+                codes = before.diverged | info.diverged, before.converged & info.converged
+                return before._replace(state=state, diverged=codes[0], converged=codes[1]), None
+
+            return jax.lax.scan(one, lane, displacement)[0]
+
+        return jax.jit(jax.vmap(moved))
+
+
+def flat_lanes(tree: Any, count: int) -> Float[np.ndarray, "lane values"]:
+    """All leaves of a tree, one row a lane; whole numbers as floats."""
+    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(tree)]
+    rows = [leaf.reshape(len(leaf), -1) for leaf in leaves]
+    return np.concatenate([np.zeros((count, 0)), *rows], axis=1)
+
+
+def lanes_like(tree: Any, flat: Float[np.ndarray, "lane values"]) -> Any:
+    """The inverse of `flat_lanes`, with the shapes and types of a tree."""
+    leaves, structure = jax.tree.flatten(tree)
+    ends = np.cumsum([leaf[0].size for leaf in leaves])[:-1]
+    parts = np.split(flat, ends, axis=1)[: len(leaves)]
+    like = [jnp.asarray(p.reshape(leaf.shape), leaf.dtype) for p, leaf in zip(parts, leaves, strict=True)]
+    return jax.tree.unflatten(structure, like)
