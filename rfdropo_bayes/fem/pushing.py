@@ -167,7 +167,7 @@ def find_contacts(scene: PushScene, cube: Cube, state: CubeState, position: Floa
     return Touch(
         gap - scene.contact_distance,
         frame,
-        sign[:, None, None] * jnp.concatenate([frame, jnp.cross(arm[:, None, :], frame)], axis=2),
+        jnp.asarray(sign)[:, None, None] * jnp.concatenate([frame, jnp.cross(arm[:, None, :], frame)], axis=2),
         *_trunk_weights(spheres, chosen, normal, position),
     )
 

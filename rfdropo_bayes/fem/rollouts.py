@@ -96,7 +96,7 @@ def simulate(
 
     start = _Progress(remembering(system, prepared, state), jnp.array(False), jnp.array(True))
     last, rows = lax.scan(row, start, displacement)
-    return Rollout(rows.position, rows.tension, *last, rows.pose)
+    return Rollout(rows.position, rows.tension, last.state, last.diverged, last.converged, rows.pose)
 
 
 def simulate_prefix(
@@ -126,4 +126,4 @@ def simulate_prefix(
     start = _Progress(remembering(system, prepared, state), jnp.array(False), jnp.array(True))
     empty = jax.tree.map(lambda one: jnp.zeros((rows, *one.shape)), _record(points, state))
     last, recorded = lax.fori_loop(0, jnp.minimum(horizon, rows), row, (start, empty))
-    return Rollout(recorded.position, recorded.tension, *last, recorded.pose)
+    return Rollout(recorded.position, recorded.tension, last.state, last.diverged, last.converged, recorded.pose)

@@ -166,11 +166,12 @@ class ReferenceLanes:
         assert self._lanes is not None
         lanes, markers = self._lanes, self._engine.body.markers
         position = jax.vmap(lambda nodes: point_positions(markers, nodes))(lanes.state.position)
-        shown = position, lanes.state.tension, lanes.diverged, lanes.imbalance, lanes.converged
         cube, pose = lanes.state.cube, None
         if cube is not None:
             pose = np.concatenate([cube.position, cube.orientation], axis=1)
-        return LaneMotion(*map(np.asarray, shown), pose)
+        parts = position, lanes.state.tension, lanes.diverged, lanes.imbalance, lanes.converged
+        shown: Any = [*map(np.asarray, parts), pose]
+        return LaneMotion(*shown)
 
     @cached_property
     def _first(self) -> Callable[[Material, Array, CubeInputs | None], _Lane]:

@@ -76,7 +76,7 @@ class Body(Protocol):
     def markers(self) -> PointMap:
         """Recorded points."""
 
-    def _replace(self, **changes: PointMap) -> Body:
+    def _replace(self, *, markers: PointMap = ...) -> Any:
         """The same with other points."""
 
 

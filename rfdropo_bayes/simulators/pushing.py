@@ -196,7 +196,7 @@ class PushSimulator(RobotSimulator):
         own = {spec.name: values[spec.name] for spec in self.trunk.parameters}
         inputs: Any = self.trunk.inputs(own, commands)
         engine = self.trunk.engine.recording(every_node(len(rest_nodes(self.trunk))))
-        motion = engine.motion(*inputs, cube=self.cube(values))
+        motion = engine.motion(inputs[0], inputs[1], inputs[2], cube=self.cube(values))
         return self.trunk.balance_of(inputs[0], motion.position, motion.tension, commands)
 
     def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
@@ -210,5 +210,5 @@ class PushSimulator(RobotSimulator):
         own = {spec.name: values[spec.name] for spec in self.trunk.parameters}
         inputs: Any = self.trunk.inputs(own, commands)
         steps = self.trunk.steps_seen(own, commands, self.time_step, steps)
-        motion = self.trunk.engine.motion(*inputs, steps, self.cube(values))
+        motion = self.trunk.engine.motion(inputs[0], inputs[1], inputs[2], steps, self.cube(values))
         return self.trunk.observation(own, commands, motion, self.unsolved)

@@ -46,7 +46,7 @@ def test_the_base_of_a_mesh_holds_what_moves_it(trunk):
     found = jax.jit(trunk.balance)(SOFT, commands)
     material, assembly = trunk.material(values), trunk.assembly
     engine = trunk.engine.recording(every_node(len(assembly.system.body.rest)))
-    motion = engine.motion(material, trunk.displacements(values, commands), None)
+    motion = engine.motion(*trunk.inputs(values, commands))
     mass, position = np.asarray(material.node_mass), np.asarray(motion.position)
     momentum = np.einsum("n,rni->ri", mass, np.diff(position, axis=0, prepend=position[:1]) / TIME_STEP)
     layout = assembly.system.cables
@@ -67,7 +67,7 @@ def test_the_base_of_a_mesh_holds_what_moves_it(trunk):
 @pytest.mark.slow
 def test_what_the_cube_is_pushed_by_pushes_the_trunk_back(trunk):
     """Without friction only the trunk moves a cube along the plate."""
-    beside = pushing(trunk)
+    beside = pushing(replace(trunk, engine=replace(trunk.engine, backend=Backend())))
     commands = every_step(beside, 50)
     height = PLATE + 0.0175 + 0.005
     values = SOFT | {"friction": jnp.asarray(0.0), "cube_x": jnp.asarray(-0.02), "cube_y": jnp.asarray(height)}
