@@ -124,18 +124,17 @@ def test_batch_and_threads_do_not_matter():
     engine = native("float64")
     before = engine.rollout(material, displacement)
     whole = engine.rollout(extended, displacement)
-    for one, two in zip(jax.tree.leaves(before), jax.tree.leaves(engine.rollout(material, displacement)), strict=True):
+    for one, two in zip(before, engine.rollout(material, displacement), strict=True):
         np.testing.assert_array_equal(one, two)
     order = np.random.default_rng(8).permutation(BATCH)
     shuffled = jax.tree.map(lambda value: value[order], extended)
+    other = native("float64", threads=2).rollout(shuffled, displacement[order])
     for one, two in zip(
-        jax.tree.leaves(whole),
-        jax.tree.leaves(native("float64", threads=2).rollout(shuffled, displacement[order])),
-        strict=True,
-    ):
+        whole[:-1], other[:-1], strict=True
+    ):  # the last part is the pose of a cube, of which there is none
         np.testing.assert_array_equal(one[order], two)
     alone = engine.rollout(jax.tree.map(lambda value: value[3], extended), displacement[3])
-    for one, two in zip(jax.tree.leaves(whole), jax.tree.leaves(alone), strict=True):
+    for one, two in zip(whole[:-1], alone[:-1], strict=True):
         np.testing.assert_array_equal(one[3:4], two)
 
 
@@ -214,5 +213,5 @@ def test_friction_alone_null_and_in_any_batch():
     order = np.random.default_rng(13).permutation(BATCH)
     shuffled = jax.tree.map(lambda value: value[order], material)
     other = NativeLayered(system, points, TIME_STEP, threads=2).rollout(shuffled, displacement[order])
-    for one, two in zip(jax.tree.leaves(whole), jax.tree.leaves(other), strict=True):
+    for one, two in zip(whole, other, strict=True):
         np.testing.assert_array_equal(one[order], two)
