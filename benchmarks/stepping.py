@@ -4,10 +4,9 @@
 
 The trunk of TrunkReach, and that of TrunkPush which presses on its cube, go through commands, drives, body and cameras,
 with parameters that differ from lane to lane.
-Episodes of 100 solves start anew each
-time. "Whole" is the compiled engine's batch of rollouts of the same episodes. Rates are those of the clock on the wall
-and of processor time, which a busy machine leaves as it is. Memory is that of all lanes' state. Then what it costs to
-start all lanes anew, from rest, from an equilibrium, and from one found before.
+Episodes of 100 solves start anew each time. "Whole" is the compiled engine's batch of rollouts of the same. Rates are
+those of the clock on the wall and of processor time, which a busy machine leaves as it is. Memory is that of all lanes'
+state. Then what it costs to start all lanes anew: from rest, from an equilibrium, and from one found before.
 """
 
 from __future__ import annotations
