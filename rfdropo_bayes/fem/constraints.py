@@ -25,8 +25,8 @@ from rfdropo_bayes.fem.cable_friction import PRESLIDING
 
 Scalar = Float[Array, ""] | float
 
-CABLE_SOFTNESS = 1e-6
-"""R of a cable, relative to its entry on the diagonal of W."""
+CABLE_SOFTNESS = 1e-9
+"""R of a cable, relative to its entry on the diagonal of W; in single precision, see ``native.constraint_problem``."""
 BETA = 1.0
 """A contact gives way with a period of BETA time steps; see docs/architecture.md for how it was chosen."""
 NORMAL_SOFTNESS = BETA**2 / (4.0 * math.pi**2)

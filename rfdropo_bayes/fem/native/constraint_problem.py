@@ -38,6 +38,7 @@ from rfdropo_bayes.fem.native.simd import (
 )
 
 SETTLED = {"float64": 1e-11, "float32": 3e-6}
+SOFTNESS = {"float64": CABLE_SOFTNESS, "float32": 1e-6}  # of cables, relative to W: single precision holds no less
 """Error of a velocity, relative to the largest that a row has or its impulse makes, that ends a lane's iterations."""
 ROUNDING = 0.1
 """Share of that error up to which the velocities are rounded."""
@@ -95,7 +96,7 @@ def _size(value, zero):
 
 
 @kernel
-def soften(p, cables, runs, contacts, time_step, token):
+def soften(p, cables, runs, contacts, time_step, softness, token):
     """Softness of every row from the diagonal of W; rows of parts that cannot move take no part."""
     zero, one, lines = fill(0.0, p.free, token), fill(1.0, p.free, token), cables + runs
     n, largest, follows = lines + 3 * contacts, zero, time_step / PRESLIDING
@@ -105,7 +106,7 @@ def soften(p, cables, runs, contacts, time_step, token):
     for c in range(cables):
         value = load(p.matrix, c * n + c, token)
         usable = where_greater(value, RIGID * largest, one, zero)
-        firm = usable / (CABLE_SOFTNESS * where_greater(usable, zero, value, one))
+        firm = usable / (softness * where_greater(usable, zero, value, one))
         store(p.firmness, c, firm)
         store(p.sign, c, one)
     for r in range(cables, lines):

@@ -21,7 +21,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
 from rfdropo_bayes.fem.equilibrium import ITERATIONS
 from rfdropo_bayes.fem.layered import PointMap
-from rfdropo_bayes.fem.native.constraint_problem import SETTLED, Problem, problem_storage
+from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
 from rfdropo_bayes.fem.native.contact_records import (
     MISSED,
     Cubes,
@@ -45,7 +45,9 @@ from rfdropo_bayes.fem.pushing import PushScene
 Precision = Literal["float64", "float32"]
 # When a step's impulses are found and what counts as a missed contact, as far as the precision resolves them;
 # refinements of every step's linear solution.
-_NUMERICS = {name: (SETTLED[name], MISSED[name], number) for name, number in (("float64", 0), ("float32", 1))}
+_NUMERICS = {
+    name: (SETTLED[name], SOFTNESS[name], MISSED[name], number) for name, number in (("float64", 0), ("float32", 1))
+}
 
 
 class NativeRollout(NamedTuple):

@@ -150,7 +150,7 @@ def _hold(tables, runs, scene, samples, factors, work, friction, touch, rows, p,
             _condense(tables, rows, work, p, n, panels, slips, corners, top, token)
         if scene is not None:
             add_cube(touch, p, lines, contacts, time_step, token)
-    soften(p, cables, slips, contacts, time_step, token)
+    soften(p, cables, slips, contacts, time_step, schedule.softness, token)
     solve_problem(p, cables, slips, contacts, schedule.settled, token)
     weigh_border(cables, work, p, token)
     weigh_rows(tables, work, token)

@@ -74,6 +74,7 @@ class Schedule(NamedTuple):
     stride: int  # steps from one recorded row to the next
     static_iterations: int  # 0 leaves out the equilibrium
     settled: float  # relative change of the velocities that ends the iterations of a step
+    softness: float  # of the cables, relative to W
     missed: float  # [m/s] velocity at which surfaces may meet that were not taken to
     refinements: int  # of every step's linear solution
     resumed: int = 0  # 1 goes on from the state in ``Work`` instead of starting anew

@@ -173,7 +173,7 @@ def solve_increment(tables, samples, factors, work, p, rate, schedule, token):
     """``solution`` = A^-1 (r - J' T) and the tensions, of a body that nothing but cables holds."""
     condense_increment(tables, samples, factors, work, rate, token)
     start_problem(tables, factors, work, p, tables.cables, rate, token)
-    soften(p, tables.cables, 0, 0, 1.0, token)
+    soften(p, tables.cables, 0, 0, 1.0, schedule.softness, token)
     solve_problem(p, tables.cables, 0, 0, schedule.settled, token)
     weigh_border(tables.cables, work, p, token)
     take_tensions(tables.cables, work, rate, token)

@@ -137,7 +137,7 @@ def hold(pattern, scene, samples, touch, work, rows, p, reached, cables, free, s
         if contacts > touch.count[3]:
             _condense(pattern, touch, work, rows, p, n, reached, cables, contacts, free, token)
         add_cube(touch, p, cables, contacts, time_step, token)
-    soften(p, cables, 0, contacts, time_step, token)
+    soften(p, cables, 0, contacts, time_step, schedule.softness, token)
     solve_problem(p, cables, 0, contacts, schedule.settled, token)
     _mark(work, p, token)
     _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, time_step, token)

@@ -18,7 +18,7 @@ from rfdropo_bayes.fem.dynamics import LOST, POISSON_LIMIT
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
-from rfdropo_bayes.fem.native.constraint_problem import SETTLED, Problem, problem_storage
+from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
 from rfdropo_bayes.fem.native.contact_records import (
     PushOutput,
     Touch,
@@ -126,7 +126,8 @@ class TetrahedralEngine:
             inputs = self._samples({name: np.asarray(value)[lane] for name, value in parameters.items()})
             displacement, work, output = self._lanes_last(commands[lane]), self._work(), self._output(rows)
             single = self.dtype.itemsize == 4
-            schedule = kernels.Schedule(float(time_step), stride, SETTLED[self.dtype.name], self._reach, single)
+            numbers = SETTLED[self.dtype.name], SOFTNESS[self.dtype.name]
+            schedule = kernels.Schedule(float(time_step), stride, *numbers, self._reach, single)
             self._kernel(
                 self._pattern, self._mesh, self._cables, self._scene, self._rest, displacement, cubes, inputs, work,
                 *self._constraints(), schedule, output, poses, int(chunk[0]), samples, lane_token(self.lanes),

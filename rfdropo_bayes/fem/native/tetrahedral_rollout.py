@@ -56,6 +56,7 @@ class Schedule(NamedTuple):
     time_step: float
     stride: int  # steps between recorded rows
     settled: float  # relative change of the velocities that ends the iterations of a step
+    softness: float  # of the cables, relative to W
     reach: float  # largest distance of a node from its place at rest [m]
     refined: bool  # solve every step twice
 
