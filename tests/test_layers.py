@@ -28,7 +28,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "audit": {"data", "posteriors", "simulators", "mechanisms", "bayes", "inference"},
     "report": {"data", "posteriors", "bayes", "inference", "audit"},
     "envs": {"posteriors", "robots", "simulators", "mechanisms", "report"},
-    "training": {"posteriors", "robots", "inference", "envs"},
+    "training": {"posteriors", "robots", "inference", "report", "envs"},
     "deployment": {"data", "robots"},
 }
 MAY_IMPORT["workflow"] = set(MAY_IMPORT)

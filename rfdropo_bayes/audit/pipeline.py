@@ -136,9 +136,7 @@ def audit(
     question = _with_differences_of(question, target)
     shared = "" if target.noise.correlation is None else ", shared between channels"
     report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.order}){shared}")
-    finer = None
-    if question.finer is not None:
-        finer = _forward(question, True, target.measurements, deadline)
+    finer = None if question.finer is None else _forward(question, True, target.measurements, deadline)
     unexamined = unaffordable(question.candidates, target, base, question.rules.slowest * question.rules.minutes)
     inquiry = _inquiry(question, target, finer, unexamined, report)
     inquiry, base, steps, last = _inquired(inquiry, base)
@@ -158,14 +156,7 @@ def audit(
     looks = [*(step.before for step in steps), last]
     stages = [held_out.gain(0, k) for k in range(1, len(steps) + 1)] if held_out else []
     gain = stages[-1] if stages else None
-    sizes_of, after = [len(step.members) for step in steps], last.omnibus.p if steps else None
-    verdict = decide(question.rules, looks[0].omnibus.p, after, sizes_of, gain, target.noise.doubtful)
-    if not base.converged or (verdict == UNEXPLAINED and deadline.reached):
-        verdict = NO_VERDICT
-    suspected = None
-    if verdict in (PARTLY, UNEXPLAINED) and last.omnibus.p <= question.rules.extended_passes:
-        with suppress(OutOfTime):
-            suspected = _suspected(inquiry, base)
+    verdict, suspected = _judged(inquiry, base, steps, looks, gain, deadline)
     stopped = deadline.reached
     deadline.lift()  # what is left are single rollouts, for the report
     sizes = widened(extended, question.coordinates)
@@ -193,6 +184,22 @@ def audit(
         target.forward.rollouts + (finer.rollouts if finer else 0),
         time.monotonic() - deadline.began,
     )
+
+
+def _judged(
+    inquiry: Inquiry, base: Fit, steps: Sequence[Step], looks: Sequence[Look], gain: Gain | None, deadline: Deadline
+) -> tuple[str, NoiseModel | None]:
+    """The verdict, and the noise under which the base model would pass where something is left unexplained."""
+    rules, last = inquiry.rules, looks[-1].omnibus.p
+    members, noise = [len(step.members) for step in steps], inquiry.target.noise
+    verdict = decide(rules, looks[0].omnibus.p, last if steps else None, members, gain, noise.doubtful)
+    if not base.converged or (verdict == UNEXPLAINED and deadline.reached):
+        verdict = NO_VERDICT
+    suspected = None
+    if verdict in (PARTLY, UNEXPLAINED) and last <= rules.extended_passes:
+        with suppress(OutOfTime):
+            suspected = _suspected(inquiry, base)
+    return verdict, suspected
 
 
 def _inquiry(

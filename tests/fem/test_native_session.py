@@ -27,7 +27,7 @@ def samples(effects: BodyEffects) -> tuple[fem.Material, np.ndarray]:
     return material._replace(effects=effects), displacement
 
 
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize("precision", [pytest.param("float64", marks=pytest.mark.slow), "float32"])
 @pytest.mark.parametrize("effects", [PLAIN, random_effects(7), RUBBING], ids=["plain", "effects", "friction"])
 def test_periods_with_partial_resets_are_whole_rollouts(precision, effects):
     """Lanes that start at different times from equilibrium, more than one block of them, on two threads."""

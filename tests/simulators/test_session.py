@@ -109,7 +109,7 @@ PUSHED = {"cube_x": 0.012, "cube_z": 0.15, "cube_mass": 0.05, "friction": 0.3}
 @pytest.mark.parametrize(
     ("engine", "precision", "tolerance"),
     [
-        ("numba", "float64", 0.0),
+        pytest.param("numba", "float64", 0.0, marks=pytest.mark.slow),  # compiles for most of a minute
         ("numba", "float32", 0.0),
         pytest.param("jax", "float64", 1e-9, marks=pytest.mark.slow),
     ],
