@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,9 +15,9 @@ CONTINUOUS_ONLY, DISCRETE_ONLY = ("SAC", "TD3", "DDPG"), ("DQN",)
 OURS = ("policy", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model")
 """Arguments that the training sets itself."""
 
+LARGEST_BATCH = 512
 PPO_DEFAULTS: dict[str, Any] = {
     "n_steps": 16,
-    "batch_size": 512,
     "n_epochs": 5,
     "learning_rate": 7e-4,
     "gae_lambda": 0.95,
@@ -46,7 +47,9 @@ def algorithm_class(name: str, kind: str) -> Any:
     return getattr(stable_baselines3, name)
 
 
-def algorithm_options(name: str, kind: str, gamma: float, given: Mapping[str, Any]) -> dict[str, Any]:
+def algorithm_options(
+    name: str, kind: str, gamma: float, given: Mapping[str, Any], environments: int = 128
+) -> dict[str, Any]:
     """Arguments of an algorithm: ours for these tasks, then what was given.
 
     Args:
@@ -55,6 +58,7 @@ def algorithm_options(name: str, kind: str, gamma: float, given: Mapping[str, An
         gamma: discount factor of one control period, unless ``given`` has another.
         given: options of the algorithm by Stable-Baselines3's own names; ``net_arch``, ``log_std_init`` and
             ``activation`` (tanh, relu or elu) may stand among them without ``policy_kwargs``.
+        environments: how many are simulated at once; a batch of PPO divides what they gather.
 
     Raises:
         InputError: an option that the algorithm does not have, or another activation.
@@ -77,7 +81,10 @@ def algorithm_options(name: str, kind: str, gamma: float, given: Mapping[str, An
         policy["activation_fn"] = _activation(policy.pop("activation"))
     ours = PPO_DEFAULTS if name == "PPO" else {}
     rest = {key: value for key, value in given.items() if key not in (*short, "policy_kwargs")}
-    return {**ours, "gamma": gamma, **rest, "policy_kwargs": policy}
+    options = {**ours, "gamma": gamma, **rest, "policy_kwargs": policy}
+    if name == "PPO" and "batch_size" not in options:
+        options["batch_size"] = math.gcd(LARGEST_BATCH, environments * options["n_steps"])
+    return options
 
 
 def _activation(name: str) -> Any:

@@ -83,7 +83,7 @@ def train(
     torch.set_num_threads(1)  # networks this small are slower on two
     venv = environments(table.environments)
     kind = venv.get_attr("layout")[0].kind
-    options = algorithm_options(table.algorithm, kind, gamma, table.options)
+    options = algorithm_options(table.algorithm, kind, gamma, table.options, table.environments)
     maker = algorithm_class(table.algorithm, kind)
     known = {"table": table.model_dump(mode="json"), "seed": seed, **(fingerprint or {})}
     folder = Path(out) / CHECKPOINT

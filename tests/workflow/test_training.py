@@ -1,0 +1,86 @@
+"""``rfdropo train`` and ``rfdropo evaluate`` from experiment files, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from rfdropo_bayes.cli.main import app
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.training.export import ExportedPolicy
+from rfdropo_bayes.workflow.training import run_evaluation, run_training
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+REACH = REPOSITORY / "experiments" / "reach_policy.toml"
+COMMITTED = REPOSITORY / "models" / "policies" / "reach"
+QUICK = [
+    "training.steps=1792",  # more than the hundred actions of an episode in each environment
+    "training.environments=16",
+    "training.evaluate_every=1792",
+    "training.evaluation_episodes=16",
+]
+
+
+def rfdropo(*words: object) -> None:
+    result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["TrunkReach-v0", "TrunkPush-v0"])
+def test_a_policy_is_trained_exported_and_evaluated(tmp_path, task) -> None:
+    settings = [part for entry in [*QUICK, f'training.task="{task}"'] for part in ("--set", entry)]
+    rfdropo("train", REACH, "--out", tmp_path / "policy", *settings)
+    assert {path.name for path in (tmp_path / "policy").iterdir()} >= {
+        "policy.onnx", "card.md", "summary.json", "curve.png", "episodes.jsonl", "config.toml", "run.json"
+    }  # fmt: skip
+    summary = json.loads((tmp_path / "policy" / "summary.json").read_text())
+    assert (summary["status"], summary["task"]) == ("done", task)
+    policy = ExportedPolicy(tmp_path / "policy" / "policy.onnx")
+    assert policy.layout.task == task
+    assert policy.facts["posterior_sha256"] == summary["posterior_sha256"]
+    rfdropo("evaluate", REACH, "--policy", tmp_path / "policy", "--out", tmp_path / "test", "--episodes", 8, *settings)
+    table = pd.read_csv(tmp_path / "test" / "episodes.csv")
+    assert len(table) == 8
+    assert table["distance"].gt(0.0).all()
+    assert (tmp_path / "test" / "policy.gif").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_the_committed_policy_reaches_its_goals(tmp_path) -> None:
+    """200 of 200 episodes ended within 5 mm. At 99 % a sample of 60 has fewer than 57 once in 300."""
+    found = run_evaluation(REACH, [COMMITTED], tmp_path, episodes=60, lanes=30, seed=5)
+    row = found["policies"]["reach"]
+    assert row["success_mm"]["5"]["share"] >= 57 / 60
+    assert row["median_mm"] < 2.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (['training.randomisation="posterior"'], "without a source"),
+        (['training.randomisation="posterior"', 'training.source="nowhere"'], "nowhere"),
+        (["training.ranges={}"], "no ranges"),
+        (["training.ranges={young_modulus = [1.0, 2.0]}"], "outside its hard bounds"),
+        (['training.algorithm="SACK"'], "did you mean 'SAC'"),
+        (["training.options={learning_rat = 1e-3}"], "did you mean 'learning_rate'"),
+        (["training.period=0.013"], "no whole number of time steps"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(tmp_path, overrides, words) -> None:
+    with pytest.raises(InputError, match=words):
+        run_training(REACH, tmp_path / "policy", overrides=[*QUICK, *overrides])
+
+
+def test_an_experiment_without_training_is_refused(tmp_path) -> None:
+    with pytest.raises(InputError, match=r"no table \[training\]"):
+        run_training(REPOSITORY / "experiments" / "sofa_reach_layered.toml", tmp_path)
+
+
+def test_a_policy_for_another_period_is_refused(tmp_path) -> None:
+    with pytest.raises(InputError, match="the policy's task is TrunkReach-v0"):
+        run_evaluation(REACH, [COMMITTED], tmp_path / "test", overrides=['training.task="TrunkPush-v0"'], episodes=2)
