@@ -37,10 +37,11 @@ from rfdropo_bayes.fem.native.simd import (
     where_greater,
 )
 
-SETTLED = {"float64": 1e-11, "float32": 3e-6}
+SETTLED = {"float64": 1e-11, "float32": 1e-5}
+"""Error of a velocity, relative to the largest that a row has or its impulse makes, that ends a lane's iterations. In
+single precision 43 of 600 prior draws of the demo never came to 3e-6; all come to 1e-5."""
 SOFTNESS = {"float64": CABLE_SOFTNESS, "float32": 1e-6}  # of cables, relative to W: single precision holds no less
-"""Error of a velocity, relative to the largest that a row has or its impulse makes, that ends a lane's iterations."""
-ROUNDING = 0.1
+ROUNDING = 0.03
 """Share of that error up to which the velocities are rounded."""
 RATIO = TANGENT_SOFTNESS / NORMAL_SOFTNESS
 
