@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import bridge, horizon_smc, laplace
-from rfdropo_bayes.inference.bridge import BridgeConfig
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.gauss_newton import Target, make_target, prior_derivatives
-from rfdropo_bayes.inference.horizon_smc import SmcConfig
-from rfdropo_bayes.inference.laplace import LaplaceConfig
-from rfdropo_bayes.inference.levenberg import maximise
+from rfdropo_bayes.inference.modes import search as laplace
+from rfdropo_bayes.inference.modes.climb import maximise
+from rfdropo_bayes.inference.modes.search import LaplaceConfig
+from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
+from rfdropo_bayes.inference.smc import bridge
+from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc.bridge import BridgeConfig
+from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
 from .toys import Decay, LinearGaussian, Spring, TwoModes
 

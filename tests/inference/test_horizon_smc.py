@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import horizon_smc
-from rfdropo_bayes.inference.horizon_smc import SmcConfig
+from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
 from .toys import Decay, LinearGaussian, TwoModes
 

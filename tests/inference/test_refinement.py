@@ -10,12 +10,13 @@ import numpyro.distributions as dist
 import pytest
 from scipy.stats import multivariate_normal, multivariate_t
 
-from rfdropo_bayes.inference import methods, refinement
-from rfdropo_bayes.inference.centring import CentredProblem, centred
-from rfdropo_bayes.inference.levenberg import Laplace
-from rfdropo_bayes.inference.mixture import ModeMixture
-from rfdropo_bayes.inference.numpyro_problem import problem_from_numpyro
-from rfdropo_bayes.inference.refinement import _clusters
+from rfdropo_bayes.inference import methods
+from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.plain import refinement
+from rfdropo_bayes.inference.plain.centring import CentredProblem, centred
+from rfdropo_bayes.inference.plain.problem import problem_from_numpyro
+from rfdropo_bayes.inference.plain.refinement import _clusters
+from rfdropo_bayes.inference.smc.mixture import ModeMixture
 
 from .test_numpyro_problem import SCHOOLS, schools_by_quadrature
 

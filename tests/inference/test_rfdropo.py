@@ -8,11 +8,11 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import rfdropo
-from rfdropo_bayes.inference.optimisers import default_population, make_optimiser
-from rfdropo_bayes.inference.randomisation import search_space
-from rfdropo_bayes.inference.rfdropo import RfdropoConfig
-from rfdropo_bayes.inference.trajectory_match import motion_scale, step_log_likelihood
+from rfdropo_bayes.inference.rfdropo import search as rfdropo
+from rfdropo_bayes.inference.rfdropo.optimisers import default_population, make_optimiser
+from rfdropo_bayes.inference.rfdropo.randomisation import search_space
+from rfdropo_bayes.inference.rfdropo.search import RfdropoConfig
+from rfdropo_bayes.inference.rfdropo.trajectory_match import motion_scale, step_log_likelihood
 
 from .toys import Spring
 

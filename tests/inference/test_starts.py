@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import climbs as climbs_of
-from rfdropo_bayes.inference import horizon_smc, laplace, methods, starts
+from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.horizon_smc import SmcConfig
-from rfdropo_bayes.inference.levenberg import Laplace
-from rfdropo_bayes.inference.mixture import ModeMixture
-from rfdropo_bayes.inference.sharpness import Way, way_from_prior
+from rfdropo_bayes.inference.modes import climbs as climbs_of
+from rfdropo_bayes.inference.modes import search as laplace
+from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc import start as starts
+from rfdropo_bayes.inference.smc.mixture import ModeMixture
+from rfdropo_bayes.inference.smc.sampler import SmcConfig
+from rfdropo_bayes.inference.smc.sharpness import Way, way_from_prior
 
 from .toys import Decay, LinearGaussian, Ratio, Spring, TwoModes, Washboard
 

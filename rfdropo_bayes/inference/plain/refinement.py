@@ -27,24 +27,24 @@ from scipy.special import expit, logit, logsumexp
 
 from rfdropo_bayes.bayes.problem import Values
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import horizon_smc
-from rfdropo_bayes.inference.bridge import BridgeConfig, BridgedProblem
-from rfdropo_bayes.inference.centring import CentredProblem, centred
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.hamiltonian import SlopedProblem, chosen_kernel
-from rfdropo_bayes.inference.horizon_smc import SmcConfig
-from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes
-from rfdropo_bayes.inference.levenberg import Laplace
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.mixture import ModeMixture
-from rfdropo_bayes.inference.numpyro_problem import NumpyroProblem
-from rfdropo_bayes.inference.proposals import fit_reference, host_generator
+from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.search import LaplaceConfig, Modes, find_modes
+from rfdropo_bayes.inference.plain.centring import CentredProblem, centred
+from rfdropo_bayes.inference.plain.problem import NumpyroProblem
 from rfdropo_bayes.inference.result import (
     InferenceResult,
     exclusion_warnings,
     prior_warnings,
     replicate_warnings,
 )
+from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc.bridge import BridgeConfig, BridgedProblem
+from rfdropo_bayes.inference.smc.hamiltonian import SlopedProblem, chosen_kernel
+from rfdropo_bayes.inference.smc.mixture import ModeMixture
+from rfdropo_bayes.inference.smc.moves import fit_reference, host_generator
+from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
 MOST_ROWS = 5000  # that a first pass takes one after the other, at the cost of all of them each time
 REPLICATES = 4  # instead of a single one, whose evidence would have no deviation

@@ -15,8 +15,8 @@ from scipy.special import gammaln, logsumexp
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.inference.evaluations import evaluate_prior
-from rfdropo_bayes.inference.levenberg import SAME, Laplace, divergence
-from rfdropo_bayes.inference.proposals import host_generator, squared_distance
+from rfdropo_bayes.inference.modes.climb import SAME, Laplace, divergence
+from rfdropo_bayes.inference.smc.moves import host_generator, squared_distance
 
 LEAST_SHARE = 0.05  # of a mode, before normalising: Laplace evidences of ill-shaped modes are off by nats
 MOMENTS = 1000  # prior draws behind its mean and covariance

@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import ResidualProblem, Values
-from rfdropo_bayes.inference import horizon_smc
 from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior
 from rfdropo_bayes.inference.logbook import Logbook
-from rfdropo_bayes.inference.straight import StraightProblem
+from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc.straight import StraightProblem
 
 MOST_MOVES = 8  # of a stage: climbs need a place in the right basins, not a fair sample of them
 

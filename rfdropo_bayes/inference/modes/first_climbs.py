@@ -8,7 +8,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.survey import Survey
+from rfdropo_bayes.inference.modes.survey import Survey
 
 SURVEYS = 2  # of the last prefixes, whose particles climbs start from
 

@@ -19,17 +19,19 @@ from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
-from rfdropo_bayes.inference import bridge, horizon_smc, refinement
 from rfdropo_bayes.inference.checkpoints import run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES, MOST_REPLICATES, WORTH_A_REPLICATE, SmcConfig
-from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.numpyro_problem import NumpyroProblem
-from rfdropo_bayes.inference.prefix_scores import PrefixEvidence, block_scores, prefix_evidence
+from rfdropo_bayes.inference.modes.search import LaplaceConfig, Modes, find_modes
+from rfdropo_bayes.inference.plain import refinement
+from rfdropo_bayes.inference.plain.problem import NumpyroProblem
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.schedules import block_boundaries
-from rfdropo_bayes.inference.sharpness import Way, way_from_prior
+from rfdropo_bayes.inference.smc import bridge
+from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc.prefix_scores import PrefixEvidence, block_scores, prefix_evidence
+from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES, MOST_REPLICATES, WORTH_A_REPLICATE, SmcConfig
+from rfdropo_bayes.inference.smc.sharpness import Way, way_from_prior
 
 CLIMBING = 0.25  # share of the budget that climbs to optima may take
 SURVEY_OF_ALL = 0.4  # and the survey before them

@@ -17,7 +17,8 @@ from blackjax.smc import resampling
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from scipy.special import logsumexp
 
-from rfdropo_bayes.inference.proposals import (
+from rfdropo_bayes.inference.schedules import log_effective_sample_size, next_step
+from rfdropo_bayes.inference.smc.moves import (
     Reference,
     accept,
     adapt_scale,
@@ -27,7 +28,6 @@ from rfdropo_bayes.inference.proposals import (
     propose,
     slowest_correlation,
 )
-from rfdropo_bayes.inference.schedules import log_effective_sample_size, next_step
 
 Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 

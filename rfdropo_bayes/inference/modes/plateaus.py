@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.inference.levenberg import Climbable, Laplace, LevenbergState, climb_cost, maximise
+from rfdropo_bayes.inference.modes.climb import Climbable, Laplace, LevenbergState, climb_cost, maximise
 
 REACHES = np.array([0.05, 0.1, 0.2, 0.4, 0.8, 1.6])  # from the optimum, in deviations of the prior
 LEVEL = 5.0  # nats by which the density may change from one reach to the next of a plateau

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.batches import padded
 from rfdropo_bayes.bayes.problem import ResidualProblem, Values
-from rfdropo_bayes.inference.levenberg import Laplace
+from rfdropo_bayes.inference.modes.climb import Laplace
 
 MOMENTS = 1000  # prior draws that tell which parameters are positive
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.bayes.problem import Values
-from rfdropo_bayes.inference.numpyro_problem import NumpyroProblem
+from rfdropo_bayes.inference.plain.problem import NumpyroProblem
 
 DRAWS = 64  # at which the data's information is looked at
 VARIES = 1e-9  # relative: what moves less with the draws is a constant

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float, PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.bayes.units import common_scale
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.levenberg import Laplace, positive_part
-from rfdropo_bayes.inference.mixture import NARROWEST, joint_covariance, prior_moments
+from rfdropo_bayes.inference.modes.climb import Laplace, positive_part
+from rfdropo_bayes.inference.smc.mixture import NARROWEST, joint_covariance, prior_moments
 
 TRIED = np.array([0.5, 2.0])  # deviations from the mode at which the quadratic model of the likelihood is looked at
 KINK = 1.0  # nats by which it may be wrong there

@@ -15,14 +15,11 @@ from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
-from rfdropo_bayes.inference.basins import OneSummit, one_point, one_ridge
 from rfdropo_bayes.inference.checkpoints import UNSAVED, Checkpoint, run_digest
-from rfdropo_bayes.inference.climbs import RIVAL, Climbs, begin, go_on, pack, record, unpack, with_starts
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.first_climbs import screened, surveyed
-from rfdropo_bayes.inference.gauss_newton import Target, make_target, prior_derivatives
-from rfdropo_bayes.inference.horizon_smc import FEWEST_PARTICLES
-from rfdropo_bayes.inference.levenberg import (
+from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
+from rfdropo_bayes.inference.modes.basins import OneSummit, one_point, one_ridge
+from rfdropo_bayes.inference.modes.climb import (
     Climbable,
     Laplace,
     LevenbergState,
@@ -31,15 +28,18 @@ from rfdropo_bayes.inference.levenberg import (
     maximise,
     normal_at,
 )
-from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.mixture import prior_moments
-from rfdropo_bayes.inference.newton import SmoothTarget, log_likelihood_derivatives
-from rfdropo_bayes.inference.plateaus import climbs_from, plateaus
-from rfdropo_bayes.inference.proposals import squared_distance
-from rfdropo_bayes.inference.restarts import affordable_generations, astray, search
+from rfdropo_bayes.inference.modes.climbs import RIVAL, Climbs, begin, go_on, pack, record, unpack, with_starts
+from rfdropo_bayes.inference.modes.first_climbs import screened, surveyed
+from rfdropo_bayes.inference.modes.newton import SmoothTarget, log_likelihood_derivatives
+from rfdropo_bayes.inference.modes.plateaus import climbs_from, plateaus
+from rfdropo_bayes.inference.modes.restarts import affordable_generations, astray, search
+from rfdropo_bayes.inference.modes.survey import survey
+from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
 from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_warnings, prior_warnings
 from rfdropo_bayes.inference.schedules import block_boundaries
-from rfdropo_bayes.inference.survey import survey
+from rfdropo_bayes.inference.smc.mixture import prior_moments
+from rfdropo_bayes.inference.smc.moves import squared_distance
+from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES
 
 JACOBIANS = ("auto", "forward", "central")
 SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before them may take, and of their progress

@@ -11,9 +11,9 @@ from scipy.stats import qmc
 
 from rfdropo_bayes.bayes.problem import RolloutProblem
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.families import Family
-from rfdropo_bayes.inference.proposals import host_generator
-from rfdropo_bayes.inference.trajectory_match import step_log_likelihood
+from rfdropo_bayes.inference.rfdropo.families import Family
+from rfdropo_bayes.inference.rfdropo.trajectory_match import step_log_likelihood
+from rfdropo_bayes.inference.smc.moves import host_generator
 
 
 class Plan(NamedTuple):

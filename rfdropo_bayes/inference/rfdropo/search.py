@@ -20,18 +20,18 @@ from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, RolloutProblem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference.candidates import Plan, Simulated, row_scores, simulate, target_features, uniforms
 from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.families import FAMILIES, make_family
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.optimisers import OPTIMISERS, default_population, make_optimiser
-from rfdropo_bayes.inference.proposals import host_generator
-from rfdropo_bayes.inference.randomisation import WIDTH, search_space
 from rfdropo_bayes.inference.result import InferenceResult, exclusion_warnings
-from rfdropo_bayes.inference.reuse import bootstrap, make_pool, refine
+from rfdropo_bayes.inference.rfdropo.candidates import Plan, Simulated, row_scores, simulate, target_features, uniforms
+from rfdropo_bayes.inference.rfdropo.families import FAMILIES, make_family
+from rfdropo_bayes.inference.rfdropo.optimisers import OPTIMISERS, default_population, make_optimiser
+from rfdropo_bayes.inference.rfdropo.randomisation import WIDTH, search_space
+from rfdropo_bayes.inference.rfdropo.reuse import bootstrap, make_pool, refine
+from rfdropo_bayes.inference.rfdropo.trajectory_match import motion_scale
 from rfdropo_bayes.inference.schedules import adaptive_horizon, linear_horizon, paper_horizon
-from rfdropo_bayes.inference.trajectory_match import motion_scale
+from rfdropo_bayes.inference.smc.moves import host_generator
 
 HORIZONS = ("paper", "linear", "adaptive", "full")
 AGREEING = 0.5  # share of effective candidates that an adaptive horizon keeps

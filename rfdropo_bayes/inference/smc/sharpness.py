@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem
-from rfdropo_bayes.inference.levenberg import Laplace
+from rfdropo_bayes.inference.modes.climb import Laplace
 
 MOVES = 4.0  # of a stage: about 3 where the posterior is normal, more where it is not
 FARTHEST = 5.0  # prior deviations that a value is taken to be away; farther ones are a prior at odds with the data

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rfdropo_bayes.inference.basins import OneSummit, summits
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.levenberg import Climbable, LevenbergState
+from rfdropo_bayes.inference.modes.basins import OneSummit, summits
+from rfdropo_bayes.inference.modes.climb import Climbable, LevenbergState
 
 RIVAL = 30.0  # [nat]: an optimum that far below the best matters to no posterior
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.special import logsumexp, ndtr, ndtri
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference.randomisation import TRUNCATION, WIDTH, SearchSpace
+from rfdropo_bayes.inference.rfdropo.randomisation import TRUNCATION, WIDTH, SearchSpace
 
 FAMILIES = ("independent", "full", "mixture")
 LARGEST_CORRELATION = 0.999

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import logsumexp
 
-from rfdropo_bayes.inference.families import Family
-from rfdropo_bayes.inference.optimisers import default_population, make_optimiser
-from rfdropo_bayes.inference.randomisation import WIDTH
-from rfdropo_bayes.inference.trajectory_match import step_log_likelihood
+from rfdropo_bayes.inference.rfdropo.families import Family
+from rfdropo_bayes.inference.rfdropo.optimisers import default_population, make_optimiser
+from rfdropo_bayes.inference.rfdropo.randomisation import WIDTH
+from rfdropo_bayes.inference.rfdropo.trajectory_match import step_log_likelihood
 
 LEAST_ESS = 30.0  # rollouts behind a mean and a covariance
 TRUST = 0.05  # initial step of the search, as a share of its range: the pool knows the neighbourhood only

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import ResidualProblem
-from rfdropo_bayes.inference.straight import StraightProblem
+from rfdropo_bayes.inference.smc.straight import StraightProblem
 
 SAME = 0.02  # largest difference of any coordinate between two climbs that ended at one point
 # Places on the line between two climbs, as shares of it, and how far below the higher end the density may lie there and

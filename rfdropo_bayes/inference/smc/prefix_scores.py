@@ -11,10 +11,10 @@ from scipy.special import logsumexp
 
 from rfdropo_bayes.bayes.problem import ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
-from rfdropo_bayes.inference.levenberg import Laplace, laplace, maximise
-from rfdropo_bayes.inference.mixture import ModeMixture
+from rfdropo_bayes.inference.modes.climb import Laplace, laplace, maximise
+from rfdropo_bayes.inference.modes.targets import make_target, prior_derivatives
 from rfdropo_bayes.inference.schedules import log_effective_sample_size
+from rfdropo_bayes.inference.smc.mixture import ModeMixture
 
 INFLATION, DEGREES, PRIOR_SHARE = 1.3, 5.0, 0.2  # a short prefix says little: its posterior is near the prior
 MOST_STEPS = 12  # of the climb from the optimum of all rows to that of a prefix

@@ -19,13 +19,11 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, Values
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import horizon_smc
 from rfdropo_bayes.inference.checkpoints import run_digest
 from rfdropo_bayes.inference.evaluations import evaluate_prior
-from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes, mode_values
-from rfdropo_bayes.inference.levenberg import Laplace
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.mixture import ModeMixture, covering
+from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.search import LaplaceConfig, Modes, find_modes, mode_values
 from rfdropo_bayes.inference.result import (
     InferenceResult,
     exclusion_warnings,
@@ -33,8 +31,10 @@ from rfdropo_bayes.inference.result import (
     replicate_warnings,
     stage_warnings,
 )
-from rfdropo_bayes.inference.soundings import Sounding, sounded
-from rfdropo_bayes.inference.straight import StraightProblem
+from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc.mixture import ModeMixture, covering
+from rfdropo_bayes.inference.smc.soundings import Sounding, sounded
+from rfdropo_bayes.inference.smc.straight import StraightProblem
 
 SOUNDINGS = 0.1  # share of the budget that soundings may take, see `soundings`
 

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import ResidualProblem
-from rfdropo_bayes.inference.levenberg import Climbable, Laplace
-from rfdropo_bayes.inference.mixture import joint_covariance, prior_moments
-from rfdropo_bayes.inference.optimisers import make_optimiser
-from rfdropo_bayes.inference.proposals import host_generator
-from rfdropo_bayes.inference.straight import StraightProblem
+from rfdropo_bayes.inference.modes.climb import Climbable, Laplace
+from rfdropo_bayes.inference.rfdropo.optimisers import make_optimiser
+from rfdropo_bayes.inference.smc.mixture import joint_covariance, prior_moments
+from rfdropo_bayes.inference.smc.moves import host_generator
+from rfdropo_bayes.inference.smc.straight import StraightProblem
 
 ASTRAY, SCATTERED = 100.0, 5.0  # nats, and deviations of noise, by which new rows may be explained worse than others
 POPULATION = 24  # candidates of a generation: some of the first must lie on the right side of a cliff

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference.proposals import Reference
+from rfdropo_bayes.inference.smc.moves import Reference
 
 WORTHWHILE = 15  # parameters from which on "auto" follows gradients; with fewer, moves by the covariance cost less
 TRAVEL = 1.5  # length of a trajectory in deviations: about a quarter of an orbit, which forgets the start

@@ -21,9 +21,7 @@ from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows, representable_draws
-from rfdropo_bayes.inference.hamiltonian import MOST_LEAPS, Flow, chosen_kernel, flow_of
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.proposals import KERNELS, initial_scale
 from rfdropo_bayes.inference.result import (
     InferenceResult,
     chains,
@@ -33,7 +31,9 @@ from rfdropo_bayes.inference.result import (
     stage_warnings,
 )
 from rfdropo_bayes.inference.schedules import SPACINGS, block_boundaries
-from rfdropo_bayes.inference.tempering import Population, StageInfo, Tuning, prolong, refresh, stage
+from rfdropo_bayes.inference.smc.hamiltonian import MOST_LEAPS, Flow, chosen_kernel, flow_of
+from rfdropo_bayes.inference.smc.moves import KERNELS, initial_scale
+from rfdropo_bayes.inference.smc.tempering import Population, StageInfo, Tuning, prolong, refresh, stage
 
 PARTICLES_WITHOUT_BUDGET = 1000
 ROLLOUTS_PER_PARTICLE = 20.0

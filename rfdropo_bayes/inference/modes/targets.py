@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.levenberg import positive_part
+from rfdropo_bayes.inference.modes.climb import positive_part
 
 DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order one
 BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
