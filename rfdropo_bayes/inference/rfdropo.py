@@ -28,7 +28,7 @@ from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.optimisers import OPTIMISERS, default_population, make_optimiser
 from rfdropo_bayes.inference.proposals import host_generator
 from rfdropo_bayes.inference.randomisation import WIDTH, search_space
-from rfdropo_bayes.inference.result import InferenceResult, exclusion_warnings
+from rfdropo_bayes.inference.result import InferenceResult, exclusion_cautions
 from rfdropo_bayes.inference.reuse import bootstrap, make_pool, refine
 from rfdropo_bayes.inference.schedules import adaptive_horizon, linear_horizon, paper_horizon
 from rfdropo_bayes.inference.trajectory_match import motion_scale
@@ -265,7 +265,7 @@ def run(
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
-        warnings=[*plan.space.edge_warnings(chosen), *exclusion_warnings(ledger.excluded, ledger.evaluations)],
+        cautions=[*plan.space.edge_cautions(chosen), *exclusion_cautions(ledger.excluded, ledger.evaluations)],
         seconds=state.seconds,
         phi=plan.space.describe(chosen, problem.units),
         held=dict(plan.fixed),
