@@ -12,6 +12,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from rfdropo_bayes.cautions import read_cautions
+
 GOOD, FAIR, BAD = "green", "yellow", "red"
 COLOURS = {
     "safe": GOOD,
@@ -24,7 +26,7 @@ COLOURS = {
     "partly_explained": FAIR,
     "unexplained": BAD,
 }
-CALIBRATED = ("title", "status", "headline", "randomisation", "parameters", "rmse", "log_evidence", "warnings")
+CALIBRATED = ("title", "status", "headline", "randomisation", "parameters", "rmse", "log_evidence", "cautions")
 AUDITED = ("verdict", "sentence", "findings", "gain", "next_experiment")
 MOST_ROWS = 20
 
@@ -48,8 +50,8 @@ def show_calibration(folder: Path, *, quiet: bool, as_json: bool) -> None:
     console.print(_parameters(rows[:MOST_ROWS]))
     if len(rows) > MOST_ROWS:
         console.print(f"and {len(rows) - MOST_ROWS} more in {folder / 'summary.json'}", soft_wrap=True)
-    for sentence in summary["warnings"]:
-        console.print(Text(f"warning: {sentence}", style=FAIR), soft_wrap=True)
+    for caution in read_cautions(summary.get("cautions", [])):
+        console.print(Text(f"caution: {caution.sentence}", style=BAD if caution.grave else FAIR), soft_wrap=True)
     console.print(f"report: {report}", soft_wrap=True)
 
 

@@ -21,7 +21,7 @@ from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
 from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, software_versions, write_run
 from rfdropo_bayes.report.object_scores import score_objects
-from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_warnings
+from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
 from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.robots import robot_shape
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
@@ -223,7 +223,7 @@ def gather_facts(
         evaluations=result.evaluations,
         log_evidence=result.log_evidence,
         excluded=result.excluded,
-        warnings=[*result.warnings, *residual_warnings(checks, problem.model.noise)],
+        cautions=[*result.cautions, *residual_cautions(checks, problem.model.noise)],
         residuals=checks,
         recordings=[
             *(RecordingFacts.of_trajectory(t, "fit") for t in fitted),

@@ -244,4 +244,4 @@ def test_centred_schools_agree_with_quadrature():
     assert result.draws["mu"].mean() == pytest.approx(mean, abs=0.33)
     assert result.draws["mu"].std() == pytest.approx(sd, rel=0.1)
     assert result.draws["tau"].mean() == pytest.approx(tau, abs=0.3)
-    assert result.warnings == []
+    assert result.cautions == []

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.checkpoints import UNSAVED, Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
@@ -35,7 +36,7 @@ from rfdropo_bayes.inference.modes.plateaus import climbs_from, plateaus
 from rfdropo_bayes.inference.modes.restarts import affordable_generations, astray, search
 from rfdropo_bayes.inference.modes.survey import survey
 from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
-from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_warnings, prior_warnings
+from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_cautions, prior_cautions
 from rfdropo_bayes.inference.schedules import block_boundaries
 from rfdropo_bayes.inference.smc.mixture import prior_moments
 from rfdropo_bayes.inference.smc.moves import squared_distance
@@ -102,7 +103,7 @@ class Modes(NamedTuple):
 
     modes: list[Laplace]
     climbs: Climbs
-    warnings: list[str]
+    cautions: list[Caution]
 
 
 def find_modes(
@@ -303,7 +304,7 @@ def _on_plateaus(
 
 def _collect(climbs: Climbs, target: Climbable, on_plateaus: list[Laplace]) -> Modes:
     """Laplace at every optimum that could matter, in the order of their evidence."""
-    warnings = []
+    cautions = []
     modes: list[Laplace] = []
     for index in np.argsort(-climbs.log_density, kind="stable"):
         state = LevenbergState(
@@ -316,16 +317,16 @@ def _collect(climbs: Climbs, target: Climbable, on_plateaus: list[Laplace]) -> M
     modes.sort(key=lambda mode: -mode.log_evidence)
     best = np.argmin(np.max(np.abs(climbs.positions - modes[0].mean), axis=1))
     if not climbs.converged[best]:
-        warnings.append(
-            "the best climb had not converged when its steps or its budget ran out; raise max_steps or rollouts"
-        )
+        sentence = "the best climb had not converged when its steps or its budget ran out; raise max_steps or rollouts"
+        cautions.append(Caution(Code.CLIMB_UNFINISHED, sentence, grave=True))
     rivals = [mode for mode in modes[1:] if mode.log_evidence > modes[0].log_evidence - 5.0]
     if rivals:
-        warnings.append(
+        sentence = (
             f"{len(rivals)} further optima have an evidence within 5 nats: one normal distribution does not describe "
             "this posterior; use the bridge or SMC"
         )
-    return Modes(modes, climbs, warnings)
+        cautions.append(Caution(Code.SEVERAL_OPTIMA, sentence))
+    return Modes(modes, climbs, cautions)
 
 
 def _apart(position: Float[np.ndarray, " d"], modes: list[Laplace]) -> bool:
@@ -359,10 +360,10 @@ def run(
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
-        warnings=[
-            *found.warnings,
-            *prior_warnings(problem, draws),
-            *exclusion_warnings(ledger.excluded, ledger.evaluations),
+        cautions=[
+            *found.cautions,
+            *prior_cautions(problem, draws),
+            *exclusion_cautions(ledger.excluded, ledger.evaluations),
         ],
         seconds=found.climbs.seconds,
         optimum=mode_values(problem, best),

@@ -26,6 +26,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import expit, logit, logsumexp
 
 from rfdropo_bayes.bayes.problem import Values
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
@@ -35,9 +36,9 @@ from rfdropo_bayes.inference.plain.centring import CentredProblem, centred
 from rfdropo_bayes.inference.plain.problem import NumpyroProblem
 from rfdropo_bayes.inference.result import (
     InferenceResult,
-    exclusion_warnings,
-    prior_warnings,
-    replicate_warnings,
+    exclusion_cautions,
+    prior_cautions,
+    replicate_cautions,
 )
 from rfdropo_bayes.inference.smc import sampler as horizon_smc
 from rfdropo_bayes.inference.smc.bridge import BridgeConfig, BridgedProblem
@@ -245,7 +246,7 @@ def _joined(
         ]
     replicates = np.asarray(second.details["log_evidence_replicates"])
     # Replicates that agree need no moves: what covers the posterior has been weighted well enough.
-    apart = replicate_warnings(draws, replicates) + _unlike(first, second)
+    apart = replicate_cautions(draws, replicates) + _unlike(first, second)
     return replace(
         first,
         draws=draws,
@@ -257,10 +258,10 @@ def _joined(
         rollouts=first.rollouts + second.rollouts + ledger.rollouts,
         evaluations=evaluations,
         excluded=dict(excluded),
-        warnings=[
-            *prior_warnings(problem, draws),
-            *exclusion_warnings(excluded, evaluations),
-            *([sentence for sentence in second.warnings if "last moves" in sentence] if apart else []),
+        cautions=[
+            *prior_cautions(problem, draws),
+            *exclusion_cautions(excluded, evaluations),
+            *([caution for caution in second.cautions if caution.code is Code.PARTICLES_STUCK] if apart else []),
             *apart,
         ],
         seconds=first.seconds + second.seconds,
@@ -299,13 +300,14 @@ def _differ(first: InferenceResult, second: InferenceResult) -> float:
     return more if abs(more) >= explained else 0.0
 
 
-def _unlike(first: InferenceResult, second: InferenceResult) -> list[str]:
-    """A sentence where the passes find different evidences: one can be too low by what was missed."""
+def _unlike(first: InferenceResult, second: InferenceResult) -> list[Caution]:
+    """A caution where the passes find different evidences: one can be too low by what was missed."""
     more = _differ(first, second)
     if not more:
         return []
     higher, lower = ("first", "second") if more > 0.0 else ("second", "first")
-    return [
+    sentence = (
         f"the log evidence of the {higher} pass is higher by {abs(more):.2g}: the {lower} may have lost a part of the "
         'posterior; compare with start = "prior"'
-    ]
+    )
+    return [Caution(Code.PASSES_DISAGREE, sentence)]

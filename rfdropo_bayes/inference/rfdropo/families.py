@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import logsumexp, ndtr, ndtri
 
+from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.rfdropo.randomisation import TRUNCATION, WIDTH, SearchSpace
 
@@ -51,8 +52,8 @@ class Family(Protocol):
         """Table by parameter: mean, std (before truncation), low, high, unit, and what the family has beside."""
         ...
 
-    def edge_warnings(self, vector: Float[np.ndarray, " k"]) -> list[str]:
-        """Sentences on what sits at the end of its range."""
+    def edge_cautions(self, vector: Float[np.ndarray, " k"]) -> list[Caution]:
+        """Cautions on what sits at the end of its range."""
         ...
 
 
@@ -139,9 +140,9 @@ class FullCovariance(NamedTuple):
             table[name]["correlation"] = dict(zip(self.names, correlation[i].tolist(), strict=True))
         return table
 
-    def edge_warnings(self, vector: Float[np.ndarray, " k"]) -> list[str]:
-        """See `Family.edge_warnings`."""
-        return self.space.edge_warnings(vector[: self.space.dimension])
+    def edge_cautions(self, vector: Float[np.ndarray, " k"]) -> list[Caution]:
+        """See `Family.edge_cautions`."""
+        return self.space.edge_cautions(vector[: self.space.dimension])
 
 
 class TwoNormals(NamedTuple):
@@ -204,7 +205,7 @@ class TwoNormals(NamedTuple):
             }
         return found
 
-    def edge_warnings(self, vector: Float[np.ndarray, " k"]) -> list[str]:
+    def edge_cautions(self, vector: Float[np.ndarray, " k"]) -> list[Caution]:
         """Those of the larger component."""
         first, second, share = self.parts(vector)
-        return self.space.edge_warnings(first if share >= 0.5 else second)
+        return self.space.edge_cautions(first if share >= 0.5 else second)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.special import ndtr, ndtri
 
 from rfdropo_bayes.bayes.problem import Problem, Values
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 
 WIDTH = 4.0  # every parameter's search range is scaled to [0, 4]
@@ -87,20 +88,22 @@ class SearchSpace(NamedTuple):
             for j, name in enumerate(self.names)
         }
 
-    def edge_warnings(self, vector: Float[np.ndarray, " k"], edge: float = 0.01) -> list[str]:
-        """A sentence for every mean or standard deviation within ``edge`` of its range from an end of it."""
-        d, sentences = len(self.names), []
+    def edge_cautions(self, vector: Float[np.ndarray, " k"], edge: float = 0.01) -> list[Caution]:
+        """A caution for every mean or standard deviation within ``edge`` of its range from an end of it."""
+        d, found = len(self.names), []
         for j, name in enumerate(self.names):
             for what, value in (("mean", vector[j]), ("standard deviation", vector[d + j])):
                 side = "lower" if value < edge * WIDTH else "upper" if value > (1.0 - edge) * WIDTH else None
                 if side and not (what == "standard deviation" and side == "lower"):
-                    sentences.append(f"the {what} of {name} sits on the {side} end of its search range")
+                    sentence = f"the {what} of {name} sits on the {side} end of its search range"
+                    found.append(Caution(Code.SEARCH_EDGE, sentence))
                 elif side:
-                    sentences.append(
+                    sentence = (
                         f"the standard deviation of {name} sits on its smallest value: the data do not ask for any "
                         "spread, which one trajectory never does"
                     )
-        return sentences
+                    found.append(Caution(Code.NO_SPREAD, sentence, grave=True))
+        return found
 
 
 def search_space(

@@ -23,7 +23,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.result import InferenceResult, exclusion_warnings
+from rfdropo_bayes.inference.result import InferenceResult, exclusion_cautions
 from rfdropo_bayes.inference.rfdropo.candidates import Plan, Simulated, row_scores, simulate, target_features, uniforms
 from rfdropo_bayes.inference.rfdropo.families import FAMILIES, make_family
 from rfdropo_bayes.inference.rfdropo.optimisers import OPTIMISERS, default_population, make_optimiser
@@ -265,7 +265,7 @@ def run(
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
-        warnings=[*plan.space.edge_warnings(chosen), *exclusion_warnings(ledger.excluded, ledger.evaluations)],
+        cautions=[*plan.space.edge_cautions(chosen), *exclusion_cautions(ledger.excluded, ledger.evaluations)],
         seconds=state.seconds,
         phi=plan.space.describe(chosen, problem.units),
         held=dict(plan.fixed),

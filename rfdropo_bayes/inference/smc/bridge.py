@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, Values
+from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.checkpoints import run_digest
 from rfdropo_bayes.inference.evaluations import evaluate_prior
@@ -26,10 +27,10 @@ from rfdropo_bayes.inference.modes.climb import Laplace
 from rfdropo_bayes.inference.modes.search import LaplaceConfig, Modes, find_modes, mode_values
 from rfdropo_bayes.inference.result import (
     InferenceResult,
-    exclusion_warnings,
-    prior_warnings,
-    replicate_warnings,
-    stage_warnings,
+    exclusion_cautions,
+    prior_cautions,
+    replicate_cautions,
+    stage_cautions,
 )
 from rfdropo_bayes.inference.smc import sampler as horizon_smc
 from rfdropo_bayes.inference.smc.mixture import ModeMixture, covering
@@ -177,11 +178,11 @@ def sample_from_modes(
     draws = {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in problem.names}
     excluded = ledger.excluded + Counter(sampled.excluded)
     evaluations = ledger.evaluations + sampled.evaluations
-    # Several optima are what the mixture is for: no warning here, unlike in Laplace alone.
+    # Several optima are what the mixture is for: no caution here, unlike in Laplace alone.
     # What the sampler says of coordinates, and of its share of rollouts, is said below of parameters and of all.
-    kept = stage_warnings(sampled.trace, sampler.rollouts, sampler.correlation)
-    kept += replicate_warnings(draws, np.asarray(sampled.details["log_evidence_replicates"]))
-    kept += [sentence for sentence in found.warnings if "converged" in sentence]
+    kept = stage_cautions(sampled.trace, sampler.rollouts, sampler.correlation)
+    kept += replicate_cautions(draws, np.asarray(sampled.details["log_evidence_replicates"]))
+    kept += [caution for caution in found.cautions if caution.code is Code.CLIMB_UNFINISHED]
     return replace(
         sampled,
         method="bridge",
@@ -193,7 +194,7 @@ def sample_from_modes(
         rollouts=ledger.rollouts + sampled.rollouts,
         evaluations=evaluations,
         excluded=dict(excluded),
-        warnings=[*kept, *prior_warnings(problem, draws), *exclusion_warnings(excluded, evaluations)],
+        cautions=[*kept, *prior_cautions(problem, draws), *exclusion_cautions(excluded, evaluations)],
         seconds=found.climbs.seconds + seconds + sampled.seconds,
         optimum=mode_values(problem, found.modes[0]),
         details=sampled.details

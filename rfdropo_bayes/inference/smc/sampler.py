@@ -25,10 +25,10 @@ from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import (
     InferenceResult,
     chains,
-    exclusion_warnings,
-    prior_warnings,
-    replicate_warnings,
-    stage_warnings,
+    exclusion_cautions,
+    prior_cautions,
+    replicate_cautions,
+    stage_cautions,
 )
 from rfdropo_bayes.inference.schedules import SPACINGS, block_boundaries
 from rfdropo_bayes.inference.smc.hamiltonian import MOST_LEAPS, Flow, chosen_kernel, flow_of
@@ -381,11 +381,11 @@ def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcSta
         rollouts=sum(state.ledger.rollouts for state in states),
         evaluations=evaluations,
         excluded=dict(excluded),
-        warnings=[
-            *prior_warnings(problem, draws),
-            *exclusion_warnings(excluded, evaluations),
-            *stage_warnings(trace, config.rollouts, config.correlation),
-            *replicate_warnings(draws, values),
+        cautions=[
+            *prior_cautions(problem, draws),
+            *exclusion_cautions(excluded, evaluations),
+            *stage_cautions(trace, config.rollouts, config.correlation),
+            *replicate_cautions(draws, values),
         ],
         seconds=sum(state.seconds for state in states),
         details={"log_evidence_replicates": values.tolist(), "particles": plan.particles, "horizons": plan.horizons},

@@ -1,4 +1,4 @@
-"""Warnings of posteriors that a bound decides, and of replicates that disagree."""
+"""Cautions about posteriors that a bound decides, and of replicates that disagree."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import jax
 import numpy as np
 import pytest
 
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.result import prior_warnings, replicate_warnings, stage_warnings
+from rfdropo_bayes.inference.result import prior_cautions, replicate_cautions, stage_cautions
 
 from .toys import LinearGaussian, Ratio
 
@@ -43,9 +44,10 @@ def log_normal(key, n):
         (log_normal, (1e-3, 10.0), 1e-3 * GRID**-0.5, "lower"),
     ],
 )
-def test_only_a_posterior_cut_off_at_its_mode_is_warned_of(prior, bounds, draws, side):
-    sentences = prior_warnings(OneParameter(prior, bounds), {"x0": draws[None]})
-    assert [sentence.split()[4] for sentence in sentences] == ([side] if side else [])
+def test_only_a_posterior_cut_off_at_its_mode_is_cautioned(prior, bounds, draws, side):
+    found = prior_cautions(OneParameter(prior, bounds), {"x0": draws[None]})
+    assert [caution.code for caution in found] == [Code.AT_BOUND] * (side is not None)
+    assert [caution.sentence.split()[4] for caution in found] == ([side] if side else [])
 
 
 @pytest.mark.parametrize(
@@ -62,8 +64,8 @@ def test_an_end_of_the_prior_between_the_bounds_is_named(ends, draws, said):
     low, high = ends
     problem = OneParameter(lambda key, n: jax.random.uniform(key, (n,), minval=low, maxval=high), (0.0, 100.0))
     problem.prior_ends = {"x0": ends}
-    sentences = prior_warnings(problem, {"x0": draws[None]})
-    assert sentences == [f"{said}, which decides there, and not the data"] * bool(said)
+    found = prior_cautions(problem, {"x0": draws[None]})
+    assert [caution.sentence for caution in found] == [f"{said}, which decides there, and not the data"] * bool(said)
 
 
 def normal(key, n):
@@ -93,37 +95,40 @@ def beyond_double_precision(key, n):
 )
 def test_a_prior_that_the_data_contradict_is_named(prior, centre, excluded):
     draws = centre * (1.0 + 1e-5 * GRID[None])
-    sentences = prior_warnings(OneParameter(prior, (-np.inf, np.inf)), {"x0": draws})
+    found = prior_cautions(OneParameter(prior, (-np.inf, np.inf)), {"x0": draws})
     said = "the data put x0 into the outermost 1 % of the prior, which excludes them"
-    assert sentences == [said] * excluded
+    assert found == [Caution(Code.AGAINST_PRIOR, said)] * excluded
 
 
 @pytest.mark.slow
 def test_methods_say_which_bound_decides():
     """The data want a ratio of stiffness to mass that only the ends of both ranges have."""
     result = methods.run(Ratio(truth=(2.02, 0.995)), "laplace", {"blocks": 1}, jax.random.key(1))
-    assert any("stiffness sits on its lower bound 2" in sentence for sentence in result.warnings)
+    assert any("stiffness sits on its lower bound 2" in caution.sentence for caution in result.cautions)
 
 
 def test_replicates_that_disagree_are_named():
     rng = np.random.default_rng(1)
     draws = {"a": rng.normal(size=(4, 500)), "b": rng.normal(size=(4, 500)) + np.array([[0.0], [0.0], [0.0], [2.0]])}
-    assert replicate_warnings({"a": draws["a"]}, np.array([1.0, 1.1, 0.9, 1.0])) == []
-    assert replicate_warnings({"b": draws["b"][:1]}, np.array([1.0])) == []
-    scattered, apart = replicate_warnings(draws, np.array([1.0, 2.5, 0.2, 1.0]))
-    assert "4 replicates scatter by 0.96" in scattered
-    assert apart.startswith("replicates disagree about b (R-hat 1.")
+    assert replicate_cautions({"a": draws["a"]}, np.array([1.0, 1.1, 0.9, 1.0])) == []
+    assert replicate_cautions({"b": draws["b"][:1]}, np.array([1.0])) == []
+    scattered, apart = replicate_cautions(draws, np.array([1.0, 2.5, 0.2, 1.0]))
+    assert "4 replicates scatter by 0.96" in scattered.sentence
+    assert (scattered.code, apart.code) == (Code.EVIDENCE_SCATTERED, Code.REPLICATES_DISAGREE)
+    assert apart.sentence.startswith("replicates disagree about b (R-hat 1.")
 
 
 def test_stages_say_that_particles_stayed_and_where_a_budget_ran_out():
     """A run of one row, as from around optima, has no row to name."""
     moved = {"budget_exhausted": False, "progress": 1.0, "ess": 0.6, "correlation": 0.2}
     settings = 3743.15, 0.3
-    assert stage_warnings([moved, moved | {"final": True}], *settings) == []
-    (stuck,) = stage_warnings([moved | {"correlation": 0.9}, moved | {"correlation": 0.97, "final": True}], *settings)
-    assert stuck.startswith("the last moves left the particles 0.97 correlated")
+    assert stage_cautions([moved, moved | {"final": True}], *settings) == []
+    (stuck,) = stage_cautions([moved | {"correlation": 0.9}, moved | {"correlation": 0.97, "final": True}], *settings)
+    assert stuck.sentence.startswith("the last moves left the particles 0.97 correlated")
     leap = moved | {"budget_exhausted": True, "ess": 0.08}
-    (said,) = stage_warnings([leap, moved | {"final": True}], *settings)
-    assert said.startswith("the budget of 3743 rollouts ran out: the rest of the data")
-    (said,) = stage_warnings([leap | {"progress": 7.0}, moved | {"final": True, "progress": 20.0}], *settings)
-    assert "ran out at row 7" in said
+    (said,) = stage_cautions([leap, moved | {"final": True}], *settings)
+    assert said.code is Code.BUDGET_SPENT
+    assert said.grave
+    assert said.sentence.startswith("the budget of 3743 rollouts ran out: the rest of the data")
+    (said,) = stage_cautions([leap | {"progress": 7.0}, moved | {"final": True, "progress": 20.0}], *settings)
+    assert "ran out at row 7" in said.sentence
