@@ -76,6 +76,39 @@ def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: 
     console.print(f"report: {files['report']}; extended model: {files['extended']}", soft_wrap=True)
 
 
+def show_simulation(found: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
+    """Print how far a simulation is from its recordings; ``found`` is the content of simulation.json."""
+    if as_json:
+        typer.echo(json.dumps(found, indent=2))
+    elif not quiet:
+        for name, facts in found["recordings"].items():
+            typer.echo(f"{name}: {facts['status']}{_off(facts['error_mm'])}; {facts['files'][0]}")
+        if found["error_mm"] is not None and len(found["recordings"]) > 1:
+            typer.echo(f"all of them{_off(found['error_mm'])}")
+
+
+def _off(error: Mapping[str, float] | None) -> str:
+    """How far markers are off."""
+    if error is None:
+        return ""
+    return (
+        f", the last marker off by {error['rms_last_marker']:.3g} mm in root mean square, "
+        f"all markers by {error['mean']:.3g} mm on average and {error['max']:.3g} mm at most"
+    )
+
+
+def show_prediction(facts: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
+    """Print what a prediction is of; ``facts`` is the content of prediction.json."""
+    if as_json:
+        typer.echo(json.dumps(facts, indent=2))
+    elif not quiet:
+        start = "from the measured first row" if facts["start_pose_known"] else "without a measured first row"
+        typer.echo(f"{facts['rows']} rows {start}, under {facts['draws']} draws of {facts['posterior']}")
+        typer.echo("mean, 50 and 90 % bands in m:")
+        for file in facts["files"]:
+            typer.echo(f"  {file}")
+
+
 def _parameters(rows: Iterable[tuple[str, Mapping[str, Any], str]]) -> Table:
     """Name, unit, mean, 5 and 95 % quantiles, and a remark."""
     from rfdropo_bayes.report.units import display_unit

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.pooling import Patterns
-from rfdropo_bayes.data import Trajectory, noise_floor
+from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.methods import make_config, method_named, run
 from rfdropo_bayes.inference.progress import Progress
@@ -28,9 +28,11 @@ from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_si
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
 from rfdropo_bayes.workflow.files import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.workflow.prediction import (
+    BEGUN,
     FITTED,
     HELD,
     MARKER_ERRORS,
+    NOISE,
     Batch,
     marker_errors,
     predict_fitted,
@@ -91,7 +93,7 @@ def run_calibration(
             kept = out / CHECKPOINTS
             result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
         problem = problem.holding(result.held)
-        attributes = _attributes(experiment, recordings)
+        attributes = {**_attributes(experiment, recordings), BEGUN: common_beginning(fitted)}
         record = record_posterior(problem, result, tested, predicting, attributes, experiment.model.groups)
         facts = gather_facts(experiment, path.stem, problem, result, fitted, tested, record)
         return write_run(out, record, facts, (out / CONFIG).read_text(encoding="utf-8"))
@@ -153,7 +155,13 @@ def record_posterior(
         trace=result.trace,
         block_scores=result.block_scores,
         log_likelihood=rows,
-        attrs={**attributes, FITTED: fitted, MARKER_ERRORS: errors, HELD: result.held},
+        attrs={
+            **attributes,
+            NOISE: problem.model.noise,
+            FITTED: fitted,
+            MARKER_ERRORS: errors,
+            HELD: result.held,
+        },
     )
     return record.with_derived(scale_free_ratios(problem.names))
 

@@ -21,6 +21,7 @@ from rfdropo_bayes.workflow.first_row import match_first_row, weighed_by_first_r
 
 # Among the attributes of a posterior.
 FITTED, MARKER_ERRORS, HELD = "fitted_recordings", "marker_errors_m", "held_parameters"
+NOISE, BEGUN = "noise_model", "fitted_recordings_begin"
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 

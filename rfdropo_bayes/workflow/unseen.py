@@ -25,7 +25,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values, measurement_specs
 from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.files import hashes, run_folder
-from rfdropo_bayes.workflow.prediction import FITTED, HELD, MARKER_ERRORS, predict_new, thin
+from rfdropo_bayes.workflow.prediction import BEGUN, FITTED, HELD, MARKER_ERRORS, NOISE, predict_new, thin
 
 DRAWS = 200
 LEVELS = {"q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
@@ -69,7 +69,8 @@ def run_prediction(
     if experiment.data is None:
         raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format the commands are")
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
-    unseen = load_unseen(experiment.data, folder, commands, start, rows)
+    _check_noise(record, experiment.model.noise)
+    unseen = load_unseen(experiment.data, folder, commands, start, rows, record.attrs.get(BEGUN))
     simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
     fixed = {**fixed_values(experiment, simulator), **record.attrs.get(HELD, {})}
     specs = simulator.parameters + measurement_specs(experiment.model)
@@ -108,6 +109,17 @@ def run_prediction(
             _columns(table).to_csv(partial, index=False, float_format="%.6f")
         write_text(out / "prediction.json", json.dumps(facts, indent=2) + "\n")
     return facts
+
+
+def _check_noise(record: PosteriorRecord, noise: str) -> None:
+    """Raise an InputError where an experiment's noise model is not the one that a posterior was fitted with."""
+    fitted = record.attrs.get(NOISE, noise)  # earlier posteriors do not say
+    if noise != fitted:
+        raise InputError(
+            f"the posterior was fitted with noise = {fitted!r}, the experiment says {noise!r}",
+            where="[model] noise",
+            remedy=f"add --set model.noise={fitted}, or predict with config.toml of the posterior's folder",
+        )
 
 
 def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> ParameterSpace:

@@ -209,9 +209,27 @@ def test_the_encoder_shows_what_happens_inside_the_drive_in_the_order_given():
     driven = simulator.driven(values, commands, STEP)
     np.testing.assert_array_equal(driven[0], commands.initial)
     np.testing.assert_allclose(driven[1:], expected, rtol=0, atol=1e-15)
-    assert float(jnp.abs(simulator.actuated(values, commands, STEP) - expected).max()) > 0.01  # the cables get less
+    assert float(jnp.abs(simulator.actuated(values, commands, STEP)[1] - expected).max()) > 0.01  # the cables get less
     without = Drives(robot, mechanisms_named(["rate_limit", "actuator_lag"], robot))
     np.testing.assert_array_equal(without.driven(values, commands, STEP), driven)
+
+
+def test_gains_scale_the_whole_command_and_what_was_in_force_before_the_first_row():
+    """A command u that was held for ever: drives stand at (1 + g) u, cables at (1 + g) (1 + e) u radii, from row 0 on,
+    whatever lags behind. Half of a command is lost, so that nothing but the whole of it can be scaled."""
+    robot = load_robot("asl_trunk")
+    time, held = STEP * np.arange(5), 0.1 * np.arange(1, 7)
+    commands = commands_on_grid(time, np.tile(held, (5, 1)), held, time, time_step=STEP)
+    errors = np.linspace(-0.5, 0.5, 6)
+    values = {f"cable_gain_error_motor_{k}": error for k, error in enumerate(errors, start=1)}
+    values |= {"command_gain_error": -0.5, "actuator_lag": 0.1, "command_delay": 0.015}
+    simulator = Drives(robot, mechanisms_named(["command_gain", "actuator_lag", "command_delay", "cable_gain"], robot))
+    known = simulator.complete({name: jnp.asarray(value) for name, value in values.items()})
+    np.testing.assert_allclose(simulator.driven(known, commands, STEP), np.tile(0.5 * held, (5, 1)), rtol=1e-14)
+    expected = robot.channel_matrix(known) @ (0.5 * (1.0 + errors) * held)
+    start, levels = simulator.wound(known, commands, STEP)
+    np.testing.assert_allclose(start - simulator.pretension(known), expected, rtol=1e-12)
+    np.testing.assert_allclose(levels, np.tile(start, (len(levels), 1)), rtol=1e-12)
 
 
 def test_a_mechanism_of_a_user_is_inside_the_drive_unless_it_says_otherwise():
