@@ -31,6 +31,7 @@ from rfdropo_bayes.workflow.prediction import (
     FITTED,
     HELD,
     MARKER_ERRORS,
+    NOISE,
     Batch,
     marker_errors,
     predict_fitted,
@@ -153,7 +154,7 @@ def record_posterior(
         trace=result.trace,
         block_scores=result.block_scores,
         log_likelihood=rows,
-        attrs={**attributes, FITTED: fitted, MARKER_ERRORS: errors, HELD: result.held},
+        attrs={**attributes, FITTED: fitted, MARKER_ERRORS: errors, HELD: result.held, **known_noise(problem)},
     )
     return record.with_derived(scale_free_ratios(problem.names))
 
@@ -245,6 +246,12 @@ def gather_facts(
         details=result.details,
         outline=robot_shape(robot) if robot is not None else None,
     )
+
+
+def known_noise(problem: CalibrationProblem) -> dict[str, Any]:
+    """The noise of the positions as an attribute of the posterior, where it is not among the parameters."""
+    known, markers = problem.model.markers.known, problem.model.recordings.markers
+    return {} if known is None else {NOISE: {"markers": list(markers), **known.as_dict()}}
 
 
 def _attributes(experiment: Experiment, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
