@@ -31,6 +31,7 @@ from rfdropo_bayes.workflow.prediction import (
     BEGUN,
     FITTED,
     HELD,
+    KNOWN_NOISE,
     MARKER_ERRORS,
     NOISE,
     Batch,
@@ -161,6 +162,7 @@ def record_posterior(
             FITTED: fitted,
             MARKER_ERRORS: errors,
             HELD: result.held,
+            **known_noise(problem),
         },
     )
     return record.with_derived(scale_free_ratios(problem.names))
@@ -253,6 +255,12 @@ def gather_facts(
         details=result.details,
         outline=robot_shape(robot) if robot is not None else None,
     )
+
+
+def known_noise(problem: CalibrationProblem) -> dict[str, Any]:
+    """The noise of the positions as an attribute of the posterior, where it is not among the parameters."""
+    known, markers = problem.model.markers.known, problem.model.recordings.markers
+    return {} if known is None else {KNOWN_NOISE: {"markers": list(markers), **known.as_dict()}}
 
 
 def _attributes(experiment: Experiment, trajectories: Sequence[Trajectory]) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def fit(job: Mapping[str, Any]) -> dict[str, Any]:
     if job["row"] == "ours + tension":
         replica = with_tension.with_measured(measured)
     else:
-        replica = problem.with_measured(measured._replace(tension=None))
+        replica = problem.with_measured({name: measured[name] for name in problem.measured})
     began = time.monotonic()
     try:
         draws, spent = infer(job, replica, fit_key)

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
-from rfdropo_bayes.bayes.model import Measured, TrajectoryModel, gather_recordings
+from rfdropo_bayes.bayes.channels import Markers
+from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.data import Trajectory
@@ -74,7 +76,9 @@ def problem(noise: str) -> CalibrationProblem:
     specs = simulator.parameters + noise_specs(noise)
     space = build_space(specs, {spec.name: {} for spec in specs}, {}, ["r"])
     recordings = gather_recordings(simulator, [trajectory])
-    return CalibrationProblem(TrajectoryModel(simulator, space, {}, noise, recordings), chunk=64)
+    return CalibrationProblem(
+        TrajectoryModel(simulator, space, {}, recordings, (Markers.gather(recordings, noise),)), chunk=64
+    )
 
 
 def with_error(noise: str, error: np.ndarray) -> CalibrationProblem:
@@ -83,7 +87,7 @@ def with_error(noise: str, error: np.ndarray) -> CalibrationProblem:
     values = {spec.name: np.array([spec.nominal]) for spec in noise_specs(noise)}
     clean = np.asarray(chosen.observe(values | {n: np.array([v]) for n, v in PHYSICAL.items()}).position)[0]
     measured = np.where(chosen.model.recordings.line.valid[..., None], clean + error, 0.0)
-    return chosen.with_measured(Measured(measured, None, None, np.zeros(0)))
+    return chosen.with_measured({"markers": measured})
 
 
 def autoregressive(rng: np.random.Generator, phi: float) -> np.ndarray:

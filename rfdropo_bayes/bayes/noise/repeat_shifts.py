@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import chi2
 
-from rfdropo_bayes.audit.noise import REPEATS, NoiseModel, estimate_noise
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS, Autoregression, estimate_noise
 
 SURE = 1e-4  # p-value under the noise within recordings, below which shifts are there
 LEAST = 0.5  # of the noise's standard deviation: what is smaller changes no conclusion
@@ -14,9 +14,9 @@ ROWS = 10  # fewer tell no constant from slow noise
 
 
 def repeat_shift(
-    deviations: Float[np.ndarray, "series time channel"], valid: Bool[np.ndarray, "series time channel"], share: float
+    deviations: Float[np.ndarray, "series time column"], valid: Bool[np.ndarray, "series time column"], share: float
 ) -> float | None:
-    """Root mean square distance of a marker that constants, one for each repeat and channel, make [m].
+    """Root mean square distance of a marker that constants, one for each repeat and column, make [m].
 
     The noise within recordings is an autoregression; the means of such recordings have a variance that it predicts, and
     of which the means that were found are a chi-squared multiple. Noise so slow that it differs little from a constant
@@ -46,7 +46,7 @@ def repeat_shift(
     return float(np.sqrt(3.0 * excess)) if excess > LEAST**2 * float(np.mean(noise.scale**2)) else None
 
 
-def _variance_of_mean(noise: NoiseModel, rows: int) -> Float[np.ndarray, " channel"]:
+def _variance_of_mean(noise: Autoregression, rows: int) -> Float[np.ndarray, " column"]:
     """Of the mean of so many successive rows of the process."""
     memory = np.zeros(rows)
     memory[: len(noise.autocorrelation)] = noise.autocorrelation[:rows]
