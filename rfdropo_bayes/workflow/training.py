@@ -216,7 +216,7 @@ def _episodes_for(
     settings = Settings(
         actions=layout.kind,
         observed=observed_of(layout),
-        period=layout.period_s,
+        period=table.period,
         step=float(np.max(layout.moves)),
         noise=table.noise,
     )
