@@ -136,6 +136,7 @@ motors.register(app)
 
 benchmark = typer.Typer(help="Comparisons that take hours; each can be interrupted and resumed.", no_args_is_help=True)
 benchmark.command()(inference.table1)
+benchmark.command()(training.table2)
 benchmark.command("audit")(audit.benchmark_audit)
 app.add_typer(benchmark, name="benchmark")
 

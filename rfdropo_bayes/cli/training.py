@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import shlex
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from rfdropo_bayes.cli.options import AsJson, ExperimentFile, OutFolder, Overrides, Overwrite, Quiet, Resume, folder_for
+from rfdropo_bayes.workflow.files import check_folder
 
 
 def train(
@@ -61,3 +64,45 @@ def evaluate(
     elif not quiet:
         typer.echo(evaluation_table(found))
         typer.echo(f"table: {folder / TABLE}")
+
+
+VIRTUAL = Path("experiments/virtual")
+
+
+def table2(
+    experiments: Annotated[
+        list[Path] | None, typer.Argument(metavar="EXPERIMENT.toml", help="one file for each task")
+    ] = None,
+    target: Annotated[Path, typer.Option(help="experiment file of the robot that policies are evaluated on")] = VIRTUAL
+    / "truth.toml",
+    audited: Annotated[Path, typer.Option("--audit", help="experiment file of the audit")] = VIRTUAL / "audit.toml",
+    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/table2"),
+    seeds: Annotated[int, typer.Option(help="policies of every row")] = 3,
+    steps: Annotated[int, typer.Option(help="environment steps of a training")] = 1_000_000,
+    episodes: Annotated[int, typer.Option(help="of an evaluation, the same for all policies")] = 200,
+    budget: Annotated[int, typer.Option(help="rollouts of a fit")] = 10_000,
+    minutes: Annotated[float, typer.Option(help="bound of the audit")] = 30.0,
+    rows: Annotated[list[str] | None, typer.Option("--row", help="only this row; may be repeated")] = None,
+    resume: Annotated[bool, typer.Option(help="keep what an interrupted study has done")] = False,
+    only_done: Annotated[bool, typer.Option(help="tables of what an interrupted study has done")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """The paper's Table II: policies of every method on a robot they never touched: table2.json, .md and .png."""
+    check_folder(out, "benchmark table2", resume=resume or only_done, overwrite=overwrite)
+    from rfdropo_bayes.workflow.table2 import Size, run_table2
+
+    content = run_table2(
+        experiments or [VIRTUAL / "push.toml", VIRTUAL / "reach.toml"],
+        target,
+        audited,
+        out,
+        Size(seeds, steps, episodes, budget, minutes),
+        rows=rows or (),
+        resume=resume,
+        only_done=only_done,
+        overwrite=overwrite,
+        command=shlex.join(["rfdropo", *sys.argv[1:]]),
+    )
+    for claim in content["claims"]:
+        typer.echo(f"{'holds' if claim['holds'] else 'FAILS'}: {claim['task']}, {claim['claim']}: {claim['value']:.2f}")
+    typer.echo(f"table: {out / 'table2.md'}")

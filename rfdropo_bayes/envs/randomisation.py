@@ -139,30 +139,30 @@ class Draws:
 
 
 @dataclass(frozen=True)
-class Fixed:
-    """Another randomisation, with further parameters held at one value."""
+class Layers:
+    """Several randomisations at once; where two vary one parameter, the later one has the say.
 
-    drawn: Randomisation
-    values: Mapping[str, float]
+    Attributes:
+        parts: from what is held at one value to what differs from episode to episode.
+        kind: that of the part that gives the whole its name.
+    """
 
-    @property
-    def kind(self) -> str:
-        """That of the randomisation."""
-        return self.drawn.kind
+    parts: tuple[Randomisation, ...]
+    kind: str
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameters that vary, and those that are held."""
-        return tuple(dict.fromkeys((*self.drawn.names, *self.values)))
+        """Parameters that vary or are held."""
+        return tuple(dict.fromkeys(name for part in self.parts for name in part.names))
 
     @property
     def sha256(self) -> str:
-        """Of both."""
-        return _digest([self.drawn.sha256, dict(self.values)])
+        """Of all parts."""
+        return _digest([part.sha256 for part in self.parts])
 
     def draw(self, rng: np.random.Generator) -> dict[str, float]:
-        """A draw; what is held does not overwrite what varies."""
-        return {**self.values, **self.drawn.draw(rng)}
+        """A draw of every part."""
+        return {name: value for part in self.parts for name, value in part.draw(rng).items()}
 
 
 def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Randomisation:
@@ -171,9 +171,9 @@ def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Ran
     Raises:
         InputError: an unknown parameter, or values outside its bounds; of a posterior the number of such draws is said.
     """
-    if isinstance(randomisation, Fixed):
-        fitting(Point(randomisation.values), specs)
-        fitting(randomisation.drawn, specs)
+    if isinstance(randomisation, Layers):
+        for part in randomisation.parts:
+            fitting(part, specs)
         return randomisation
     where = f"randomisation ({randomisation.kind})"
     check_names(randomisation.names, specs, where=where)

@@ -5,11 +5,12 @@ from rfdropo_bayes.robots.cable import Cable, Channels
 from rfdropo_bayes.robots.catalogue import find_robot_file, known_robots, load_robot
 from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.parameter import Parameter
-from rfdropo_bayes.robots.robot import Command, Marker, PushScene, Robot
+from rfdropo_bayes.robots.robot import OBJECT, Command, Marker, PushScene, Robot
 from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, section_profile
 from rfdropo_bayes.robots.shape import robot_shape
 
 __all__ = [
+    "OBJECT",
     "Body",
     "Cable",
     "Channels",

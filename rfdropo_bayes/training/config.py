@@ -30,6 +30,10 @@ class TrainingTable(BaseModel):
         default_factory=dict, description="options of the algorithm by Stable-Baselines3's names, net_arch among them"
     )
     steps: int = Field(default=1_000_000, ge=1, description="environment steps, over all environments")
+    anneal: bool = Field(
+        default=False,
+        description="lower the learning rate in proportion to what is left of the steps, from evaluation to evaluation",
+    )
     environments: int = Field(default=128, ge=1, le=4096, description="environments that are simulated at once")
     randomisation: Literal["posterior", "phi", "uniform", "none"] = Field(
         default="none",
@@ -41,6 +45,14 @@ class TrainingTable(BaseModel):
     )
     ranges: dict[str, tuple[float, float]] = Field(
         default_factory=dict, description="lowest and highest value of each parameter, for uniform randomisation"
+    )
+    start: dict[str, tuple[float, float]] = Field(
+        default_factory=dict,
+        description="lowest and highest value of what differs from episode to episode whatever the randomisation, such "
+        "as where the cube stands",
+    )
+    goals: tuple[tuple[float, float, float], tuple[float, float, float]] | None = Field(
+        default=None, description="corners of the box that goals are drawn from [m]; the task's own by default"
     )
     normalise: bool = Field(default=True, description="scale observations and rewards by their running moments")
     evaluate_every: int = Field(

@@ -148,7 +148,12 @@ def _leg(
     model.set_env(normalisation or venv, force_reset=True)
     venv.set_attr("log", log)
     count = _Failures()
-    steps = min(table.evaluate_every, table.steps - model.num_timesteps)
+    left = table.steps - model.num_timesteps
+    if table.anneal:
+        # Stable-Baselines3's own schedules count from the start of a leg.
+        rate = model.learning_rate * left / table.steps
+        model.lr_schedule = lambda _: rate
+    steps = min(table.evaluate_every, left)
     model.learn(steps, callback=count.callback(), reset_num_timesteps=False, tb_log_name="run", log_interval=None)
     venv.set_attr("log", None)
     policy = Trained(model, normalisation, [], 0, 0.0)

@@ -152,6 +152,9 @@ class CommandsTable(Table):
     sample_time: float = Field(gt=0.0, description="time between observations [s]")
     recordings: list[str] = Field(min_length=1, description="a name for each recording")
     markers: list[str] = Field(default_factory=list, description="markers that are observed; all by default")
+    blind: bool = Field(
+        default=False, description="leave the parameters out of the recordings, for data whose truth is to be guessed"
+    )
 
 
 class NoiseTable(Table):

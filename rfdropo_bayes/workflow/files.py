@@ -48,6 +48,7 @@ COMMANDS = {
     "train": Command(("summary.json", "policy.onnx", "card.md", "curve.png", "episodes.jsonl"), resumable=True),
     "evaluate": Command(("evaluation.json", "evaluation.md", "episodes.csv", "success.png")),
     "benchmark table1": Command(("table1.json", "table1.md", "table1.png", "fits.jsonl"), resumable=True),
+    "benchmark table2": Command(("table2.json", "table2.md", "table2.png"), resumable=True),
 }
 
 
@@ -133,6 +134,12 @@ def run_folder(
 def hashes(recordings: Iterable[Any]) -> dict[str, str]:
     """Hash of the content of each recording (`Trajectory`), by its name."""
     return {recording.name: recording.sha256[:12] for recording in recordings}
+
+
+def run_ended(out: Path) -> bool:
+    """Whether a folder holds a run that came to its end."""
+    found = _read(out / RUN)
+    return found is not None and found.get("status") == DONE
 
 
 def _read(path: Path) -> dict[str, Any] | None:

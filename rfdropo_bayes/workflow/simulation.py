@@ -156,12 +156,14 @@ def _as_trajectory(
     if experiment.noise is not None:
         key = jax.random.fold_in(jax.random.key(experiment.seed), index)
         position = position + _noise(experiment.noise, key, source.time, position.shape[1])
-    settings = {
+    settings: dict[str, Any] | None = {
         "simulator": simulator.description,
         "parameters": {spec.name: values.get(spec.name, spec.nominal) for spec in simulator.parameters},
         "noise": None if experiment.noise is None else experiment.noise.model_dump(),
         "seed": experiment.seed,
     }
+    if experiment.commands is not None and experiment.commands.blind:
+        settings = None
     return Trajectory.build(
         name=source.name,
         robot=simulator.robot.name,

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rfdropo_bayes.envs.episodes import Episodes, Settings
-from rfdropo_bayes.envs.randomisation import Fixed, Phi, Point, Randomisation, Uniform, read_phi, read_posterior
+from rfdropo_bayes.envs.randomisation import Layers, Point, Randomisation, Uniform, read_phi, read_posterior
 from rfdropo_bayes.envs.rendering import picture
 from rfdropo_bayes.envs.tasks import Task, observed_of, task_named
 from rfdropo_bayes.envs.vec_env import TrunkVecEnv
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.report import software_versions
+from rfdropo_bayes.robots import OBJECT
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.training.config import TrainingTable
@@ -99,6 +101,7 @@ def run_evaluation(
     episodes: int = 200,
     lanes: int = 64,
     seed: int = 0,
+    film: bool = True,
     overrides: Sequence[str] = (),
     overwrite: bool = False,
 ) -> dict[str, Any]:
@@ -112,6 +115,7 @@ def run_evaluation(
         episodes: of each policy.
         lanes: episodes that are simulated at once.
         seed: of the cases.
+        film: whether to draw the animations.
 
     Returns:
         the content of evaluation.json.
@@ -133,7 +137,8 @@ def run_evaluation(
             venv = TrunkVecEnv(batch)
             cases = cases or draw_cases(venv, episodes, EVALUATION_SEED + seed)
             found[name] = play(policy.act, venv, cases)
-            _film(batch, found[name], cases, out / f"{name}.gif")
+            if film:
+                _film(batch, found[name], cases, out / f"{name}.gif")
         content = _judged(found, cases, experiment.seed)
         with whole(out / CSV) as partial:
             episode_table(found, cases).to_csv(partial, index=False)
@@ -148,31 +153,43 @@ def _training(experiment: Experiment, folder: Path) -> tuple[TrainingTable, Task
         raise InputError(
             "the experiment has no table [training]", where="training", remedy='add it, with task = "TrunkReach-v0"'
         )
-    task = task_named(experiment.training.task)
+    table = experiment.training
+    task = task_named(table.task)
+    if table.goals is not None:
+        task = replace(task, goal_low=table.goals[0], goal_high=table.goals[1])
     simulator_table = experiment.simulator.model_copy(update={"push": task.push})
     experiment = experiment.model_copy(update={"simulator": simulator_table})
-    return (
-        experiment.training or TrainingTable(),
-        task,
-        build_simulator(experiment, find_robot(experiment, folder), folder),
-    )
+    return table, task, build_simulator(experiment, find_robot(experiment, folder), folder)
 
 
 def _randomisation(
     table: TrainingTable, experiment: Experiment, simulator: RobotSimulator, folder: Path
 ) -> Randomisation:
-    """Where parameters come from, with the experiment's fixed values."""
-    fixed = {
-        n: v for n, v in fixed_values(experiment, simulator).items() if n in {s.name for s in simulator.parameters}
-    }
-    if table.randomisation == "none":
-        return Point(fixed)
+    """Where parameters come from: values that are held, what is randomised, and what differs between episodes.
+
+    A task without a cube has no use for what the experiment says of one.
+    """
+    absent = () if "cube_mass" in {spec.name for spec in simulator.parameters} else OBJECT
+    model = experiment.model
+    held = model.model_copy(update={"fixed": {n: v for n, v in model.fixed.items() if n not in absent}})
+    fixed = fixed_values(experiment.model_copy(update={"model": held}), simulator)
+    known = {spec.name for spec in simulator.parameters}
+    parts: list[Randomisation] = [Point({name: value for name, value in fixed.items() if name in known})]
+    if table.randomisation != "none":
+        parts.append(_randomised(table, simulator, folder))
+    kind = parts[-1].kind
+    start = {name: ends for name, ends in table.start.items() if name not in absent}
+    return Layers((*parts, Uniform(start)), kind) if start or len(parts) > 1 else parts[0]
+
+
+def _randomised(table: TrainingTable, simulator: RobotSimulator, folder: Path) -> Randomisation:
+    """What [training] randomises over."""
     if table.randomisation == "uniform":
         if not table.ranges:
             raise InputError(
                 "no ranges", where="[training.ranges]", remedy="give name = [low, high] for each parameter"
             )
-        return Fixed(Uniform(table.ranges), fixed) if fixed else Uniform(table.ranges)
+        return Uniform(table.ranges)
     if table.source is None:
         raise InputError(
             f"randomisation = {table.randomisation!r} without a source",
@@ -181,13 +198,9 @@ def _randomisation(
         )
     beside = folder / table.source
     source = beside if beside.exists() else Path(table.source)
-    drawn: Randomisation | Phi
-    drawn = (
-        read_phi(source, simulator.parameters)
-        if table.randomisation == "phi"
-        else read_posterior(source, simulator.parameters)[0]
-    )
-    return Fixed(drawn, fixed) if fixed else drawn
+    if table.randomisation == "phi":
+        return read_phi(source, simulator.parameters)
+    return read_posterior(source, simulator.parameters)[0]
 
 
 def _episodes_for(
@@ -203,7 +216,7 @@ def _episodes_for(
     settings = Settings(
         actions=layout.kind,
         observed=observed_of(layout),
-        period=layout.period_s,
+        period=table.period,
         step=float(np.max(layout.moves)),
         noise=table.noise,
     )

@@ -81,6 +81,13 @@ def test_an_experiment_without_training_is_refused(tmp_path) -> None:
         run_training(REPOSITORY / "experiments" / "sofa_reach_layered.toml", tmp_path)
 
 
-def test_a_policy_for_another_period_is_refused(tmp_path) -> None:
-    with pytest.raises(InputError, match="the policy's task is TrunkReach-v0"):
-        run_evaluation(REACH, [COMMITTED], tmp_path / "test", overrides=['training.task="TrunkPush-v0"'], episodes=2)
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ('training.task="TrunkPush-v0"', "task is TrunkReach-v0"),
+        ("training.period=0.1", "period_s is 0.05, here it is 0.1"),
+    ],
+)
+def test_a_policy_for_another_task_or_period_is_refused(tmp_path, override, words) -> None:
+    with pytest.raises(InputError, match=f"the policy's {words}"):
+        run_evaluation(REACH, [COMMITTED], tmp_path / "test", overrides=[override], episodes=2)

@@ -1,0 +1,98 @@
+"""The comparison with Table II: cells that are kept, intervals, claims, and a small study from end to end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binomtest
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.workflow import table2
+from rfdropo_bayes.workflow.table2 import ROWS, WITHOUT_CUBE, Size, Study, claims, list_jobs, run_table2, summarise
+
+VIRTUAL = Path(__file__).resolve().parents[2] / "experiments" / "virtual"
+PUSH, REACH, TRUTH, AUDIT = (VIRTUAL / f"{name}.toml" for name in ("push", "reach", "truth", "audit"))
+SMALL = Size(seeds=2, steps=1000, episodes=20, budget=100, minutes=1.0)
+
+
+def keep(out: Path, row: str, seed: int, distances: np.ndarray) -> None:
+    """Write what an evaluation leaves."""
+    place = out / "push" / "evaluations" / f"{row.replace(' ', '_')}_{seed}"
+    place.mkdir(parents=True)
+    pd.DataFrame({"distance": distances, "diverged": ~np.isfinite(distances)}).to_csv(place / "episodes.csv")
+    (place / "policy.json").write_text(json.dumps({"sha256": "", "steps": 1000, "seconds": 1.0, "diverged": 0}))
+
+
+def test_seeds_are_done_one_after_the_other_and_a_task_without_a_cube_has_few_rows(tmp_path) -> None:
+    jobs = list_jobs(Study({"push": PUSH, "reach": REACH}, TRUTH, AUDIT, tmp_path, SMALL))
+    assert len(jobs) == 2 * (len(ROWS) + len(WITHOUT_CUBE))
+    assert [seed for _, _, seed in jobs] == sorted(seed for _, _, seed in jobs)
+    assert jobs[0] == ("push", "no randomisation", 0)
+
+
+def test_what_is_done_makes_a_table(tmp_path) -> None:
+    near, far = np.full(20, 0.012), np.full(20, 0.025)
+    keep(tmp_path, "ours after the audit", 0, near)
+    keep(tmp_path, "ours after the audit", 1, np.where(np.arange(20) < 10, near, np.inf))
+    keep(tmp_path, "oracle", 0, near)
+    keep(tmp_path, "udr", 0, far)
+    keep(tmp_path, "ours", 0, near[:5])  # of a study with fewer episodes
+    found = run_table2([PUSH], TRUTH, AUDIT, tmp_path, SMALL, only_done=True)
+    rows = {row["row"]: row for row in found["rows"]}
+    assert set(rows) == {"UDR", "ours after the audit", "oracle"}
+    own = rows["ours after the audit"]
+    assert own["success"]["15.25"]["share"] == 30 / 40
+    interval = binomtest(30, 40).proportion_ci(method="wilson")
+    assert own["success"]["15.25"]["low"] == pytest.approx(interval.low)
+    assert (own["by_seed"], own["episodes"]) == ([1.0, 0.5], 40)
+    assert (rows["UDR"]["success"]["21.57"]["share"], rows["UDR"]["success"]["30"]["share"]) == (0.0, 1.0)
+    assert [claim["holds"] for claim in found["claims"]] == [False, True]
+    assert found["not_done"] == 2 * len(ROWS) - 4
+    assert "75 %" in (tmp_path / "table2.md").read_text()
+    assert (tmp_path / "table2.png").stat().st_size > 5000
+
+
+def test_claims_follow_their_definitions() -> None:
+    def row(name: str, hits: int) -> dict:
+        cell = {"task": "push", "row": name, "seed": 0, "steps": 1, "seconds": 1.0, "episodes": 200}
+        return summarise("push", name, [{**cell, "hits": {"15.25": hits}, "distance_mm": [1.0]}])
+
+    found = claims([row("UDR", 100), row("ours", 185), row("ours after the audit", 180), row("oracle", 195)])
+    assert [(claim["claim"].split(",")[0], claim["holds"]) for claim in found] == [
+        ("succeeds at 15.25 mm at least 0.9 times as often as the oracle", True),
+        ("succeeds more often than UDR", True),
+        ("succeeds more often than ours", False),
+    ]
+
+
+def test_the_target_keeps_its_truth_and_takes_the_task(tmp_path) -> None:
+    study = Study({"reach": REACH}, TRUTH, AUDIT, tmp_path, SMALL)
+    tables = table2._on_target(study, table2._tables(study, "reach"))
+    assert tables["training"]["task"] == "TrunkReach-v0"
+    assert tables["model"]["fixed"]["young_modulus"] == 3.2e6
+    assert "data" not in tables
+
+
+def test_what_cannot_be_is_refused(tmp_path) -> None:
+    with pytest.raises(InputError, match="unknown row 'RFDROPO'"):
+        run_table2([PUSH], TRUTH, AUDIT, tmp_path, SMALL, rows=["RFDROPO"])
+    with pytest.raises(InputError, match="seeds = 0"):
+        Size(seeds=0)
+
+
+@pytest.mark.slow
+def test_a_small_study_from_recording_to_table_goes_on_where_it_stopped(tmp_path) -> None:
+    size = Size(seeds=1, steps=2048, episodes=4, budget=200)
+    run = [[REACH], TRUTH, AUDIT, tmp_path / "study", size]
+    first = run_table2(*run, rows=["no randomisation"])
+    assert [row["row"] for row in first["rows"]] == ["no randomisation"]
+    policy = tmp_path / "study" / "reach" / "policies" / "no_randomisation_0" / "policy.onnx"
+    before = policy.stat().st_mtime
+    second = run_table2(*run, rows=["no randomisation", "oracle"], resume=True)
+    assert [row["row"] for row in second["rows"]] == ["no randomisation", "oracle"]
+    assert policy.stat().st_mtime == before
+    assert second["cells"][0] == first["cells"][0]
