@@ -5,24 +5,28 @@ The deployment file names it: ``plant = "rfdropo_bayes.workflow.plant:trunk"``, 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import tomli_w
 from jaxtyping import Float
 
 from rfdropo_bayes.deployment.plant import PlantState
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots import OBJECT, Robot
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
+from rfdropo_bayes.workflow.experiment_file import override
 
 PERIOD = 0.01  # [s]: drums turn steadily between two states this far apart
 
 
 def trunk(
-    robot: Robot, experiment: str = "", marker_noise: float = 0.0, seed: int = 0, **values: float
+    robot: Robot, experiment: str = "", marker_noise: float = 0.0, seed: int = 0, **changes: float | str | bool
 ) -> SimulatedTrunk:
     """The trunk that an experiment file describes, or the robot itself.
 
@@ -31,15 +35,39 @@ def trunk(
         experiment: file whose robot, [simulator], mechanisms and [model.fixed] are the truth; by default ``robot``.
         marker_noise: standard deviation of white noise on every coordinate of a marker [m].
         seed: of the noise.
-        values: of parameters, by name; they go before those of the experiment.
+        changes: entries that replace the experiment's, as ``--set`` takes them: a parameter's name, or ``"table.key"``.
 
     Raises:
         InputError: a bad experiment, or a robot with other channels or markers than the one deployed.
     """
-    path = Path(experiment)
-    folder = path.resolve().parent
-    described = load_experiment(path)[0] if experiment else Experiment(robot=robot.name)
-    base = find_robot(described, folder) if experiment else robot
+    simulator, values = true_simulator(robot, experiment, changes)
+    command = simulator.robot.command
+    # Drums turn steadily from one state to the next. What ramps and delays commands stands before the plant.
+    period = simulator.time_step * max(1, round(PERIOD / simulator.time_step))
+    timing = command.model_copy(update={"ramp_s": period, "dead_time_s": 0.0})
+    base = simulator.robot.model_copy(update={"command": timing})
+    simulator, values = true_simulator(robot, experiment, changes, base)
+    return SimulatedTrunk(robot, simulator, period, values, marker_noise, seed)
+
+
+def true_simulator(
+    robot: Robot, experiment: str, changes: Mapping[str, float | str | bool], base: Robot | None = None
+) -> tuple[RobotSimulator, dict[str, float]]:
+    """The simulator behind `trunk` and the values of its parameters, with the commands' own timing.
+
+    Args:
+        robot, experiment, changes: as for `trunk`.
+        base: instead of the experiment's robot.
+    """
+    overrides = [f"{name}={tomli_w.dumps({'x': value})[4:].strip()}" for name, value in changes.items()]
+    if experiment:
+        described, folder = load_experiment(Path(experiment), overrides)[0], Path(experiment).resolve().parent
+        base = base or find_robot(described, folder)
+    else:
+        tables: dict[str, Any] = {"robot": robot.name}
+        for assignment in overrides:
+            override(tables, assignment, Experiment.model_fields)
+        described, folder, base = Experiment.model_validate(tables), Path(), base or robot
     for what, found, wanted in (
         ("channels", base.channel_names, robot.channel_names),
         ("markers", base.marker_names, robot.marker_names),
@@ -51,18 +79,17 @@ def trunk(
                 where=f"plant {base.name}",
                 remedy="deploy a robot that has the same",
             )
-    table = described.simulator
-    step = table.time_step or base.time_step_s
-    period = step * max(1, round(PERIOD / step))
-    # Drums turn steadily from one state to the next. What ramps and delays commands stands before the plant.
-    timing = base.command.model_copy(update={"ramp_s": period, "dead_time_s": 0.0})
-    base = base.model_copy(update={"command": timing})
+    table, model = described.simulator, described.model
+    held = {name: value for name, value in model.fixed.items() if table.push or name not in OBJECT}
     described = described.model_copy(
-        update={"simulator": table.model_copy(update={"drives": "robot", "threads": table.threads or 1})}
+        update={
+            "simulator": table.model_copy(update={"drives": "robot", "threads": table.threads or 1}),
+            "model": model.model_copy(update={"fixed": held}),
+        }
     )
     simulator = build_simulator(described, base, folder)
-    truth = {n: v for n, v in fixed_values(described, simulator).items() if n in {s.name for s in simulator.parameters}}
-    return SimulatedTrunk(robot, simulator, period, truth | values, marker_noise, seed)
+    known = {spec.name for spec in simulator.parameters}
+    return simulator, {n: v for n, v in fixed_values(described, simulator).items() if n in known}
 
 
 class SimulatedTrunk:
