@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 PRIORITY = 50  # SCHED_FIFO: above every ordinary process, below the kernel's own interrupt threads
+PLANT_PRIORITY = 30  # of a simulated robot: after everything that has a deadline
 _SWITCH = 5e-4  # [s]: other threads of this process give the interpreter back after so long; 5 ms by default
 
 
@@ -52,10 +53,10 @@ class CycleClock:
         return Tick(self._number, due + missed * self.period, lateness, missed)
 
 
-def schedule_fifo(thread: int = 0) -> bool:
+def schedule_fifo(thread: int = 0, priority: int = PRIORITY) -> bool:
     """Give a thread (this one by default) real-time priority; False where the system does not permit it."""
     try:
-        os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError):
         return False
     return True

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from jaxtyping import Shaped
+from jaxtyping import Bool, Float, Shaped
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.bus import FrameLog
@@ -27,7 +27,7 @@ from rfdropo_bayes.robots import Robot
 
 JOURNAL, EVENTS, SESSION, FRAMES, SUMMARY = "cycles.bin", "log.jsonl", "session.nc", "frames.log", "summary.json"
 FORMAT = "drive-session"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 _SYNC = 1.0  # [s]: how often the disk is told to keep what it has
 _HEADER = 4096  # [bytes]
 
@@ -52,6 +52,7 @@ def record_type(channels: int, markers: int) -> np.dtype[np.void]:
             ("controlword", "<u2", (channels,)),
             ("position", "<f8", (markers, 3)),
             ("seen", "?", (markers,)),
+            ("seen_at", "<f8"),  # when the markers were where this cycle saw them
         ]
     )
 
@@ -143,10 +144,28 @@ def read_journal(folder: Path) -> tuple[dict[str, Any], Shaped[np.ndarray, " cyc
         raise InputError(
             f"is no journal of a session ({error})", where=str(path), remedy="give a session's folder"
         ) from None
+    if header["schema_version"] != SCHEMA_VERSION:
+        raise InputError(
+            f"is of version {header['schema_version']} of the format, not {SCHEMA_VERSION}",
+            where=str(path),
+            remedy=f"read it with the version that wrote it; {SESSION} can be read by any",
+        )
     robot = header["robot"]
     kind = record_type(len(robot["channels"]["names"]), len(robot["markers"]))
     whole = (len(content) - size) // kind.itemsize
     return header, np.frombuffer(content, kind, count=whole, offset=size)
+
+
+def _seen_when(
+    rows: Shaped[np.ndarray, " cycle"],
+) -> tuple[Float[np.ndarray, "cycle marker 3"], Bool[np.ndarray, "cycle marker"]]:
+    """Markers [m] in the cycles nearest to when they were there, not when the loop heard of it; and which are new."""
+    heard = np.flatnonzero(rows["seen"].any(axis=1))
+    edges = 0.5 * (rows["time"][1:] + rows["time"][:-1])
+    place = np.searchsorted(edges, rows["seen_at"][heard])
+    position, seen = rows["position"].copy(), np.zeros_like(rows["seen"])
+    position[place], seen[place] = rows["position"][heard], rows["seen"][heard]
+    return position, seen
 
 
 def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> Trajectory:
@@ -166,21 +185,24 @@ def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> T
     """
     header, rows = read_journal(folder)
     robot = Robot.model_validate(header["robot"])
+    before = rows["command"][:1]
     if phases is not None and np.count_nonzero(np.isin(rows["phase"], phases)) > 1:
-        rows = rows[np.isin(rows["phase"], phases)]
+        chosen = np.isin(rows["phase"], phases)
+        before = rows["command"][max(int(np.argmax(chosen)) - 1, 0)][None]
+        rows = rows[chosen]
     if len(rows) < 2:
         raise InputError(f"has {len(rows)} cycles", where=str(folder), remedy="there is nothing to make a recording of")
-    seen = rows["seen"]
+    position, seen = _seen_when(rows)
     acted = np.flatnonzero(rows["acted"])
     first = acted if acted.size else np.array([0])
     radius = np.array([motor.drum_radius_m for motor in robot.motors])
-    before = rows["command"][max(first[0] - 1, 0)]
+    before = np.concatenate([before, rows["command"][: first[0]]])[-1]
     trajectory = Trajectory.build(
         name=Path(folder).name,
         robot=robot.name,
         format=FORMAT,
         time=rows["time"],
-        position=rows["position"],
+        position=position,
         position_mask=seen,
         command_time=rows["time"][first],
         command=rows["command"][first],

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+from itertools import count
 from typing import NamedTuple
 
 import can
@@ -146,6 +148,7 @@ class ControlLoop:
             record["statusword"] = [drive.reading.statusword for drive in all_drives if drive.reading]
             record["controlword"] = [drive.controlword for drive in all_drives]
             record["position"], record["seen"] = self.markers.position, self.markers.fresh
+            record["seen_at"] = self.markers.instant
             self.log.write()
         act_time = self.act_times[-1] if self.act_times else 0.0
         self.snapshot = Snapshot(
@@ -231,24 +234,34 @@ class ControlLoop:
             acted = False
 
     def follow(self, source: CommandSource, duration: float, phase: Phase = Phase.RUNNING) -> None:
-        """Let the source command for so long [s]; what it asks is ramped over its own period, within all limits.
+        """Let the source command for so long [s], then let the last ramp end.
+
+        Every change of a command is carried out linearly over the robot's ``ramp_s``, within all limits: as its
+        simulator does, so that the log is calibrated as it stands.
 
         Raises:
             Stop: if it commands what cannot be followed, or a marker it needs is lost.
         """
         cycles = round(1.0 / (source.rate_hz * self.period))
-        previous = self.command.copy()
-        for number in range(round(duration / self.period)):
-            self._left = duration - number * self.period
-            share = number % cycles
-            if share == 0:
+        steps = max(1, round(self.robot.command.ramp_s / self.period))
+        changes: deque[tuple[int, np.ndarray]] = deque(maxlen=1 + steps // cycles)
+        last = round(duration / self.period)
+        for number in count():
+            self._left = max(0.0, duration - number * self.period)
+            acting = number < last and number % cycles == 0
+            if acting:
                 previous = self.command.copy()
-                if not self._act(source, cycles * self.period):
-                    return
-            goal = self._without_slack(self.command)
-            ramp = self._without_slack(previous + (self.command - previous) * (share + 1) / cycles)
-            self.set_points.towards(goal, ramp)
-            self.cycle(phase, acted=share == 0)
+                acting = self._act(source, cycles * self.period)
+                if acting:
+                    changes.append((number, self.command - previous))
+                else:
+                    last = number
+            if number >= last + steps - cycles:
+                return
+            shares = [(max(0.0, 1.0 - (number + 1 - given) / steps), change) for given, change in changes]
+            ramp = self.command - sum((share * change for share, change in shares), np.zeros(len(self.command)))
+            self.set_points.towards(self._without_slack(self.command), self._without_slack(ramp))
+            self.cycle(phase, acting)
             if source.sees_markers and (name := self.markers.lost(time.monotonic())):
                 raise Stop(Cause.MARKERS_LOST, f"marker {name!r} is lost")
 

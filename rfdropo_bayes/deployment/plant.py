@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib
 import multiprocessing
-import time
+import os
+import sys
 from collections.abc import Mapping
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, Protocol
@@ -12,8 +13,11 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Float
 
+from rfdropo_bayes.deployment.clock import PLANT_PRIORITY, schedule_fifo, steady_interpreter
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
+
+START = 300.0  # [s]: a plant may compile itself first
 
 
 class PlantState(NamedTuple):
@@ -35,8 +39,11 @@ class Plant(Protocol):
         """Let time pass.
 
         Args:
-            length: cable wound up by each drum [m], pull > 0.
-            duration: time since the last call [s].
+            length: cable wound up by each drum at the end of that time [m], pull > 0.
+            duration: time since the last call [s]; 0 at the first, which starts at rest with these lengths.
+
+        Raises:
+            InputError: if it has no state at the end.
         """
         ...
 
@@ -87,6 +94,27 @@ def build_plant(name: str, robot: Robot, settings: Mapping[str, Any] | None = No
         ) from None
 
 
+class PlantHere:
+    """A plant in this process.
+
+    Args:
+        plant: that is asked.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant = plant
+        self._state: PlantState | None = None
+
+    def request(self, length: Float[np.ndarray, " channel"], duration: float) -> None:
+        """Let time pass, until the drums have reached these lengths [m]."""
+        self._state = self._plant.advance(length, duration)
+
+    def newest(self) -> PlantState:
+        """State at the end of the last request."""
+        assert self._state is not None
+        return self._state
+
+
 class PlantProcess:
     """A plant in a process of its own, which drives never wait for: they get the newest state that it has sent.
 
@@ -107,15 +135,20 @@ class PlantProcess:
         channels = len(robot.channel_names)
         self._state = PlantState(np.zeros(channels), robot.marker_points())
         self._sent, self._answered = 0.0, 0.0
-        if not self._pipe.poll(60.0):
+        if not self._pipe.poll(START):
             self.close()
-            raise InputError("did not start within 60 s", where=f"plant {name}", remedy="try it in this process")
+            raise InputError(
+                f"did not start within {START:g} s", where=f"plant {name}", remedy="try it in this process"
+            )
         self._receive()
 
-    def advance(self, length: Float[np.ndarray, " channel"], duration: float) -> PlantState:
-        """Send the lengths; return the newest state there is."""
+    def request(self, length: Float[np.ndarray, " channel"], duration: float) -> None:
+        """Let time pass, until the drums have reached these lengths [m]; returns at once."""
         self._sent += duration
         self._pipe.send((self._sent, np.asarray(length)))
+
+    def newest(self) -> PlantState:
+        """The newest state there is."""
         while self._pipe.poll():
             self._receive()
         return self._state
@@ -148,15 +181,18 @@ def _serve(pipe: Connection, name: str, robot: dict[str, Any], settings: dict[st
     try:
         plant = build_plant(name, Robot.model_validate(robot), settings)
         length = np.zeros(len(robot["channels"]["names"]))
-        pipe.send((0.0, plant.advance(length, 0.0)))
+        state = plant.advance(length, 0.0)
+        for thread in os.listdir("/proc/self/task") if sys.platform == "linux" else ():  # numerical libraries have some
+            schedule_fifo(int(thread), PLANT_PRIORITY)
+        pipe.send((0.0, state))
         reached = 0.0
-        while True:
-            instant, length = pipe.recv()
-            while pipe.poll():
+        with steady_interpreter():
+            while True:
                 instant, length = pipe.recv()
-            pipe.send((instant, plant.advance(length, instant - reached)))
-            reached = instant
-            time.sleep(0.0)
+                while pipe.poll():
+                    instant, length = pipe.recv()
+                pipe.send((instant, plant.advance(length, instant - reached)))
+                reached = instant
     except (EOFError, ConnectionError, KeyboardInterrupt):
         return
     except InputError as error:

@@ -137,7 +137,8 @@ class SimulatedMarkers:
             if len(data) == size and data[:4] == MAGIC:
                 position = np.frombuffer(data, dtype="<f8", offset=DATAGRAM.size).reshape(-1, 3).copy()
                 seen = np.all(np.isfinite(position), axis=1)
-                self._sighting = Sighting(DATAGRAM.unpack_from(data)[1], time.monotonic(), position, seen)
+                _, number, instant = DATAGRAM.unpack_from(data)  # of this machine's clock: the simulation runs here
+                self._sighting = Sighting(number, instant, position, seen)
 
     def close(self) -> None:
         """Close the socket."""
@@ -266,6 +267,7 @@ class MarkerView:
         self.position = np.zeros((len(names), 3))
         self.moved = np.zeros((len(names), 3))  # between the last two acts
         self.fresh = np.zeros(len(names), dtype=bool)
+        self.instant = 0.0  # of the newest frame [s, monotonic]
         self._last = np.full(len(names), -np.inf)  # time of the last good position
         self._number = 0
         self._acted: np.ndarray | None = None
@@ -274,7 +276,7 @@ class MarkerView:
         """Look at the sensor once a cycle."""
         sighting = self._sensor.latest()
         new = sighting.number != self._number and now - sighting.time <= self._table.stale_s
-        self._number = sighting.number
+        self._number, self.instant = sighting.number, sighting.time
         self.fresh = sighting.seen & new & np.all(np.isfinite(sighting.position), axis=1)
         self.position[self.fresh] = sighting.position[self.fresh]
         self._last[self.fresh] = sighting.time

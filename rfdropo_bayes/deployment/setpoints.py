@@ -48,13 +48,13 @@ class SetPoints:
             ramp: where it should be at the next cycle on its way there [m]; the goal itself by default.
             rate_limit: slower than the motors' own [m/s].
         """
-        wanted = ((goal if ramp is None else ramp) - self.length) / self.period
-        distance = goal - self.length
-        stopping = self._stopping_rate(np.abs(distance))
+        ramp = goal if ramp is None else ramp  # ramps that overlap may pass the goal, and come back
         fastest = np.minimum(self.rate_limit, rate_limit)
-        upper = np.minimum(fastest, np.where(distance > 0.0, stopping, 0.0))
-        lower = -np.minimum(fastest, np.where(distance < 0.0, stopping, 0.0))
-        return self._step(np.clip(wanted, lower, upper))
+        above = np.maximum(0.0, np.maximum(goal, ramp) - self.length)
+        below = np.maximum(0.0, self.length - np.minimum(goal, ramp))
+        upper = np.minimum(fastest, self._stopping_rate(above))
+        lower = -np.minimum(fastest, self._stopping_rate(below))
+        return self._step(np.clip((ramp - self.length) / self.period, lower, upper))
 
     def _stopping_rate(self, distance: Float[np.ndarray, " motor"]) -> Float[np.ndarray, " motor"]:
         """Largest rate from which steps of the acceleration limit still end within a distance, this step included.

@@ -137,7 +137,7 @@ class SimulationSettings(_Table):
 
     Attributes:
         plant: "springs", or MODULE:CALLABLE.
-        settings: of the plant.
+        settings: of the plant; a name that ends in .toml is a file.
         own_process: whether the plant runs in a process of its own.
     """
 
@@ -201,6 +201,9 @@ def _resolved(settings: Deployment, base: Path) -> dict[str, object]:
     if settings.policy is not None:
         found["policy"] = settings.policy.model_copy(update={"file": str(base / settings.policy.file)})
     found["drives"] = settings.drives.model_copy(update={"eds": str(base / settings.drives.eds)})
+    plant = settings.simulation.settings
+    files = {key: str(base / name) for key, name in plant.items() if str(name).endswith(".toml")}
+    found["simulation"] = settings.simulation.model_copy(update={"settings": plant | files})
     if settings.homing.file is not None:
         found["homing"] = settings.homing.model_copy(update={"file": str(base / settings.homing.file)})
     return found

@@ -351,11 +351,7 @@ class SimulatedDrive:
                 self.target = self.demand = round(self.position)
 
     def _follow(self, duration: float, now: float) -> None:
-        low, high = self.value(Object.POSITION_LIMIT, 1), self.value(Object.POSITION_LIMIT, 2)
-        self.demand = min(max(self.target, low), high)
-        wanted = (self.demand - self.position) * -math.expm1(-duration / _LAG)
-        largest = self.value(Object.MAX_MOTOR_SPEED) / 60.0 * self.counts_per_turn * duration
-        step = 0.0 if self.fault is SimulatedFault.JAMMED else min(max(wanted, -largest), largest)
+        step = self._step(duration)
         self.position += step
         self.velocity = step / duration
         if abs(self.demand - self.position) > self.value(Object.FOLLOWING_WINDOW):
@@ -364,6 +360,27 @@ class SimulatedDrive:
                 self._fail(EmergencyCode.FOLLOWING_ERROR)
         else:
             self._error_since = None
+
+    def _step(self, duration: float) -> float:
+        """Counts that a following drive covers in this time, towards the target within the drive's limits."""
+        low, high = self.value(Object.POSITION_LIMIT, 1), self.value(Object.POSITION_LIMIT, 2)
+        self.demand = min(max(self.target, low), high)
+        if self.fault is SimulatedFault.JAMMED:
+            return 0.0
+        wanted = (self.demand - self.position) * -math.expm1(-duration / _LAG)
+        largest = self.value(Object.MAX_MOTOR_SPEED) / 60.0 * self.counts_per_turn * duration
+        return min(max(wanted, -largest), largest)
+
+    def ahead(self, duration: float) -> float:
+        """Counts where it will stand after this time, if no set-point comes before."""
+        following = self.state is State.OPERATION_ENABLED
+        return self.position + (self._step(duration) if following else 0.0)
+
+    @property
+    def interpolation_time(self) -> float:
+        """Time from one SYNC to the next, by object 0x60C2 [s]."""
+        exponent = self.value(Object.INTERPOLATION_TIME, 2)
+        return float(self.value(Object.INTERPOLATION_TIME, 1) * 10.0**exponent)
 
     counts_per_turn = 2048.0
     """Of the encoder, per turn of the motor; the speed limit 0x6080 is in turns."""

@@ -26,13 +26,13 @@ from rfdropo_bayes.deployment.bus import BusTable, open_bus
 from rfdropo_bayes.deployment.clock import schedule_fifo, steady_interpreter
 from rfdropo_bayes.deployment.hub import Hub
 from rfdropo_bayes.deployment.objects import Object
-from rfdropo_bayes.deployment.plant import Plant, PlantProcess, build_plant
+from rfdropo_bayes.deployment.plant import START, PlantHere, PlantProcess, build_plant
 from rfdropo_bayes.deployment.simulated_drive import SimulatedDrive
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot, load_robot
 
 TICK = 0.002  # [s]: drives check their guards and move between frames
-PLANT_PERIOD = 0.01  # [s]: how often plant and markers are brought up to date
+PLANT_PERIOD = 0.01  # [s]: how often plant and markers are brought up to date where no SYNC comes
 DATAGRAM = struct.Struct("<4sId")
 MAGIC = b"RFMK"
 
@@ -65,17 +65,22 @@ class SimulationTable(NamedTuple):
 
 
 class SimulatedDrives:
-    """All drives of a robot on one bus, fed by one thread."""
+    """All drives of a robot on one bus, fed by one thread.
 
-    def __init__(self, robot: Robot, table: SimulationTable, bus: can.BusABC, plant: Plant) -> None:
+    The plant is computed while the time from one SYNC to the next passes, with the drives where they will be then:
+    status, tensions and markers of a cycle belong to one instant.
+    """
+
+    def __init__(self, robot: Robot, table: SimulationTable, bus: can.BusABC, plant: PlantHere | PlantProcess) -> None:
         if not robot.motors:
             raise InputError("has no motors", where=f"robot {robot.name}", remedy="add [[motors]], one per channel")
         self.robot, self._bus, self._plant = robot, bus, plant
         self._zero = [motor.offset_counts + table.encoder_offset for motor in robot.motors]
         self.drives = [self._drive(index, table) for index in range(len(robot.motors))]
         self._markers = _marker_socket(table.markers)
-        self._next_plant = time.monotonic()
-        self.state = plant.advance(self.lengths(), 0.0)
+        self._next_plant = self._reached = time.monotonic()
+        plant.request(self.lengths(), 0.0)
+        self.state = plant.newest()
         self._frame = 0
 
     def _drive(self, index: int, table: SimulationTable) -> SimulatedDrive:
@@ -86,10 +91,10 @@ class SimulatedDrives:
         drive.counts_per_turn = motor.counts_per_turn
         return drive
 
-    def lengths(self) -> np.ndarray:
-        """Cable on each drum [m]."""
+    def lengths(self, ahead: float = 0.0) -> np.ndarray:
+        """Cable on each drum [m], now or a time ahead [s]."""
         rows = zip(self.robot.motors, self.drives, self._zero, strict=True)
-        return np.array([motor.length(drive.position, zero) for motor, drive, zero in rows])
+        return np.array([motor.length(drive.ahead(ahead), zero) for motor, drive, zero in rows])
 
     def _send(self, identifier: int, data: bytes) -> None:
         self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
@@ -102,25 +107,45 @@ class SimulatedDrives:
             message = self._bus.recv(max(0.0, due - now))
             now = time.monotonic()
             if message is not None and not (message.is_remote_frame or message.is_error_frame):
+                beat = message.arbitration_id == objects.SYNC
+                if beat:
+                    self._show(now)
                 for drive in self.drives:
                     drive.receive(message.arbitration_id, bytes(message.data), now)
+                if beat:
+                    period = self.drives[0].interpolation_time or PLANT_PERIOD
+                    self._next_plant = now + 2.5 * period
+                    self._request(now, period)
             if now >= due:
                 due = max(due + TICK, now)
                 self.tick(now)
 
     def tick(self, now: float) -> None:
-        """Let time pass for the drives, and every so often for the plant."""
+        """Let time pass for the drives, and for the plant where no SYNC leads it."""
         for drive in self.drives:
             drive.tick(now)
         if now < self._next_plant:
             return
         self._next_plant = max(self._next_plant + PLANT_PERIOD, now)
-        self.state = self._plant.advance(self.lengths(), PLANT_PERIOD)
+        self._show(now)
+        self._request(now, 0.0)
+
+    def _request(self, now: float, ahead: float) -> None:
+        """Ask the plant for its state at a time ahead of now."""
+        duration = now + ahead - self._reached
+        if duration > 0.0:
+            self._plant.request(self.lengths(ahead), duration)
+            self._reached = now + ahead
+
+    def _show(self, now: float) -> None:
+        """Torques and markers as the plant has them by now."""
+        self.state = self._plant.newest()
         for motor, drive, tension in zip(self.robot.motors, self.drives, self.state.tension, strict=True):
             drive.torque = motor.sign * motor.per_mille(float(tension))
         if self._markers is not None:
             self._frame += 1
-            header = DATAGRAM.pack(MAGIC, self._frame, now)
+            late = self._plant.late if isinstance(self._plant, PlantProcess) else 0.0
+            header = DATAGRAM.pack(MAGIC, self._frame, now - late)
             with contextlib.suppress(OSError):  # nobody listens
                 self._markers.send(header + np.asarray(self.state.position, dtype="<f8").tobytes())
 
@@ -160,9 +185,9 @@ def serve(table: SimulationTable, ready: Path | None = None) -> None:
         if table.own_process:
             process = PlantProcess(table.plant, robot, table.settings)
             stack.callback(process.close)
-            plant: Plant = process
+            plant: PlantHere | PlantProcess = process
         else:
-            plant = build_plant(table.plant, robot, table.settings)
+            plant = PlantHere(build_plant(table.plant, robot, table.settings))
         drives = SimulatedDrives(robot, table, bus, plant)
         schedule_fifo()
         if ready is not None:
@@ -197,7 +222,7 @@ def run_hub(channel: str) -> None:
 
 
 @contextlib.contextmanager
-def simulated_drives(table: SimulationTable, patience: float = 60.0) -> Iterator[BusTable]:
+def simulated_drives(table: SimulationTable, patience: float = START) -> Iterator[BusTable]:
     """The drives in a process of their own; yields the bus to find them on.
 
     Raises:

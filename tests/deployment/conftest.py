@@ -14,7 +14,7 @@ from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork
 from rfdropo_bayes.deployment.drives import Drive, Drives, Guards
 from rfdropo_bayes.deployment.hub import Hub, HubBus
-from rfdropo_bayes.deployment.plant import SpringCables
+from rfdropo_bayes.deployment.plant import PlantHere, SpringCables
 from rfdropo_bayes.deployment.simulation import SimulatedDrives, SimulationTable
 from rfdropo_bayes.robots import Robot, load_robot
 
@@ -28,7 +28,8 @@ class Rig:
         self.robot, self.channel = robot, channel
         bus = BusTable(interface="hub", channel=channel)
         self._bus = HubBus(channel)
-        self.simulated = SimulatedDrives(robot, SimulationTable(ROBOT, bus, **table), self._bus, SpringCables(robot))
+        plant = PlantHere(SpringCables(robot))
+        self.simulated = SimulatedDrives(robot, SimulationTable(ROBOT, bus, **table), self._bus, plant)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()

@@ -156,12 +156,12 @@ def test_a_plant_in_its_own_process_gives_the_same(robot: Robot) -> None:
     plant = PlantProcess("springs", robot, {"stiffness": 100.0, "pretension": 1.0})
     length = np.array([0.01, 0.0, 0.0, 0.0])
     end = time.monotonic() + 10.0
-    while plant.advance(length, 0.01).tension[0] != 2.0:
+    plant.request(length, 0.01)
+    while plant.newest().tension[0] != 2.0:
         assert time.monotonic() < end
         time.sleep(0.005)
-    np.testing.assert_allclose(
-        plant.advance(length, 0.0).position, build_plant("springs", robot).advance(length, 0.0).position
-    )
+    assert plant.late == 0.0
+    np.testing.assert_allclose(plant.newest().position, build_plant("springs", robot).advance(length, 0.0).position)
     plant.close()
 
 

@@ -92,8 +92,9 @@ def test_the_log_is_a_recording_of_what_the_policy_did(dry_run, robot: Robot) ->
     length = recording.motor_angle * np.array([motor.drum_radius_m for motor in robot.motors])
     assert np.abs(recording.command).max() > 0.003
     assert np.abs(length).max() > 0.003
-    # 20 ms of delay between the drives and the plant, at 50 mm/s and 300 N/m
-    np.testing.assert_allclose(recording.tension, np.maximum(0.0, 3.0 + 300.0 * length), atol=0.4)
+    # One per mille of torque is 0.03 N; a cycle that comes 0.5 ms early or late adds 0.01 N at 50 mm/s and 300 N/m.
+    apart = np.abs(recording.tension - np.maximum(0.0, 3.0 + 300.0 * length))
+    assert np.percentile(apart, 90) < 0.05
     model = recording.command_at(recording.time - 0.1)
     assert np.corrcoef(model[:, 0], length[:, 0])[0, 1] > 0.9
 
