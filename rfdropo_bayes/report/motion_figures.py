@@ -45,7 +45,7 @@ def _frame(motion: Motion) -> tuple[Figure, Axes, dict[str, Axes]]:
     if motion.plate is not None:
         low[2] = min(low[2], MILLIMETRES * motion.plate - 5.0)
     space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    space.set_box_aspect(high - low)
+    space.set_box_aspect(high - low, zoom=0.87)  # room for the labels of the axes
     space.view_init(elev=22, azim=-60)
     space.set(xlabel=AXES[0], ylabel=AXES[1], zlabel=AXES[2])
     for axis, extent in zip((space.xaxis, space.yaxis, space.zaxis), high - low, strict=True):
