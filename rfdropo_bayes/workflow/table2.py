@@ -191,10 +191,11 @@ def has_cube(tables: Mapping[str, Any]) -> bool:
 
 def _do(study: Study, task: str, row: str, seed: int) -> None:
     """Fit, training and evaluation of a cell, as far as they are not done."""
+    done = _cell(study, task, row, seed)
+    if done is not None and done["steps"] >= study.size.steps:
+        return
     policy = _trained(study, task, row, seed)
     out = _place(study, task, "evaluations", row, seed)
-    if run_ended(out) and _cell(study, task, row, seed) is not None:
-        return
     tables = _on_target(study, _tables(study, task))
     path = _written(tables, study.out / task / "experiments" / "target.toml")
     run_evaluation(path, [policy], out, episodes=study.size.episodes, film=seed == 0, overwrite=True)
