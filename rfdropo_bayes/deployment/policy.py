@@ -66,6 +66,12 @@ class CommandSource(Protocol):
         """
         ...
 
+    def rehearse(self) -> None:
+        """Do the work of an act, to no effect, shortly before it: then code and weights are in the caches.
+
+        Others use the processor between two acts. A policy of 128 x 128 takes 0.35 ms from memory, 0.06 ms from caches.
+        """
+
 
 class OnnxPolicy:
     """A policy from an ONNX file, as `rfdropo train` exports it.
@@ -111,6 +117,11 @@ class OnnxPolicy:
         self._low, self._high = np.array(self.layout.low), np.array(self.layout.high)
         self._input = self._session.get_inputs()[0]
         self._check_shapes(where)
+        self._last = np.zeros(self.layout.size, dtype=np.float32)
+
+    def rehearse(self) -> None:
+        """Run the network on what was seen last; see `CommandSource.rehearse`."""
+        self._run(self._last)
 
     def act(self, scene: Scene) -> Act:
         """Run the network: what it gives is the change of the command, which the layout's limits end.
@@ -121,6 +132,7 @@ class OnnxPolicy:
         observation = self._observe(scene)
         if not np.all(np.isfinite(observation)):
             raise Stop(Cause.MARKERS_LOST, "the observation is not finite")
+        self._last = observation
         raw = self._run(observation)
         if not np.all(np.isfinite(raw)):
             raise Stop(Cause.ACTION_NOT_FINITE, f"the policy's output is {raw.tolist()}")
@@ -262,6 +274,9 @@ class RecordedCommands:
         commands = np.concatenate([recording.initial_command[None], recording.command])
         self._commands = np.repeat(commands, np.append(before, periods), axis=0)
         self._next = 0
+
+    def rehearse(self) -> None:
+        """Nothing to prepare."""
 
     def act(self, scene: Scene) -> Act | None:
         """The command in force at the next instant of the recording."""
