@@ -386,6 +386,7 @@ def _run_session(name: str, case: Case, channel: str, port: int, folder: Path, o
     finally:
         process.kill()
         process.wait()
+        process.stdout.close()
     observer.begin()
     time.sleep(0.3)
     return fault

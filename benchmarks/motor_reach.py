@@ -4,8 +4,8 @@
 
 Every episode is a session of `rfdropo deploy --mode dry-run` in real time: 100 actions from rest, drives, hub and trunk
 in processes of their own that outlive it. Goals are drawn from the task's box. The simulation has the trunk's own
-parameters and plays the same goals as `rfdropo evaluate` does, without drives and their delays. An episode succeeds where
-its last distance is within a threshold; intervals are Wilson's, at 95 %.
+parameters and plays the same goals as `rfdropo evaluate` does, without drives and their delays. An episode succeeds
+where its last distance is within a threshold; intervals are Wilson's, at 95 %.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ import json
 import os
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -89,10 +90,10 @@ class TimedDrives(Drives):
 
     times: ClassVar[list[float]] = []
 
-    def exchange(self, timeout: float) -> bool:
+    def exchange(self, timeout: float, meanwhile: Callable[[], None] | None = None) -> bool:
         """As ever, timed."""
         start = time.monotonic()
-        complete = super().exchange(timeout)
+        complete = super().exchange(timeout, meanwhile)
         self.times.append(time.monotonic() - start)
         return complete
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -60,13 +61,16 @@ class FrameLog(can.Listener):
 
     def __init__(self, path: Path) -> None:
         self._writer = can.Logger(str(path))
+        self._waiting: deque[can.Message] = deque()
 
     def on_message_received(self, msg: can.Message) -> None:
-        """Write a frame."""
-        self._writer.on_message_received(msg)
+        """Keep a frame for the next `flush`: whoever has sent or received it must not wait for a disk."""
+        self._waiting.append(msg)
 
     def flush(self) -> None:
-        """Hand what is written to the operating system."""
+        """Write the frames, and hand them to the operating system."""
+        while self._waiting:
+            self._writer.on_message_received(self._waiting.popleft())
         file = getattr(self._writer, "file", None)
         if file is not None:
             with contextlib.suppress(ValueError):  # closed meanwhile
@@ -74,6 +78,7 @@ class FrameLog(can.Listener):
 
     def stop(self) -> None:
         """Close the file."""
+        self.flush()
         self._writer.stop()
 
 

@@ -245,7 +245,10 @@ class Drive:
         for index, subindex, value in self._settings(period, guards):
             if self.knows(index, subindex):
                 self.write(index, value, subindex)
-        if (mode := self.read(Object.MODE_DISPLAY)) != CYCLIC_SYNCHRONOUS_POSITION:
+        end = time.monotonic() + _MODE_TIME
+        while (mode := self.read(Object.MODE_DISPLAY)) != CYCLIC_SYNCHRONOUS_POSITION and time.monotonic() < end:
+            time.sleep(0.005)
+        if mode != CYCLIC_SYNCHRONOUS_POSITION:
             raise InputError(
                 f"stays in mode {mode}", where=f"{self.name}, object 0x6061", remedy="look into its manual"
             )
@@ -298,6 +301,8 @@ class Drive:
         try:
             with self._sdo:
                 pdo.read()
+                # Off under its own identifier first: only an invalid PDO may change it.
+                pdo.com_record[1].raw = pdo.com_record[1].raw | objects.PDO_INVALID
                 pdo.clear()
                 for index, subindex, bits in wanted:
                     if pdo.add_variable(index, subindex, bits) is None:
@@ -405,11 +410,12 @@ class Drives:
                 )
             time.sleep(0.005)
 
-    def exchange(self, timeout: float) -> bool:
+    def exchange(self, timeout: float, meanwhile: Callable[[], None] | None = None) -> bool:
         """One cycle: set-points, SYNC, heartbeat; then wait for the answers.
 
         Args:
             timeout: how long to wait [s].
+            meanwhile: what is done before the wait.
 
         Returns:
             Whether every drive has answered in time.
@@ -428,6 +434,8 @@ class Drives:
             self._complete.clear()
             self.network.send_message(objects.SYNC, b"")
         self.send_heartbeat()
+        if meanwhile is not None:
+            meanwhile()
         complete = self._complete.wait(timeout)
         for drive in self.all:
             drive.unanswered = drive.unanswered + 1 if drive.motor.node in self._awaited else 0
@@ -485,5 +493,6 @@ class Drives:
         self.emergencies.append(Emergency(time.monotonic(), channel, code, register))
 
 
+_MODE_TIME = 0.2  # [s]: a drive may take some cycles of its own to change its mode
 _EDS_REMEDY = "give the data sheet that came with this drive"
 _SDO_REMEDY = "check power, node number, bit rate and termination; `rfdropo doctor` lists who answers"

@@ -1,8 +1,8 @@
 """The log of a session: a journal of every cycle that a crash cannot take back, and the recording made of it.
 
-Each cycle is one fixed-size record, handed to the operating system at once: if the program is killed, nothing is lost,
-and if the machine loses power, at most the last second. `session.nc` is written from the journal at the end, or after a
-crash.
+Each cycle is one fixed-size record. A thread hands them to the operating system, since a write may wait for the disk:
+if the program is killed, some hundredths of a second are lost, and if the machine loses power, at most the last second.
+`session.nc` is written from the journal at the end, or after a crash.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import json
 import os
 import threading
 import time
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from rfdropo_bayes.robots import Robot
 JOURNAL, EVENTS, SESSION, FRAMES, SUMMARY = "cycles.bin", "log.jsonl", "session.nc", "frames.log", "summary.json"
 FORMAT = "drive-session"
 SCHEMA_VERSION = 2
+_WRITE = 0.02  # [s]: how often what is waiting is written
 _SYNC = 1.0  # [s]: how often the disk is told to keep what it has
 _HEADER = 4096  # [bytes]
 
@@ -94,36 +96,51 @@ class SessionLog:
         os.write(self._journal, str(size).encode().rjust(8) + text.ljust(size - 8))
         self.record = np.zeros((), record_type(len(robot.channel_names), len(robot.marker_names)))
         self.frames = FrameLog(self.folder / frames)
+        self._records: deque[bytes] = deque()
+        self._lines: deque[str] = deque()
         self._closed, self._writing = threading.Event(), threading.Lock()
-        self._keeper = threading.Thread(target=self._keep, name="log", daemon=True)
-        self._keeper.start()
+        repeated = {"log": (self.flush, _WRITE), "log to disk": (self._sync, _SYNC)}
+        self._threads = [
+            threading.Thread(target=self._repeat, args=what, name=name, daemon=True) for name, what in repeated.items()
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def write(self) -> None:
         """Add ``record`` as it stands."""
-        os.write(self._journal, self.record.tobytes())
+        self._records.append(self.record.tobytes())
 
     def event(self, kind: str, text: str, **more: Any) -> None:
         """Add a line to log.jsonl."""
         line = {"time": time.time(), "monotonic": time.monotonic(), "event": kind, "text": text} | more
-        with self._writing:
-            self._events.write(json.dumps(line) + "\n")
-            self._events.flush()
+        self._lines.append(json.dumps(line) + "\n")
 
     def close(self) -> None:
         """End the journal."""
         self._closed.set()
-        self._keeper.join()
+        for thread in self._threads:
+            thread.join()
+        self.flush()
         self._sync()
         self.frames.stop()
         os.close(self._journal)
         self._events.close()
 
-    def _keep(self) -> None:
-        while not self._closed.wait(_SYNC):
-            self._sync()
+    def _repeat(self, what: Callable[[], None], period: float) -> None:
+        while not self._closed.wait(period):
+            what()
+
+    def flush(self) -> None:
+        """Hand everything to the operating system; not for the thread that writes."""
+        with self._writing:
+            while self._records:
+                os.write(self._journal, self._records.popleft())
+            while self._lines:
+                self._events.write(self._lines.popleft())
+            self._events.flush()
+            self.frames.flush()
 
     def _sync(self) -> None:
-        self.frames.flush()
         with contextlib.suppress(OSError):  # a full disk must not stop a robot in motion; the next write says it
             os.fsync(self._journal)
             os.fsync(self._events.fileno())

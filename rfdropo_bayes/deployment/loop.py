@@ -103,8 +103,13 @@ class ControlLoop:
 
     # One cycle
 
-    def cycle(self, phase: Phase, acted: bool = False) -> Tick:
+    def cycle(self, phase: Phase, acted: bool = False, meanwhile: Callable[[], None] | None = None) -> Tick:
         """Wait for the beat; send set-points; take in status and markers; look at both; log.
+
+        Args:
+            phase: for the log.
+            acted: whether a command comes into force.
+            meanwhile: what is done while the drives answer.
 
         Raises:
             Stop: if this cycle must be the last of its phase.
@@ -122,7 +127,7 @@ class ControlLoop:
             elif drive.reading is not None:
                 drive.target = drive.reading.position  # a drive must find itself where it is when it is enabled
         try:
-            self.drives.exchange(_ANSWER * self.period)
+            self.drives.exchange(_ANSWER * self.period, meanwhile)
         except can.CanError as error:
             raise Stop(Cause.SEND_ERROR, str(error)) from None
         self.markers.update(self.pulse)
@@ -246,6 +251,7 @@ class ControlLoop:
         steps = max(1, round(self.robot.command.ramp_s / self.period))
         changes: deque[tuple[int, np.ndarray]] = deque(maxlen=1 + steps // cycles)
         last = round(duration / self.period)
+        source.rehearse()
         for number in count():
             self._left = max(0.0, duration - number * self.period)
             acting = number < last and number % cycles == 0
@@ -261,7 +267,7 @@ class ControlLoop:
             shares = [(max(0.0, 1.0 - (number + 1 - given) / steps), change) for given, change in changes]
             ramp = self.command - sum((share * change for share, change in shares), np.zeros(len(self.command)))
             self.set_points.towards(self._without_slack(self.command), self._without_slack(ramp))
-            self.cycle(phase, acting)
+            self.cycle(phase, acting, source.rehearse if (number + 1) % cycles == 0 else None)
             if source.sees_markers and (name := self.markers.lost(time.monotonic())):
                 raise Stop(Cause.MARKERS_LOST, f"marker {name!r} is lost")
 

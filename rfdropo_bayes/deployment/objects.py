@@ -20,6 +20,7 @@ class Object(IntEnum):
     CONSUMER_HEARTBEAT = 0x1016  # node << 16 | ms
     PRODUCER_HEARTBEAT = 0x1017  # [ms]
     IDENTITY = 0x1018
+    ERROR_BEHAVIOUR = 0x1029  # :1, where communication fails: 0 PRE-OPERATIONAL, 1 none, 2 STOPPED
     RPDO = 0x1400
     RPDO_MAP = 0x1600
     TPDO = 0x1800

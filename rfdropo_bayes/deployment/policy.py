@@ -8,7 +8,7 @@ policy is refused unless its layout fits the robot and the session to the letter
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -66,6 +66,12 @@ class CommandSource(Protocol):
         """
         ...
 
+    def rehearse(self) -> None:
+        """Do the work of an act, to no effect, shortly before it: then code and weights are in the caches.
+
+        Others use the processor between two acts. A policy of 128 x 128 takes 0.35 ms from memory, 0.06 ms from caches.
+        """
+
 
 class OnnxPolicy:
     """A policy from an ONNX file, as `rfdropo train` exports it.
@@ -111,6 +117,13 @@ class OnnxPolicy:
         self._low, self._high = np.array(self.layout.low), np.array(self.layout.high)
         self._input = self._session.get_inputs()[0]
         self._check_shapes(where)
+        self._run = _bound(self._session, self.layout.size, len(self._reach))
+        nowhere, still = np.zeros((len(robot.marker_names), 3)), np.zeros(len(robot.channel_names))
+        self._last = Scene(nowhere, nowhere, still, still, still)
+
+    def rehearse(self) -> None:
+        """Look at the last scene again; see `CommandSource.rehearse`."""
+        self._answer(self._last)
 
     def act(self, scene: Scene) -> Act:
         """Run the network: what it gives is the change of the command, which the layout's limits end.
@@ -118,10 +131,10 @@ class OnnxPolicy:
         Raises:
             Stop: if its output is not finite, or more than any of its actions.
         """
-        observation = self._observe(scene)
+        self._last = scene
+        observation, raw = self._answer(scene)
         if not np.all(np.isfinite(observation)):
             raise Stop(Cause.MARKERS_LOST, "the observation is not finite")
-        raw = self._run(observation)
         if not np.all(np.isfinite(raw)):
             raise Stop(Cause.ACTION_NOT_FINITE, f"the policy's output is {raw.tolist()}")
         if np.any(np.abs(raw) > self._reach * (1.0 + 1e-4)):  # single precision
@@ -139,12 +152,13 @@ class OnnxPolicy:
         }
         return self.layout.assemble(parts)
 
-    def _run(self, observation: Float[np.ndarray, " feature"]) -> Float[np.ndarray, " channel"]:
+    def _answer(self, scene: Scene) -> tuple[Float[np.ndarray, " feature"], Float[np.ndarray, " channel"]]:
+        """Observation, and what the network makes of it."""
+        observation = self._observe(scene)
         try:
-            answer = self._session.run(["action"], {self._input.name: observation[None]})[0]
+            return observation, self._run(observation)
         except Exception as error:  # onnxruntime raises many types, none of them documented
             raise Stop(Cause.POLICY_FAILED, f"{type(error).__name__}: {error}") from None
-        return np.asarray(answer, dtype=float).reshape(-1)
 
     def _check_shapes(self, where: str) -> None:
         wanted, kind = self.layout.size, self._input.type
@@ -156,9 +170,27 @@ class OnnxPolicy:
                 where=where,
                 remedy="export it again with its layout",
             )
-        given = self._run(np.zeros(wanted, dtype=np.float32))
-        if given.shape != (len(self._reach),):
-            raise InputError(f"gives {given.size} values for {len(self._reach)} channels", where=where)
+        given = self._session.run(["action"], {self._input.name: np.zeros((1, wanted), np.float32)})[0]
+        if np.size(given) != len(self._reach):
+            raise InputError(f"gives {np.size(given)} values for {len(self._reach)} channels", where=where)
+
+
+def _bound(session: Any, size: int, channels: int) -> Callable[[np.ndarray], Float[np.ndarray, " channel"]]:
+    """A network whose input and output stay where they are in memory, from observation to output."""
+    import onnxruntime
+
+    seen, given = np.zeros((1, size), np.float32), np.zeros((1, channels), np.float32)
+    binding = session.io_binding()
+    kept = onnxruntime.OrtValue.ortvalue_from_numpy(seen), onnxruntime.OrtValue.ortvalue_from_numpy(given)
+    binding.bind_ortvalue_input(session.get_inputs()[0].name, kept[0])
+    binding.bind_ortvalue_output("action", kept[1])
+
+    def run(observation: np.ndarray) -> np.ndarray:
+        seen[0] = observation
+        session.run_with_iobinding(binding)
+        return given[0].astype(float)
+
+    return run
 
 
 def _markers_seen(robot: Robot, names: Sequence[str] | None) -> list[int]:
@@ -222,6 +254,7 @@ def _open(content: bytes, where: str) -> tuple[Any, PolicyLayout]:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # a pool of threads costs more than the network
     options.log_severity_level = 3
+    options.enable_cpu_mem_arena = options.enable_mem_pattern = False  # buffers of a small network are soon found
     try:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:
@@ -262,6 +295,9 @@ class RecordedCommands:
         commands = np.concatenate([recording.initial_command[None], recording.command])
         self._commands = np.repeat(commands, np.append(before, periods), axis=0)
         self._next = 0
+
+    def rehearse(self) -> None:
+        """Nothing to prepare."""
 
     def act(self, scene: Scene) -> Act | None:
         """The command in force at the next instant of the recording."""

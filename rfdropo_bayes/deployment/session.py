@@ -297,6 +297,7 @@ class _Session:
             self.log.event("homed", home.channel, offset_counts=home.offset_counts, tension_n=home.tension_n)
 
     def _outcome(self, stop: Stop, loop: ControlLoop | None) -> Outcome:
+        self.log.flush()
         figures = {} if loop is None else _figures(loop, self.period)
         if loop is not None:
             self._write_recording(stop)

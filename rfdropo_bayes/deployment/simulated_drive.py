@@ -1,6 +1,6 @@
 """A CiA 402 drive in software: object dictionary, process data applied on SYNC, guards, motion, faults on request.
 
-The object dictionary and the SDO server are canopen's `LocalNode`; everything that it lacks (PDOs linked to the
+The object dictionary and the SDO server are canopen's (`sdo_server`); everything that they lack (PDOs linked to the
 dictionary, NMT, SYNC, heartbeats both ways, emergencies) is here. One thread feeds it: `receive` for every frame,
 `tick` between.
 """
@@ -26,6 +26,7 @@ from rfdropo_bayes.deployment.cia402 import (
     obey,
 )
 from rfdropo_bayes.deployment.objects import EmergencyCode, Nmt, NmtState, Object
+from rfdropo_bayes.deployment.sdo_server import StrictNode
 
 
 class SimulatedFault(IntEnum):
@@ -46,6 +47,9 @@ _ABORT_PDO_ACTIVE = 0x08000022
 _ABORT_NOT_MAPPABLE = 0x06040041
 _ABORT_PDO_LENGTH = 0x06040042
 _ABORT_RANGE = 0x06090030
+_ABORT_HIGH = 0x06090031
+_ABORT_LOW = 0x06090032
+_EXTENDED = 1 << 29  # of an identifier: 29 bits, which this drive does not speak
 _LAG = 0.004  # [s]: time constant of a tuned position loop of 40 Hz
 _BOOT = 0.02  # [s]
 
@@ -82,7 +86,7 @@ class SimulatedDrive:
     # Communication
 
     def _power_on(self, now: float) -> None:
-        self.local = canopen.LocalNode(self.node, self._eds)
+        self.local = StrictNode(self.node, self._eds)
         self.local.sdo.network = _Sender(self._send)  # type: ignore[assignment]
         self.local._write_callbacks.clear()  # LocalNode's own heartbeat runs in a thread that one send error ends
         self.local.add_write_callback(self._check_write)
@@ -90,7 +94,7 @@ class SimulatedDrive:
         for (index, subindex), value in self._values.items():
             self.local.data_store.setdefault(index, {})[subindex] = self._variable(index, subindex).encode_raw(value)
         self.nmt, self.boot_at = NmtState.BOOT_UP, now + _BOOT
-        self.state, self.controlword, self.error_code = State.SWITCH_ON_DISABLED, 0, 0
+        self.state, self.controlword, self.error_code, self.error_field = State.SWITCH_ON_DISABLED, 0, 0, 0
         self.target = self.demand = round(self.position)
         self.fault = SimulatedFault.NONE
         self._settings: dict[tuple[int, int], int] = {}
@@ -100,6 +104,8 @@ class SimulatedDrive:
         self._next_heartbeat = now
         self._error_since: float | None = None
         self._last_status = b""
+        self._sent: dict[int, tuple[float, bytes]] = {}  # of each TPDO: when, and what
+        self._beats = 0
         self._time = now
 
     def receive(self, identifier: int, data: bytes, now: float) -> None:
@@ -132,6 +138,8 @@ class SimulatedDrive:
                 self._send(objects.HEARTBEAT + self.node, bytes([NmtState.BOOT_UP]))
             return
         self._check_guards(now)
+        if self.nmt is NmtState.OPERATIONAL:
+            self._on_event(now)
         period = 1e-3 * self.value(Object.PRODUCER_HEARTBEAT)
         if period and now >= self._next_heartbeat and self.fault is not SimulatedFault.NO_HEARTBEAT:
             self._next_heartbeat = max(self._next_heartbeat + period, now)
@@ -167,7 +175,11 @@ class SimulatedDrive:
             return
         if new is NmtState.STOPPED and self.nmt is not NmtState.STOPPED:
             self._connection_lost(EmergencyCode.NONE, now)
-        self.nmt, self._last_sync = new, math.inf
+        self._enter(new)
+
+    def _enter(self, state: NmtState) -> None:
+        self.nmt, self._last_sync, self._beats = state, math.inf, 0
+        self._sent.clear()
 
     def _cob(self, index: int) -> int | None:
         cob = self.value(index, 1)
@@ -213,50 +225,93 @@ class SimulatedDrive:
         for number, data in sorted(self._pending.items()):
             self._apply(number, data, now)
         self._pending.clear()
+        self._beats += 1
+        for number in (0, 1):
+            cob, kind = self._cob(Object.TPDO + number), self.value(Object.TPDO + number, 2)
+            if cob is None or kind > 240:
+                continue
+            data = self._collect(number)
+            if self._beats % kind == 0 if kind else self._sent.get(number, (0.0, b""))[1] != data:
+                self._transmit(number, cob, data, now)
+
+    def _on_event(self, now: float) -> None:
+        """Send TPDOs of types 254 and 255 whose content has changed, or whose timer has run out."""
         for number in (0, 1):
             cob = self._cob(Object.TPDO + number)
-            if cob is not None and 1 <= self.value(Object.TPDO + number, 2) <= 240:
-                self._transmit(number, cob)
+            if cob is None or self.value(Object.TPDO + number, 2) < 254:
+                continue
+            data = self._collect(number)
+            when, before = self._sent.get(number, (-math.inf, b""))
+            inhibited = now - when < 1e-4 * self.value(Object.TPDO + number, 3)
+            timer = 1e-3 * self.value(Object.TPDO + number, 5)
+            if not inhibited and (data != before or (timer and now - when >= timer)):
+                self._transmit(number, cob, data, now)
 
-    def _transmit(self, number: int, cob: int) -> None:
+    def _collect(self, number: int) -> bytes:
+        mapped = self._mapped(Object.TPDO_MAP + number)
+        return b"".join(self.local.get_data(index, subindex)[: bits // 8] for index, subindex, bits in mapped)
+
+    def _transmit(self, number: int, cob: int, data: bytes, now: float) -> None:
+        self._sent[number] = now, data
         if self.fault is SimulatedFault.NO_TPDO:
             return
-        mapped = self._mapped(Object.TPDO_MAP + number)
-        data = b"".join(self.local.get_data(index, subindex)[: bits // 8] for index, subindex, bits in mapped)
         if self.fault is SimulatedFault.FROZEN_STATUS and self._last_status:
             data = self._last_status
         self._last_status = data
         self._send(cob, data[:-1] if self.fault is SimulatedFault.SHORT_TPDO else data)
 
     def _emergency(self, code: int, detail: bytes = b"", register: int = 0x01) -> None:
-        self.error_code = int(code)
+        self.error_code = self.error_field = int(code)
         self._send(objects.EMCY + self.node, objects.EMERGENCY.pack(code, register, detail.ljust(5, b"\0")))
 
     # Object dictionary
 
     def _read(self, index: int, subindex: int, od: Any) -> int | None:
+        if (index, subindex) == (Object.ERROR_FIELD, 0):
+            return int(self.error_field != 0)
         return _LIVE[index](self) if index in _LIVE else None
 
     def _check_write(self, index: int, subindex: int, od: Any, data: bytes) -> None:
         value = int.from_bytes(data, "little")
+        if index == Object.ERROR_FIELD:
+            if value:
+                raise SdoAbortedError(_ABORT_RANGE)
+            self.error_field = 0
+        if index == Object.MODE and value not in (0, CYCLIC_SYNCHRONOUS_POSITION):
+            raise SdoAbortedError(_ABORT_RANGE)
         if Object.RPDO <= index < Object.RPDO + 2 or Object.TPDO <= index < Object.TPDO + 2:
             active = not self.value(index, 1) & objects.PDO_INVALID
             if subindex == 1 and active and not value & objects.PDO_INVALID and value != self.value(index, 1):
                 raise SdoAbortedError(_ABORT_RANGE)  # an identifier changes only while the PDO is off
+            if (subindex == 1 and value & _EXTENDED) or (subindex == 2 and 240 < value < 254):
+                raise SdoAbortedError(_ABORT_RANGE)
         for maps, comm in ((Object.RPDO_MAP, Object.RPDO), (Object.TPDO_MAP, Object.TPDO)):
             if maps <= index < maps + 2:
                 self._check_mapping(index, subindex, value, comm + index - maps)
-        if od.min is not None and od.max is not None and not od.min <= od.decode_raw(bytes(data)) <= od.max:
-            raise SdoAbortedError(_ABORT_RANGE)
+        if od.max is not None and od.decode_raw(bytes(data)) > od.max:
+            raise SdoAbortedError(_ABORT_HIGH)
+        if od.min is not None and od.decode_raw(bytes(data)) < od.min:
+            raise SdoAbortedError(_ABORT_LOW)
 
     def _check_mapping(self, index: int, subindex: int, value: int, comm: int) -> None:
         if not self.value(comm, 1) & objects.PDO_INVALID or (subindex and self.value(index, 0)):
             raise SdoAbortedError(_ABORT_PDO_ACTIVE)
         if subindex:
-            variable = self.local.object_dictionary.get_variable(value >> 16, value >> 8 & 0xFF)
-            if value and (variable is None or not variable.pdo_mappable or len(variable) != value & 0xFF):
+            variable = self.local.variable(value >> 16, value >> 8 & 0xFF) if value else None
+            received = comm < Object.TPDO
+            if variable is not None and not (
+                variable.pdo_mappable
+                and len(variable) == value & 0xFF
+                and (variable.writable if received else variable.readable)
+            ):
                 raise SdoAbortedError(_ABORT_NOT_MAPPABLE)
-        elif sum(self.value(index, number) & 0xFF for number in range(1, value + 1)) > 64:
+            return
+        if value > 8:
+            raise SdoAbortedError(_ABORT_HIGH)
+        bits = [self.value(index, number) & 0xFF for number in range(1, value + 1)]
+        if not all(bits):
+            raise SdoAbortedError(_ABORT_NOT_MAPPABLE)
+        if sum(bits) > 64:
             raise SdoAbortedError(_ABORT_PDO_LENGTH)
 
     def _after_write(self, now: float) -> None:
@@ -315,6 +370,9 @@ class SimulatedDrive:
         """What object 0x6007 says: 0 nothing, 1 fault, 2 disable voltage, 3 quick stop."""
         if code:
             self._emergency(code, register=0x11)
+            behaviour = self.value(Object.ERROR_BEHAVIOUR, 1) if self.nmt is NmtState.OPERATIONAL else 1
+            if behaviour != 1:
+                self._enter(NmtState.STOPPED if behaviour == 2 else NmtState.PRE_OPERATIONAL)
         if not self.state.powered:
             return
         option = self.value(Object.ABORT_CONNECTION)
@@ -391,6 +449,9 @@ class SimulatedDrive:
         self.velocity = math.copysign(max(0.0, abs(before) - change), before)
         self.position += 0.5 * (before + self.velocity) * duration if self.velocity else 0.0
         self.demand = round(self.position)
+        stops = self.state is State.QUICK_STOP_ACTIVE and self.velocity == 0.0
+        if stops and self.value(Object.QUICK_STOP_OPTION) < 5:  # options 1 to 4 end in SWITCH ON DISABLED
+            self.state = State.SWITCH_ON_DISABLED
 
 
 _LIVE: dict[int, Callable[[SimulatedDrive], int]] = {
@@ -402,6 +463,7 @@ _LIVE: dict[int, Callable[[SimulatedDrive], int]] = {
     Object.TARGET_POSITION: lambda drive: drive.target,
     Object.CONTROLWORD: lambda drive: drive.controlword,
     Object.ERROR_CODE: lambda drive: drive.error_code,
+    Object.ERROR_FIELD: lambda drive: drive.error_field,
     Object.ERROR_REGISTER: lambda drive: int(drive.state is State.FAULT),
     Object.FOLLOWING_ERROR: lambda drive: round(drive.target - drive.position),
     Object.MODE_DISPLAY: lambda drive: drive.value(Object.MODE),

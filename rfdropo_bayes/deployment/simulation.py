@@ -211,6 +211,8 @@ def _hub_process(table: BusTable) -> Iterator[BusTable]:
     finally:
         process.terminate()
         process.wait(5.0)
+        if process.stdout is not None:
+            process.stdout.close()
 
 
 def run_hub(channel: str) -> None:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ for number in range(10**6):
 """
 
 
-def write(log: SessionLog, robot: Robot, cycles: int = 30) -> None:
+def write(log: SessionLog, robot: Robot, cycles: int = 30, late: float = 0.0) -> None:
     for number in range(cycles):
         record = log.record
         record["time"], record["phase"], record["acted"] = 0.01 * number, 5, number % 10 == 0
@@ -40,7 +41,8 @@ def write(log: SessionLog, robot: Robot, cycles: int = 30) -> None:
         record["raw"], record["asked"] = 1.0, 2.0
         record["length"], record["tension"] = 1e-3 * number, 2.0 + 0.1 * number
         record["fresh"] = number != 7
-        record["position"], record["seen"] = robot.marker_points(), number % 2 == 0
+        record["position"], record["seen"] = robot.marker_points() + 1e-3 * number, number % 2 == 0
+        record["seen_at"] = 0.01 * number - late
         log.write()
 
 
@@ -64,6 +66,17 @@ def test_a_session_becomes_a_recording(robot: Robot, tmp_path: Path) -> None:
     assert not read.position_mask[1::2].any()
 
 
+def test_markers_stand_in_the_cycle_in_which_they_were_there(robot: Robot, tmp_path: Path) -> None:
+    """A sensor that answers 12 ms late, every second cycle: what cycle 8 hears was there in cycle 7."""
+    log = SessionLog(tmp_path / "s", robot, {"mode": "run"})
+    write(log, robot, late=0.012)
+    log.close()
+    made = session_trajectory(tmp_path / "s")
+    assert made.position_mask[1:28:2].all()
+    assert not made.position_mask[2::2].any()
+    np.testing.assert_allclose(made.position[7], robot.marker_points() + 8e-3)
+
+
 def test_a_session_without_markers_is_a_recording_of_tensions(robot: Robot, tmp_path: Path) -> None:
     log = SessionLog(tmp_path / "s", robot, {})
     for number in range(5):
@@ -82,17 +95,18 @@ def test_a_record_cut_short_is_left_out(robot: Robot, tmp_path: Path) -> None:
     assert len(read_journal(tmp_path / "s")[1]) == 29
 
 
-def test_a_killed_writer_loses_nothing(tmp_path: Path) -> None:
-    """SIGKILL, without any warning: every record written before is there."""
+def test_a_killed_writer_loses_less_than_a_second(tmp_path: Path) -> None:
+    """SIGKILL, without any warning, half a second after record 200: all before it are there."""
     folder = tmp_path / "s"
     command = [sys.executable, "-c", WRITER, str(folder)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "going\n"
+        time.sleep(0.5)
         os.kill(process.pid, signal.SIGKILL)
-    time = read_journal(folder)[1]["time"]
-    assert len(time) > 200
-    np.testing.assert_array_equal(time, np.arange(len(time)))
+    instants = read_journal(folder)[1]["time"]
+    assert len(instants) > 200
+    np.testing.assert_array_equal(instants, np.arange(len(instants)))
 
 
 def test_a_folder_is_used_once(robot: Robot, tmp_path: Path) -> None:

@@ -89,7 +89,13 @@ def test_identity_and_types_are_those_of_the_data_sheet(bench: Bench) -> None:
         (Object.IDENTITY, 9, None, 4, 0x06090011),  # no such subindex
         (Object.STATUSWORD, 0, 1, 2, 0x06010002),  # read only
         (Object.PRODUCER_HEARTBEAT, 0, 1, 4, 0x06070010),  # wrong length
-        (Object.ABORT_CONNECTION, 0, 9, 2, 0x06090030),  # out of range
+        (Object.DEVICE_TYPE, 3, None, 4, 0x06090011),  # a plain variable has subindex 0 alone
+        (Object.ABORT_CONNECTION, 0, 9, 2, 0x06090031),  # too high
+        (Object.QUICK_STOP_OPTION, 0, -1, 2, 0x06090032),  # too low
+        (Object.MODE, 0, 1, 1, 0x06090030),  # a mode that it does not have
+        (Object.TPDO, 2, 245, 1, 0x06090030),  # reserved transmission type
+        (Object.TPDO, 1, 0xE0000185, 4, 0x06090030),  # 29-bit identifier
+        (Object.ERROR_FIELD, 0, 1, 1, 0x06090030),  # only 0 clears it
         (Object.RPDO_MAP, 0, 0, 1, 0x08000022),  # mapped anew while the PDO is on
         (Object.RPDO, 1, 0x345, 4, 0x06090030),  # another identifier while the PDO is on
     ],
@@ -193,6 +199,7 @@ def test_a_fault_needs_a_rising_edge_and_tells_its_end(bench: Bench) -> None:
 )
 def test_a_lost_master_is_answered_as_object_6007_says(bench: Bench, option: int, state: State) -> None:
     bench.sdo(Object.ABORT_CONNECTION, 0, option, 2)
+    bench.sdo(Object.QUICK_STOP_OPTION, 0, 6, 2)
     bench.sdo(Object.CONSUMER_HEARTBEAT, 1, 127 << 16 | 60)
     bench.enable()
     bench.wait(0.5)
@@ -209,6 +216,7 @@ def test_a_lost_master_is_answered_as_object_6007_says(bench: Bench, option: int
 
 def test_a_lost_sync_is_noticed_after_one_and_a_half_cycles(bench: Bench) -> None:
     bench.sdo(Object.ABORT_CONNECTION, 0, 3, 2)
+    bench.sdo(Object.QUICK_STOP_OPTION, 0, 6, 2)
     bench.sdo(Object.CYCLE_PERIOD, 0, 10_000)
     bench.enable()
     bench.wait(0.012)
@@ -245,3 +253,130 @@ def test_heartbeats_come_at_their_period(bench: Bench) -> None:
     beats = [data for identifier, data in bench.sent if identifier == objects.HEARTBEAT + NODE]
     assert len(beats) == pytest.approx(50, abs=2)
     assert set(beats) == {bytes([NmtState.PRE_OPERATIONAL])}
+
+
+SDO = 0x600 + NODE
+
+
+def abort_of(frames: list[tuple[int, bytes]]) -> int:
+    """Code of the one abort among the answers."""
+    ((_, answer),) = [row for row in frames if row[0] == 0x580 + NODE]
+    assert answer[0] == 0x80
+    return int.from_bytes(answer[4:], "little")
+
+
+@pytest.mark.parametrize("frame", ["60", "70", "00", "0D", "E0", "C0", "A0"])
+def test_what_nothing_has_begun_is_aborted_and_the_server_lives_on(bench: Bench, frame: str) -> None:
+    """Segments without a beginning, block transfers, and a command that CiA 301 does not know."""
+    assert abort_of(bench.take(SDO, bytes.fromhex(frame).ljust(8, b"\0"))) == 0x05040001
+    assert bench.take(SDO, b"\x40\x00\x10") == []  # no SDO has three bytes
+    assert bench.sdo(Object.DEVICE_TYPE) & 0xFFFF == 402
+
+
+def test_a_segmented_upload_keeps_to_its_toggle_bit(bench: Bench) -> None:
+    bench.take(SDO, bytes.fromhex("4008100000000000"))  # device name: longer than four bytes
+    bench.take(SDO, bytes.fromhex("6000000000000000"))
+    assert abort_of(bench.take(SDO, bytes.fromhex("6000000000000000"))) == 0x05030000
+    assert abort_of(bench.take(SDO, bytes.fromhex("7000000000000000"))) == 0x05040001  # it has ended
+
+
+def test_a_segmented_download_has_the_length_that_it_announced(bench: Bench) -> None:
+    begin, last = bytes.fromhex("2117100002000000"), bytes.fromhex("0B64000000000000")
+    bench.take(SDO, begin)
+    bench.take(SDO, last)  # 100 ms in two bytes
+    assert bench.sdo(Object.PRODUCER_HEARTBEAT) == 100
+    bench.take(SDO, begin)
+    assert abort_of(bench.take(SDO, bytes.fromhex("0964000000000000"))) == 0x06070010  # three bytes
+    assert abort_of(bench.take(SDO, bytes.fromhex("2141600002000000"))) == 0x06010002  # read only: at the first frame
+
+
+def test_an_expedited_download_may_leave_its_length_open(bench: Bench) -> None:
+    bench.take(SDO, bytes.fromhex("2217100032000000"))
+    assert bench.sdo(Object.PRODUCER_HEARTBEAT) == 50
+
+
+@pytest.mark.parametrize(
+    ("maps", "comm", "entry", "abort"),
+    [
+        (Object.RPDO_MAP, Object.RPDO, 0x60410010, 0x06040041),  # nobody may write the statusword
+        (Object.RPDO_MAP, Object.RPDO, 0x60400020, 0x06040041),  # 32 bits of 16
+        (Object.TPDO_MAP, Object.TPDO, 0x55550010, 0x06020000),
+    ],
+)
+def test_what_cannot_be_mapped_is_refused(bench: Bench, maps: int, comm: int, entry: int, abort: int) -> None:
+    bench.sdo(comm, 1, bench.sdo(comm, 1) | objects.PDO_INVALID)
+    bench.sdo(maps, 0, 0, 1)
+    assert bench.sdo(maps, 1, entry) == -abort
+    bench.sdo(maps, 1, 0)
+    assert bench.sdo(maps, 0, 1, 1) == -0x06040041  # an empty entry is none
+    assert bench.sdo(maps, 0, 9, 1) == -0x06090031
+
+
+def transmissions(bench: Bench, kind: int, event_timer: int = 0, inhibit: int = 0) -> None:
+    """TPDO 1 of another kind; its content is the statusword alone."""
+    bench.sdo(Object.TPDO, 1, bench.sdo(Object.TPDO, 1) | objects.PDO_INVALID)
+    bench.sdo(Object.TPDO, 2, kind, 1)
+    bench.sdo(Object.TPDO, 3, inhibit, 2)
+    bench.sdo(Object.TPDO, 5, event_timer, 2)
+    bench.sdo(Object.TPDO_MAP, 0, 0, 1)
+    bench.sdo(Object.TPDO_MAP, 1, 0x60410010)
+    bench.sdo(Object.TPDO_MAP, 0, 1, 1)
+    bench.sdo(Object.TPDO, 1, bench.sdo(Object.TPDO, 1) & ~objects.PDO_INVALID)
+    bench.operational()
+
+
+def statuses(bench: Bench) -> int:
+    return sum(identifier == objects.TPDO1 + NODE for identifier, _ in bench.sent)
+
+
+@pytest.mark.parametrize(("kind", "answers"), [(0, 1), (1, 6), (3, 2)])
+def test_a_synchronous_status_comes_with_every_nth_sync_or_with_the_next_after_a_change(
+    bench: Bench, kind: int, answers: int
+) -> None:
+    transmissions(bench, kind)
+    assert sum(len(bench.take(objects.SYNC, b"")) for _ in range(6)) == answers
+
+
+def test_an_event_driven_status_comes_with_a_change_and_with_its_timer(bench: Bench) -> None:
+    transmissions(bench, 255)
+    bench.sent.clear()
+    bench.wait(0.1)
+    assert statuses(bench) == 1
+    bench.sdo(Object.CONTROLWORD, value=Command.SHUTDOWN, size=2)
+    bench.wait(0.1)
+    assert statuses(bench) == 1
+    bench.take(objects.NMT, bytes([Nmt.PRE_OPERATIONAL, NODE]))
+    transmissions(bench, 254, event_timer=20)
+    bench.sent.clear()
+    bench.wait(0.1)
+    assert 4 <= statuses(bench) <= 6
+    bench.take(objects.NMT, bytes([Nmt.PRE_OPERATIONAL, NODE]))
+    transmissions(bench, 254, event_timer=2, inhibit=500)  # 50 ms
+    bench.sent.clear()
+    bench.wait(0.1)
+    assert 2 <= statuses(bench) <= 3
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "state"), [(0, NmtState.PRE_OPERATIONAL), (1, NmtState.OPERATIONAL), (2, NmtState.STOPPED)]
+)
+def test_a_lost_heartbeat_does_what_the_error_behaviour_says(bench: Bench, behaviour: int, state: NmtState) -> None:
+    bench.sdo(Object.ERROR_BEHAVIOUR, 1, behaviour, 1)
+    bench.sdo(Object.CONSUMER_HEARTBEAT, 1, 127 << 16 | 20)
+    bench.enable()
+    bench.take(objects.HEARTBEAT + 127, b"\x05")
+    bench.wait(0.1)
+    assert bench.drive.nmt is state
+    if state is not NmtState.STOPPED:
+        assert bench.sdo(Object.ERROR_FIELD, 1) == EmergencyCode.HEARTBEAT_LOST
+        assert bench.sdo(Object.ERROR_FIELD, 0, 0, 1) == 0
+        assert bench.sdo(Object.ERROR_FIELD, 1) == 0
+
+
+@pytest.mark.parametrize(("option", "state"), [(2, State.SWITCH_ON_DISABLED), (6, State.QUICK_STOP_ACTIVE)])
+def test_a_quick_stop_ends_as_its_option_says(bench: Bench, option: int, state: State) -> None:
+    bench.sdo(Object.QUICK_STOP_OPTION, 0, option, 2)
+    bench.enable()
+    bench.cycle(Command.QUICK_STOP, 0)
+    bench.wait(0.1)
+    assert bench.state is state
