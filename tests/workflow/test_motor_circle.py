@@ -76,14 +76,19 @@ class KeptOpen(SimulatedMarkers):
         """Stay open."""
 
 
-def record(folder: Path, names: dict[str, int], changes: dict[str, float | str]) -> None:
+def record(folder: Path, names: dict[str, int], hidden: str = "") -> None:
     """Replay random commands on the virtual arm, one session each: NAME.nc in the folder.
 
-    ``names`` gives the seed of each.
+    Args:
+        folder: to write to.
+        names: of the sessions, with the seed of each.
+        hidden: entries of the truth beside its parameters.
     """
+    values = [f"model.fixed.{name} = {value}" for name, value in TRUTH.items()]
+    (folder / "truth.toml").write_text("\n".join(['robot = "motor_arm"', *values, hidden, ""]))
     robot = load_robot("motor_arm")
     sensor = KeptOpen(len(robot.marker_names))
-    settings: dict[str, object] = {"marker_noise": NOISE, **TRUTH, **changes}
+    settings = {"marker_noise": NOISE, "experiment": str(folder / "truth.toml")}
     hub = BusTable(interface="hub", channel="127.0.0.1:0")
     table = SimulationTable("motor_arm", hub, "rfdropo_bayes.workflow.plant:trunk", settings, True, sensor.address)
     # A loaded machine without real-time scheduling is no robot.
@@ -110,7 +115,7 @@ def experiment(folder: Path, fit: list[str], test: list[str]) -> Path:
 
 @pytest.mark.slow
 def test_torques_in_the_log_break_the_scale_and_the_truth_is_recovered(tmp_path: Path) -> None:
-    record(tmp_path, {"one": 1, "two": 2}, {})
+    record(tmp_path, {"one": 1, "two": 2})
     path = experiment(tmp_path, ["one"], ["two"])
     deviations = {}
     for tension in ("true", "false"):
@@ -128,7 +133,7 @@ def test_torques_in_the_log_break_the_scale_and_the_truth_is_recovered(tmp_path:
 @pytest.mark.slow
 def test_the_audit_of_the_log_names_what_is_hidden_in_the_robot(tmp_path: Path) -> None:
     names = {"one": 1, "again": 1, "two": 2, "three": 3, "four": 4}
-    record(tmp_path, names, {"model.mechanisms": "backlash", "backlash": PLAY})
+    record(tmp_path, names, f'model.mechanisms = ["backlash"]\nmodel.fixed.backlash = {PLAY}')
     content = run_audit(experiment(tmp_path, ["one", "again", "two"], ["three", "four"]), tmp_path / "out")
     assert content["verdict"] in ("explained", "equivalent")
     assert "backlash" in content["findings"][0]["equivalence_class"]
