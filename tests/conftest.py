@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import os
 from pathlib import Path
 
+import jax
 import meshio
 import numpy as np
+import psutil
 import pytest
 from jaxtyping import install_import_hook
 
@@ -32,6 +36,20 @@ def checked_modules() -> list[str]:
 
 
 install_import_hook(checked_modules(), "beartype.beartype")
+
+
+MOST_MEMORY = 1.0e9  # bytes of a process above which what JAX compiled for earlier modules is dropped
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_programs_are_dropped():
+    """After a module of tests, drop the compiled programs once they fill the memory: 4 GB a process without this."""
+    yield
+    if psutil.Process().memory_info().rss > MOST_MEMORY:
+        jax.clear_caches()
+        gc.collect()
+        if hasattr(ctypes.CDLL(None), "malloc_trim"):  # glibc keeps what was freed, unless asked
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(scope="session")

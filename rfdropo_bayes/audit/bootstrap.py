@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.noise import RESIDUALS, STATED, NoiseModel
 from rfdropo_bayes.audit.score import project_out
+from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED, Autoregression
 
 
 def null_residuals(
     measurements: Measurements,
-    noise: NoiseModel,
+    noise: Autoregression,
     base: Float[np.ndarray, "n rank"],
     parameters: int,
     rng: np.random.Generator,
@@ -44,7 +44,7 @@ def null_residuals(
     return project_out(base, found.T).T
 
 
-def _fitted(measurements: Measurements, noise: NoiseModel, base: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+def _fitted(measurements: Measurements, noise: Autoregression, base: np.ndarray, drawn: np.ndarray) -> np.ndarray:
     """What the base model leaves of data sets without repeats: where the noise is estimated from that, it is estimated
     from that here, too; the noise before a fit would be a little larger in most of them, and give itself away."""
     order = [group[0] for group in measurements.members]

@@ -15,7 +15,7 @@ from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.journal import Arrays, Journal, digest
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.noise import NoiseModel
+from rfdropo_bayes.bayes.noise.autoregression import Autoregression
 
 FIRST, ALL = 8, 40  # evaluations of a short climb, and of one to its end
 CLOSE = 1e-3  # of the squared misfit: climbs end where steps bring less than a thousandth of that
@@ -65,7 +65,7 @@ class Target:
 
     forward: Forward
     measurements: Measurements
-    noise: NoiseModel
+    noise: Autoregression
     journal: Journal = field(default_factory=Journal)
 
     @cached_property

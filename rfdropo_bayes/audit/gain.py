@@ -12,7 +12,7 @@ from scipy.linalg import toeplitz
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from rfdropo_bayes.audit.noise import STATED, NoiseModel
+from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 
 DIFFERENCE_FROM = 6  # trajectories below which an ELPD difference has no standard error worth stating
 RESAMPLES = 2000
@@ -81,7 +81,7 @@ def measure_gain(
     unseen: Unseen,
     base: Prediction,
     extended: Prediction,
-    noise: NoiseModel,
+    noise: Autoregression,
     pattern: Float[np.ndarray, "group time channel"],
     rng: np.random.Generator,
 ) -> Gain:
@@ -113,19 +113,19 @@ def measure_gain(
     )
 
 
-def noise_distance(noise: NoiseModel) -> float:
+def noise_distance(noise: Autoregression) -> float:
     """Root mean square distance of a marker that the noise alone makes [m]."""
     return float(np.sqrt(3.0 * np.mean(noise.scale**2)))
 
 
-def _elpd(unseen: Unseen, prediction: Prediction, noise: NoiseModel) -> Float[np.ndarray, " trajectory"]:
+def _elpd(unseen: Unseen, prediction: Prediction, noise: Autoregression) -> Float[np.ndarray, " trajectory"]:
     """Log predictive density of each trajectory, up to the noise's normaliser."""
     residual = np.where(unseen.valid, unseen.position - prediction.draws, 0.0)
     white = noise.whiten(residual, unseen.valid)
     return logsumexp(-0.5 * np.sum(white**2, axis=(-2, -1)), axis=0) - np.log(len(residual))
 
 
-def _coverage(unseen: Unseen, prediction: Prediction, noise: NoiseModel) -> dict[float, float]:
+def _coverage(unseen: Unseen, prediction: Prediction, noise: Autoregression) -> dict[float, float]:
     spread = np.sqrt(prediction.draws.var(axis=0) + noise.scale**2)
     z = (
         np.abs(unseen.position - prediction.mean)[unseen.valid]
@@ -138,7 +138,7 @@ def explained_fraction(
     unseen: Unseen,
     base: Float[np.ndarray, "trajectory time channel"],
     extended: Float[np.ndarray, "trajectory time channel"],
-    noise: NoiseModel,
+    noise: Autoregression,
     pattern: Float[np.ndarray, "group time channel"],
     rng: np.random.Generator,
 ) -> tuple[float, tuple[float, float]]:
@@ -187,7 +187,7 @@ def _fraction(base: np.ndarray, extended: np.ndarray, floor: float, size: np.nda
     return 1.0 - left / np.maximum(base - size * floor, 1e-3 * floor)
 
 
-def _floor_error(noise: NoiseModel, weight: Float[np.ndarray, " row"]) -> float:
+def _floor_error(noise: Autoregression, weight: Float[np.ndarray, " row"]) -> float:
     """Relative standard error of the noise's power, summed over frequencies with weights.
 
     Innovation variance and coefficients of an estimated autoregression are independent; their variances are 2 / n and
@@ -215,7 +215,7 @@ def _components(pattern: np.ndarray, channels: int) -> Float[np.ndarray, "channe
     return np.linalg.eigh(flat.T @ flat)[1]
 
 
-def _noise_power(noise: NoiseModel, rows: int) -> Float[np.ndarray, " row"]:
+def _noise_power(noise: Autoregression, rows: int) -> Float[np.ndarray, " row"]:
     """Power of the noise at the frequencies of the cosine transform, in units of its variance."""
     coefficients, deviation = noise.predictors
     return _spectrum(coefficients[-1][: noise.order], deviation[-1], rows)

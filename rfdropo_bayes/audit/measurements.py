@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.noise import REPEATS, RESIDUALS, NoiseModel, estimate_noise
-from rfdropo_bayes.audit.repeat_shifts import repeat_shift
-from rfdropo_bayes.bayes.model import RecordingSet
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS, RESIDUALS, Autoregression, estimate_noise
+from rfdropo_bayes.bayes.noise.repeat_shifts import repeat_shift
+from rfdropo_bayes.bayes.recordings import RecordingSet
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.repeats import group_repeats
 
@@ -51,7 +51,7 @@ class Measurements:
         """Whether any command sequence was carried out twice."""
         return any(len(group) > 1 for group in self.members)
 
-    def whiten(self, residual: np.ndarray, noise: NoiseModel) -> Float[np.ndarray, "*batch n"]:
+    def whiten(self, residual: np.ndarray, noise: Autoregression) -> Float[np.ndarray, "*batch n"]:
         """Residuals (..., group, time, channel) of the means as independent unit normals, flattened."""
         white = noise.separate(noise.innovations(residual, self.valid) * np.sqrt(self.count), self.valid)
         return white.reshape(*residual.shape[:-3], int(np.prod(residual.shape[-3:])))
@@ -83,8 +83,8 @@ class Measurements:
         return repeat_shift(*self.deviations(self.single)) if self.has_repeats else None
 
     def noise(
-        self, residual: Float[np.ndarray, "recording time channel"], parameters: int, like: NoiseModel | None = None
-    ) -> NoiseModel:
+        self, residual: Float[np.ndarray, "recording time channel"], parameters: int, like: Autoregression | None = None
+    ) -> Autoregression:
         """Noise from repeats where there are any, else from what a model leaves, of whose correlation between channels
         nothing says how much is noise: a discrepancy moves them together, too.
 

@@ -22,12 +22,12 @@ from rfdropo_bayes.audit.forward import Forward, Lanes
 from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
-from rfdropo_bayes.audit.noise import RESIDUALS, STATED, NoiseModel
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Look, look
 from rfdropo_bayes.audit.search import better_nearby, search, with_usable_differences
 from rfdropo_bayes.audit.verdict import NO_VERDICT, PARTLY, UNEXPLAINED, decide
-from rfdropo_bayes.bayes.model import RecordingSet
+from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED, Autoregression
+from rfdropo_bayes.bayes.recordings import RecordingSet
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
@@ -61,7 +61,7 @@ class Question:
     recordings: RecordingSet
     trajectories: Sequence[Trajectory]
     candidates: Sequence[Candidate]
-    stated_noise: NoiseModel | None
+    stated_noise: Autoregression | None
     start: dict[str, float] | None
     rules: Rules
     seed: int
@@ -96,7 +96,7 @@ class Answer:
     unseen: Unseen | None
     sizes: Fit
     draws: Float[np.ndarray, "draw d"]
-    suspected: NoiseModel | None
+    suspected: Autoregression | None
     shift: float | None
     stopped: bool
     rollouts: int
@@ -188,7 +188,7 @@ def audit(
 
 def _judged(
     inquiry: Inquiry, base: Fit, steps: Sequence[Step], looks: Sequence[Look], gain: Gain | None, deadline: Deadline
-) -> tuple[str, NoiseModel | None]:
+) -> tuple[str, Autoregression | None]:
     """The verdict, and the noise under which the base model would pass where something is left unexplained."""
     rules, last = inquiry.rules, looks[-1].omnibus.p
     members, noise = [len(step.members) for step in steps], inquiry.target.noise
@@ -278,7 +278,9 @@ def base_model(
     noise = question.stated_noise
     if measurements.has_repeats:
         noise = measurements.noise(measurements.single, 0)
-    known = noise or NoiseModel(np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf)
+    known = noise or Autoregression(
+        np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf
+    )
     target = Target(forward, measurements, known, journal)
     try:
         target, fit = _base_fit(target, question.start, seed, report)
@@ -287,7 +289,7 @@ def base_model(
         raise InputError(
             "the time was up before the base model was fitted",
             where=(deadline or Deadline()).where,
-            remedy="raise it, fit fewer or shorter recordings, or start from a calibration",
+            remedy="raise it, fit fewer or shorter recordings, or start from a calibration (--base)",
         ) from None
 
 
@@ -321,7 +323,7 @@ def _under_residual_noise(target: Target, fit: Fit) -> tuple[Target, Fit]:
     return target, fit if converged else replace(fit, promise=np.inf)
 
 
-def residual_noise(target: Target, fit: Fit) -> NoiseModel:
+def residual_noise(target: Target, fit: Fit) -> Autoregression:
     """An autoregression fitted to what a model leaves of every recording."""
     predicted = target.forward.position(fit.x)
     single = np.array(target.measurements.single)
@@ -363,7 +365,7 @@ def _final_look(inquiry: Inquiry, extended: Fit, steps: Sequence[Step]) -> Look:
     return found
 
 
-def _suspected(inquiry: Inquiry, base: Fit) -> NoiseModel | None:
+def _suspected(inquiry: Inquiry, base: Fit) -> Autoregression | None:
     """Noise fitted to what the base model leaves, where it passes under that, though not under the noise stated."""
     if inquiry.target.noise.source != STATED:
         return None
@@ -400,7 +402,7 @@ class HeldOut:
     unseen: Unseen
     predictions: list[Prediction]
     patterns: list[np.ndarray]
-    noise: NoiseModel
+    noise: Autoregression
     seed: int
 
     def gain(self, before: int, after: int) -> Gain:

@@ -8,13 +8,13 @@ import numpy as np
 
 from rfdropo_bayes.audit.extension import DISCRETISATION, Step
 from rfdropo_bayes.audit.gain import LEVELS, noise_distance
-from rfdropo_bayes.audit.noise import REPEATS
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.prequential import in_words, prequential
 from rfdropo_bayes.audit.score import likeness
 from rfdropo_bayes.audit.screen import Look, Row
 from rfdropo_bayes.audit.sentence import sentence
 from rfdropo_bayes.audit.verdict import NO_DISCREPANCY, UNEXPLAINED
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS
 from rfdropo_bayes.bayes.units import force_power
 
 SCHEMA_VERSION = 1

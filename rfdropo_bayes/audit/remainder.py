@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.noise import NoiseModel
+from rfdropo_bayes.bayes.noise.autoregression import Autoregression
 
 MOST_ROWS = 300
 AMPLITUDES = np.concatenate([[0.0], np.geomspace(0.02, 50.0, 28)])  # in deviations of the noise
@@ -34,7 +34,7 @@ class Remainder(NamedTuple):
     log_likelihood_ratio: float
 
 
-def describe_remainder(measurements: Measurements, white: Float[np.ndarray, " n"], noise: NoiseModel) -> Remainder:
+def describe_remainder(measurements: Measurements, white: Float[np.ndarray, " n"], noise: Autoregression) -> Remainder:
     """Fit the process to the whitened residuals of a model.
 
     The whitening is a linear map, so that the process is fitted to the residual itself under correlated noise: its
@@ -46,7 +46,7 @@ def describe_remainder(measurements: Measurements, white: Float[np.ndarray, " n"
     data = channels[:, rows] * noise.scale / np.mean(noise.scale)
     weight = np.sqrt(np.maximum(measurements.count[:, rows].max(axis=(1, 2)), 1.0))
     every = np.ones((len(rows), 1), dtype=bool)
-    unit = NoiseModel(np.ones(1), noise.autocorrelation, noise.source, noise.freedom)
+    unit = Autoregression(np.ones(1), noise.autocorrelation, noise.source, noise.freedom)
     whitener = unit.whiten(np.eye(len(rows))[:, :, None], np.broadcast_to(every, (len(rows), len(rows), 1)))[..., 0].T
     best = (0.0, 0.0, LENGTHS[0])
     for length in LENGTHS:

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from rfdropo_bayes.audit.bootstrap import null_residuals, tail
 from rfdropo_bayes.audit.candidates import Probe
 from rfdropo_bayes.audit.fit import Fit, Target
-from rfdropo_bayes.audit.noise import RESIDUALS
 from rfdropo_bayes.audit.omnibus import Omnibus, block_means, joint_test, statistics
 from rfdropo_bayes.audit.score import project_out, span, statistic
+from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS
 
 CHUNK_NUMBERS = 2e7  # of simulated residuals in memory at a time
 DIRECTED = "candidates"

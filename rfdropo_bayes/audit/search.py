@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.audit.fit import CLOSE, Fit, Target
-from rfdropo_bayes.inference.laplace import LaplaceConfig, find_modes
+from rfdropo_bayes.inference import LaplaceConfig, find_modes
 from rfdropo_bayes.simulators.differences import usable_difference
 
 CLIMBED = 0.1  # nats that a step of these climbs promises at their end; the audit's own climb goes on from there

@@ -10,9 +10,9 @@ import numpy as np
 from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.extension import DISCRETISATION, TOLD_APART
 from rfdropo_bayes.audit.gain import noise_distance
-from rfdropo_bayes.audit.noise import REPEATS, STATED
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.verdict import EXPLAINED, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED, unclear
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
 
 MOST_EXCLUDED = 3
 MOST_SIZES = 4

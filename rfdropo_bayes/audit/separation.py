@@ -16,9 +16,9 @@ from jaxtyping import Float, Int
 from rfdropo_bayes.audit.candidates import Candidate, lead, probe_all
 from rfdropo_bayes.audit.extension import SHARES, TOLD_APART
 from rfdropo_bayes.audit.fit import Fit, Target, best_between, climb
-from rfdropo_bayes.audit.noise import RESIDUALS
 from rfdropo_bayes.audit.pipeline import residual_noise
 from rfdropo_bayes.audit.score import Signature, likeness, project_out, signature, span, statistic
+from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS
 
 PASSES = 2  # over the models without each, which begin where the one with all of them ends, and it where the best does
 WITH_NONE = np.append(SHARES, 0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -14,12 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 
-from rfdropo_bayes.bayes.angles import angle_specs
 from rfdropo_bayes.bayes.batches import is_batch, padded
-from rfdropo_bayes.bayes.forces import tension_specs
+from rfdropo_bayes.bayes.channels import Channel, FeatureChannel, Series
 from rfdropo_bayes.bayes.model import Measured, TrajectoryModel
-from rfdropo_bayes.bayes.noise import draw_noise, noise_specs
-from rfdropo_bayes.bayes.objects import draw_feature_error, feature_deviation, object_features, object_specs, offset_of
 from rfdropo_bayes.bayes.space import ParameterSpace
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
@@ -57,25 +54,25 @@ class CalibrationProblem:
         self.n_rows = model.recordings.time.shape[1]
         self.n_recordings = len(model.recordings.names)
         self.status_names = {int(result): result.name.lower() for result in Result}
-        specs = (*noise_specs(model.noise), *tension_specs(True), *angle_specs(True), *object_specs(True))
-        noise = {spec.name for spec in specs}
-        self.physical_names = tuple(p.name for p in model.space.parameters if p.spec.name not in noise)
+        self.compared = [channel for channel in model.channels if isinstance(channel, FeatureChannel)]
+        physical = {spec.name for spec in model.simulator.parameters}
+        self.physical_names = tuple(p.name for p in model.space.parameters if p.physical in physical)
 
     @cached_property
     def fingerprint(self) -> str:
         """Digest of data, parameters and simulator: a checkpoint belongs to the problem it was made for."""
         digest = hashlib.sha256()
         recordings = self.model.recordings
-        data = [array for array in self.measured if array is not None]
+        data = self.measured.values()
         for array in (*data, recordings.time, *recordings.line, *recordings.commands):
             digest.update(np.ascontiguousarray(array).tobytes())
         priors = [(p.name, sorted((p.table or {}).items())) for p in self.model.space.parameters]
         rest = (
             priors,
             sorted(self.model.fixed.items()),
+            [(channel.name, _plain(channel)) for channel in self.model.channels],
             self.model.noise,
             sorted(self.model.simulator.description.items()),
-            *self.model.weighed,
             *((name, draws.tobytes()) for name, draws in sorted(self.earlier.items())),
         )
         digest.update(repr(rest).encode())
@@ -167,8 +164,7 @@ class CalibrationProblem:
     def rollouts(
         self, values: Batch, horizon: int
     ) -> tuple[Float[np.ndarray, "n horizon feature"], Int[np.ndarray, " n"]]:
-        """Simulated features [m] of all recordings side by side, without observation noise: coordinates of the markers,
-        and `object_features` where poses are data."""
+        """Simulated features [m] of all recordings side by side, without observation noise; see `FeatureChannel`."""
         features, status = self._chunked(self._features, values, horizon)
         return self._side_by_side(features)[:, :horizon], status
 
@@ -177,22 +173,17 @@ class CalibrationProblem:
     ) -> tuple[Float[np.ndarray, "n n_rows feature"], Int[np.ndarray, " n"]]:
         """`rollouts` of all rows with a realisation of the observation noise [m]."""
         clean, status = self.rollouts(values, self.n_rows)
-        noise = self.draw_noise(key, values)
-        noise = noise.reshape(*noise.shape[:3], -1)
-        if self.model.object_pose is not None:
-            poses = self._realised(self._pose_noise, jax.random.fold_in(key, 1), values)
-            noise = np.concatenate([noise, poses], axis=-1)
-        return clean + self._side_by_side(noise), status
+        noise = [
+            self._realised(channel.draw_features, jax.random.fold_in(key, index) if index else key, values)
+            for index, channel in enumerate(self.compared)
+        ]
+        return clean + self._side_by_side(np.concatenate(noise, axis=-1)), status
 
     def noise_deviation(self, values: Mapping[str, float]) -> Float[np.ndarray, " feature"]:
         """Standard deviation of the observation noise [m] of each feature, laid out like `rollouts`, at one set of
         values."""
-        recordings, _, markers, _ = self.model.recordings.position.shape
         known = {**self.model.fixed, **values}
-        deviation = np.full(3 * markers, float(self.model.noise_of(values).deviation))
-        if self.model.object_pose is not None:
-            deviation = np.concatenate([deviation, feature_deviation(known)])
-        return np.tile(deviation, recordings)
+        return np.tile(np.concatenate([c.feature_deviation(known) for c in self.compared]), self.n_recordings)
 
     @cached_property
     def actions(self) -> Float[np.ndarray, "n_rows channel"]:
@@ -206,20 +197,13 @@ class CalibrationProblem:
     @cached_property
     def observed(self) -> Float[np.ndarray, "n_rows feature"]:
         """Measured features [m], laid out like `rollouts`."""
-        position = np.asarray(self.measured.position)
-        features = position.reshape(*position.shape[:2], -1)
-        if self.measured.object_pose is not None:
-            poses = np.asarray(object_features(self.measured.object_pose))
-            features = np.concatenate([features, poses], axis=-1)
-        return self._side_by_side(features[None])[0]
+        features = [np.asarray(channel.features(self.measured[channel.name])) for channel in self.compared]
+        return self._side_by_side(np.concatenate(features, axis=-1)[None])[0]
 
     @cached_property
     def observed_mask(self) -> np.ndarray:
         """True where ``observed`` may be used."""
-        valid = np.repeat(self.model.recordings.line.valid, 3, axis=-1)
-        if self.model.object_pose is not None:
-            valid = np.concatenate([valid, np.repeat(self.model.object_pose.line.valid, 6, axis=-1)], axis=-1)
-        return self._side_by_side(valid[None])[0]
+        return self._side_by_side(np.concatenate([c.feature_valid for c in self.compared], axis=-1)[None])[0]
 
     def _side_by_side(self, features: Shaped[Any, "n recording time f"]) -> Shaped[np.ndarray, "n time recording*f"]:
         return np.moveaxis(np.asarray(features), 1, 2).reshape(len(features), features.shape[2], -1)
@@ -227,20 +211,19 @@ class CalibrationProblem:
     def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " residual"]:
         """Whitened residuals of the first ``horizon`` rows (zero where masked); traceable, for one set of values."""
         white = self.model.residuals(values, jnp.asarray(self.steps_for(horizon)), self.measured)
-        return jnp.concatenate(
-            [part[0] for part in _flat([None if part is None else part[None] for part in white], horizon)]
-        )
+        return self._flat({name: part[None] for name, part in white.items()}, horizon)[0]
 
     def residual_batch(self, values: Batch, horizon: int) -> Float[np.ndarray, "n residual"]:
         """`residuals` of many sets of values at once, in compiled chunks."""
         white = self._chunked(self._white, values, horizon, self.measured)
-        return np.concatenate(_flat(white, horizon), axis=1)
+        return np.asarray(self._flat(white, horizon))
 
     def white_positions(self, values: Mapping[str, float]) -> Float[np.ndarray, "recording time marker 3"]:
         """Whitened residuals of the markers at one set of values, NaN where masked."""
         single = {name: np.array([values[name]]) for name in self.names}
-        white = self._chunked(self._white, single, self.n_rows, self.measured)[0][0]
-        return np.where(self.model.recordings.line.valid[..., None], white, np.nan)
+        white = self._chunked(self._white, single, self.n_rows, self.measured)[self.model.markers.name][0]
+        valid = self.model.recordings.line.valid[..., None]
+        return np.where(valid, white.reshape(*valid.shape[:3], 3), np.nan)
 
     def with_measured(self, measured: Measured) -> CalibrationProblem:
         """The same problem with other data, which shares all that has been compiled.
@@ -258,7 +241,7 @@ class CalibrationProblem:
 
     def predict(self, values: Batch) -> tuple[Float[np.ndarray, "n recording time marker 3"], Int[np.ndarray, " n"]]:
         """Simulated marker positions [m] of every recording, without observation noise."""
-        position, _, status = self._chunked(self._positions, values, self.n_rows)
+        position, _, status = self.predict_scene(values)
         return position, status
 
     def predict_scene(self, values: Batch) -> tuple[np.ndarray, np.ndarray | None, Int[np.ndarray, " n"]]:
@@ -272,24 +255,15 @@ class CalibrationProblem:
 
     def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
         """A realisation of the observation noise [m] for every set of values."""
-        return self._realised(self._marker_noise, key, values)
-
-    def _marker_noise(
-        self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
-    ) -> Float[Array, "time marker 3"]:
-        return draw_noise(key, time, self.model.recordings.position.shape[2], self.model.noise_of(values))
-
-    def _pose_noise(
-        self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
-    ) -> Float[Array, "time 6"]:
-        return draw_feature_error(key, time, {**self.model.fixed, **values})
+        return self._realised(self.model.markers.draw_noise, key, values)
 
     def _realised(self, draw: Callable, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time ..."]:
         """What ``draw`` makes of a key, the times of a recording and a set of values, for all of both."""
 
         def of_all(key: PRNGKeyArray, values: Mapping[str, Array]) -> Array:
             keys = jax.random.split(key, self.n_recordings)
-            return jax.vmap(lambda k, t: draw(k, t, values))(keys, self.model.recordings.time)
+            known = {**self.model.fixed, **values}
+            return jax.vmap(lambda k, t: draw(k, t, known))(keys, jnp.asarray(self.model.recordings.time))
 
         inferred = {name: jnp.asarray(values[name]) for name in self.names}
         count = len(next(iter(inferred.values())))
@@ -314,15 +288,9 @@ class CalibrationProblem:
     @cached_property
     def _features(self) -> Callable:
         def features(values: Mapping[str, Array], steps: Int[Array, ""]) -> tuple[Array, Array]:
-            observation = self.model.simulate(values, steps)
-            position = observation.position
-            found = position.reshape(*position.shape[:2], -1)
-            if self.model.object_pose is not None:
-                names = self.model.recordings.names
-                offset = jnp.stack([offset_of(self.model.rollout_values(values, name)) for name in names])
-                poses = object_features(observation.object_pose)
-                found = jnp.concatenate([found, poses.at[..., :3].add(offset[:, None])], axis=-1)
-            return found, jnp.max(observation.status)
+            seen = self.model.seen(self.model.simulate(values, steps), values)
+            found = [c.features(c.expected(seen)) for c in self.compared]
+            return jnp.concatenate(found, axis=-1), jnp.max(seen.observation.status)
 
         return jax.jit(jax.vmap(features, in_axes=(0, None)))
 
@@ -334,7 +302,7 @@ class CalibrationProblem:
 
         return jax.jit(jax.vmap(observations, in_axes=(0, None)))
 
-    def _chunked(self, evaluate: Callable, values: Batch, horizon: int, *rest: Any) -> tuple[Any, ...]:
+    def _chunked(self, evaluate: Callable, values: Batch, horizon: int, *rest: Any) -> Any:
         """Evaluate a batch chunk by chunk; the padding of the last chunk repeats its last set and is dropped."""
         steps = jnp.asarray(self.steps_for(horizon))
         columns = {name: np.asarray(values[name], dtype=float) for name in self.names}
@@ -347,14 +315,21 @@ class CalibrationProblem:
             parts.append(jax.device_get(evaluate(chunk, steps, *rest)))
             if self.watch is not None:
                 self.watch(min(n - start, self.chunk) * horizon / self.n_rows)
-        return tuple(None if column[0] is None else np.concatenate(column)[:n] for column in zip(*parts, strict=True))
+        return jax.tree.map(lambda *column: np.concatenate(column)[:n], *parts)
+
+    def _flat(self, white: Mapping[str, Any], horizon: int) -> Any:
+        """Residuals by rollout, cut to the horizon where they have a time axis, and flattened."""
+        series = {channel.name for channel in self.model.channels if isinstance(channel, Series)}
+        cut = [part[:, :, :horizon] if name in series else part for name, part in white.items()]
+        return jnp.concatenate([part.reshape(len(part), -1) for part in cut], axis=1)
 
 
-def _flat(white: Sequence[Any], horizon: int) -> list[Any]:
-    """Residuals by rollout, cut to the horizon where they have a time axis, and flattened."""
-    *timed, weighed = white
-    cut = [part[:, :, :horizon] for part in timed if part is not None]
-    return [part.reshape(len(part), -1) for part in (*cut, weighed) if part is not None]
+def _plain(channel: Channel) -> str:
+    """What beside its readings tells a channel from another one."""
+    if isinstance(channel, Series):
+        known = channel.known
+        return repr(None if known is None else (known.scale, known.autocorrelation, known.correlation))
+    return repr(channel)
 
 
 def chunk_sizes(largest: int) -> tuple[int, ...]:

@@ -22,13 +22,15 @@ from rfdropo_bayes.cli.options import (
 )
 from rfdropo_bayes.cli.results import show_audit
 
+Base = Annotated[
+    Path | None, typer.Option("--base", help="folder of an earlier calibration, to start the base model from")
+]
+
 
 def audit(
     experiment: ExperimentFile,
     out: OutFolder = None,
-    base: Annotated[
-        Path | None, typer.Option("--base", help="folder of an earlier calibration, to start the base model from")
-    ] = None,
+    base: Base = None,
     seed: Seed = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -57,9 +59,7 @@ def audit(
 def separate(
     experiment: ExperimentFile,
     out: OutFolder = None,
-    base: Annotated[
-        Path | None, typer.Option("--base", help="folder of an earlier calibration, to start the base model from")
-    ] = None,
+    base: Base = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
     overrides: Overrides = None,
@@ -84,16 +84,18 @@ def separate(
 def design(
     experiment: ExperimentFile,
     out: OutFolder = None,
+    base: Base = None,
     seed: Seed = None,
     overwrite: Overwrite = False,
     overrides: Overrides = None,
 ) -> None:
     """Propose the commands that best separate the leading explanations: writes next_commands.csv and design.json."""
+    see_calibration(base, "--base")
     folder = folder_for("design", experiment, out, overrides, overwrite=overwrite)
     from rfdropo_bayes.workflow.design import COMMANDS, run_design
 
     found = run_design(
-        experiment, folder, overrides=overrides or [], seed=seed, overwrite=overwrite, report=say_progress()
+        experiment, folder, overrides=overrides or [], base=base, seed=seed, overwrite=overwrite, report=say_progress()
     )
     typer.echo(found["sentence"])
     typer.echo(f"commands: {folder / COMMANDS}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from pathlib import Path
@@ -23,7 +22,7 @@ from rfdropo_bayes.cli.options import (
     folder_for,
     see_calibration,
 )
-from rfdropo_bayes.cli.results import show_calibration
+from rfdropo_bayes.cli.results import show_calibration, show_simulation
 from rfdropo_bayes.errors import InputError, Interrupted
 from rfdropo_bayes.interrupts import EXIT_STATUS, NOTHING_LOST, watch_interrupts
 from rfdropo_bayes.runtime import keep_compilations
@@ -99,14 +98,16 @@ def simulate(
     out: OutFolder = None,
     balance: Annotated[bool, typer.Option(help="also write base reaction, energies and work to the NetCDF")] = False,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
-    """Simulate the experiment's commands: writes NetCDF and CSV, prints the error against the recording as JSON."""
+    """Simulate the experiment's commands: writes NetCDF and CSV, prints the error against the recordings."""
     folder = folder_for("simulate", experiment, out, overrides, overwrite=overwrite)
     from rfdropo_bayes.workflow.simulation import run_simulation
 
-    report = run_simulation(experiment, folder, overrides=overrides or [], balance=balance, overwrite=overwrite)
-    typer.echo(json.dumps(report, indent=2))
+    found = run_simulation(experiment, folder, overrides=overrides or [], balance=balance, overwrite=overwrite)
+    show_simulation(found, quiet=quiet, as_json=as_json)
 
 
 @app.command()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from rfdropo_bayes.cli.options import Overwrite, see_calibration
+from rfdropo_bayes.cli.options import AsJson, Overwrite, Quiet, see_calibration
+from rfdropo_bayes.cli.results import show_prediction
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.workflow.experiment_file import look_through
 from rfdropo_bayes.workflow.files import check_folder
@@ -25,6 +25,8 @@ def predict(
     rows: Annotated[str | None, typer.Option("--rows", help="FIRST:LAST observation rows, both included")] = None,
     seed: Annotated[int | None, typer.Option(help="seed of the draws; that of the experiment by default")] = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
     overrides: Annotated[list[str] | None, typer.Option("--set", help="as in calibrate")] = None,
 ) -> None:
     """Predict commands that were never run: mean, 50 and 90 % bands as NetCDF and CSV (m, base frame)."""
@@ -44,7 +46,7 @@ def predict(
         seed=seed,
         overwrite=overwrite,
     )
-    typer.echo(json.dumps(facts, indent=2))
+    show_prediction(facts, quiet=quiet, as_json=as_json)
 
 
 def _from_here(name: str) -> str:

@@ -12,6 +12,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from rfdropo_bayes.cautions import read_cautions
+
 GOOD, FAIR, BAD = "green", "yellow", "red"
 COLOURS = {
     "safe": GOOD,
@@ -24,7 +26,7 @@ COLOURS = {
     "partly_explained": FAIR,
     "unexplained": BAD,
 }
-CALIBRATED = ("title", "status", "headline", "randomisation", "parameters", "rmse", "log_evidence", "warnings")
+CALIBRATED = ("title", "status", "headline", "randomisation", "parameters", "rmse", "log_evidence", "cautions")
 AUDITED = ("verdict", "sentence", "findings", "gain", "next_experiment")
 MOST_ROWS = 20
 
@@ -48,8 +50,8 @@ def show_calibration(folder: Path, *, quiet: bool, as_json: bool) -> None:
     console.print(_parameters(rows[:MOST_ROWS]))
     if len(rows) > MOST_ROWS:
         console.print(f"and {len(rows) - MOST_ROWS} more in {folder / 'summary.json'}", soft_wrap=True)
-    for sentence in summary["warnings"]:
-        console.print(Text(f"warning: {sentence}", style=FAIR), soft_wrap=True)
+    for caution in read_cautions(summary.get("cautions", [])):
+        console.print(Text(f"caution: {caution.sentence}", style=BAD if caution.grave else FAIR), soft_wrap=True)
     console.print(f"report: {report}", soft_wrap=True)
 
 
@@ -72,6 +74,39 @@ def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: 
     if rows:
         console.print(_parameters(rows[:MOST_ROWS]))
     console.print(f"report: {files['report']}; extended model: {files['extended']}", soft_wrap=True)
+
+
+def show_simulation(found: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
+    """Print how far a simulation is from its recordings; ``found`` is the content of simulation.json."""
+    if as_json:
+        typer.echo(json.dumps(found, indent=2))
+    elif not quiet:
+        for name, facts in found["recordings"].items():
+            typer.echo(f"{name}: {facts['status']}{_off(facts['error_mm'])}; {facts['files'][0]}")
+        if found["error_mm"] is not None and len(found["recordings"]) > 1:
+            typer.echo(f"all of them{_off(found['error_mm'])}")
+
+
+def _off(error: Mapping[str, float] | None) -> str:
+    """How far markers are off."""
+    if error is None:
+        return ""
+    return (
+        f", the last marker off by {error['rms_last_marker']:.3g} mm in root mean square, "
+        f"all markers by {error['mean']:.3g} mm on average and {error['max']:.3g} mm at most"
+    )
+
+
+def show_prediction(facts: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
+    """Print what a prediction is of; ``facts`` is the content of prediction.json."""
+    if as_json:
+        typer.echo(json.dumps(facts, indent=2))
+    elif not quiet:
+        start = "from the measured first row" if facts["start_pose_known"] else "without a measured first row"
+        typer.echo(f"{facts['rows']} rows {start}, under {facts['draws']} draws of {facts['posterior']}")
+        typer.echo("mean, 50 and 90 % bands in m:")
+        for file in facts["files"]:
+            typer.echo(f"  {file}")
 
 
 def _parameters(rows: Iterable[tuple[str, Mapping[str, Any], str]]) -> Table:

@@ -82,6 +82,9 @@ def table2(
     episodes: Annotated[int, typer.Option(help="of an evaluation, the same for all policies")] = 200,
     budget: Annotated[int, typer.Option(help="rollouts of a fit")] = 10_000,
     minutes: Annotated[float, typer.Option(help="bound of the audit")] = 30.0,
+    exact_oracle: Annotated[
+        bool, typer.Option("--exact-oracle", help="train the oracle on the target's own mesh and time step; slower")
+    ] = False,
     rows: Annotated[list[str] | None, typer.Option("--row", help="only this row; may be repeated")] = None,
     resume: Annotated[bool, typer.Option(help="keep what an interrupted study has done")] = False,
     only_done: Annotated[bool, typer.Option(help="tables of what an interrupted study has done")] = False,
@@ -96,7 +99,7 @@ def table2(
         target,
         audited,
         out,
-        Size(seeds, steps, episodes, budget, minutes),
+        Size(seeds, steps, episodes, budget, minutes, exact_oracle),
         rows=rows or (),
         resume=resume,
         only_done=only_done,

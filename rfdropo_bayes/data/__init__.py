@@ -2,6 +2,7 @@
 
 from rfdropo_bayes.data.asl_csv import read_asl_csv, read_motor_step
 from rfdropo_bayes.data.faults import Faults, find_faults
+from rfdropo_bayes.data.first_command import common_beginning
 from rfdropo_bayes.data.matching import check_channels, shared_markers
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
 from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
@@ -24,6 +25,7 @@ __all__ = [
     "Trajectory",
     "check_channels",
     "clock_offset",
+    "common_beginning",
     "find_data_file",
     "find_faults",
     "first_row_only",

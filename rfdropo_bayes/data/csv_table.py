@@ -185,6 +185,12 @@ class CsvTable:
             )
         return values
 
+    def numeric(self) -> pd.DataFrame:
+        """The columns that hold nothing but numbers and empty cells, as numbers."""
+        values = self.frame.apply(self._number)
+        told = values.notna().any() & (values.notna() | self.frame.isna()).all()
+        return values.loc[:, told]
+
     def _number(self, cells: pd.Series) -> pd.Series:
         """Cells of a column as numbers; pandas leaves those of a column with any text as they were."""
         if self.decimal == "," and not pd.api.types.is_numeric_dtype(cells):

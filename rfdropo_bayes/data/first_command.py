@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.data.trajectory import Trajectory
+from rfdropo_bayes.data.trajectory import FIRST_COMMAND, Trajectory
 from rfdropo_bayes.errors import InputError
 
 Rule = Literal["first", "zero"] | Sequence[float]
@@ -64,6 +64,13 @@ def begun_from(trajectory: Trajectory, rule: Rule | None) -> Trajectory:
         return trajectory.with_initial_command(np.asarray(rule, dtype=float), {"rule": "given", "why": why})
     first = trajectory.command[0]
     return trajectory.with_initial_command(first if rule == "first" else 0.0 * first, {"rule": rule, "why": why})
+
+
+def common_beginning(trajectories: Sequence[Trajectory]) -> str | None:
+    """The rule by which all of some recordings begin, "first" or "zero"; None where they differ, or need none."""
+    rules = {trajectory.settings.get(FIRST_COMMAND, {}).get("rule") for trajectory in trajectories}
+    rule = rules.pop() if len(rules) == 1 else None
+    return rule if rule in ("first", "zero") else None
 
 
 class Beginning(NamedTuple):

@@ -61,10 +61,11 @@ class DataSpec(BaseModel):
         "or one value per channel [m or rad]; where the file does not say, recognised from the first rows by default",
     )
     lead_in: float = Field(
-        default=0.0,
+        default=2.0,
         ge=0,
         description="for so long [s] before the first of rows commands are simulated, too: a piece that starts in "
-        "motion is then in motion, and starts at rest under the command in force without",
+        "motion is then in motion; with 0 it starts at rest under the command in force, as every piece does in which "
+        "an object was tracked, since that starts where the first of rows shows it",
     )
 
     @field_validator("fit", "test", mode="before")
@@ -79,6 +80,12 @@ class DataSpec(BaseModel):
         if (self.format == "csv") != (self.columns is not None):
             raise ValueError("format 'csv' needs a [data.columns] table, and no other format takes one")
         return self
+
+    def piece(self, whole: Trajectory, rows: tuple[int, int] | None) -> Trajectory:
+        """Rows first to last of a recording, with the commands of `lead_in`; all of it without rows."""
+        if rows is None:
+            return whole
+        return whole.slice_rows(*rows, self.lead_in if whole.object_pose is None else 0.0)
 
     @classmethod
     def parse(cls, table: Mapping[str, Any], where: str = "[data]") -> DataSpec:
@@ -120,7 +127,7 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
             loaded[key] = begun_from(_read(spec, source), rule)
             said = loaded[key].name, loaded[key].first_command
             logging.getLogger(__name__).info("%s: command before the first row: %s", *said)
-        recording = loaded[key] if source.rows is None else loaded[key].slice_rows(*source.rows, spec.lead_in)
+        recording = spec.piece(loaded[key], source.rows)
         recordings.append(recording if spec.resample is None else recording.resample(spec.resample))
     return _distinct_names(recordings, sources)
 

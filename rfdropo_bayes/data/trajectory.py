@@ -289,7 +289,9 @@ class Trajectory:
         piece = Trajectory(dataset.assign_attrs(name=f"{self.name}[{first}:{last}]"))
         if not before.any():
             return piece
-        return piece.with_attributes(settings={FIRST_COMMAND: {"rule": "given", "why": f"in force before row {first}"}})
+        earlier = f"{lead_in:g} s " if lead_in > 0.0 else ""
+        why = f"in force {earlier}before row {first}"
+        return piece.with_attributes(settings={FIRST_COMMAND: {"rule": "given", "why": why}})
 
     def resample(self, sample_time: float) -> Trajectory:
         """Observations on the grid 0, sample_time, 2 sample_time, ... [s] by linear interpolation (quaternions: slerp).

@@ -20,7 +20,12 @@ from rfdropo_bayes.errors import InputError
 
 
 def load_unseen(
-    spec: DataSpec, base: Path, commands: str, start: str | None = None, rows: tuple[int, int] | None = None
+    spec: DataSpec,
+    base: Path,
+    commands: str,
+    start: str | None = None,
+    rows: tuple[int, int] | None = None,
+    begun: str | None = None,
 ) -> Trajectory:
     """The commands of a file in the format of an experiment, and its start pose.
 
@@ -33,6 +38,8 @@ def load_unseen(
         commands: the file of commands.
         start: the file of observations, where it is another; only one row of it counts.
         rows: keep observation rows first to last, both included; the start pose is then that of row ``first``.
+        begun: how the fitted recordings begin, "zero" or "first" (`common_beginning`), where all begin alike: so do
+            these commands, unless [data] or the file says otherwise.
 
     Raises:
         InputError: a file that is missing or bad, or a start where the format has it in the same file.
@@ -40,13 +47,13 @@ def load_unseen(
     if spec.format == "asl-csv":
         observations = None if start is None else find_data_file(start, base)
         whole = read_asl_start(find_data_file(commands, base), observations, rows[0] if rows else 0)
-        return _piece(_begun(whole, spec), spec, rows)
+        return spec.piece(_begun(whole, spec, begun), rows)
     if spec.format == "csv" and spec.columns is not None:
         path = find_data_file(commands, base)
         if holds_commands_alone(path, spec.columns):
             observations = None if start is None else find_data_file(start, base)
             whole = read_csv_start(path, spec.columns, observations, rows[0] if rows else 0)
-            return _piece(_begun(whole, spec), spec, rows)
+            return spec.piece(_begun(whole, spec, begun), rows)
     if spec.format == "csv" and start is not None:
         entry = RecordingEntry(observations=start, commands=commands)
     elif start is not None:
@@ -63,19 +70,17 @@ def load_unseen(
     recordings = load_recordings(spec.model_copy(update=changes), base)
     if len(recordings) > 1:
         raise InputError(f"names {len(recordings)} files", where=commands, remedy="predict one at a time")
-    return first_row_only(_piece(_begun(recordings[0], spec), spec, rows))
+    return first_row_only(spec.piece(_begun(recordings[0], spec, begun), rows))
 
 
-def _begun(whole: Trajectory, spec: DataSpec) -> Trajectory:
-    """With the command before the first row as [data] has it; the first one where neither it nor the file tells."""
+def _begun(whole: Trajectory, spec: DataSpec, begun: str | None) -> Trajectory:
+    """With the command before the first row as [data], the file or the fitted recordings have it; else the first."""
     if spec.initial_command is not None or spec.format not in UNTOLD:
         return begun_from(whole, spec.initial_command)
-    why = "assumed; set data.initial_command where it was another"
-    return whole.with_initial_command(whole.command[0], {"rule": "first", "why": why})
-
-
-def _piece(whole: Trajectory, spec: DataSpec, rows: tuple[int, int] | None) -> Trajectory:
-    return whole if rows is None else whole.slice_rows(*rows, spec.lead_in)
+    why = "assumed" if begun is None else "as in the fitted recordings"
+    initial = 0.0 * whole.command[0] if begun == "zero" else whole.command[0]
+    beginning = {"rule": begun or "first", "why": f"{why}; set data.initial_command where it was another"}
+    return whole.with_initial_command(initial, beginning)
 
 
 def first_row_only(trajectory: Trajectory) -> Trajectory:

@@ -1,5 +1,69 @@
-"""Inference methods. They see a `Problem` and nothing of the simulator behind it."""
+"""Inference methods. They see a `Problem` and nothing of the simulator behind it.
+
+Other rooms import from here, and the modules `methods` and `sbc`; a name's module is loaded when it is first used.
+
+| to find | look in |
+|---|---|
+| the methods by name | `methods` |
+| where SMC starts, how it goes on, how its particles move | `smc.start`, `smc.sampler`, `smc.moves` |
+| where modes are searched | `modes.search` |
+| RF-DROPO | `rfdropo.search` |
+| plain numpyro models | `plain.problem` |
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from rfdropo_bayes.runtime import configure_jax
 
 configure_jax()
+
+if TYPE_CHECKING:
+    from rfdropo_bayes.inference.checkpoints import Checkpoint as Checkpoint
+    from rfdropo_bayes.inference.methods import METHODS as METHODS
+    from rfdropo_bayes.inference.methods import make_config as make_config
+    from rfdropo_bayes.inference.methods import method_named as method_named
+    from rfdropo_bayes.inference.modes.search import LaplaceConfig as LaplaceConfig
+    from rfdropo_bayes.inference.modes.search import find_modes as find_modes
+    from rfdropo_bayes.inference.nested import NestedConfig as NestedConfig
+    from rfdropo_bayes.inference.nuts import NutsConfig as NutsConfig
+    from rfdropo_bayes.inference.plain.problem import problem_from_numpyro as problem_from_numpyro
+    from rfdropo_bayes.inference.progress import Progress as Progress
+    from rfdropo_bayes.inference.result import InferenceResult as InferenceResult
+    from rfdropo_bayes.inference.rfdropo.search import RfdropoConfig as RfdropoConfig
+    from rfdropo_bayes.inference.rivals import BayesSimConfig as BayesSimConfig
+    from rfdropo_bayes.inference.rivals import NpdrConfig as NpdrConfig
+    from rfdropo_bayes.inference.rivals import UdrConfig as UdrConfig
+    from rfdropo_bayes.inference.rivals import import_sbi as import_sbi
+    from rfdropo_bayes.inference.schedules import next_step as next_step
+    from rfdropo_bayes.inference.smc.bridge import BridgeConfig as BridgeConfig
+    from rfdropo_bayes.inference.smc.sampler import SmcConfig as SmcConfig
+
+PUBLIC = {
+    "Checkpoint": "checkpoints",
+    "METHODS": "methods",
+    "make_config": "methods",
+    "method_named": "methods",
+    "LaplaceConfig": "modes.search",
+    "find_modes": "modes.search",
+    "NestedConfig": "nested",
+    "NutsConfig": "nuts",
+    "problem_from_numpyro": "plain.problem",
+    "Progress": "progress",
+    "InferenceResult": "result",
+    "RfdropoConfig": "rfdropo.search",
+    "BayesSimConfig": "rivals",
+    "NpdrConfig": "rivals",
+    "UdrConfig": "rivals",
+    "import_sbi": "rivals",
+    "next_step": "schedules",
+    "BridgeConfig": "smc.bridge",
+    "SmcConfig": "smc.sampler",
+}
+"""Public names, and the module of each."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{PUBLIC[name]}"), name)

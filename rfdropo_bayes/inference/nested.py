@@ -17,11 +17,12 @@ from blackjax.ns import utils
 from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.nuts import log_densities
-from rfdropo_bayes.inference.result import InferenceResult, chains, prior_warnings
+from rfdropo_bayes.inference.result import InferenceResult, chains, prior_cautions
 
 SHRINKAGES = 100  # simulated prior volumes behind the evidence's deviation
 EVALUATIONS = 8  # of a slice, roughly: stepping out and shrinking
@@ -83,9 +84,8 @@ def run(
     draws, evidence = _collect(problem, final, end_key, config.draws)
     ledger = Ledger()
     ledger.charge(problem, config.live + len(dead) * replaced * slices * EVALUATIONS, problem.n_rows)
-    short = [f"nested sampling stopped after {config.max_steps} steps, before the evidence was in"] * (
-        left >= config.remaining
-    )
+    sentence = f"nested sampling stopped after {config.max_steps} steps, before the evidence was in"
+    short = [Caution(Code.EVIDENCE_UNFINISHED, sentence, grave=True)] * (left >= config.remaining)
     return InferenceResult(
         method="nested",
         draws=draws,
@@ -93,7 +93,7 @@ def run(
         trace=[{"rollouts": ledger.rollouts, "log_evidence": evidence[0], "steps": len(dead)}],
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
-        warnings=[*short, *prior_warnings(problem, draws)],
+        cautions=[*short, *prior_cautions(problem, draws)],
         seconds=time.monotonic() - began,
         details={"live": config.live, "steps": len(dead), "rollouts_are_estimated": True},
     )

@@ -17,10 +17,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from numpyro.infer import MCMC, NUTS
 
 from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.result import InferenceResult, chains, prior_warnings
+from rfdropo_bayes.inference.result import InferenceResult, chains, prior_cautions
 
 LOWEST = -1e10  # density of a rollout that failed: finite, so that a gradient there is zero and not NaN
 
@@ -114,9 +115,8 @@ def run(
     u = np.asarray(sampler.get_samples(group_by_chain=True))
     draws = chains(problem, list(u))
     diverging = int(np.sum(extra["diverging"]))
-    warnings = [f"{diverging} transitions diverged: the posterior has a place that steps cannot follow"] * bool(
-        diverging
-    )
+    sentence = f"{diverging} transitions diverged: the posterior has a place that steps cannot follow"
+    diverged = [Caution(Code.TRANSITIONS_DIVERGED, sentence)] * bool(diverging)
     logbook.stage(1.0, method="nuts", rollouts=ledger.rollouts)
     return InferenceResult(
         method="nuts",
@@ -125,7 +125,7 @@ def run(
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
-        warnings=[*warnings, *prior_warnings(problem, draws)],
+        cautions=[*diverged, *prior_cautions(problem, draws)],
         seconds=time.monotonic() - began,
         details={"diverging": diverging, "gradients": steps},
     )

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from scipy.stats import skew
 
 from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.posteriors import contradiction, contradicts, piled_at
 
 SCATTERED = 0.5  # nats
@@ -38,7 +39,7 @@ class InferenceResult:
         trace: one dictionary per stage.
         rollouts: full-length equivalents used; evaluations: parameter sets tried.
         excluded: parameter sets that got no weight, by reason.
-        warnings: sentences for the report.
+        cautions: what speaks against the draws.
         seconds: time spent, earlier parts of a resumed run included.
         phi: distribution to randomise over, {name: {mean, std, low, high, unit}}, of RF-DROPO; else None.
         held: {name: value} of the parameters that the method did not infer and took for known.
@@ -56,7 +57,7 @@ class InferenceResult:
     rollouts: float = 0.0
     evaluations: int = 0
     excluded: dict[str, int] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    cautions: list[Caution] = field(default_factory=list)
     seconds: float = 0.0
     phi: dict[str, dict[str, Any]] | None = None
     held: dict[str, float] = field(default_factory=dict)
@@ -70,15 +71,15 @@ def chains(problem: Problem, positions: list[np.ndarray]) -> Draws:
     return {name: np.stack([np.asarray(v[name], dtype=float) for v in values]) for name in problem.names}
 
 
-def prior_warnings(problem: Problem, draws: Draws) -> list[str]:
-    """A sentence for every parameter whose posterior is cut off at its mode by a bound or an end of its prior, which
+def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
+    """A caution for every parameter whose posterior is cut off at its mode by a bound or an end of its prior, which
     decide there, and one for those that the data put where the prior hardly is.
 
     A prior that is more even in logarithms has its posterior compared with a bound in logarithms: a scale that ranges
     over decades has much of a linear range's mass at the lower end.
     """
     drawn, ends = problem.sample_prior(jax.random.key(0), PRIOR_DRAWS), getattr(problem, "prior_ends", problem.bounds)
-    sentences, apart = [], []
+    found, apart = [], []
     for name, values in draws.items():
         values, (low, high), prior = np.ravel(values), ends[name], np.asarray(drawn[name], dtype=float)
         side = piled_at(values, low, high)
@@ -88,17 +89,18 @@ def prior_warnings(problem: Problem, draws: Draws) -> list[str]:
             word, end = ("lower", low) if side == "low" else ("upper", high)
             hard = np.isclose(end, problem.bounds[name], rtol=1e-6, atol=0.0).any()
             what = f"its {word} bound {end:g}" if hard else f"the {word} end {end:g} of its prior"
-            sentences.append(f"{name} sits on {what}, which decides there, and not the data")
+            sentence = f"{name} sits on {what}, which decides there, and not the data"
+            found.append(Caution(Code.AT_BOUND, sentence))
         elif contradicts(values, prior):
             apart.append(name)
-    return sentences + [contradiction(apart)] * bool(apart)
+    return found + [Caution(Code.AGAINST_PRIOR, contradiction(apart))] * bool(apart)
 
 
 def _even_in_logarithms(prior: Float[np.ndarray, " n"]) -> bool:
     return bool(np.all(prior > 0.0) and abs(skew(np.log(prior))) < abs(skew(prior)))
 
 
-def stage_warnings(trace: list[dict[str, Any]], rollouts: float | None, correlation: float) -> list[str]:
+def stage_cautions(trace: list[dict[str, Any]], rollouts: float | None, correlation: float) -> list[Caution]:
     """What the stages of all replicates say against the draws: a budget that ran out, particles that did not move.
 
     Args:
@@ -106,33 +108,36 @@ def stage_warnings(trace: list[dict[str, Any]], rollouts: float | None, correlat
         rollouts: their budget.
         correlation: that moves were to leave at most.
     """
-    sentences = []
+    found = []
     leaps = [row for row in trace if row["budget_exhausted"] and not row.get("final")]
     if leaps:
         worst, whole = min(row["ess"] for row in leaps), max(row["progress"] for row in trace)
         place = f" at row {leaps[0]['progress']:g}" if whole > 1.0 else ""
-        sentences.append(
+        sentence = (
             f"the budget of {rollouts:.0f} rollouts ran out{place}: the rest of the data was brought in by "
             f"reweighting only (effective share {worst:.2%}); allow more rollouts or use fewer particles"
         )
+        found.append(Caution(Code.BUDGET_SPENT, sentence, grave=True))
     if (stuck := max(row["correlation"] for row in trace if row.get("final"))) > max(STUCK, correlation):
-        sentences.append(
+        sentence = (
             f"the last moves left the particles {stuck:.2f} correlated with where they were, so that the posterior may "
             "be too narrow: several modes, a rugged likelihood, or a shape that moves cannot follow; compare replicates"
         )
-    return sentences
+        found.append(Caution(Code.PARTICLES_STUCK, sentence, grave=True))
+    return found
 
 
-def replicate_warnings(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) -> list[str]:
+def replicate_cautions(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) -> list[Caution]:
     """What independent repetitions do not agree about: the evidence, or where parameters lie (R-hat)."""
     if len(log_evidence) < 2:
         return []
-    sentences, sd = [], float(np.std(log_evidence, ddof=1))
+    found, sd = [], float(np.std(log_evidence, ddof=1))
     if sd > SCATTERED:
-        sentences.append(
+        sentence = (
             f"the log evidences of {len(log_evidence)} replicates scatter by {sd:.2g}: compare models only where they "
             "differ by several times that, or take more particles or a target_ess closer to 1"
         )
+        found.append(Caution(Code.EVIDENCE_SCATTERED, sentence))
     apart = {}
     for name, values in draws.items():
         within = float(np.mean(np.var(values, axis=1, ddof=1)))
@@ -141,17 +146,19 @@ def replicate_warnings(draws: Draws, log_evidence: Float[np.ndarray, " chain"]) 
     worst = sorted((name for name in apart if apart[name] > APART), key=lambda name: -apart[name])
     if worst:
         others = f" and {len(worst) - 3} more" if len(worst) > 3 else ""
-        sentences.append(
+        sentence = (
             f"replicates disagree about {', '.join(worst[:3])}{others} (R-hat {apart[worst[0]]:.2f}): some have "
             "not seen all of the posterior"
         )
-    return sentences
+        found.append(Caution(Code.REPLICATES_DISAGREE, sentence))
+    return found
 
 
-def exclusion_warnings(excluded: Mapping[str, int], evaluations: int, *, share: float = 0.05) -> list[str]:
-    """A sentence where more than ``share`` of the rollouts had to be left out."""
+def exclusion_cautions(excluded: Mapping[str, int], evaluations: int, *, share: float = 0.05) -> list[Caution]:
+    """A caution where more than ``share`` of the rollouts had to be left out."""
     total = sum(excluded.values())
     if evaluations == 0 or total / evaluations <= share:
         return []
     reasons = ", ".join(f"{name} {count}" for name, count in sorted(excluded.items()))
-    return [f"{total} of {evaluations} rollouts got no weight ({reasons})"]
+    sentence = f"{total} of {evaluations} rollouts got no weight ({reasons})"
+    return [Caution(Code.ROLLOUTS_EXCLUDED, sentence)]

@@ -28,8 +28,8 @@ from rfdropo_bayes.bayes.problem import Problem, RolloutProblem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior
 from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.proposals import host_generator
-from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_warnings, prior_warnings
+from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_cautions, prior_cautions
+from rfdropo_bayes.inference.smc.moves import host_generator
 from rfdropo_bayes.inference.summaries import cross_correlation_summary, informative, thinned_summary
 
 FEWEST_ROLLOUTS = 50
@@ -282,9 +282,9 @@ def _run(
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
-        warnings=[
-            *prior_warnings(problem, draws),
-            *exclusion_warnings(ledger.excluded, ledger.evaluations),
+        cautions=[
+            *prior_cautions(problem, draws),
+            *exclusion_cautions(ledger.excluded, ledger.evaluations),
         ],
         seconds=time.monotonic() - began,
         details={"simulations": int(share * rounds), "rounds": rounds},

@@ -118,8 +118,6 @@ class CommandGain(MemorylessActuation):
         ),
     )
 
-    def reach(
-        self, values: Values, sent: Float[Array, "*step channel"], initial: Float[Array, " channel"]
-    ) -> Float[Array, "*step channel"]:
-        """Scale the displacement from the initial command, to which the initial state belongs."""
-        return initial + (1.0 + values["command_gain_error"]) * (sent - initial)
+    def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
+        """Scale the whole command."""
+        return (1.0 + values["command_gain_error"]) * sent

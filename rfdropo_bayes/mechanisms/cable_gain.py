@@ -46,10 +46,8 @@ class CableGain(MemorylessActuation):
         """One error for every command channel of a robot."""
         return cls(robot.channel_names)
 
-    def reach(
-        self, values: Values, sent: Float[Array, "*step channel"], initial: Float[Array, " channel"]
-    ) -> Float[Array, "*step channel"]:
-        """Scale the displacements from the initial command."""
+    def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
+        """Scale each command, from zero on."""
         count = sent.shape[-1]
         error = jnp.stack([values[spec.name] for spec in self.parameters[:count]])
-        return initial + (1.0 + error) * (sent - initial)
+        return (1.0 + error) * sent

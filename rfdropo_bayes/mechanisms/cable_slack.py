@@ -30,9 +30,7 @@ class CableSlack(InCommandUnit, MemorylessActuation):
         ),
     )
 
-    def reach(
-        self, values: Values, sent: Float[Array, "*step channel"], initial: Float[Array, " channel"]
-    ) -> Float[Array, "*step channel"]:
+    def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
         """Shrink the command towards zero by the slack."""
         slack = values["cable_slack"]
         return jnp.where(sent > slack, sent - slack, jnp.where(sent < -slack, sent + slack, 0.0))

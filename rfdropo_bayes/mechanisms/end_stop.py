@@ -31,9 +31,7 @@ class EndStop(InCommandUnit, MemorylessActuation):
         ),
     )
 
-    def reach(
-        self, values: Values, sent: Float[Array, "*step channel"], initial: Float[Array, " channel"]
-    ) -> Float[Array, "*step channel"]:
+    def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
         """Cut the command off at the limit."""
         inverse = values["inverse_travel_limit"]
         limit = jnp.sign(sent) / jnp.maximum(inverse, 1e-12)

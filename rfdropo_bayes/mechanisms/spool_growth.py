@@ -29,8 +29,6 @@ class SpoolGrowth(InCommandUnit, MemorylessActuation):
         ),
     )
 
-    def reach(
-        self, values: Values, sent: Float[Array, "*step channel"], initial: Float[Array, " channel"]
-    ) -> Float[Array, "*step channel"]:
+    def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
         """Add the square of the command, from zero command on."""
-        return sent + values["spool_growth"] * (sent**2 - initial**2)
+        return sent + values["spool_growth"] * sent**2

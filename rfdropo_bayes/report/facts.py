@@ -8,6 +8,7 @@ from importlib import metadata
 from platform import python_version
 from typing import Any
 
+from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.report.baselines import BaselineErrors
 from rfdropo_bayes.report.object_scores import ObjectScore
@@ -76,7 +77,7 @@ class RunFacts:
         seconds: of wall time.
         log_evidence: value and standard deviation in nats (NaN: not measured); None if the method has none.
         excluded: parameter sets that got no weight, by reason.
-        warnings: sentences.
+        cautions: what speaks against the result.
         recordings: fit first, then test.
         model: label -> words, e.g. mechanisms, noise, fixed values, time step.
         residuals: from `check_residuals`; empty where the method has no likelihood.
@@ -102,7 +103,7 @@ class RunFacts:
     evaluations: int = 0
     log_evidence: tuple[float, float] | None = None
     excluded: Mapping[str, int] = field(default_factory=dict)
-    warnings: Sequence[str] = ()
+    cautions: Sequence[Caution] = ()
     recordings: Sequence[RecordingFacts] = ()
     model: Mapping[str, str] = field(default_factory=dict)
     residuals: Mapping[str, ResidualCheck] = field(default_factory=dict)

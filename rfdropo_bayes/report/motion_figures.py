@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.spatial import ConvexHull
 
@@ -26,6 +27,8 @@ PLANES = {"from the side": (0, 2), "from above": (0, 1)}
 AXES = ("along [mm]", "across [mm]", "up [mm]")
 INSTANTS = 6
 """Instants that a still shows."""
+TICKS = 5
+"""Ticks along the longest axis in space; shorter ones have fewer, so that their labels do not meet."""
 GROUND = "#D9D9D9"
 MILLIMETRES = 1e3
 
@@ -42,9 +45,11 @@ def _frame(motion: Motion) -> tuple[Figure, Axes, dict[str, Axes]]:
     if motion.plate is not None:
         low[2] = min(low[2], MILLIMETRES * motion.plate - 5.0)
     space.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    space.set_box_aspect(high - low)
+    space.set_box_aspect(high - low, zoom=0.87)  # room for the labels of the axes
     space.view_init(elev=22, azim=-60)
     space.set(xlabel=AXES[0], ylabel=AXES[1], zlabel=AXES[2])
+    for axis, extent in zip((space.xaxis, space.yaxis, space.zaxis), high - low, strict=True):
+        axis.set_major_locator(MaxNLocator(max(2, round(TICKS * extent / float(np.max(high - low))))))
     flat = {}
     for row, (name, (i, j)) in enumerate(PLANES.items()):
         axes = figure.add_subplot(grid[row, 1])

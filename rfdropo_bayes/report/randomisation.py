@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
+from rfdropo_bayes.cautions import grave, read_cautions
 from rfdropo_bayes.posteriors import PosteriorRecord, contradiction, contradicts
 from rfdropo_bayes.report.headline import best_baseline
 
@@ -17,8 +18,6 @@ FEW_DRAWS = 100.0  # effective ones
 UNMIXED = 1.1  # R-hat
 HALF = 0.5  # of a variance: beyond it, most of an error is systematic
 LOST = 0.05  # share of rollouts without weight
-# In the warnings of samplers and climbs that a budget cut off, of particles that did not move, and of RF-DROPO.
-UNFINISHED = ("ran out", "left the particles", "sits on its smallest value")
 
 WORDS = {
     "safe": "Safe to randomise over",
@@ -50,10 +49,10 @@ class Safety:
 
 def judge(record: PosteriorRecord, summary: Mapping[str, Any]) -> Safety:
     """Judge a posterior by the numbers of its summary (without its key "randomisation")."""
-    grave = [*_bands(summary), *_against_baselines(summary), *_sampling(summary), *_conflicts(record)]
+    against = [*_bands(summary), *_against_baselines(summary), *_sampling(summary), *_conflicts(record)]
     slight = [*_systematic(summary), *_reservations(summary)]
-    verdict = "unsafe" if grave else "with care" if slight else "safe"
-    reasons = grave + slight
+    verdict = "unsafe" if against else "with care" if slight else "safe"
+    reasons = against + slight
     nothing = "bands, residuals, errors, sampler, bounds and prior give no reason against it"
     why = f": {'; '.join(reasons) or nothing}."
     return Safety(verdict, WORDS[verdict] + why, reasons, _advice(summary))
@@ -143,16 +142,11 @@ def _sampling(summary: Mapping[str, Any]) -> list[str]:
     apart = [name for name, row in rows.items() if (row.get("r_hat") or 1.0) > UNMIXED]
     if apart:
         found.append(f"independent runs disagree about {', '.join(apart)}")
-    found += unfinished(summary["warnings"])
+    found += [caution.sentence for caution in grave(read_cautions(summary["cautions"]))]
     total = sum(summary["excluded"].values())
     if summary["evaluations"] and total > LOST * summary["evaluations"]:
         found.append(f"{100 * total / summary['evaluations']:.0f} % of the rollouts failed")
     return found
-
-
-def unfinished(warnings: Sequence[str]) -> list[str]:
-    """Those of a method's warnings that say that it did not arrive at its posterior."""
-    return [sentence for sentence in warnings if any(words in sentence for words in UNFINISHED)]
 
 
 def _conflicts(record: PosteriorRecord) -> list[str]:

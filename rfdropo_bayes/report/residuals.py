@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import stats
 
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.posteriors import RecordingPrediction
 
 TOO_NARROW = 1.2  # a fifth: as much as a correlation of 0.2 from row to row
@@ -94,28 +95,30 @@ def autocorrelations(series: Sequence[Float[np.ndarray, " time"]]) -> Float[np.n
     )
 
 
-def residual_warnings(checks: Mapping[str, ResidualCheck], noise: str) -> list[str]:
-    """A sentence where residuals are correlated beyond the noise model, and one where many are far off.
+def residual_cautions(checks: Mapping[str, ResidualCheck], noise: str) -> list[Caution]:
+    """A caution where residuals are correlated beyond the noise model, and one where many are far off.
 
     Args:
         checks: from `check_residuals`.
         noise: name of the noise model.
     """
-    sentences = []
+    found = []
     correlated = _names(checks, "correlated")
     if correlated:
         worst = max(check.narrowing for check in checks.values() if check.correlated)
-        sentences.append(
+        sentence = (
             f"residuals are correlated beyond the noise model {noise!r} ({correlated}): intervals are too narrow, by "
             f"up to {worst:.2g} times; {REMEDIES.get(noise, NO_REMEDY)}"
         )
+        found.append(Caution(Code.RESIDUALS_CORRELATED, sentence))
     if noise != "student-t" and (heavy := _names(checks, "heavy")):
         share = max(check.far for check in checks.values() if check.heavy)
-        sentences.append(
+        sentence = (
             f"up to {share:.1%} of the residuals are more than {FAR:g} deviations off ({heavy}) and inflate the noise: "
             'mask recording faults, or use noise = "student-t"'
         )
-    return sentences
+        found.append(Caution(Code.RESIDUALS_HEAVY, sentence))
+    return found
 
 
 def _names(checks: Mapping[str, ResidualCheck], flag: str) -> str:

@@ -52,7 +52,9 @@ class ActuationMechanism(Mechanism, Protocol):
     """Acts on the command before it becomes a cable displacement.
 
     It may have an attribute ``inside_drive``, True if it is not said: whether an encoder on the motor shows the effect.
-    What happens behind the motor, in gears, spools and cables, has ``inside_drive = False``.
+    What happens behind the motor, in gears, spools and cables, has ``inside_drive = False``. It may have a method
+    ``settle(values, held)``: what it makes of a command that was held long before the first step. Without one, that is
+    the command itself. The initial state of the body, and the ``initial`` of the next mechanism, belong to it.
     """
 
     def actuate(
@@ -125,29 +127,37 @@ class SteppedActuation:
 
 
 class MemorylessActuation:
-    """Base of mechanisms of actuation that look at nothing but the command and the one before the first step."""
+    """Base of mechanisms of actuation that look at nothing but the command of the moment."""
 
-    def reach(
-        self, values: Values, sent: Float[Array, "*step channel"], initial: Float[Array, " channel"]
-    ) -> Float[Array, "*step channel"]:
+    def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
         """Return the command that reaches the cables, given the one that was sent."""
         raise NotImplementedError
 
-    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Float[Array, " channel"]:
+    def settle(self, values: Values, held: Float[Array, " channel"]) -> Float[Array, " channel"]:
+        """See `ActuationMechanism`."""
+        return self.reach(values, held)
+
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[()]:
         """See `SteppedMechanism`."""
-        return first
+        return ()
 
     def advance(
-        self, values: Values, memory: Float[Array, " channel"], given: Float[Array, " channel"], now: float
-    ) -> tuple[Float[Array, " channel"], Float[Array, " channel"]]:
+        self, values: Values, memory: tuple[()], given: Float[Array, " channel"], now: float
+    ) -> tuple[tuple[()], Float[Array, " channel"]]:
         """See `SteppedMechanism`."""
-        return memory, self.reach(values, given, memory)
+        return memory, self.reach(values, given)
 
     def actuate(
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
     ) -> Float[Array, "step channel"]:
         """Return the command that reaches the cables at the end of each step, given the one that was sent."""
-        return self.reach(values, command, initial)
+        return self.reach(values, command)
+
+
+def settled(mechanism: Mechanism, values: Values, held: Float[Array, " channel"]) -> Float[Array, " channel"]:
+    """What a mechanism of actuation makes of a command that was held long before the first step."""
+    settle = getattr(mechanism, "settle", None)
+    return held if settle is None else settle(values, held)
 
 
 def inside_drive(mechanism: Mechanism) -> bool:

@@ -134,7 +134,7 @@ class MeshTrunkSimulator(RobotSimulator):
         """Commanded cable displacements [m] at the end of every step; SOFA's limits are those of the engine."""
         if self.options.drives == "robot":
             return self.wound(values, commands, self.time_step)[1]
-        command = self.actuated(values, commands, self.time_step)
+        command = self.actuated(values, commands, self.time_step)[1]
         return command @ jnp.asarray(self.robot.channel_matrix(values)).T + self.pretension(values)
 
     @cached_property

@@ -24,6 +24,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     TimedSensingMechanism,
     code_of,
     inside_drive,
+    settled,
 )
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
 from rfdropo_bayes.simulators.protocol import Observation, Result
@@ -160,21 +161,24 @@ class RobotSimulator:
 
     def actuated(
         self, values: Values, commands: Commands, time_step: float, *, drives_only: bool = False
-    ) -> Float[Array, "step channel"]:
-        """Commands that reach the cables at the end of every step; or the drives, before the transmission."""
+    ) -> tuple[Float[Array, " channel"], Float[Array, "step channel"]]:
+        """Commands that reach the cables before the first step and at the end of every step; or the drives, before the
+        transmission."""
         command = jnp.asarray(commands.step)
+        initial = jnp.asarray(commands.initial, command.dtype)
         for mechanism in self.mechanisms:
             if isinstance(mechanism, ActuationMechanism) and (inside_drive(mechanism) or not drives_only):
-                command = mechanism.actuate(values, command, commands.initial, time_step)
-        return command
+                command = mechanism.actuate(values, command, initial, time_step)
+                initial = settled(mechanism, values, initial)
+        return initial, command
 
     def driven(self, values: Values, commands: Commands, time_step: float) -> Float[Array, "time channel"]:
         """Where the drives stand at the observation times, in the unit of the commands.
 
         Limits of the cables' displacements are no part of it. Whoever does not look at it pays nothing under ``jit``.
         """
-        command = self.actuated(values, commands, time_step, drives_only=True)
-        return sample(jnp.concatenate([jnp.asarray(commands.initial, command.dtype)[None], command]), commands)
+        initial, command = self.actuated(values, commands, time_step, drives_only=True)
+        return sample(jnp.concatenate([initial[None], command]), commands)
 
     def pretension(self, values: Values) -> Float[Array, " cable"]:
         """Cable displacements at zero command [m]."""
@@ -184,13 +188,13 @@ class RobotSimulator:
         self, values: Values, commands: Commands, time_step: float
     ) -> tuple[Float[Array, " cable"], Float[Array, "step cable"]]:
         """Cable displacements [m] before the first step and at the end of every step, by drives with end stops."""
-        command = self.actuated(values, commands, time_step)
-        start = self.unwound(values, commands.initial)
+        initial, command = self.actuated(values, commands, time_step)
+        start = self.unwound(values, initial)
         levels = jax.lax.scan(lambda drives, sent: self.wind(values, drives, sent), start, command)[1]
         return start.level + self.pretension(values), levels
 
     def unwound(self, values: Values, initial: Float[Array, " channel"]) -> Wound:
-        """The drives before the first step, at this command [m or rad]."""
+        """The drives before the first step, where this command [m or rad] has reached them."""
         limits = self.robot.displacement_limits()
         level = self.robot.channel_matrix(values) @ initial
         return Wound(jnp.clip(level, limits[:, 0], limits[:, 1]), jnp.asarray(initial, float))

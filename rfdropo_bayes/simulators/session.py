@@ -28,6 +28,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     SteppedMechanism,
     TimedSensingMechanism,
     inside_drive,
+    settled,
 )
 from rfdropo_bayes.simulators.parameters import check_names, check_value
 from rfdropo_bayes.simulators.protocol import Observation, Result
@@ -105,7 +106,7 @@ class Session:
         channels = len(self.robot.channel_names)
         self._past = _Past(np.full((lanes, kept), -np.inf), np.zeros((lanes, kept, channels)), np.zeros(lanes, int))
         self._started = np.zeros(lanes, bool)
-        self._drives = self._first_drives(self._values, np.zeros((lanes, channels)))
+        self._drives = self._first_drives(self._values, np.zeros((lanes, channels)))[0]
         self._cameras = self._first_look(self._values, np.zeros((lanes, len(self.robot.marker_names), 3)))[0]
 
     @property
@@ -151,7 +152,7 @@ class Session:
         first = np.zeros((len(rows), len(self.robot.channel_names))) if command is None else np.asarray(command, float)
         past = self._past
         past.given[rows], past.value[rows], past.periods[rows] = -np.inf, first[:, None], 0
-        fresh = self._first_drives(self._values, past.value[:, -1])
+        fresh, angle = self._first_drives(self._values, past.value[:, -1])
         chosen = np.zeros(self.lanes, bool)
         chosen[rows] = True
         self._drives = _chosen(chosen, fresh, self._drives)
@@ -162,7 +163,7 @@ class Session:
         cameras, seen = self._first_look(self._values, position)
         self._cameras = _chosen(chosen, cameras, self._cameras)
         self._started |= chosen
-        return self._observation(found, np.asarray(seen)[rows], first.copy())
+        return self._observation(found, np.asarray(seen)[rows], np.asarray(angle)[rows])
 
     def act(self, commands: Float[np.ndarray, "lane channel"]) -> Observation:
         """Let all lanes run for one control period with these commands [m or rad], in force from its start.
@@ -281,12 +282,20 @@ class Session:
 
     @cached_property
     def _first_drives(self) -> Any:
-        """Drives of all lanes before the first step, given the command before it."""
+        """Drives of all lanes before the first step, given the command before it, and where encoders stand."""
         chains, interval = self._drive_chains, self.simulator.time_step
 
-        def first(values: Values, command: Float[Array, " channel"]) -> _Drives:
-            cables, encoders = (tuple(m.begin(values, command, interval) for m in chain) for chain in chains)
-            return _Drives(cables, encoders, self.simulator.unwound(values, command))
+        def through(chain: list[Any], values: Values, held: Array) -> tuple[tuple, Array]:
+            memories = []
+            for mechanism in chain:
+                memories.append(mechanism.begin(values, held, interval))
+                held = settled(mechanism, values, held)
+            return tuple(memories), held
+
+        def first(values: Values, command: Float[Array, " channel"]) -> tuple[_Drives, Float[Array, " channel"]]:
+            cables, reached = through(chains[0], values, command)
+            encoders, angle = through(chains[1], values, command)
+            return _Drives(cables, encoders, self.simulator.unwound(values, reached)), angle
 
         return self._by_lane(first)
 

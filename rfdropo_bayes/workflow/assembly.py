@@ -6,13 +6,29 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from rfdropo_bayes.bayes.angles import angle_specs, gather_angles
+import numpy as np
+
 from rfdropo_bayes.bayes.calibration import Batch, CalibrationProblem
-from rfdropo_bayes.bayes.forces import TENSION_GAIN, Weighed, check_weighed, gather_tension, tension_specs
-from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
-from rfdropo_bayes.bayes.noise import NOISE_MODELS, noise_specs
-from rfdropo_bayes.bayes.objects import gather_objects, object_specs
+from rfdropo_bayes.bayes.channels import (
+    Channel,
+    Markers,
+    MotorAngle,
+    ObjectPose,
+    Series,
+    Tension,
+    Weighed,
+    WeighedParts,
+)
+from rfdropo_bayes.bayes.channels.motor_angle import MOTOR_ANGLE_NOISE
+from rfdropo_bayes.bayes.channels.object_pose import OBJECT_CORRELATION_TIME, OBJECT_NOISE, OBJECT_TURN_NOISE
+from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN, TENSION_NOISE
+from rfdropo_bayes.bayes.channels.weighed import check_weighed
+from rfdropo_bayes.bayes.model import TrajectoryModel
+from rfdropo_bayes.bayes.noise import NOISE_MODELS, Autoregression, noise_specs
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
 from rfdropo_bayes.bayes.pooling import Pooled, gather_groups
+from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
+from rfdropo_bayes.bayes.repeats import group_recordings, with_noise_of_repeats
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory, find_data_file, load_recordings
 from rfdropo_bayes.errors import InputError
@@ -31,6 +47,14 @@ from rfdropo_bayes.workflow.engines import backend
 from rfdropo_bayes.workflow.experiment import Experiment, ModelTable, matching
 
 Entry = TypeVar("Entry")
+
+KNOWN = (REPEATS, STATED)  # noise of the positions that is not inferred
+
+SWITCHED = {  # channels beside the markers, by the key of [model] that makes their readings data
+    "tension": (TENSION_NOISE, TENSION_GAIN),
+    "motor_angle": (MOTOR_ANGLE_NOISE,),
+    "object_pose": (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME),
+}
 
 
 def find_robot(experiment: Experiment, folder: Path) -> Robot:
@@ -62,10 +86,10 @@ def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path())
 
 
 def measurement_specs(table: ModelTable) -> tuple[ParameterSpec, ...]:
-    """Parameters of what is measured: noise of the positions, and of tensions, motor angles and poses of the pushed
-    body where they are used."""
-    forces, drives = tension_specs(table.tension), angle_specs(table.motor_angle)
-    return noise_specs(table.noise) + forces + drives + object_specs(table.object_pose)
+    """Parameters of the channels that are data: the noise of the positions, and of what else is measured."""
+    noise = () if table.noise in KNOWN else noise_specs(table.noise)
+    further = [spec for key, specs in SWITCHED.items() if getattr(table, key) for spec in specs]
+    return (*noise, *(s for s in further if table.noise != REPEATS or s == TENSION_GAIN))
 
 
 def fixed_values(experiment: Experiment, simulator: RobotSimulator) -> dict[str, float]:
@@ -83,8 +107,7 @@ def check_used(names: Iterable[str], experiment: Experiment, simulator: RobotSim
     table = experiment.model
     specs = simulator.parameters + measurement_specs(table)
     known = [spec.name for spec in specs]
-    switches = {"tension": tension_specs(True), "motor_angle": angle_specs(True), "object_pose": object_specs(True)}
-    further = {f"set [model] {key} = true": found for key, found in switches.items()}
+    further = {f"set [model] {key} = true": found for key, found in SWITCHED.items()}
     further |= {f'set [model] noise = "{model}"': noise_specs(model) for model in NOISE_MODELS}
     for mechanism in mechanisms_named(REGISTRY, simulator.robot):
         further[f"add {mechanism.name!r} to [model] mechanisms"] = mechanism.parameters
@@ -160,12 +183,47 @@ def build_model(
     }
     pooled = pooling(experiment, simulator.parameters, recordings.names)
     space = build_space(specs, priors, scopes, recordings.names, pooled=pooled)
-    weighed = tuple(Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed)
-    check_weighed(weighed, space.names)
-    tension = gather_tension(simulator, trajectories, recordings.time.shape[1]) if table.tension else None
-    angles = gather_angles(trajectories, recordings.time.shape[1]) if table.motor_angle else None
-    poses = gather_objects(simulator, trajectories, recordings.time.shape[1]) if table.object_pose else None
-    return TrajectoryModel(simulator, space, fixed, table.noise, recordings, tension, weighed, angles, poses)
+    channels = gather_channels(experiment, simulator, trajectories, recordings)
+    if isinstance(channels[-1], WeighedParts):
+        check_weighed(channels[-1].entries, space.names)
+    return TrajectoryModel(simulator, space, fixed, recordings, channels)
+
+
+def gather_channels(
+    experiment: Experiment, simulator: RobotSimulator, trajectories: Sequence[Trajectory], recordings: RecordingSet
+) -> tuple[Channel, ...]:
+    """What was measured and is to be used, markers first and weighed parts last."""
+    table, length = experiment.model, recordings.time.shape[1]
+    stated = stated_noise(experiment, recordings, trajectories[0]) if table.noise == STATED else None
+    channels: list[Channel] = [Markers.gather(recordings, table.noise, stated)]
+    if table.tension:
+        channels.append(Tension.gather(simulator, trajectories, length))
+    if table.motor_angle:
+        channels.append(MotorAngle.gather(trajectories, length))
+    if table.object_pose:
+        channels.append(ObjectPose.gather(simulator, trajectories, length))
+    if table.noise == REPEATS:
+        groups = group_recordings(recordings, trajectories)
+        channels = [with_noise_of_repeats(channel, groups) for channel in channels if isinstance(channel, Series)]
+    if table.weighed:
+        entries = (Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed)
+        channels.append(WeighedParts(tuple(entries)))
+    return tuple(channels)
+
+
+def stated_noise(experiment: Experiment, recordings: RecordingSet, first: Trajectory) -> Autoregression:
+    """The noise of the positions that the experiment file states.
+
+    Raises:
+        InputError: none is stated.
+    """
+    noise = experiment.noise
+    if noise is None or noise.standard_deviation == 0.0:
+        raise InputError("no noise is stated", where='[model] noise = "stated"', remedy="give [noise]")
+    step = float(first.dataset.attrs["sample_time"])
+    memory = [] if noise.correlation_time is None else [float(np.exp(-step / noise.correlation_time))]
+    scale = np.full(3 * len(recordings.markers), noise.standard_deviation)
+    return Autoregression(scale, np.array([1.0, *memory]), STATED, np.inf)
 
 
 def build_problem(model: TrajectoryModel, earlier: Batch | None = None) -> CalibrationProblem:

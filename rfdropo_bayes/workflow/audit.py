@@ -18,10 +18,10 @@ from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
 from rfdropo_bayes.audit.fit import widening
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
 from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.noise import STATED, NoiseModel
 from rfdropo_bayes.audit.pipeline import Answer, Question, audit
 from rfdropo_bayes.audit.record import next_experiment, record
-from rfdropo_bayes.bayes.model import gather_recordings
+from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
+from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import ParameterSpace, build_space
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
@@ -319,14 +319,14 @@ def _space(
     return whole, len(base.parameters)
 
 
-def _stated(experiment: Experiment, markers: int, first: Trajectory) -> NoiseModel | None:
+def _stated(experiment: Experiment, markers: int, first: Trajectory) -> Autoregression | None:
     """The noise that the experiment file states, for recordings without repeats."""
     noise = experiment.noise
     if noise is None or noise.standard_deviation == 0.0:
         return None
     step = float(first.dataset.attrs["sample_time"])
     memory = [] if noise.correlation_time is None else [float(np.exp(-step / noise.correlation_time))]
-    return NoiseModel(np.full(3 * markers, noise.standard_deviation), np.array([1.0, *memory]), STATED, np.inf)
+    return Autoregression(np.full(3 * markers, noise.standard_deviation), np.array([1.0, *memory]), STATED, np.inf)
 
 
 def start_values(base: Path | None) -> dict[str, float] | None:

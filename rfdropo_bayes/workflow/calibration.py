@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.pooling import Patterns
-from rfdropo_bayes.data import Trajectory, noise_floor
+from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.methods import make_config, method_named, run
 from rfdropo_bayes.inference.progress import Progress
@@ -21,16 +21,19 @@ from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
 from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, software_versions, write_run
 from rfdropo_bayes.report.object_scores import score_objects
-from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_warnings
+from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
 from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.robots import robot_shape
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
 from rfdropo_bayes.workflow.files import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.workflow.prediction import (
+    BEGUN,
     FITTED,
     HELD,
+    KNOWN_NOISE,
     MARKER_ERRORS,
+    NOISE,
     Batch,
     marker_errors,
     predict_fitted,
@@ -91,7 +94,7 @@ def run_calibration(
             kept = out / CHECKPOINTS
             result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
         problem = problem.holding(result.held)
-        attributes = _attributes(experiment, recordings)
+        attributes = {**_attributes(experiment, recordings), BEGUN: common_beginning(fitted)}
         record = record_posterior(problem, result, tested, predicting, attributes, experiment.model.groups)
         facts = gather_facts(experiment, path.stem, problem, result, fitted, tested, record)
         return write_run(out, record, facts, (out / CONFIG).read_text(encoding="utf-8"))
@@ -153,7 +156,14 @@ def record_posterior(
         trace=result.trace,
         block_scores=result.block_scores,
         log_likelihood=rows,
-        attrs={**attributes, FITTED: fitted, MARKER_ERRORS: errors, HELD: result.held},
+        attrs={
+            **attributes,
+            NOISE: problem.model.noise,
+            FITTED: fitted,
+            MARKER_ERRORS: errors,
+            HELD: result.held,
+            **known_noise(problem),
+        },
     )
     return record.with_derived(scale_free_ratios(problem.names))
 
@@ -223,7 +233,7 @@ def gather_facts(
         evaluations=result.evaluations,
         log_evidence=result.log_evidence,
         excluded=result.excluded,
-        warnings=[*result.warnings, *residual_warnings(checks, problem.model.noise)],
+        cautions=[*result.cautions, *residual_cautions(checks, problem.model.noise)],
         residuals=checks,
         recordings=[
             *(RecordingFacts.of_trajectory(t, "fit") for t in fitted),
@@ -245,6 +255,12 @@ def gather_facts(
         details=result.details,
         outline=robot_shape(robot) if robot is not None else None,
     )
+
+
+def known_noise(problem: CalibrationProblem) -> dict[str, Any]:
+    """The noise of the positions as an attribute of the posterior, where it is not among the parameters."""
+    known, markers = problem.model.markers.known, problem.model.recordings.markers
+    return {} if known is None else {KNOWN_NOISE: {"markers": list(markers), **known.as_dict()}}
 
 
 def _attributes(experiment: Experiment, trajectories: Sequence[Trajectory]) -> dict[str, Any]:

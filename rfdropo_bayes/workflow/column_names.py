@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.errors import InputError
 
 TIME = re.compile(r"^(t|time|timestamp|stamp|secs?|seconds|clock)(?![a-z])", re.IGNORECASE)
@@ -57,7 +58,7 @@ def guess_columns(path: Path) -> Guess:
     Raises:
         InputError: a file that cannot be read, or in which no positions or commands are found.
     """
-    table = _head(path)
+    table = CsvTable(path, (), machine_written=False).numeric().head(LOOKED_AT)
     names = [str(name) for name in table.columns]
     time = next((name for name in names if TIME.search(name)), None)
     triples = _triples([name for name in names if name != time])
@@ -91,20 +92,6 @@ def guess_columns(path: Path) -> Guess:
 def names_of(positions: list[list[str]]) -> list[str]:
     """The columns of all markers."""
     return [name for triple in positions for name in triple]
-
-
-def _head(path: Path) -> pd.DataFrame:
-    """The first rows of a file, whatever stands between its columns, and whichever sign its decimals have."""
-    try:
-        with pd.io.common.get_handle(path, "r", compression="infer", encoding="utf-8", errors="replace") as opened:
-            lines = [opened.handle.readline() for _ in range(2)]
-        separator = max(",;\t", key=lines[0].count)
-        decimal = "," if separator != "," and re.search(r"\d,\d", lines[1]) else "."
-        table = pd.read_csv(path, sep=separator, decimal=decimal, nrows=LOOKED_AT, encoding_errors="replace")
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot be read as a CSV: {error}", where=str(path), remedy="give a CSV file") from None
-    table.columns = [str(name).strip() for name in table.columns]
-    return table.select_dtypes("number")
 
 
 def _triples(names: list[str]) -> dict[str, list[str]]:

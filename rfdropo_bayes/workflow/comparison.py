@@ -57,7 +57,7 @@ def fit(job: Mapping[str, Any]) -> dict[str, Any]:
     if job["row"] == "ours + tension":
         replica = with_tension.with_measured(measured)
     else:
-        replica = problem.with_measured(measured._replace(tension=None))
+        replica = problem.with_measured({name: measured[name] for name in problem.measured})
     began = time.monotonic()
     try:
         draws, spent = infer(job, replica, fit_key)
@@ -77,7 +77,7 @@ def fit(job: Mapping[str, Any]) -> dict[str, Any]:
 def infer(
     job: Mapping[str, Any], problem: CalibrationProblem, key: jax.Array
 ) -> tuple[dict[str, Float[np.ndarray, " n"]], dict[str, Any]]:
-    """Draws of the task's parameters by the method of a row, and the ``rollouts`` and ``warnings`` they came with."""
+    """Draws of the task's parameters by the method of a row, and the ``rollouts`` and ``cautions`` they came with."""
     ranges = TASKS[job["task"]].ranges
     method, options = ROWS[job["row"]]
     if job["row"] == "prior":
@@ -90,7 +90,7 @@ def infer(
         extra |= {"parameters": list(ranges), "search": {name: list(ends) for name, ends in ranges.items()}}
     result = methods.run(problem, method, {**options, **extra}, key)
     draws = {name: np.asarray(result.draws[name]).reshape(-1) for name in ranges}
-    return draws, {"rollouts": float(result.rollouts), "warnings": list(result.warnings)}
+    return draws, {"rollouts": float(result.rollouts), "cautions": [caution.as_dict() for caution in result.cautions]}
 
 
 def scores(

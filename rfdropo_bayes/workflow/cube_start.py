@@ -11,12 +11,20 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.channels.object_pose import (
+    OBJECT_CORRELATION_TIME,
+    OBJECT_NOISE,
+    OBJECT_TURN_NOISE,
+    OFFSETS,
+    draw_object_error,
+)
 from rfdropo_bayes.bayes.model import TrajectoryModel
-from rfdropo_bayes.bayes.objects import OFFSETS, draw_object_error, object_specs
 from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.simulators.pushing import PushSimulator
+
+SIZES = (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME)
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 
@@ -78,7 +86,7 @@ def measured_objects(
     for index, name in enumerate(model.recordings.names):
         known = {**model.fixed, **model.space.for_recording(values, name)}
         shifted[:, index, :, :3] += offsets(known, count)[:, None]
-        sizes = {s.name: np.broadcast_to(known[s.name], (count,)) for s in object_specs(True) if s.name in known}
+        sizes = {s.name: np.broadcast_to(known[s.name], (count,)) for s in SIZES if s.name in known}
         if sizes:
             keys = jax.random.split(jax.random.fold_in(key, index), count)
             draw = jax.vmap(draw_object_error, in_axes=(0, 0, None, 0))

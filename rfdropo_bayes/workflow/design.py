@@ -24,7 +24,7 @@ from rfdropo_bayes.data.plain_csv import command_columns
 from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.workflow.assembly import load_data
-from rfdropo_bayes.workflow.audit import build_question
+from rfdropo_bayes.workflow.audit import build_question, start_values
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
 from rfdropo_bayes.workflow.files import hashes, run_folder
 
@@ -61,6 +61,7 @@ def run_design(
     out: Path,
     *,
     overrides: Sequence[str] = (),
+    base: Path | None = None,
     seed: int | None = None,
     overwrite: bool = False,
     report: Callable[[str], None] = lambda line: None,
@@ -72,6 +73,15 @@ def run_design(
     tells most about the base parameters is proposed. When the time of [design] minutes is up, it is the best of the
     sequences, and the leading one of the explanations, that have been looked at.
 
+    Args:
+        path: the experiment file.
+        out: folder to write to.
+        overrides: assignments that replace entries of the file.
+        base: folder of an earlier calibration, from whose optimum the base model starts.
+        seed: of proposals and climbs; that of the experiment by default.
+        overwrite: write whatever ``out`` holds.
+        report: told how far it is.
+
     Returns:
         the content of design.json.
 
@@ -81,8 +91,10 @@ def run_design(
     experiment, tables = load_experiment(path, overrides)
     folder = Path(path).resolve().parent
     fitted = load_data(experiment, folder, "fit")
-    question = build_question(experiment, folder, fitted, [], experiment.seed if seed is None else seed)
-    settings = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": {"seed": question.seed}}
+    chosen = experiment.seed if seed is None else seed
+    question = build_question(experiment, folder, fitted, [], chosen, start=start_values(base))
+    options = {"base": base, "seed": chosen}
+    settings = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": options}
     with run_folder(out, "design", **settings, overwrite=overwrite) as out:
         content = _designed(experiment, question, fitted, out, report)
         write_text(out / DESIGN, json.dumps(content, indent=2) + "\n")

@@ -37,10 +37,10 @@ class ModelTable(Table):
         default_factory=list,
         description="effects on top of the base simulator, by name, or file.py:ClassName of one's own",
     )
-    noise: Literal["auto", "white", "ar1", "student-t"] = Field(
+    noise: Literal["auto", "white", "ar1", "student-t", "repeats", "stated"] = Field(
         default="auto",
         description="noise of the positions: white and lasting (auto), white, lasting (ar1), heavy-tailed (student-t);"
-        " see docs/inference.md",
+        " of all that is measured, what repeats differ by (repeats); what [noise] says (stated); see docs/inference.md",
     )
     priors: dict[str, dict[str, Any]] = Field(
         default_factory=dict,

@@ -67,15 +67,16 @@ def write_first_files(
     robot.write_text(robot_text(outline), encoding="utf-8")
     load_robot(robot)
     data = _random_commands(outline) if guess is None else _data(folder, outline, recordings, guess)
-    experiment.write_text("\n".join([*_head(robot.name), *data, *_model(outline, guess)]), encoding="utf-8")
+    experiment.write_text("\n".join([*_head(outline.name), *data, *_model(outline, guess)]), encoding="utf-8")
     load_experiment(experiment)
     return robot, experiment
 
 
-def _head(robot: str) -> list[str]:
+def _head(name: str) -> list[str]:
     return [
         "# Written by rfdropo init; docs/reference/experiment.md has every key. Look it over, then: rfdropo check.",
-        f'robot = "{robot}"',
+        f'title = "{name}"',
+        f'robot = "{name}.toml"',
         "seed = 0",
         "",
     ]

@@ -12,11 +12,11 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.special import softmax
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
-from rfdropo_bayes.bayes.model import RecordingSet
-from rfdropo_bayes.bayes.objects import OFFSETS
+from rfdropo_bayes.bayes.channels.object_pose import OFFSETS
+from rfdropo_bayes.bayes.recordings import RecordingSet
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference.schedules import next_step
+from rfdropo_bayes.inference import next_step
 
 SMALLEST_ERROR = 1e-6  # [m]
 STEP = 0.05  # of a central difference, in prior deviations

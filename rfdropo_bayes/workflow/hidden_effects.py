@@ -21,10 +21,10 @@ from jaxtyping import Float
 from rfdropo_bayes.audit.fit import Target, climb
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.measurements import gather_measurements
-from rfdropo_bayes.audit.noise import STATED, NoiseModel
 from rfdropo_bayes.audit.score import project_out, span
-from rfdropo_bayes.bayes.model import gather_recordings
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
+from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
+from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot
 from rfdropo_bayes.workflow.audit import Workshop, build_question
@@ -128,7 +128,7 @@ def hide(
     measurements = gather_measurements(gather_recordings(question.lanes.simulator, fitted), fitted, join=True)
     chosen = {name: group[0] for name, group in zip(measurements.names, measurements.members, strict=True)}
     forward = Forward(question.lanes, coordinates, question.recordings.commands, chosen)
-    white = NoiseModel(np.full(measurements.position.shape[-1], NOISE), np.ones(1), STATED, np.inf)
+    white = Autoregression(np.full(measurements.position.shape[-1], NOISE), np.ones(1), STATED, np.inf)
     target = Target(forward, replace(measurements, count=measurements.valid.astype(float)), white)
     sizes = {}
     for name in mechanisms:

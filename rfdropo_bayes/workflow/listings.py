@@ -41,7 +41,7 @@ def robot_facts(robot: Robot) -> Row:
         f"E = {robot.nominal()['young_modulus']:.4g} Pa",
         "gravity": f"{', '.join(f'{g:g}' for g in robot.gravity_m_s2)} m/s2 along x, y, z; z runs along the body, away "
         "from the clamp",
-        "starts": "undeformed" if robot.initial_state == "rest" else "in equilibrium with the first command",
+        "starts": "undeformed" if robot.initial_state == "rest" else "in equilibrium with the command before row 0",
         "commands": f"{', '.join(robot.channel_names)} ({robot.command_unit})",
         "cables": ", ".join(robot.cable_names),
         "markers": ", ".join(f"{m.name} (z = {1e3 * m.point_m[2]:.4g} mm)" for m in robot.markers),

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
-from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
+from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.pooling import Patterns, gather_groups, whole
+from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
@@ -21,6 +22,8 @@ from rfdropo_bayes.workflow.first_row import match_first_row, weighed_by_first_r
 
 # Among the attributes of a posterior.
 FITTED, MARKER_ERRORS, HELD = "fitted_recordings", "marker_errors_m", "held_parameters"
+NOISE, BEGUN = "noise_model", "fitted_recordings_begin"
+KNOWN_NOISE = "known_noise"  # of the positions, where its parameters are not inferred
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 
@@ -80,7 +83,8 @@ def predict_new(
     names = [t.name for t in trajectories]
     own_key, row_key, noise_key = jax.random.split(key, 3)
     space, extended = _for_new_recordings(model.space, values, names, fitted, own_key, groups or {})
-    fresh = replace(model, space=space, recordings=gather_recordings(model.simulator, trajectories), object_pose=None)
+    recordings = gather_recordings(model.simulator, trajectories)
+    fresh = replace(model, space=space, recordings=recordings, channels=(model.markers.like(recordings),))
     problem = CalibrationProblem(fresh, chunk=chunk)
     own = {whole(name) for name in fitted}
     drawn = [p for p in space.parameters if p.added_to and p.name not in values]

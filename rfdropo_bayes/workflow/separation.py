@@ -12,9 +12,9 @@ import numpy as np
 from rfdropo_bayes.audit.fit import Fit, Target
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import gather_measurements
-from rfdropo_bayes.audit.noise import RESIDUALS, NoiseModel
 from rfdropo_bayes.audit.pipeline import FIRST_GUESS, Question, simulated
 from rfdropo_bayes.audit.separation import Separation, separate
+from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, Autoregression
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_text
 from rfdropo_bayes.report import software_versions
@@ -101,7 +101,7 @@ def _target(question: Question, journal: Journal) -> Target:
     if measurements.has_repeats:
         noise = measurements.noise(measurements.single, 0)
     if noise is None:
-        noise = NoiseModel(np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf)
+        noise = Autoregression(np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf)
     return Target(simulated(question, False, chosen), measurements, noise, journal)
 
 

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from rfdropo_bayes.cautions import grave, read_cautions
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.rivals import import_sbi
 from rfdropo_bayes.report.facts import software_versions
-from rfdropo_bayes.report.randomisation import unfinished
 from rfdropo_bayes.workflow.comparison import RIVALS, ROWS, fit, misleads
 from rfdropo_bayes.workflow.files import LOG, run_folder
 from rfdropo_bayes.workflow.fits import finished, run_fits
@@ -121,7 +121,7 @@ def run_table1(
             "claims": claims(found),
             "ahead_of_ours": ahead_of_ours(found),
             "misleading": misleading(found),
-            "by_warning": by_warning(found),
+            "by_caution": by_caution(found),
             "versions": software_versions(),
         }
         write_text(out / "table1.json", json.dumps(content, indent=1) + "\n")
@@ -177,25 +177,27 @@ def summarise(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def misleading(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Our fits that say less of their truths than the prior does, worst first, with the warnings they gave.
+    """Our fits that say less of their truths than the prior does, worst first, with the cautions they gave.
 
-    Warnings are None where the fit is older than their record.
+    Cautions are None where the fit is older than their record.
     """
     wrong = [r for r in found if r["row"] in OWN and "failed" not in r and misleads(TASKS[r["task"]], r)]
     kept = ("task", "truths", "row", "index", "log_score")
-    entries = [{**{name: r[name] for name in kept}, "warnings": r.get("warnings")} for r in wrong]
+    entries = [{**{name: r[name] for name in kept}, "cautions": r.get("cautions")} for r in wrong]
     return sorted(entries, key=lambda entry: -np.inf if entry["log_score"] is None else entry["log_score"])
 
 
-def by_warning(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Coverage of our fits off the centre whose sampler said that it did not arrive, and of those where it did not, as
-    the report's verdict tells them apart; without fits older than the record of warnings."""
+def by_caution(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Coverage of our fits off the centre, those with a grave caution apart from the others.
+
+    Fits older than the record of cautions are left out.
+    """
     cells = []
     for task in TASKS:
         for row in OWN:
-            known = [r for r in _of(found, task, "off-centre", row) if r.get("warnings") is not None]
+            known = [r for r in _of(found, task, "off-centre", row) if r.get("cautions") is not None]
             for said in (False, True):
-                fits = [r for r in known if bool(unfinished(r["warnings"])) == said]
+                fits = [r for r in known if bool(grave(read_cautions(r["cautions"]))) == said]
                 if fits:
                     share = float(np.mean([hit for r in fits for hit in r["inside_90"]]))
                     misled = sum(misleads(TASKS[task], r) for r in fits)
@@ -313,10 +315,10 @@ def as_markdown(content: Mapping[str, Any]) -> str:
     ]
     lines += ["", "## Where another row is better than ours without tension, on the same data", ""]
     lines += [_ahead(entry) for entry in content["ahead_of_ours"]] or ["Nowhere."]
-    if content["by_warning"]:
+    if content["by_caution"]:
         lines += ["", "## Off-centre fits of ours by whether the sampler said that it did not arrive", ""]
         lines += ["| task | row | it said so | fits | 90 % coverage | misleading |", "|---|---|---|---|---|---|"]
-        lines += [_told(cell) for cell in content["by_warning"]]
+        lines += [_told(cell) for cell in content["by_caution"]]
     lines += ["", "## Posteriors of ours that mislead, and whether they said so", ""]
     lines += [_misled(entry) for entry in content["misleading"]] or ["None."]
     missing = [f"{row}: {reason}" for row, reason in content["left_out"].items()]
@@ -340,8 +342,8 @@ def _told(cell: Mapping[str, Any]) -> str:
 
 
 def _misled(entry: Mapping[str, Any]) -> str:
-    warnings = entry["warnings"]
-    said = "warnings not recorded" if warnings is None else "; ".join(warnings) or "no warning"
+    cautions = entry["cautions"]
+    said = "cautions not recorded" if cautions is None else "; ".join(c["sentence"] for c in cautions) or "no caution"
     place = f"{entry['task']}, {_kind(entry['truths'])} {entry['index']}, {entry['row']}"
     score = "no spread" if entry["log_score"] is None else f"log score {entry['log_score']:.3g}"
     return f"- {place}: {score}; {said}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,12 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
-from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
+from rfdropo_bayes.bayes.channels import Markers
+from rfdropo_bayes.bayes.channels.markers import noise_of_markers
+from rfdropo_bayes.bayes.model import TrajectoryModel
+from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
+from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
 from rfdropo_bayes.data import load_unseen, start_is_known
 from rfdropo_bayes.errors import InputError
@@ -22,10 +26,10 @@ from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.simulators.parameters import ParameterSpec
-from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values, measurement_specs
+from rfdropo_bayes.workflow.assembly import KNOWN, build_simulator, find_robot, fixed_values, measurement_specs
 from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.files import hashes, run_folder
-from rfdropo_bayes.workflow.prediction import FITTED, HELD, MARKER_ERRORS, predict_new, thin
+from rfdropo_bayes.workflow.prediction import BEGUN, FITTED, HELD, KNOWN_NOISE, MARKER_ERRORS, NOISE, predict_new, thin
 
 DRAWS = 200
 LEVELS = {"q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
@@ -69,12 +73,15 @@ def run_prediction(
     if experiment.data is None:
         raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format the commands are")
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
-    unseen = load_unseen(experiment.data, folder, commands, start, rows)
+    _check_noise(record, experiment.model.noise)
+    unseen = load_unseen(experiment.data, folder, commands, start, rows, record.attrs.get(BEGUN))
     simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
     fixed = {**fixed_values(experiment, simulator), **record.attrs.get(HELD, {})}
     specs = simulator.parameters + measurement_specs(experiment.model)
     space = _fitted_space(record, specs)
-    model = TrajectoryModel(simulator, space, fixed, experiment.model.noise, gather_recordings(simulator, [unseen]))
+    recordings = gather_recordings(simulator, [unseen])
+    channels = (_markers(recordings, experiment.model.noise, record.attrs.get(KNOWN_NOISE)),)
+    model = TrajectoryModel(simulator, space, fixed, recordings, channels)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, DRAWS)
     key = jax.random.key(experiment.seed if seed is None else seed)
     belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
@@ -108,6 +115,35 @@ def run_prediction(
             _columns(table).to_csv(partial, index=False, float_format="%.6f")
         write_text(out / "prediction.json", json.dumps(facts, indent=2) + "\n")
     return facts
+
+
+def _check_noise(record: PosteriorRecord, noise: str) -> None:
+    """Raise an InputError where an experiment's noise model is not the one that a posterior was fitted with."""
+    fitted = record.attrs.get(NOISE, noise)  # earlier posteriors do not say
+    if noise != fitted:
+        raise InputError(
+            f"the posterior was fitted with noise = {fitted!r}, the experiment says {noise!r}",
+            where="[model] noise",
+            remedy=f"add --set model.noise={fitted}, or predict with config.toml of the posterior's folder",
+        )
+
+
+def _markers(recordings: RecordingSet, noise: str, known: Mapping[str, Any] | None) -> Markers:
+    """The positions to predict, under the noise that was inferred, or that the posterior knows.
+
+    Raises:
+        InputError: a noise that is not inferred, and a posterior that does not hold it.
+    """
+    if noise not in KNOWN:
+        return Markers.gather(recordings, noise)
+    if known is None:
+        raise InputError(
+            "the posterior does not hold the noise of the positions",
+            where="--posterior",
+            remedy="predict with the experiment that was calibrated",
+        )
+    own = noise_of_markers(Autoregression.from_dict(known), known["markers"], recordings)
+    return Markers.gather(recordings, noise, own)
 
 
 def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> ParameterSpace:

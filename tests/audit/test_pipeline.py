@@ -22,12 +22,12 @@ from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
 from rfdropo_bayes.audit.gain import Gain
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import gather_measurements
-from rfdropo_bayes.audit.noise import STATED, NoiseModel
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.audit.sentence import _named
 from rfdropo_bayes.audit.verdict import decide
-from rfdropo_bayes.bayes.model import gather_recordings
+from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
+from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.audit_page import p_value, render_audit
@@ -366,7 +366,7 @@ def test_without_repeats_the_noise_is_what_the_extended_model_leaves():
 
 @pytest.mark.parametrize(("size", "play", "suspected"), [(1 / 3, 0.0, True), (1.0, 0.0, False), (1.0, 3.0, False)])
 def test_a_stated_noise_that_is_too_small_is_suspected_and_a_right_one_is_not(size, play, suspected):
-    stated = NoiseModel(np.full(12, size * NOISE), np.array([1.0, 0.6]), STATED, np.inf)
+    stated = Autoregression(np.full(12, size * NOISE), np.array([1.0, 0.6]), STATED, np.inf)
     answer = audit(replace(unrepeated({"play": play}, 6), stated_noise=stated))
     content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
     assert ("check [noise]" in content["sentence"]) == suspected
@@ -377,7 +377,7 @@ def test_a_stated_noise_that_is_too_small_is_suspected_and_a_right_one_is_not(si
 
 
 def test_where_nothing_is_wrong_a_stated_noise_is_not_suspected_however_low_the_passing_p():
-    stated = NoiseModel(np.full(12, NOISE), np.array([1.0, 0.6]), STATED, np.inf)
+    stated = Autoregression(np.full(12, NOISE), np.array([1.0, 0.6]), STATED, np.inf)
     asked = replace(unrepeated({}, 6), stated_noise=stated)
     strict = replace(asked, rules=replace(asked.rules, extended_passes=1.0))
     answer = audit(strict)

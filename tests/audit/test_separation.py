@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfdropo_bayes.audit.noise import RESIDUALS
 from rfdropo_bayes.audit.pipeline import base_model
 from rfdropo_bayes.audit.separation import effects, separate
+from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.separation_table import separation_figure, separation_markdown
 from rfdropo_bayes.tables import parse_table

@@ -5,11 +5,11 @@ import pytest
 
 from rfdropo_bayes.audit.bootstrap import null_residuals, tail
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.noise import REPEATS, STATED, NoiseModel
 from rfdropo_bayes.audit.omnibus import statistics
-from rfdropo_bayes.audit.repeat_shifts import repeat_shift
 from rfdropo_bayes.audit.score import project_out, span
-from rfdropo_bayes.audit.shared_noise import mixed, shrunk_correlation
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED, Autoregression
+from rfdropo_bayes.bayes.noise.repeat_shifts import repeat_shift
+from rfdropo_bayes.bayes.noise.shared import mixed, shrunk_correlation
 
 MEMORY = np.array([1.0, 0.6])
 
@@ -35,7 +35,7 @@ def test_squares_of_whitened_rows_are_those_of_the_whole_covariance():
     rng = np.random.default_rng(1)
     across = common(0.7, 2)
     scale = np.linspace(1.0, 2.0, 6)
-    noise = NoiseModel(scale, MEMORY, STATED, np.inf, across)
+    noise = Autoregression(scale, MEMORY, STATED, np.inf, across)
     series, valid = rng.normal(size=(20, 6)), np.ones((20, 6), dtype=bool)
     in_time = 0.6 ** np.abs(np.subtract.outer(np.arange(20), np.arange(20)))
     covariance = np.kron(in_time, np.outer(scale, scale) * across)
@@ -94,7 +94,7 @@ def test_data_without_discrepancy_pass_whatever_their_markers_share(share):
     within 3.3 standard errors of a half (12 assertions: 1 seed in 80)."""
     rng = np.random.default_rng(4)
     shape = (4, 60, 12)
-    truth = NoiseModel(np.ones(12), MEMORY, REPEATS, np.inf, common(share))
+    truth = Autoregression(np.ones(12), MEMORY, REPEATS, np.inf, common(share))
     columns = rng.normal(size=(8, 2, *shape[1:]))
     p = []
     for _ in range(60):
@@ -115,7 +115,7 @@ def test_constants_between_repeats_are_found_and_noise_is_not_taken_for_them(sha
     bias included). Shifts of 3 deviations, the same for all markers: the size within 40 % (6 degrees of freedom each,
     mean of 10: four standard errors)."""
     rng = np.random.default_rng(8)
-    truth = NoiseModel(np.full(12, 5e-4), MEMORY, REPEATS, np.inf, common(share) if share else None)
+    truth = Autoregression(np.full(12, 5e-4), MEMORY, REPEATS, np.inf, common(share) if share else None)
     plain = [repeats(truth.draw(rng, (4, 80, 12))) for _ in range(40)]
     assert [measured.shift for measured in plain] == [None] * 40
     sizes = []

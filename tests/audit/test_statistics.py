@@ -16,10 +16,18 @@ from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.fit import Fit, widened
 from rfdropo_bayes.audit.gain import Gain, Unseen, _floor_error, _noise_power, explained_fraction
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.noise import REPEATS, RESIDUALS, STATED, NoiseModel, estimate_noise, levinson, rows_before
 from rfdropo_bayes.audit.omnibus import joint_test, statistics
 from rfdropo_bayes.audit.score import likeness, project_out, signature, span, statistic
 from rfdropo_bayes.audit.verdict import decide
+from rfdropo_bayes.bayes.noise.autoregression import (
+    REPEATS,
+    RESIDUALS,
+    STATED,
+    Autoregression,
+    estimate_noise,
+    levinson,
+    rows_before,
+)
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -30,7 +38,7 @@ EFFECT = RNG.normal(size=(ROWS, 1)) + BASE[:, :1]
 
 
 def ar1(rng: np.random.Generator, shape: tuple[int, ...], phi: float) -> np.ndarray:
-    return NoiseModel(np.ones(shape[-1]), np.array([1.0, phi]), STATED, np.inf).draw(rng, shape)
+    return Autoregression(np.ones(shape[-1]), np.array([1.0, phi]), STATED, np.inf).draw(rng, shape)
 
 
 def test_the_score_statistic_is_chi_squared_where_the_base_model_is_right():
@@ -118,7 +126,7 @@ def test_levinson_predicts_as_the_normal_equations_do():
 
 def test_whitening_is_the_inverse_of_the_covariance_across_gaps_as_well():
     """Squares of whitened rows sum to r' C^-1 r; a gap of AR(1) noise starts a new stretch."""
-    noise = NoiseModel(np.array([2.0]), np.array([1.0, 0.6]), STATED, np.inf)
+    noise = Autoregression(np.array([2.0]), np.array([1.0, 0.6]), STATED, np.inf)
     series, valid = RNG.normal(size=(30, 1)), np.ones((30, 1), dtype=bool)
     covariance = 4.0 * 0.6 ** np.abs(np.subtract.outer(np.arange(30), np.arange(30)))
     white = noise.whiten(series, valid)
@@ -144,7 +152,7 @@ def test_the_noise_is_found_from_deviations_of_repeats():
 def test_the_explained_fraction_is_that_of_the_discrepancy():
     """Half of the amplitude taken away is three quarters of the mean square. 90 % intervals: 60 data sets, of which
     fewer than 46 cover the truth for one seed in 1000."""
-    noise = NoiseModel(np.ones(12), np.array([1.0, 0.6]), REPEATS, 2400.0)
+    noise = Autoregression(np.ones(12), np.array([1.0, 0.6]), REPEATS, 2400.0)
     time = np.arange(100)[:, None]
     wave = np.sin(time / 9.0 + np.arange(12)) * np.linspace(0.2, 1.6, 12)
     valid = np.ones((6, 100, 12), dtype=bool)
@@ -152,7 +160,7 @@ def test_the_explained_fraction_is_that_of_the_discrepancy():
     for _ in range(60):
         size = 1.0 + 0.02 * RNG.standard_normal()
         error = ar1(RNG, (6, 100, 12), 0.6)
-        stated = NoiseModel(size * np.ones(12), noise.autocorrelation, REPEATS, 2400.0)
+        stated = Autoregression(size * np.ones(12), noise.autocorrelation, REPEATS, 2400.0)
         pattern = stated.whiten(ar1(RNG, (2, 100, 12), 0.6) + wave, np.ones((2, 100, 12), dtype=bool))
         point, (low, high) = explained_fraction(
             Unseen(error, valid), error + wave, error + 0.5 * wave, stated, pattern, RNG
@@ -166,7 +174,7 @@ def test_the_explained_fraction_is_that_of_the_discrepancy():
 def test_the_error_of_the_noise_floor_is_that_of_repeated_estimates():
     """The floor at slow frequencies is known worse than the variance. 200 estimates show a deviation to 5 %, three
     times of which fails for one seed in 400."""
-    noise = NoiseModel(np.ones(12), np.array([1.0, 0.6]), REPEATS, 2 / 3 * 3 * 100 * 12)
+    noise = Autoregression(np.ones(12), np.array([1.0, 0.6]), REPEATS, 2 / 3 * 3 * 100 * 12)
     weight = np.where(np.arange(100) < 8, 1.0, 0.0)
     found = []
     for _ in range(200):
@@ -227,12 +235,12 @@ def test_residuals_that_change_slowly_are_not_called_noise():
     """An autoregression of one tenth innovations is a discrepancy; where repeats show such a noise, it is noise."""
     slow, fast = np.array([1.0, 0.97]), np.array([1.0, 0.8])
     for source, memory, doubtful in ((RESIDUALS, slow, True), (RESIDUALS, fast, False), (REPEATS, slow, False)):
-        assert NoiseModel(np.ones(3), memory, source, 100.0).doubtful is doubtful
+        assert Autoregression(np.ones(3), memory, source, 100.0).doubtful is doubtful
     assert decide(Rules(), 0.2, None, [], None, doubtful=True) == "unexplained"
 
 
 def test_noise_is_coloured_as_it_was_whitened_across_gaps_as_well():
-    noise = NoiseModel(np.array([2.0, 1.0]), np.array([1.0, 0.7, 0.3, 0.05]), STATED, np.inf)
+    noise = Autoregression(np.array([2.0, 1.0]), np.array([1.0, 0.7, 0.3, 0.05]), STATED, np.inf)
     valid = RNG.uniform(size=(2, 30, 2)) > 0.15
     series = np.where(valid, RNG.normal(size=(3, 2, 30, 2)), 0.0)
     white = noise.whiten(series, np.broadcast_to(valid, series.shape))
@@ -250,7 +258,7 @@ def test_noise_guessed_from_residuals_gives_the_same_statistics_as_data_without_
         np.ones(shape, dtype=bool),
     )  # fmt: skip
     columns = rng.normal(size=(np.prod(shape), 8))
-    truth = NoiseModel(np.ones(6), np.array([1.0, memory][: 1 + (memory > 0)]), RESIDUALS, np.inf)
+    truth = Autoregression(np.ones(6), np.array([1.0, memory][: 1 + (memory > 0)]), RESIDUALS, np.inf)
     p = []
     for _ in range(60):
         noise = truth

@@ -12,7 +12,7 @@ from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.forward import Lanes
 from rfdropo_bayes.audit.pipeline import Question
-from rfdropo_bayes.bayes.model import gather_recordings
+from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.simulators.commands import commands_on_grid

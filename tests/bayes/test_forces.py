@@ -11,18 +11,13 @@ import pytest
 from scipy import stats
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
-from rfdropo_bayes.bayes.forces import (
-    ABOVE_ZERO,
-    TENSION_NOISE,
-    TensionData,
-    Weighed,
-    check_weighed,
-    gather_tension,
-    tension_log_density,
-    tension_specs,
-)
-from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
+from rfdropo_bayes.bayes.channels import Markers, Seen, Tension, Weighed, WeighedParts
+from rfdropo_bayes.bayes.channels.channel import ABOVE_ZERO
+from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN, TENSION_NOISE
+from rfdropo_bayes.bayes.channels.weighed import check_weighed
+from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
@@ -81,12 +76,14 @@ def recording(tension: bool = True) -> Trajectory:
 
 def problem(*, tension: bool, weighed: Sequence[Weighed] = (), gain: bool = False) -> CalibrationProblem:
     simulator, trajectory = HangingMass(), recording()
-    specs = simulator.parameters + noise_specs("white") + tension_specs(tension)
+    specs = simulator.parameters + noise_specs("white") + (TENSION_NOISE, TENSION_GAIN) * tension
     priors = {spec.name: {} for spec in specs if gain or spec.name != "tension_gain"}
     space = build_space(specs, priors, {}, ["r"])
     recordings = gather_recordings(simulator, [trajectory])
-    data = gather_tension(simulator, [trajectory], 15) if tension else None
-    return CalibrationProblem(TrajectoryModel(simulator, space, {}, "white", recordings, data, tuple(weighed)))
+    channels = [Markers.gather(recordings, "white")]
+    channels += [Tension.gather(simulator, [trajectory], 15)] if tension else []
+    channels += [WeighedParts(tuple(weighed))] if weighed else []
+    return CalibrationProblem(TrajectoryModel(simulator, space, {}, recordings, tuple(channels)))
 
 
 def spread(result, name: str) -> float:
@@ -117,10 +114,15 @@ def test_readings_that_happen_to_be_low_count_no_more_than_high_ones():
     """20000 readings of 10 %: the force that fits best scatters by 0.07 %, and would be 2 % low if errors were relative
     to what was read."""
     true, tension = 5.0, 5.0 * (1.0 + 0.1 * np.random.default_rng(4).normal(size=(1, 20000, 1)))
-    data = TensionData(tension, np.ones(tension.shape, dtype=bool), np.array([0]))
+    channel = Tension(tension, np.ones(tension.shape, dtype=bool), cables=np.array([0]))
     force = true * np.linspace(0.97, 1.03, 121)
     values = {"tension_noise": 0.1}
-    density = [float(tension_log_density(jnp.full(tension.shape, f), values, data).sum()) for f in force]
+
+    def log_density(force: float) -> float:
+        observation = Observation(None, jnp.full(tension.shape, force), None, jnp.asarray(0))
+        return float(channel.row_log_density(Seen(observation, values, np.zeros((1, 3))), tension).sum())
+
+    density = [log_density(f) for f in force]
     assert force[np.argmax(density)] == pytest.approx(true, rel=0.0035)
 
 
@@ -156,13 +158,13 @@ def test_a_balance_breaks_it_too_and_an_unknown_gain_restores_it():
 
 def test_what_cannot_be_used_is_refused():
     with pytest.raises(InputError, match="has no cable tensions"):
-        gather_tension(HangingMass(), [recording(tension=False)], 15)
+        Tension.gather(HangingMass(), [recording(tension=False)], 15)
     with pytest.raises(InputError, match="weighed but is not inferred"):
         check_weighed([Weighed(("maas",), 0.1, 0.01)], ("mass",))
     other = HangingMass()
     other.cable_names = ("push",)
     with pytest.raises(InputError, match="no cables of the robot"):
-        gather_tension(other, [recording()], 15)
+        Tension.gather(other, [recording()], 15)
 
 
 def test_a_parameter_of_the_second_recording_alone_acts_there_and_is_nominal_in_the_first():
@@ -174,7 +176,7 @@ def test_a_parameter_of_the_second_recording_alone_acts_there_and_is_nominal_in_
         specs = simulator.parameters + noise_specs("white")
         priors = {"stiffness": {}, "mass": {}, "observation_noise": {}}
         space = build_space(specs, priors, {"mass": ["s"]}, list(recordings.names))
-        model = TrajectoryModel(simulator, space, {}, "white", recordings)
+        model = TrajectoryModel(simulator, space, {}, recordings, (Markers.gather(recordings, "white"),))
         values = {"stiffness": jnp.asarray(200.0), "mass@s": jnp.asarray(0.4), "observation_noise": jnp.asarray(1e-4)}
         position = np.asarray(model.simulate(values).position)
         sag = dict(zip(recordings.names, np.abs(position[:, 0, 0]).max(axis=-1), strict=True))

@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
-from rfdropo_bayes.bayes.model import Measured, TrajectoryModel, gather_recordings
+from rfdropo_bayes.bayes.channels import Markers
+from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.posteriors import central_interval
-from rfdropo_bayes.report.residuals import check_residuals, residual_warnings
+from rfdropo_bayes.report.residuals import check_residuals, residual_cautions
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
@@ -73,7 +76,9 @@ def problem(noise: str) -> CalibrationProblem:
     specs = simulator.parameters + noise_specs(noise)
     space = build_space(specs, {spec.name: {} for spec in specs}, {}, ["r"])
     recordings = gather_recordings(simulator, [trajectory])
-    return CalibrationProblem(TrajectoryModel(simulator, space, {}, noise, recordings), chunk=64)
+    return CalibrationProblem(
+        TrajectoryModel(simulator, space, {}, recordings, (Markers.gather(recordings, noise),)), chunk=64
+    )
 
 
 def with_error(noise: str, error: np.ndarray) -> CalibrationProblem:
@@ -82,7 +87,7 @@ def with_error(noise: str, error: np.ndarray) -> CalibrationProblem:
     values = {spec.name: np.array([spec.nominal]) for spec in noise_specs(noise)}
     clean = np.asarray(chosen.observe(values | {n: np.array([v]) for n, v in PHYSICAL.items()}).position)[0]
     measured = np.where(chosen.model.recordings.line.valid[..., None], clean + error, 0.0)
-    return chosen.with_measured(Measured(measured, None, None, np.zeros(0)))
+    return chosen.with_measured({"markers": measured})
 
 
 def autoregressive(rng: np.random.Generator, phi: float) -> np.ndarray:
@@ -96,9 +101,10 @@ def fit(data: CalibrationProblem, seed: int):
     return methods.run(data, "laplace", {"starts": 1, "draws": 1000}, jax.random.key(seed))
 
 
-def warnings_of(data: CalibrationProblem, result) -> list[str]:
+def codes_of(data: CalibrationProblem, result) -> list[Code]:
     white = data.white_positions(result.optimum)
-    return residual_warnings(check_residuals(list(white), LaggingArm.marker_names), data.model.noise)
+    found = residual_cautions(check_residuals(list(white), LaggingArm.marker_names), data.model.noise)
+    return [caution.code for caution in found]
 
 
 def coverage(noise: str, phi: float, datasets: int) -> tuple[float, float]:
@@ -110,7 +116,7 @@ def coverage(noise: str, phi: float, datasets: int) -> tuple[float, float]:
         for name, truth in PHYSICAL.items():
             low, high = central_interval(result.draws[name].ravel())
             inside.append(low <= truth <= high)
-        warned.append(any("correlated" in sentence for sentence in warnings_of(data, result)))
+        warned.append(Code.RESIDUALS_CORRELATED in codes_of(data, result))
     return float(np.mean(inside)), float(np.mean(warned))
 
 
@@ -153,7 +159,7 @@ def test_outliers_inflate_white_noise_which_says_so_and_not_heavy_tails():
             data = with_error(noise, error)
             result = fit(data, seed)
             sizes.append(np.median(result.draws["observation_noise"]))
-            sentences.append(any('noise = "student-t"' in sentence for sentence in warnings_of(data, result)))
+            sentences.append(Code.RESIDUALS_HEAVY in codes_of(data, result))
         found[noise], said[noise] = float(np.mean(sizes)), float(np.mean(sentences))
     assert found["white"] > 1.3 * SIGMA
     assert said == {"white": 1.0, "student-t": 0.0}

@@ -11,9 +11,11 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
-from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
-from rfdropo_bayes.bayes.noise import Timeline, noise_specs, timeline
-from rfdropo_bayes.bayes.objects import LEVER, draw_object_error, gather_objects, object_specs
+from rfdropo_bayes.bayes.channels import Markers, ObjectPose
+from rfdropo_bayes.bayes.channels.object_pose import LEVER, draw_object_error
+from rfdropo_bayes.bayes.model import TrajectoryModel
+from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory
@@ -21,6 +23,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
+from rfdropo_bayes.workflow.assembly import SWITCHED
 
 STEP = 0.1  # [s]
 START = np.array([0.02, 0.0, 0.1])
@@ -94,14 +97,15 @@ def recording(*, pose: bool = True) -> Trajectory:
 
 def problem(trajectory: Trajectory, *, poses: bool = True, lost: tuple[int, ...] = ()) -> CalibrationProblem:
     simulator = Finger()
-    specs = simulator.parameters + noise_specs("white") + object_specs(poses)
+    specs = simulator.parameters + noise_specs("white") + (SWITCHED["object_pose"] if poses else ())
     space = build_space(specs, {s.name: {} for s in specs if s.name != "start_x"}, {}, [trajectory.name])
-    data = gather_objects(simulator, [trajectory], len(trajectory.time)) if poses else None
-    if lost:
-        seen = timeline(trajectory.time, ~np.isin(np.arange(len(trajectory.time)), lost)[:, None])
-        data = data._replace(line=Timeline(*(part[None] for part in seen)))
     recordings = gather_recordings(simulator, [trajectory])
-    return CalibrationProblem(TrajectoryModel(simulator, space, {}, "white", recordings, object_pose=data))
+    channels = [Markers.gather(recordings, "white")]
+    if poses:
+        data = ObjectPose.gather(simulator, [trajectory], len(trajectory.time))
+        seen = ~np.isin(np.arange(len(trajectory.time)), lost)
+        channels.append(ObjectPose.of(data.readings, seen[None], data.time))
+    return CalibrationProblem(TrajectoryModel(simulator, space, {}, recordings, tuple(channels)))
 
 
 def test_the_density_of_the_poses_is_that_of_an_ornstein_uhlenbeck_process_about_the_simulated_ones():
@@ -136,7 +140,7 @@ def test_the_density_of_the_poses_is_that_of_an_ornstein_uhlenbeck_process_about
     squares = [float(jnp.sum(chosen.residuals(v, 30) ** 2)) for v in (single, further)]
     there = chosen.row_log_likelihood({**values, "slip": jnp.array([0.5])}, 30)[0][0]
     assert there.sum() - rows.sum() == pytest.approx(0.5 * (squares[0] - squares[1]), rel=1e-9)
-    moved = chosen.with_measured(chosen.measured._replace(object_pose=chosen.measured.object_pose + 0.1))
+    moved = chosen.with_measured({**chosen.measured, "object_pose": chosen.measured["object_pose"] + 0.1})
     assert moved.row_log_likelihood(values, 30)[0][0].sum() < rows.sum() - 100.0
     assert len({chosen.fingerprint, plain.fingerprint, moved.fingerprint}) == 3
 
@@ -173,9 +177,9 @@ def test_poses_tell_what_the_tip_does_not():
 
 def test_what_is_lacking_is_said():
     with pytest.raises(InputError, match="no pose of the pushed body"):
-        gather_objects(Finger(), [recording(pose=False)], 30)
+        ObjectPose.gather(Finger(), [recording(pose=False)], 30)
     with pytest.raises(InputError, match="no body whose pose"):
-        gather_objects(object(), [recording()], 30)
+        ObjectPose.gather(object(), [recording()], 30)
 
 
 def test_methods_that_compare_rollouts_see_the_way_and_the_turn_of_the_body():

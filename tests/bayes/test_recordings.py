@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rfdropo_bayes.bayes.model import gather_recordings
+from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import load_robot

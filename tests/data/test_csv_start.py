@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rfdropo_bayes.data import DataSpec, load_unseen, start_is_known
+from rfdropo_bayes.data import DataSpec, common_beginning, load_unseen, start_is_known
 from rfdropo_bayes.data.plain_csv import CsvColumns, command_columns
 from rfdropo_bayes.errors import InputError
 
@@ -57,3 +57,20 @@ def test_the_start_pose_is_one_row_of_another_file_in_the_base_frame(tmp_path: P
     np.testing.assert_allclose(found.position[0, 1], [0.200, 0.202, -0.201], atol=1e-12)
     with pytest.raises(InputError, match="no row 2 to start from"):
         load_unseen(spec, tmp_path, "next.csv", "start.csv", (2, 4))
+
+
+def test_new_commands_begin_as_the_fitted_recordings_do(tmp_path: Path, spec: DataSpec) -> None:
+    """Unless [data] says how they do; where the fitted ones differ, the first command is taken for the one before."""
+    pd.DataFrame(command_columns(CsvColumns.model_validate(COLUMNS), TIME, COMMAND + 0.01)).to_csv(
+        tmp_path / "next.csv", index=False
+    )
+    found = {begun: load_unseen(spec, tmp_path, "next.csv", begun=begun) for begun in ("zero", "first", None)}
+    assert not found["zero"].initial_command.any()
+    assert "as in the fitted recordings" in found["zero"].first_command
+    for begun in ("first", None):
+        np.testing.assert_array_equal(found[begun].initial_command, found[begun].command[0])
+    assert "assumed" in found[None].first_command
+    said = load_unseen(spec.model_copy(update={"initial_command": "first"}), tmp_path, "next.csv", begun="zero")
+    np.testing.assert_array_equal(said.initial_command, said.command[0])
+    assert common_beginning([found["zero"], found["zero"]]) == "zero"
+    assert common_beginning([found["zero"], found["first"]]) is None

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rfdropo_bayes.inference import first_climbs, methods
-from rfdropo_bayes.inference.basins import Climb, one_point, one_ridge, summits
+from rfdropo_bayes.inference import methods
+from rfdropo_bayes.inference.modes import first_climbs
+from rfdropo_bayes.inference.modes.basins import Climb, one_point, one_ridge, summits
 
 from .toys import LateVerdict, LinearGaussian, Ratio, TwoModes, Washboard
 

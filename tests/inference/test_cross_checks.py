@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.numpyro_problem import problem_from_numpyro
+from rfdropo_bayes.inference.plain.problem import problem_from_numpyro
 
 from .test_numpyro_problem import SCHOOLS, schools, schools_by_quadrature
 from .toys import Decay

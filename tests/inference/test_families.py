@@ -8,9 +8,9 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.families import make_family
-from rfdropo_bayes.inference.randomisation import SearchSpace
-from rfdropo_bayes.inference.reuse import LEAST_ESS, bootstrap, make_pool, refine
+from rfdropo_bayes.inference.rfdropo.families import make_family
+from rfdropo_bayes.inference.rfdropo.randomisation import SearchSpace
+from rfdropo_bayes.inference.rfdropo.reuse import LEAST_ESS, bootstrap, make_pool, refine
 
 from .toys import Spring
 

@@ -6,14 +6,17 @@ import jax
 import numpy as np
 import pytest
 
+from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import bridge, horizon_smc, laplace
-from rfdropo_bayes.inference.bridge import BridgeConfig
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.gauss_newton import Target, make_target, prior_derivatives
-from rfdropo_bayes.inference.horizon_smc import SmcConfig
-from rfdropo_bayes.inference.laplace import LaplaceConfig
-from rfdropo_bayes.inference.levenberg import maximise
+from rfdropo_bayes.inference.modes import search as laplace
+from rfdropo_bayes.inference.modes.climb import maximise
+from rfdropo_bayes.inference.modes.search import LaplaceConfig
+from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
+from rfdropo_bayes.inference.smc import bridge
+from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc.bridge import BridgeConfig
+from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
 from .toys import Decay, LinearGaussian, Spring, TwoModes
 
@@ -145,7 +148,7 @@ def test_the_bridge_keeps_two_modes_that_the_climbs_found():
     assert result.log_evidence[0] == pytest.approx(evidence, abs=0.2)
     assert np.mean(result.draws["x0"] > 0) == pytest.approx(share, abs=0.1)
     alone = laplace.run(problem, config.climb, KEY)
-    assert any("further optima" in sentence for sentence in alone.warnings)
+    assert Code.SEVERAL_OPTIMA in [caution.code for caution in alone.cautions]
 
 
 def test_a_climb_ends_where_nothing_comes_of_what_it_promises():

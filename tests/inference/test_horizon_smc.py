@@ -10,9 +10,10 @@ import jax
 import numpy as np
 import pytest
 
+from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import horizon_smc
-from rfdropo_bayes.inference.horizon_smc import SmcConfig
+from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
 from .toys import Decay, LinearGaussian, TwoModes
 
@@ -131,7 +132,7 @@ def test_failed_rollouts_get_no_weight_and_are_counted():
     assert np.isfinite(result.log_evidence[0])
     assert result.excluded.keys() == {"diverged"}
     assert result.excluded["diverged"] > 100
-    assert any("got no weight" in sentence for sentence in result.warnings)
+    assert Code.ROLLOUTS_EXCLUDED in [caution.code for caution in result.cautions]
 
 
 def test_a_failure_costs_evidence_by_its_prior_mass():
@@ -158,7 +159,7 @@ def test_a_prior_far_from_the_data_collapses_the_evidence():
     result = horizon_smc.run(far, SmcConfig(particles=300), KEY)
     assert exact < near.prefix_log_evidence()[-1] - 100.0
     assert result.log_evidence[0] == pytest.approx(exact, rel=0.01)
-    assert any(sentence.startswith("the data put x0, x1, x2 into the outermost") for sentence in result.warnings)
+    assert any(caution.sentence.startswith("the data put x0, x1, x2 into the outermost") for caution in result.cautions)
 
 
 @pytest.mark.parametrize("budget", [pytest.param(1500.0, marks=pytest.mark.slow), 8000.0])
@@ -174,7 +175,7 @@ def test_a_budget_that_runs_out_is_said():
     problem = LinearGaussian(n_rows=40, d=8)
     result = horizon_smc.run(problem, SmcConfig(rollouts=1100.0, particles=300), KEY)
     assert result.rollouts <= 1100
-    assert any("ran out" in sentence for sentence in result.warnings)
+    assert Code.BUDGET_SPENT in [caution.code for caution in result.cautions]
 
 
 def test_a_budget_that_allows_nothing_is_refused():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import pytest
 
+from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 
@@ -62,4 +63,4 @@ def test_every_method_answers_in_the_same_form(method):
     assert result.evaluations > 0
     assert result.seconds > 0
     assert result.trace
-    assert all(isinstance(sentence, str) for sentence in result.warnings)
+    assert all(isinstance(caution, Caution) for caution in result.cautions)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import ortho_group
 
-from rfdropo_bayes.inference.levenberg import Laplace
-from rfdropo_bayes.inference.mixture import NARROWEST, ModeMixture, covering, joint_covariance, prior_moments
+from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.smc.mixture import NARROWEST, ModeMixture, covering, joint_covariance, prior_moments
 
 from .toys import LinearGaussian
 

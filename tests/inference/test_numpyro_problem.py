@@ -12,9 +12,10 @@ from scipy.special import gammainc, gammaln, logsumexp
 from scipy.stats import gamma, multivariate_normal
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import horizon_smc, methods
-from rfdropo_bayes.inference.horizon_smc import SmcConfig
-from rfdropo_bayes.inference.numpyro_problem import problem_from_numpyro
+from rfdropo_bayes.inference import methods
+from rfdropo_bayes.inference.plain.problem import problem_from_numpyro
+from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
 from .toys import LinearGaussian
 

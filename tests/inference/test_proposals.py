@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rfdropo_bayes.inference.proposals import distinct_size, fit_reference, propose
+from rfdropo_bayes.inference.smc.moves import distinct_size, fit_reference, propose
 
 SIZES = np.array([1e-9, 1.0, 1e6])
 

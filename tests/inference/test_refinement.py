@@ -10,12 +10,13 @@ import numpyro.distributions as dist
 import pytest
 from scipy.stats import multivariate_normal, multivariate_t
 
-from rfdropo_bayes.inference import methods, refinement
-from rfdropo_bayes.inference.centring import CentredProblem, centred
-from rfdropo_bayes.inference.levenberg import Laplace
-from rfdropo_bayes.inference.mixture import ModeMixture
-from rfdropo_bayes.inference.numpyro_problem import problem_from_numpyro
-from rfdropo_bayes.inference.refinement import _clusters
+from rfdropo_bayes.inference import methods
+from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.plain import refinement
+from rfdropo_bayes.inference.plain.centring import CentredProblem, centred
+from rfdropo_bayes.inference.plain.problem import problem_from_numpyro
+from rfdropo_bayes.inference.plain.refinement import _clusters
+from rfdropo_bayes.inference.smc.mixture import ModeMixture
 
 from .test_numpyro_problem import SCHOOLS, schools_by_quadrature
 
@@ -243,4 +244,4 @@ def test_centred_schools_agree_with_quadrature():
     assert result.draws["mu"].mean() == pytest.approx(mean, abs=0.33)
     assert result.draws["mu"].std() == pytest.approx(sd, rel=0.1)
     assert result.draws["tau"].mean() == pytest.approx(tau, abs=0.3)
-    assert result.warnings == []
+    assert result.cautions == []

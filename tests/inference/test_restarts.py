@@ -9,14 +9,12 @@ import jax
 import numpy as np
 import pytest
 
-from rfdropo_bayes.inference import restarts
 from rfdropo_bayes.inference.checkpoints import Checkpoint
-from rfdropo_bayes.inference.climbs import begin
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
-from rfdropo_bayes.inference.laplace import FEWEST_STEPS, LaplaceConfig, _affordable_steps, find_modes
-from rfdropo_bayes.inference.levenberg import Laplace, laplace, maximise
-from rfdropo_bayes.inference.restarts import (
+from rfdropo_bayes.inference.modes import restarts
+from rfdropo_bayes.inference.modes.climb import Laplace, laplace, maximise
+from rfdropo_bayes.inference.modes.climbs import begin
+from rfdropo_bayes.inference.modes.restarts import (
     FEWEST_GENERATIONS,
     MOST_GENERATIONS,
     POPULATION,
@@ -24,6 +22,8 @@ from rfdropo_bayes.inference.restarts import (
     astray,
     search,
 )
+from rfdropo_bayes.inference.modes.search import FEWEST_STEPS, LaplaceConfig, _affordable_steps, find_modes
+from rfdropo_bayes.inference.modes.targets import make_target, prior_derivatives
 
 from .toys import LateContact, LinearGaussian
 

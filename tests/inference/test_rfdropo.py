@@ -8,11 +8,11 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import rfdropo
-from rfdropo_bayes.inference.optimisers import default_population, make_optimiser
-from rfdropo_bayes.inference.randomisation import search_space
-from rfdropo_bayes.inference.rfdropo import RfdropoConfig
-from rfdropo_bayes.inference.trajectory_match import motion_scale, step_log_likelihood
+from rfdropo_bayes.inference.rfdropo import search as rfdropo
+from rfdropo_bayes.inference.rfdropo.optimisers import default_population, make_optimiser
+from rfdropo_bayes.inference.rfdropo.randomisation import search_space
+from rfdropo_bayes.inference.rfdropo.search import RfdropoConfig
+from rfdropo_bayes.inference.rfdropo.trajectory_match import motion_scale, step_log_likelihood
 
 from .toys import Spring
 
@@ -84,9 +84,10 @@ def test_draws_are_truncated_normals_inside_the_hard_bounds():
     assert draws[:, 0].std() == pytest.approx(0.8796 * 0.25, rel=0.025)
     table = space.describe(vector, problem.units)
     assert table["damping"] == {"mean": 0.0, "std": pytest.approx(0.5), "low": 0.0, "high": 1.0, "unit": "1/s"}
-    sentences = space.edge_warnings(vector)
-    assert any("mean of damping" in sentence for sentence in sentences)
-    assert not any("mean of frequency" in sentence for sentence in sentences)
+    found = space.edge_cautions(vector)
+    assert found
+    assert any("mean of damping" in caution.sentence for caution in found)
+    assert not any("mean of frequency" in caution.sentence for caution in found)
 
 
 @pytest.mark.parametrize("optimiser", ["cma", "cem"])

@@ -12,16 +12,16 @@ from scipy.stats import norm
 
 from rfdropo_bayes.bayes.units import force_power
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.bridge import BridgeConfig, sample_from_modes
-from rfdropo_bayes.inference.climbs import RIVAL
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.gauss_newton import make_target, prior_derivatives
-from rfdropo_bayes.inference.laplace import LaplaceConfig, Modes, find_modes
-from rfdropo_bayes.inference.levenberg import Laplace, init, laplace, maximise
-from rfdropo_bayes.inference.mixture import NARROWEST
-from rfdropo_bayes.inference.plateaus import Held, climbs_from, plateaus
-from rfdropo_bayes.inference.soundings import Sounding, sounded
-from rfdropo_bayes.inference.straight import StraightProblem
+from rfdropo_bayes.inference.modes.climb import Laplace, init, laplace, maximise
+from rfdropo_bayes.inference.modes.climbs import RIVAL
+from rfdropo_bayes.inference.modes.plateaus import Held, climbs_from, plateaus
+from rfdropo_bayes.inference.modes.search import LaplaceConfig, Modes, find_modes
+from rfdropo_bayes.inference.modes.targets import make_target, prior_derivatives
+from rfdropo_bayes.inference.smc.bridge import BridgeConfig, sample_from_modes
+from rfdropo_bayes.inference.smc.mixture import NARROWEST
+from rfdropo_bayes.inference.smc.soundings import Sounding, sounded
+from rfdropo_bayes.inference.smc.straight import StraightProblem
 
 from .toys import Crooked, LinearGaussian, Ratio, Stuck
 

@@ -6,14 +6,18 @@ import jax
 import numpy as np
 import pytest
 
+from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import climbs as climbs_of
-from rfdropo_bayes.inference import horizon_smc, laplace, methods, starts
+from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.horizon_smc import SmcConfig
-from rfdropo_bayes.inference.levenberg import Laplace
-from rfdropo_bayes.inference.mixture import ModeMixture
-from rfdropo_bayes.inference.sharpness import Way, way_from_prior
+from rfdropo_bayes.inference.modes import climbs as climbs_of
+from rfdropo_bayes.inference.modes import search as laplace
+from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc import start as starts
+from rfdropo_bayes.inference.smc.mixture import ModeMixture
+from rfdropo_bayes.inference.smc.sampler import SmcConfig
+from rfdropo_bayes.inference.smc.sharpness import Way, way_from_prior
 
 from .toys import Decay, LinearGaussian, Ratio, Spring, TwoModes, Washboard
 
@@ -60,14 +64,14 @@ def test_a_sharp_ridge_is_sampled_within_its_budget(fitted):
     assert np.abs((draws.mean(axis=0) - mean) / np.sqrt(np.diag(covariance))).max() < 0.4
     np.testing.assert_allclose(draws.std(axis=0), np.sqrt(np.diag(covariance)), rtol=0.25)
     assert abs(np.corrcoef(draws[:, 0], draws[:, 1])[0, 1]) > 0.999
-    assert not result.warnings
+    assert not result.cautions
 
 
 @pytest.mark.slow
 def test_from_the_prior_the_same_budget_is_exhausted():
     """Why the start is chosen at all: the leap at the end, which the report must then name."""
     result = methods.run(sharp(), "smc", {"rollouts": 8000, "blocks": 3, "start": "prior"}, KEY)
-    assert any("ran out" in sentence for sentence in result.warnings)
+    assert Code.BUDGET_SPENT in [caution.code for caution in result.cautions]
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory, group_repeats, noise_floor
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
 from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, software_versions
@@ -150,7 +151,7 @@ def make_run(rng: np.random.Generator, *, draws: int = 400, rows: int = 90) -> R
         evaluations=20000,
         log_evidence=(2712.4, float("nan")),
         excluded={"diverged": 12},
-        warnings=["rayleigh_stiffness sits on its lower bound"],
+        cautions=[Caution(Code.AT_BOUND, "rayleigh_stiffness sits on its lower bound")],
         recordings=[
             RecordingFacts.of_trajectory(t, role) for role, group in (("fit", fit), ("test", test)) for t in group
         ],

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfdropo_bayes.inference.result import stage_warnings
+from rfdropo_bayes.inference.result import stage_cautions
 from rfdropo_bayes.posteriors import ParameterInfo
 from rfdropo_bayes.report.randomisation import judge
 from rfdropo_bayes.report.summary import build_summary
@@ -27,7 +27,7 @@ def clean(summary):
     spotless = copy.deepcopy(summary)
     for row in spotless["parameters"].values():
         row["at_bound"] = False
-    spotless["warnings"] = []
+    spotless["cautions"] = []
     return spotless
 
 
@@ -46,6 +46,10 @@ LEAP = {"budget_exhausted": True, "progress": 1.0, "ess": 0.1, "correlation": fl
 """Stages of a sampler: the last, and one for whose moves nothing was left."""
 
 
+def said(stages):
+    return [caution.as_dict() for caution in stage_cautions(stages, 10.0, 0.3)]
+
+
 def test_without_grounds_against_it_is_safe(run, summary):
     safety = judge(run.record, clean(summary))
     assert safety.verdict == "safe"
@@ -59,8 +63,8 @@ def test_without_grounds_against_it_is_safe(run, summary):
         (lambda s: s["rmse"]["test"].update({list(s["rmse"]["test"])[-1]: 1e3}), "no better than one without physics"),
         (lambda s: s["parameters"]["sigma"].update(r_hat=1.4), "independent runs disagree about sigma"),
         (lambda s: s["parameters"]["sigma"].update(ess_bulk=3.0), "fewer than 100 effective draws of sigma"),
-        (lambda s: s["warnings"].extend(stage_warnings([LEAP, LAST], 10.0, 0.3)), "10 rollouts ran out"),
-        (lambda s: s["warnings"].extend(stage_warnings([LAST | {"correlation": 0.98}], 10.0, 0.3)), "0.98 correlated"),
+        (lambda s: s["cautions"].extend(said([LEAP, LAST])), "10 rollouts ran out"),
+        (lambda s: s["cautions"].extend(said([LAST | {"correlation": 0.98}])), "0.98 correlated"),
         (lambda s: s["excluded"].update(diverged=9000), "45 % of the rollouts failed"),
         (lambda s: s["coverage_by_role"]["test"]["tip"].update({"0.9": 0.77}), "only 77 % at the tip (tip)"),
         (lambda s: s["coverage_by_role"]["test"]["middle"].update({"0.9": 0.5}), "only 50 % at middle"),

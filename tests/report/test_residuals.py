@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rfdropo_bayes.report.residuals import TOO_NARROW, check_residuals, residual_warnings
+from rfdropo_bayes.cautions import Code
+from rfdropo_bayes.report.residuals import TOO_NARROW, check_residuals, residual_cautions
 
 MARKERS = ("middle", "tip")
 
@@ -35,31 +36,33 @@ def test_chance_is_not_taken_for_correlation_or_outliers():
     for seed in range(200):
         white = series(seed, 0.0, rows=60)
         white[np.random.default_rng(seed).uniform(size=(60, 2)) < 0.2] = np.nan
-        said += len(residual_warnings(check_residuals([white[:25], white[25:]], MARKERS), "white"))
+        said += len(residual_cautions(check_residuals([white[:25], white[25:]], MARKERS), "white"))
     assert said <= 3
 
 
-def test_warnings_name_the_marker_and_the_remedy():
+def test_cautions_name_the_marker_and_the_remedy():
     white = series(0, 0.0)
     white[:, 1] = series(1, 0.8)[:, 1]
     checks = check_residuals([white], MARKERS)
     assert checks["middle"].narrowing < TOO_NARROW < checks["tip"].narrowing
-    (sentence,) = residual_warnings(checks, "white")
-    assert "(tip)" in sentence
-    assert 'noise = "auto"' in sentence
-    assert "audit" in residual_warnings(checks, "auto")[0]
+    (caution,) = residual_cautions(checks, "white")
+    assert caution.code is Code.RESIDUALS_CORRELATED
+    assert "(tip)" in caution.sentence
+    assert 'noise = "auto"' in caution.sentence
+    assert "audit" in residual_cautions(checks, "auto")[0].sentence
 
 
 def test_outliers_are_named_with_a_remedy_unless_the_noise_has_tails():
     white = series(2, 0.0)
     white[np.random.default_rng(3).uniform(size=white.shape) < 0.01] *= 10.0
     checks = check_residuals([white], MARKERS)
-    (sentence,) = residual_warnings(checks, "white")
-    assert 'noise = "student-t"' in sentence
-    assert residual_warnings(checks, "student-t") == []
+    (caution,) = residual_cautions(checks, "white")
+    assert caution.code is Code.RESIDUALS_HEAVY
+    assert 'noise = "student-t"' in caution.sentence
+    assert residual_cautions(checks, "student-t") == []
 
 
 def test_without_residuals_there_is_nothing_to_say():
     nothing = check_residuals([np.full((5, 2, 3), np.nan)], MARKERS)
-    assert residual_warnings(nothing, "white") == []
+    assert residual_cautions(nothing, "white") == []
     assert nothing["all"].values == 0

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from rfdropo_bayes.bayes.model import TrajectoryModel, gather_recordings
+from rfdropo_bayes.bayes.channels import Markers
+from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
@@ -55,7 +57,8 @@ def test_the_cube_starts_where_it_was_measured_less_the_offset_and_on_the_plate(
     specs = simulator.parameters + noise_specs("white")
     offsets = [f"offset_{axis}" for axis in "xyz"]
     space = build_space(specs, {name: {} for name in (*offsets, "cube_x", "observation_noise")}, {}, ["pushed"])
-    model = TrajectoryModel(simulator, space, {}, "white", gather_recordings(simulator, [trajectory]))
+    recordings = gather_recordings(simulator, [trajectory])
+    model = TrajectoryModel(simulator, space, {}, recordings, (Markers.gather(recordings, "white"),))
     values = {"cube_x": np.array([0.5, 0.5]), "observation_noise": np.full(2, 1e-3)}
     values |= {name: np.array([0.0, shift]) for name, shift in zip(offsets, SHIFT, strict=True)}
     placed, found = with_measured_starts(model, [first_row_only(trajectory)], values)

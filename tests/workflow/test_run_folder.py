@@ -15,7 +15,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError, Interrupted
 from rfdropo_bayes.files import append_line, whole, write_text
-from rfdropo_bayes.inference.checkpoints import Checkpoint
+from rfdropo_bayes.inference import Checkpoint
 from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.experiment_file import look_through, self_contained
 from rfdropo_bayes.workflow.files import COMMANDS, check_folder, run_folder

@@ -52,7 +52,7 @@ recordings = ["walk"]
 def simulate(experiment: Path, out: Path, monkeypatch, capsys, *overrides: str) -> dict:
     """The JSON that the command prints."""
     options = [part for assignment in overrides for part in ("--set", assignment)]
-    monkeypatch.setattr(sys, "argv", ["rfdropo", "simulate", str(experiment), "--out", str(out), *options])
+    monkeypatch.setattr(sys, "argv", ["rfdropo", "simulate", str(experiment), "--json", "--out", str(out), *options])
     with pytest.raises(SystemExit) as stopped:
         main()
     captured = capsys.readouterr()

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.workflow import table1
 from rfdropo_bayes.workflow.comparison import fit, misleads, scores
@@ -18,7 +19,7 @@ from rfdropo_bayes.workflow.table1 import (
     Size,
     ahead_of_ours,
     as_markdown,
-    by_warning,
+    by_caution,
     claims,
     list_jobs,
     misleading,
@@ -27,6 +28,8 @@ from rfdropo_bayes.workflow.table1 import (
 )
 from rfdropo_bayes.workflow.tasks import TASKS, draw_truth, excited, task_problem
 
+STUCK = Caution(Code.PARTICLES_STUCK, "the last moves left the particles where they were", grave=True).as_dict()
+AT_BOUND = Caution(Code.AT_BOUND, "friction sits on its lower bound").as_dict()
 REACH, PUSH = TASKS["TrunkReach"], TASKS["TrunkPush"]
 
 
@@ -203,7 +206,7 @@ def test_cells_claims_and_the_table_follow_from_the_fits(tmp_path):
         "claims": checked,
         "ahead_of_ours": [],
         "misleading": [],
-        "by_warning": [],
+        "by_caution": [],
         "left_out": {},
         "not_done": 0,
         "paper": table1.PAPER,
@@ -220,14 +223,14 @@ def test_a_posterior_that_says_less_than_the_prior_is_counted_and_named():
     found = [r for r in rows() if r["row"] in ("ours", "UDR", "prior") and "failed" not in r]
     ours, rival = ([r for r in found if (r["row"], r["truths"]) == (row, "paper")] for row in ("ours", "UDR"))
     ours[0]["log_score"], ours[1]["log_score"], ours[2]["log_score"] = -4.3, -100.0, -4.1
-    ours[1]["warnings"] = ["the last moves left the particles where they were"]
+    ours[1]["cautions"] = [STUCK]
     rival[0]["log_score"], rival[1]["log_score"] = -5.0, None
     counted = {(c["row"], c["truths"]): c["misleading"] for c in summarise(found)}
     assert [counted[row, "paper"] for row in ("ours", "UDR", "prior")] == [2, 2, None]
     assert [counted[row, "off-centre"] for row in ("ours", "UDR")] == [0, 0]
     named = misleading(found)
-    assert [(entry["row"], entry["index"], entry["warnings"]) for entry in named] == [
-        ("ours", ours[1]["index"], ours[1]["warnings"]),
+    assert [(entry["row"], entry["index"], entry["cautions"]) for entry in named] == [
+        ("ours", ours[1]["index"], ours[1]["cautions"]),
         ("ours", ours[0]["index"], None),
     ]
 
@@ -235,12 +238,12 @@ def test_a_posterior_that_says_less_than_the_prior_is_counted_and_named():
 def test_coverage_is_told_apart_by_whether_the_sampler_arrived():
     found = [r for r in rows() if r["row"] == "ours" and "failed" not in r]
     ours = [r for r in found if r["truths"] == "off-centre"]
-    assert by_warning(found) == []  # older than the record of warnings
+    assert by_caution(found) == []  # older than the record of cautions
     for r in ours[1:]:
-        r["warnings"], r["inside_90"] = ["friction sits on its lower bound"], [True, True, True]
-    ours[1]["warnings"] = ["the last moves left the particles 0.98 correlated with where they were"]
+        r["cautions"], r["inside_90"] = [AT_BOUND], [True, True, True]
+    ours[1]["cautions"] = [STUCK]
     ours[1]["inside_90"], ours[1]["log_score"] = [True, False, False], -100.0
-    arrived, stuck = by_warning(found)
+    arrived, stuck = by_caution(found)
     assert (arrived["said"], arrived["fits"], arrived["coverage_90"]) == (False, len(ours) - 2, 1.0)
     assert (stuck["said"], stuck["fits"], stuck["misleading"]) == (True, 1, 1)
     assert stuck["coverage_90"] == pytest.approx(1.0 / 3.0)

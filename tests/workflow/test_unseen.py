@@ -25,7 +25,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.workflow.assembly import pooling
 from rfdropo_bayes.workflow.experiment import Experiment
 from rfdropo_bayes.workflow.first_row import match_first_row, weighed_by_first_row
-from rfdropo_bayes.workflow.prediction import MARKER_ERRORS, _for_new_recordings
+from rfdropo_bayes.workflow.prediction import MARKER_ERRORS, NOISE, _for_new_recordings
 from rfdropo_bayes.workflow.simulation import simulate_all
 from rfdropo_bayes.workflow.unseen import run_prediction
 
@@ -93,6 +93,14 @@ def test_the_marker_that_the_model_knows_best_sets_the_frame(posterior, tmp_path
     measured = Trajectory.load(EXPERIMENTS / COMMANDS).position[0]
     np.testing.assert_allclose(start[0], measured[0], atol=1e-8)
     assert np.abs(start - measured)[1:].max() > 1e-4
+
+
+def test_another_noise_than_the_fitted_one_is_refused(posterior, tmp_path):
+    record = PosteriorRecord.load(posterior / "posterior.nc")
+    (tmp_path / "auto").mkdir()
+    PosteriorRecord(record.parameters, record.posterior, attrs={NOISE: "auto"}).save(tmp_path / "auto" / "posterior.nc")
+    with pytest.raises(InputError, match=r"fitted with noise = 'auto', the experiment says 'white'.*model\.noise=auto"):
+        predict(tmp_path / "auto", COMMANDS, tmp_path / "a")
 
 
 def test_a_piece_of_a_fitted_recording_keeps_its_frame(posterior, tmp_path):

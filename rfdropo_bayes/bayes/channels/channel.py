@@ -1,0 +1,202 @@
+"""What every channel of measurements has: its parameters, its residuals, its density, and a draw of its noise."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.protocol import Observation
+
+
+class Seen(NamedTuple):
+    """What a model shows under one set of values.
+
+    Attributes:
+        observation: of every recording, with a leading axis over them.
+        values: all parameters by name, inferred and fixed.
+        offset: shift of measured against simulated positions of each recording [m].
+    """
+
+    observation: Observation
+    values: Mapping[str, Any]
+    offset: Float[Any, "recording 3"]
+
+
+class Channel(ABC):
+    """One kind of measurement; a model's log likelihood is the sum of those of its channels.
+
+    Attributes:
+        name: by which its data are known.
+    """
+
+    name: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def specs(self) -> tuple[ParameterSpec, ...]:
+        """Parameters of its noise and of its gain."""
+
+    @property
+    @abstractmethod
+    def measured(self) -> Float[Any, "..."]:
+        """What was measured; other arrays of this shape are other data of the same channel."""
+
+    @abstractmethod
+    def residuals(self, seen: Seen, measured: Float[Any, "..."]) -> Float[Array, "..."]:
+        """Residuals of unit variance, zero where there is no reading; axes (recording, time, ...) of a `Series`."""
+
+    @abstractmethod
+    def row_log_density(self, seen: Seen, measured: Float[Any, "..."]) -> Float[Array, " row"]:
+        """Log density of each row given those before it, summed over recordings; the first row only of what is known
+        before any recording."""
+
+    @abstractmethod
+    def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Array, "..."]:
+        """What would be measured: what a model shows, with a draw of the noise."""
+
+
+@dataclass(frozen=True)
+class Series(Channel):
+    """A channel with readings in every row of every recording.
+
+    Attributes:
+        readings: what was read, zero where there is nothing.
+        valid: which columns of an error (`deviation`) count.
+        linear: whether errors are readings less what a rollout shows, and nothing else.
+        known: its noise where that is stated or estimated; None where its parameters are inferred.
+    """
+
+    linear: ClassVar[bool]
+    readings: Float[Any, "recording time *reading"]
+    valid: Bool[np.ndarray, "recording time column"]
+    known: Autoregression | None = None
+
+    @property
+    def measured(self) -> Float[Any, "recording time *reading"]:
+        """See `Channel.measured`."""
+        return self.readings
+
+    @property
+    def specs(self) -> tuple[ParameterSpec, ...]:
+        """See `Channel.specs`."""
+        return self.gain_specs + (() if self.known is not None else self.noise_specs)
+
+    @property
+    def gain_specs(self) -> tuple[ParameterSpec, ...]:
+        """Parameters that are not of the noise; known unless they have a prior."""
+        return ()
+
+    @property
+    @abstractmethod
+    def noise_specs(self) -> tuple[ParameterSpec, ...]:
+        """Parameters of its noise, where they are inferred."""
+
+    @abstractmethod
+    def expected(self, seen: Seen) -> Float[Any, "recording time *reading"]:
+        """What would be read without noise."""
+
+    @abstractmethod
+    def deviation(
+        self, measured: Float[Any, "recording time *reading"], about: Float[Any, "recording time *reading"]
+    ) -> Float[Any, "recording time column"]:
+        """Readings less others, in the unit of the noise."""
+
+    @abstractmethod
+    def whiten_inferred(
+        self, errors: Float[Any, "recording time column"], values: Mapping[str, Any]
+    ) -> tuple[Float[Any, "recording time column"], Float[Any, "recording time column"]]:
+        """Errors as residuals of unit variance, and the logarithms that normalise them, under inferred noise."""
+
+    def log_size(
+        self, about: Float[Any, "recording time *reading"], measured: Float[Any, "recording time *reading"]
+    ) -> Float[Any, "recording time column"] | None:
+        """Logarithm of what an error is relative to; None where it is absolute."""
+        return None
+
+    def of_recordings(self, index: list[int], rows: int | None = None) -> Series:
+        """The same channel of some recordings, and of their first rows, only."""
+        return replace(self, readings=self.readings[index, :rows], valid=self.valid[index, :rows])
+
+    def mean(
+        self, readings: Float[np.ndarray, "repeat time *reading"], valid: Bool[np.ndarray, "repeat time column"]
+    ) -> Float[np.ndarray, "time *reading"]:
+        """Mean over repeats of what is valid, zero where nothing is."""
+        shape = readings.shape[1:]
+        used = np.where(valid, readings.reshape(valid.shape), 0.0)
+        return (used.sum(axis=0) / np.maximum(valid.sum(axis=0), 1)).reshape(shape)
+
+    def errors(
+        self, seen: Seen, measured: Float[Any, "recording time *reading"]
+    ) -> Float[Any, "recording time column"]:
+        """Measured less expected readings, in the unit of the noise."""
+        return self.deviation(measured, self.expected(seen))
+
+    def whiten(
+        self, errors: Float[Any, "recording time column"], values: Mapping[str, Any]
+    ) -> tuple[Float[Any, "recording time column"], Float[Any, "recording time column"]]:
+        """Errors as residuals of unit variance, zero where not valid, and the logarithms that normalise them."""
+        if self.known is None:
+            return self.whiten_inferred(errors, values)
+        return self.known.whiten(errors, self.valid), self.known.log_scale(self.valid)
+
+    def residuals(
+        self, seen: Seen, measured: Float[Any, "recording time *reading"]
+    ) -> Float[Any, "recording time column"]:
+        """See `Channel.residuals`; further columns stand for the sizes that errors are relative to."""
+        about = self.expected(seen)
+        white, _ = self.whiten(self.deviation(measured, about), seen.values)
+        size = self.log_size(about, measured)
+        if size is None:
+            return white
+        return jnp.concatenate([white, size_residuals(size, self.log_size(measured, measured), self.valid)], axis=-1)
+
+    def row_log_density(self, seen: Seen, measured: Float[Any, "recording time *reading"]) -> Float[Array, " time"]:
+        """See `Channel.row_log_density`."""
+        about = self.expected(seen)
+        white, scale = self.whiten(self.deviation(measured, about), seen.values)
+        size = self.log_size(about, measured)
+        normaliser = scale + 0.5 * jnp.log(2.0 * jnp.pi) + (0.0 if size is None else size)
+        return jnp.sum(-0.5 * white**2 - jnp.where(self.valid, normaliser, 0.0), axis=(0, 2))
+
+
+ABOVE_ZERO = 50.0  # larger than any logarithm of a ratio of sizes: keeps a root in `size_residuals` real
+
+
+def size_residuals(
+    size: Float[Any, "recording time column"],
+    read: Float[Any, "recording time column"] | None,
+    valid: Bool[np.ndarray, "recording time column"],
+) -> Float[Any, "recording time column"]:
+    """Residuals whose squares add to twice the logarithms of the sizes, up to a constant; zero where not valid.
+
+    With them the log likelihood is a sum of squares but for terms in the noise alone, as Gauss-Newton wants it.
+    """
+    return jnp.where(valid, jnp.sqrt(2.0 * (ABOVE_ZERO + size - (0.0 if read is None else read))), 0.0)
+
+
+@runtime_checkable
+class FeatureChannel(Protocol):
+    """A channel that methods without a likelihood compare rollouts by: features in metres, side by side."""
+
+    @property
+    def feature_valid(self) -> Bool[np.ndarray, "recording time feature"]:
+        """True where a feature was measured."""
+
+    def features(self, readings: Float[Any, "recording time *reading"]) -> Float[Any, "recording time feature"]:
+        """Features of readings [m]."""
+
+    def draw_features(
+        self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
+    ) -> Float[Array, "time feature"]:
+        """A realisation of the features' noise [m] in one recording."""
+
+    def feature_deviation(self, values: Mapping[str, Any]) -> Float[np.ndarray, " feature"]:
+        """Standard deviation of the features' noise [m]."""

@@ -1,0 +1,115 @@
+"""Measured motor angles: what the drives did, apart from what the body made of it.
+
+Marker positions alone cannot tell a slow drive from a damped body, or a drive that stops short from a smaller spool. An
+encoder on the motor sees the first of each pair only (`Observation.motor_angle`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from rfdropo_bayes.bayes.channels.channel import Seen, Series
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+MOTOR_ANGLE_NOISE = ParameterSpec(
+    "motor_angle_noise",
+    "rad",
+    1e-5,
+    3.0,
+    0.01,
+    {"distribution": "LogNormal", "median": 0.02, "sigma": 1.5},
+    "standard deviation of a motor angle: the encoder, and what the model of the drives misses; white",
+)
+
+
+@dataclass(frozen=True)
+class MotorAngle(Series):
+    """Motor angles [rad]; columns are the channels of the commands. Readings that repeat an older one do not count."""
+
+    name: ClassVar[str] = "motor_angle"
+    linear: ClassVar[bool] = True
+
+    @classmethod
+    def gather(cls, trajectories: Sequence[Trajectory], length: int) -> MotorAngle:
+        """Motor angles of recordings padded to ``length`` rows.
+
+        They belong to the columns of commands, and these to the robot's channels, in the order in which they stand.
+
+        Raises:
+            InputError: a recording without motor angles, or commands that are no angles.
+        """
+        measured, valid = [], []
+        for trajectory in trajectories:
+            if trajectory.motor_angle is None:
+                raise InputError(
+                    "has no motor angles",
+                    where=trajectory.name,
+                    remedy="leave [model] motor_angle = true out, or record them",
+                )
+            if trajectory.command_unit != "rad":
+                raise InputError(
+                    f"its commands are in {trajectory.command_unit}: motor angles tell of commands in rad only",
+                    where=trajectory.name,
+                    remedy="leave [model] motor_angle = true out, or give the commands as angles of the motors",
+                )
+            angle, mask = np.asarray(trajectory.motor_angle, dtype=float), trajectory.motor_angle_mask
+            missing = ((0, length - len(angle)), (0, 0))
+            measured.append(np.pad(angle, missing))
+            valid.append(np.pad(np.ones(angle.shape, dtype=bool) if mask is None else mask, missing))
+            if not valid[-1].any():
+                raise InputError(
+                    "none of its motor angles is a new reading",
+                    where=trajectory.name,
+                    remedy="resample less coarsely: a row counts where the angles were just read",
+                )
+        known = np.stack(valid)
+        return cls(np.where(known, np.stack(measured), 0.0), known)
+
+    @property
+    def noise_specs(self) -> tuple[ParameterSpec, ...]:
+        """See `Series.noise_specs`."""
+        return (MOTOR_ANGLE_NOISE,)
+
+    def expected(self, seen: Seen) -> Float[Any, "recording time channel"]:
+        """See `Series.expected`.
+
+        Raises:
+            InputError: a simulator that does not tell where its drives stand.
+        """
+        if seen.observation.motor_angle is None:
+            raise InputError(
+                "the simulator does not tell where its drives stand",
+                where="[model] motor_angle",
+                remedy="leave it out, or let its rollout return Observation.motor_angle",
+            )
+        return seen.observation.motor_angle
+
+    def deviation(
+        self, measured: Float[Any, "recording time channel"], about: Float[Any, "recording time channel"]
+    ) -> Float[Any, "recording time channel"]:
+        """See `Series.deviation`: a difference [rad]."""
+        return measured - about
+
+    def whiten_inferred(
+        self, errors: Float[Any, "recording time channel"], values: Mapping[str, Any]
+    ) -> tuple[Float[Any, "recording time channel"], Float[Any, "recording time channel"]]:
+        """See `Series.whiten_inferred`: white noise."""
+        size = values[MOTOR_ANGLE_NOISE.name]
+        return jnp.where(self.valid, errors / size, 0.0), jnp.broadcast_to(jnp.log(size), errors.shape)
+
+    def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time channel"]:
+        """See `Channel.draw`."""
+        if self.known is not None:
+            error = self.known.draw_recordings(key, *self.readings.shape[:2])
+        else:
+            error = seen.values[MOTOR_ANGLE_NOISE.name] * jax.random.normal(key, self.readings.shape)
+        return jnp.where(self.valid, self.expected(seen) + error, 0.0)

@@ -1,0 +1,146 @@
+"""Measured cable tensions, which break the free scale of length-driven cables.
+
+With cables that impose a displacement, all stiffnesses and masses times one factor give the same motion. A tension
+reading fixes the factor as far as its gain is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
+
+from rfdropo_bayes.bayes.channels.channel import Seen, Series
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.protocol import Simulator
+
+TENSION_NOISE = ParameterSpec(
+    "tension_noise",
+    "-",
+    1e-5,
+    1.0,
+    0.01,
+    {"distribution": "LogNormal", "median": 0.02, "sigma": 1.0},
+    "standard deviation of a tension reading as a share of the reading, independent from sample to sample",
+)
+TENSION_GAIN = ParameterSpec(
+    "tension_gain",
+    "-",
+    0.01,
+    100.0,
+    1.0,
+    {"distribution": "LogNormal", "median": 1.0, "sigma": 0.1},
+    "tension read per true tension; known (1) unless it has a prior, which leaves the scale of forces free again",
+)
+# A slack cable reads nothing: below this share of the recording's root mean square the error no longer shrinks.
+SMALLEST_READING = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tension(Series):
+    """Cable tensions [N]; an error is relative to the size of the tension.
+
+    That is the size of the tension, not of what was read for it: readings that happen to be low would count more than
+    high ones, and pull all forces down by twice the square of their relative error.
+
+    Attributes:
+        cables: which of the simulator's cables were measured.
+    """
+
+    name: ClassVar[str] = "tension"
+    linear: ClassVar[bool] = False
+    cables: Int[np.ndarray, " cable"]
+
+    @classmethod
+    def gather(cls, simulator: Simulator, trajectories: Sequence[Trajectory], length: int) -> Tension:
+        """Tensions of recordings padded to ``length`` rows.
+
+        Raises:
+            InputError: a recording without tensions, or with columns that are no cables of the robot.
+        """
+        names = simulator.cable_names
+        measured, valid, columns = [], [], []
+        for trajectory in trajectories:
+            if trajectory.tension is None:
+                raise InputError(
+                    "has no cable tensions",
+                    where=trajectory.name,
+                    remedy="leave [model] tension = true out, or record them",
+                )
+            unknown = [name for name in trajectory.cable_names if name not in names]
+            if unknown:
+                raise InputError(
+                    f"its tensions are of {', '.join(unknown)}, which are no cables of the robot ({', '.join(names)})",
+                    where=trajectory.name,
+                    remedy="name the columns after the robot's cables",
+                )
+            columns.append([names.index(name) for name in trajectory.cable_names])
+            tension = np.asarray(trajectory.tension, dtype=float)
+            known = np.asarray(trajectory.tension_mask)
+            missing = ((0, length - len(tension)), (0, 0))
+            measured.append(np.pad(np.where(known, tension, 0.0), missing))
+            valid.append(np.pad(known, missing))
+        if any(column != columns[0] for column in columns):
+            raise InputError("the recordings measure different cables", where="[model] tension", remedy="use one set")
+        return cls(np.stack(measured), np.stack(valid), cables=np.array(columns[0]))
+
+    @property
+    def noise_specs(self) -> tuple[ParameterSpec, ...]:
+        """See `Series.noise_specs`."""
+        return (TENSION_NOISE,)
+
+    @property
+    def gain_specs(self) -> tuple[ParameterSpec, ...]:
+        """See `Series.gain_specs`."""
+        return (TENSION_GAIN,)
+
+    def expected(self, seen: Seen) -> Float[Any, "recording time cable"]:
+        """See `Series.expected`."""
+        gain = seen.values.get(TENSION_GAIN.name, TENSION_GAIN.nominal)
+        return gain * seen.observation.tension[..., self.cables]
+
+    def deviation(
+        self, measured: Float[Any, "recording time cable"], about: Float[Any, "recording time cable"]
+    ) -> Float[Any, "recording time cable"]:
+        """See `Series.deviation`: relative to the size of the tensions that readings are compared with."""
+        return (measured - about) / reading_size(about, self.valid, measured)
+
+    def log_size(
+        self, about: Float[Any, "recording time cable"], measured: Float[Any, "recording time cable"]
+    ) -> Float[Any, "recording time cable"]:
+        """See `Series.log_size`."""
+        return jnp.log(reading_size(about, self.valid, measured))
+
+    def whiten_inferred(
+        self, errors: Float[Any, "recording time cable"], values: Mapping[str, Any]
+    ) -> tuple[Float[Any, "recording time cable"], Float[Any, "recording time cable"]]:
+        """See `Series.whiten_inferred`: white noise."""
+        size = values[TENSION_NOISE.name]
+        return jnp.where(self.valid, errors / size, 0.0), jnp.broadcast_to(jnp.log(size), errors.shape)
+
+    def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time cable"]:
+        """See `Channel.draw`."""
+        clean = self.expected(seen)
+        if self.known is not None:
+            error = self.known.draw_recordings(key, *self.readings.shape[:2])
+        else:
+            error = seen.values[TENSION_NOISE.name] * jax.random.normal(key, self.readings.shape)
+        return jnp.where(self.valid, clean + error * reading_size(clean, self.valid, clean), 0.0)
+
+
+def reading_size(
+    tension: Float[Any, "recording time cable"],
+    known: Bool[np.ndarray, "recording time cable"],
+    among: Float[Any, "recording time cable"],
+) -> Float[Any, "recording time cable"]:
+    """Size of each tension that its reading's relative error applies to [N]; ``among`` sets what the least one is."""
+    square = jnp.sum(jnp.where(known, among, 0.0) ** 2, axis=(1, 2), keepdims=True)
+    least = SMALLEST_READING * jnp.sqrt(square / np.maximum(known.sum(axis=(1, 2), keepdims=True), 1))
+    return jnp.maximum(jnp.abs(tension), jnp.where(least > 0.0, least, 1.0))

@@ -1,0 +1,37 @@
+"""Noise of measured series: white, correlated in time, heavy-tailed or shared between columns; inferred or known."""
+
+from rfdropo_bayes.bayes.noise.autoregression import Autoregression
+from rfdropo_bayes.bayes.noise.inferred import (
+    LASTING_NOISE,
+    LONG_AGO,
+    NOISE_CORRELATION_TIME,
+    NOISE_DEGREES,
+    NOISE_MODELS,
+    OBSERVATION_NOISE,
+    Noise,
+    Timeline,
+    draw_noise,
+    noise_specs,
+    noise_values,
+    row_log_density,
+    timeline,
+    whiten,
+)
+
+__all__ = [
+    "LASTING_NOISE",
+    "LONG_AGO",
+    "NOISE_CORRELATION_TIME",
+    "NOISE_DEGREES",
+    "NOISE_MODELS",
+    "OBSERVATION_NOISE",
+    "Autoregression",
+    "Noise",
+    "Timeline",
+    "draw_noise",
+    "noise_specs",
+    "noise_values",
+    "row_log_density",
+    "timeline",
+    "whiten",
+]

@@ -1,0 +1,264 @@
+"""Noise that is known: an autoregression, stated or estimated where an experiment was repeated.
+
+Whitening is exact for a stationary Gaussian AR(p) on every unbroken stretch of rows: the k-th row of a stretch is
+predicted from the min(k, p) rows before it (Levinson-Durbin). Noise that columns share has the same memory as the rest
+(a separable covariance); across a gap in some of the columns alone its whitening is approximate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, PRNGKeyArray
+from scipy.signal import lfilter
+
+from rfdropo_bayes.bayes.noise.shared import half_log_determinant, mixed, shrunk_correlation
+
+Array = np.ndarray | jax.Array
+
+MAX_ORDER = 3
+LEAST_SHARE = 0.05  # of the mean deviation that a column has at least: a marker that never moves is no certainty
+REPEATS, STATED, RESIDUALS = "repeats", "stated", "residuals"
+SLOW = 0.9  # share that the rows before predict, from which on a model's residuals are not taken for noise alone
+
+
+@dataclass(frozen=True)
+class Autoregression:
+    """Stationary AR(p) noise with one memory for all columns.
+
+    Attributes:
+        scale: marginal standard deviation of each column, in the column's unit.
+        autocorrelation: at lags 0 ... p; its length says the order.
+        source: "repeats" (pure error), "stated" (in the experiment file) or "residuals" (an assumption: what the base
+            model leaves is taken for noise as far as such a process can make it).
+        freedom: degrees of freedom of the variance; infinite where stated.
+        correlation: of the columns at one time; None where they are independent.
+    """
+
+    scale: Float[np.ndarray, " column"]
+    autocorrelation: Float[np.ndarray, " lag"]
+    source: str
+    freedom: float
+    correlation: Float[np.ndarray, "column column"] | None = None
+
+    @property
+    def order(self) -> int:
+        """Rows of memory."""
+        return len(self.autocorrelation) - 1
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether it was taken from residuals of a model that change more slowly than the noise of a measurement."""
+        return self.source == RESIDUALS and float(self.predictors[1][-1] ** 2) < 1.0 - SLOW
+
+    def of_columns(self, columns: Sequence[int]) -> Autoregression:
+        """The noise of some columns."""
+        index = list(columns)
+        across = None if self.correlation is None else self.correlation[np.ix_(index, index)]
+        return replace(self, scale=self.scale[index], correlation=across)
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values; `from_dict` undoes it."""
+        arrays = {"scale": self.scale, "autocorrelation": self.autocorrelation, "correlation": self.correlation}
+        found = {name: None if array is None else array.tolist() for name, array in arrays.items()}
+        return {**found, "source": self.source, "freedom": self.freedom if np.isfinite(self.freedom) else None}
+
+    @classmethod
+    def from_dict(cls, given: Mapping[str, Any]) -> Autoregression:
+        """From plain values."""
+        across, freedom = given["correlation"], given["freedom"]
+        return cls(
+            np.array(given["scale"]),
+            np.array(given["autocorrelation"]),
+            given["source"],
+            np.inf if freedom is None else freedom,
+            None if across is None else np.array(across),
+        )
+
+    @cached_property
+    def predictors(self) -> tuple[Float[np.ndarray, "rows order"], Float[np.ndarray, " rows"]]:
+        """Coefficients of the best prediction from 0, 1, ... p rows, and its relative standard deviation."""
+        return levinson(self.autocorrelation)
+
+    def whiten(
+        self,
+        series: Float[Array, "*batch time column"],
+        valid: Bool[np.ndarray, "*rest time column"],
+        count: Float[np.ndarray, "*rest time column"] | None = None,
+    ) -> Float[Array, "*batch time column"]:
+        """Independent unit-variance rows, zero where not valid; linear in the series.
+
+        ``count`` repeats stand behind each value, whose noise is smaller by its root; one without.
+        """
+        innovations = self.innovations(series, valid)
+        return self.separate(innovations if count is None else innovations * np.sqrt(count), valid)
+
+    def log_scale(self, valid: Bool[np.ndarray, "*rest time column"]) -> Float[np.ndarray, "*rest time column"]:
+        """Logarithms that normalise the density of `whiten`: zero where not valid, and their sum is half that of the
+        covariance's determinant. A row's columns have equal parts of what their correlation takes away."""
+        _, deviation = self.predictors
+        found = np.log(deviation[np.minimum(rows_before(valid), self.order)] * self.scale)
+        if self.correlation is not None:
+            shared = half_log_determinant(self.correlation, valid)
+            found = found + (shared / np.maximum(valid.sum(axis=-1), 1))[..., None]
+        return np.where(valid, found, 0.0)
+
+    def innovations(
+        self, series: Float[Array, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
+    ) -> Float[Array, "*batch time column"]:
+        """What the rows before do not predict, in unit variance; columns that share noise still do."""
+        coefficients, deviation = self.predictors
+        numbers: Any = jnp if isinstance(series, jax.Array) else np
+        memory = np.minimum(rows_before(valid), self.order)
+        innovation = numbers.asarray(series, dtype=float)
+        for lag in range(1, self.order + 1):
+            nothing = numbers.zeros_like(series[..., :lag, :])
+            before = numbers.concatenate([nothing, series[..., :-lag, :]], axis=-2)
+            innovation = innovation - coefficients[memory, lag - 1] * before
+        return numbers.where(valid, innovation / (deviation[memory] * self.scale), 0.0)
+
+    def separate(
+        self, innovations: Float[Array, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
+    ) -> Float[Array, "*batch time column"]:
+        """Innovations of which each column has its own; `gather` undoes it."""
+        return innovations if self.correlation is None else mixed(innovations, valid, self.correlation, -0.5)
+
+    def gather(
+        self, white: Float[np.ndarray, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
+    ) -> Float[np.ndarray, "*batch time column"]:
+        """Innovations of the columns themselves, what they share included."""
+        return white if self.correlation is None else mixed(white, valid, self.correlation, 0.5)
+
+    def colour(
+        self, white: Float[np.ndarray, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
+    ) -> Float[np.ndarray, "*batch time column"]:
+        """The series that `whiten` makes ``white`` of; zero where not valid."""
+        coefficients, deviation = self.predictors
+        memory = np.minimum(rows_before(valid), self.order)
+        series = np.where(valid, self.gather(white, valid) * deviation[memory] * self.scale, 0.0)
+        for row in range(1, series.shape[-2]):
+            for lag in range(1, min(self.order, row) + 1):
+                share = coefficients[memory[..., row, :], lag - 1]
+                series[..., row, :] += np.where(valid[..., row, :], share * series[..., row - lag, :], 0.0)
+        return series
+
+    def row_log_density(
+        self, series: Float[Array, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
+    ) -> Float[Array, "*batch time"]:
+        """Log density of each row given those before it."""
+        white = self.whiten(series, valid)
+        return -(0.5 * white**2 + np.where(valid, self.log_scale(valid) + 0.5 * np.log(2.0 * np.pi), 0.0)).sum(axis=-1)
+
+    def draw_rows(self, key: PRNGKeyArray, rows: int) -> Float[jax.Array, "time column"]:
+        """A realisation in one recording; traceable."""
+        coefficients, deviation = self.predictors
+        white = jax.random.normal(key, (rows, len(self.scale)))
+        if self.correlation is not None:
+            white = mixed(white, np.ones(white.shape, dtype=bool), self.correlation, 0.5)
+        memory = np.minimum(np.arange(rows), self.order)
+
+        def advance(last: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+            share, spread, fresh = row
+            now = share @ last + spread * fresh
+            return jnp.concatenate([now[None], last[:-1]]), now
+
+        before = jnp.zeros((coefficients.shape[1], len(self.scale)))
+        rows_of = (jnp.asarray(coefficients[memory]), jnp.asarray(deviation[memory]), white)
+        return self.scale * jax.lax.scan(advance, before, rows_of)[1]
+
+    def draw_recordings(self, key: PRNGKeyArray, count: int, rows: int) -> Float[jax.Array, "recording time column"]:
+        """Realisations in several recordings."""
+        return jax.vmap(lambda k: self.draw_rows(k, rows))(jax.random.split(key, count))
+
+    def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "*batch time column"]:
+        """A realisation of shape (..., time, column)."""
+        coefficients, deviation = self.predictors
+        warm = 0 if self.order == 0 else 60
+        white = rng.standard_normal((*shape[:-2], shape[-2] + warm, shape[-1]))
+        white = self.gather(white, np.ones(white.shape[-2:], dtype=bool))
+        filtered = lfilter([deviation[-1]], np.concatenate([[1.0], -coefficients[-1]]), white, axis=-2)
+        return self.scale * filtered[..., warm:, :]
+
+
+def rows_before(valid: Bool[np.ndarray, "*batch time column"]) -> np.ndarray:
+    """Valid rows in unbroken succession before each row."""
+    rows = np.arange(valid.shape[-2])[:, None]
+    broken = np.maximum.accumulate(np.where(valid, -1, rows), axis=-2)
+    shifted = np.concatenate([np.full_like(broken[..., :1, :], -1), broken[..., :-1, :]], axis=-2)
+    return rows - shifted - 1
+
+
+def levinson(
+    autocorrelation: Float[np.ndarray, " lag"],
+) -> tuple[Float[np.ndarray, "rows order"], Float[np.ndarray, " rows"]]:
+    """Levinson-Durbin recursion: row k holds the coefficients of the best linear prediction from k rows."""
+    order = len(autocorrelation) - 1
+    table, variance = np.zeros((order + 1, max(order, 1))), np.ones(order + 1)
+    for k in range(1, order + 1):
+        last = table[k - 1, : k - 1]
+        partial = (autocorrelation[k] - last @ autocorrelation[k - 1 : 0 : -1]) / variance[k - 1]
+        partial = float(np.clip(partial, -0.999, 0.999))
+        table[k, : k - 1] = last - partial * last[::-1]
+        table[k, k - 1] = partial
+        variance[k] = variance[k - 1] * (1.0 - partial**2)
+    return table, np.sqrt(variance)
+
+
+def estimate_noise(
+    series: Float[np.ndarray, "series time column"],
+    valid: Bool[np.ndarray, "series time column"],
+    freedom_share: float,
+    *,
+    source: str,
+    order: int | None = None,
+    pooled: bool | None = None,
+    shared: bool | None = False,
+) -> Autoregression:
+    """Fit the noise to deviations that hold nothing else.
+
+    Args:
+        series: deviations [m], e.g. of repeats from their mean.
+        valid: which may be used.
+        freedom_share: degrees of freedom per value: (n - 1) / n for deviations from the mean of n repeats.
+        source: what the deviations are.
+        order: of the process; by default the one of smallest BIC up to `MAX_ORDER`.
+        pooled: one standard deviation for all columns; by default as BIC has it.
+        shared: whether columns share noise; None to test it.
+    """
+    square = np.where(valid, series, 0.0) ** 2
+    count = np.maximum(valid.sum(axis=(0, 1)), 1) * freedom_share
+    own = np.sqrt(np.maximum(square.sum(axis=(0, 1)) / count, 1e-20))
+    mean = float(np.sqrt(max(square.sum() / count.sum(), 1e-20)))
+    own = np.maximum(own, LEAST_SHARE * mean)
+    if pooled is None:
+        gain = count.sum() * np.log(mean) - np.sum(count * np.log(own))
+        pooled = bool(gain < 0.5 * len(own) * np.log(count.sum()) * 3.0)  # memory leaves a third of the rows' worth
+    scale = np.full(len(own), mean) if pooled else own
+    correlation = _autocorrelation(np.where(valid, series, 0.0) / scale, valid, MAX_ORDER if order is None else order)
+    if order is None:
+        _, deviation = levinson(correlation)
+        total = count.sum()
+        order = int(np.argmin([2.0 * total * np.log(deviation[k]) + k * np.log(total) for k in range(len(deviation))]))
+    alone = Autoregression(scale, correlation[: order + 1], source, float(count.sum()))
+    whole = valid.all(axis=-1)
+    across = shrunk_correlation(alone.innovations(series, valid)[whole], freedom_share, shared=shared)
+    if across is None:
+        return alone
+    # The mean of correlated squares is known as well as that of fewer independent ones.
+    return replace(alone, correlation=across, freedom=alone.freedom * len(across) / float(np.sum(across**2)))
+
+
+def _autocorrelation(series: np.ndarray, valid: np.ndarray, lags: int) -> np.ndarray:
+    """Pooled over series and columns, each lag over the pairs of rows it has."""
+    variance = np.sum(series**2) / max(valid.sum(), 1)
+    values = [1.0]
+    for lag in range(1, lags + 1):
+        pairs = max(int((valid[..., lag:, :] & valid[..., :-lag, :]).sum()), 1)
+        values.append(float(np.sum(series[..., lag:, :] * series[..., :-lag, :]) / pairs / max(variance, 1e-300)))
+    return np.array(values)

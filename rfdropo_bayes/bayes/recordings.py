@@ -1,0 +1,96 @@
+"""Recordings as the arrays that a likelihood needs, on one clock and padded to one length."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from rfdropo_bayes.bayes.noise import Timeline, timeline
+from rfdropo_bayes.data import Trajectory, check_channels, shared_markers
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.commands import Commands, stack_commands
+from rfdropo_bayes.simulators.protocol import Simulator
+
+
+@dataclass(frozen=True)
+class RecordingSet:
+    """Recordings as the arrays a likelihood needs, padded to a common length (padding is not valid).
+
+    Attributes:
+        names: one per recording.
+        markers: the markers that all recordings have.
+        marker_index: where these are among the simulator's.
+        time: observation times, from zero [s].
+        rows: number of rows of each recording.
+        position: measured marker positions [m]; zero where masked.
+        commands: commands on the simulator's clock.
+    """
+
+    names: tuple[str, ...]
+    markers: tuple[str, ...]
+    marker_index: Int[np.ndarray, " marker"]
+    time: Float[np.ndarray, "recording time"]
+    rows: Int[np.ndarray, " recording"]
+    position: Float[np.ndarray, "recording time marker 3"]
+    line: Timeline
+    commands: Commands
+
+    def of(self, index: Sequence[int], rows: int | None = None) -> RecordingSet:
+        """Some recordings only, and of each the first rows."""
+        chosen = list(index)
+        return RecordingSet(
+            tuple(self.names[i] for i in chosen),
+            self.markers,
+            self.marker_index,
+            self.time[chosen, :rows],
+            np.minimum(self.rows[chosen], self.time.shape[1] if rows is None else rows),
+            self.position[chosen, :rows],
+            Timeline(*(np.asarray(part)[chosen, :rows] for part in self.line)),
+            Commands(*(np.asarray(part)[chosen] for part in self.commands)),
+        )
+
+
+def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) -> RecordingSet:
+    """Bring trajectories onto the simulator's clock and markers: those of the robot's that every recording has.
+
+    Raises:
+        InputError: no trajectory, two of one name, no marker in common, or another number of channels.
+    """
+    if not trajectories:
+        raise InputError("no recordings", where="[data] fit", remedy="name at least one recording")
+    names = tuple(trajectory.name for trajectory in trajectories)
+    if len(set(names)) < len(names):
+        raise InputError(f"two recordings share a name: {', '.join(names)}", where="[data]", remedy="list each once")
+    length = max(len(trajectory.time) for trajectory in trajectories)
+    markers = shared_markers(trajectories, simulator.marker_names)
+    times, positions, valid, commands = [], [], [], []
+    for trajectory in trajectories:
+        chosen = [trajectory.marker_names.index(name) for name in markers]
+        mask = np.asarray(trajectory.position_mask)[:, chosen]
+        position = np.where(mask[:, :, None], np.asarray(trajectory.position)[:, chosen], 0.0)
+        missing = length - len(trajectory.time)
+        tail = trajectory.time[-1] + trajectory.dataset.attrs["sample_time"] * np.arange(1, missing + 1)
+        times.append(np.concatenate([trajectory.time, tail]) - trajectory.time[0])
+        positions.append(np.pad(position, ((0, missing), (0, 0), (0, 0))))
+        valid.append(np.pad(mask, ((0, missing), (0, 0))))
+        commands.append(_commands(simulator, trajectory))
+    lines = [timeline(time, ok) for time, ok in zip(times, valid, strict=True)]
+    return RecordingSet(
+        names,
+        markers,
+        np.array([simulator.marker_names.index(name) for name in markers]),
+        np.stack(times),
+        np.array([len(trajectory.time) for trajectory in trajectories]),
+        np.stack(positions),
+        Timeline(*(np.stack(part) for part in zip(*lines, strict=True))),
+        stack_commands(commands),
+    )
+
+
+def _commands(simulator: Simulator, trajectory: Trajectory) -> Commands:
+    unit = getattr(simulator, "command_unit", trajectory.command_unit)
+    check_channels(trajectory, simulator.channel_names, unit)
+    return simulator.commands(trajectory.command_time, trajectory.command, trajectory.initial_command, trajectory.time)

@@ -1,0 +1,120 @@
+"""Recordings of the same commands: which they are, their mean, and the noise that they differ by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rfdropo_bayes.bayes.channels import Series
+from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS, estimate_noise
+from rfdropo_bayes.bayes.recordings import RecordingSet
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.repeats import group_repeats
+from rfdropo_bayes.errors import InputError
+
+CLOCKS_AGREE = 0.1  # of a sample time: what the clocks of repeats may differ by
+
+Groups = tuple[tuple[int, ...], ...]
+"""Indices of the recordings in each group of repeats."""
+
+
+def group_recordings(recordings: RecordingSet, trajectories: Sequence[Trajectory]) -> Groups:
+    """Recordings with the same commands, rows and clock."""
+    groups: list[tuple[int, ...]] = []
+    for found in group_repeats(trajectories):
+        kept: list[list[int]] = []
+        for index in found:
+            for group in kept:
+                first = group[0]
+                step = trajectories[first].dataset.attrs["sample_time"]
+                same = recordings.rows[first] == recordings.rows[index]
+                if same and np.abs(recordings.time[first] - recordings.time[index]).max() < CLOCKS_AGREE * step:
+                    group.append(index)
+                    break
+            else:
+                kept.append([index])
+        groups += [tuple(group) for group in kept]
+    return tuple(groups)
+
+
+def repeats_apart(recordings: RecordingSet, trajectories: Sequence[Trajectory], groups: Groups) -> tuple[str, ...]:
+    """Recordings that repeat the commands of another one and are not joined with it, as rows or clocks differ."""
+    firsts = {group[0] for group in groups}
+    repeats = [index for found in group_repeats(trajectories) for index in found[1:]]
+    return tuple(recordings.names[index] for index in repeats if index in firsts)
+
+
+def mean_of(channel: Series, groups: Groups) -> Float[np.ndarray, "group time *reading"]:
+    """Mean of a channel's readings over each group."""
+    readings = np.asarray(channel.measured)
+    return np.stack([channel.mean(readings[list(group)], channel.valid[list(group)]) for group in groups])
+
+
+def spread(channel: Series, groups: Groups) -> Float[np.ndarray, "recording time column"]:
+    """Every recording less the mean of its group, in the unit of the noise; zero where not valid."""
+    readings = np.asarray(channel.measured)
+    about = np.empty_like(readings)
+    for group, mean in zip(groups, mean_of(channel, groups), strict=True):
+        about[list(group)] = mean
+    return np.where(channel.valid, np.asarray(channel.deviation(readings, about)), 0.0)
+
+
+def mean_error(
+    errors: Float[np.ndarray, "*batch recording time column"],
+    valid: Bool[np.ndarray, "recording time column"],
+    groups: Groups,
+) -> Float[np.ndarray, "*batch group time column"]:
+    """Mean of errors over each group, zero where nothing is valid."""
+    means = []
+    for group in groups:
+        own, index = valid[list(group)], list(group)
+        total = np.where(own, errors[..., index, :, :], 0.0).sum(axis=-3)
+        means.append(total / np.maximum(own.sum(axis=0), 1))
+    return np.stack(means, axis=-3)
+
+
+def deviations(
+    errors: Float[np.ndarray, "recording time column"],
+    valid: Bool[np.ndarray, "recording time column"],
+    groups: Groups,
+) -> tuple[Float[np.ndarray, "repeat time column"], Bool[np.ndarray, "repeat time column"], float]:
+    """Errors of repeats about their means, which of them count, and their degrees of freedom per value."""
+    parts, counted, freedom, values = [], [], 0.0, 0
+    for group, mean in zip(groups, mean_error(errors, valid, groups), strict=True):
+        if len(group) > 1:
+            own = valid[list(group)]
+            own = own & (own.sum(axis=0) > 1)
+            parts.append(np.where(own, errors[list(group)] - mean, 0.0))
+            counted.append(own)
+            freedom += own.sum() * (1.0 - 1.0 / len(group))
+            values += int(own.sum())
+    return np.concatenate(parts), np.concatenate(counted), freedom / max(values, 1)
+
+
+def with_noise_of_repeats(channel: Series, groups: Groups) -> Series:
+    """The channel under the noise that its repeats differ by.
+
+    Raises:
+        InputError: nothing was repeated.
+    """
+    return replace(channel, known=noise_of_repeats(channel, groups))
+
+
+def noise_of_repeats(channel: Series, groups: Groups) -> Autoregression:
+    """The noise that the repeats of a channel differ by.
+
+    Raises:
+        InputError: nothing was repeated.
+    """
+    if all(len(group) == 1 for group in groups):
+        raise InputError(
+            "no command sequence was carried out twice",
+            where='[model] noise = "repeats"',
+            remedy="repeat one, or let the noise be inferred",
+        )
+    found = deviations(spread(channel, groups), channel.valid, groups)
+    return estimate_noise(*found, source=REPEATS, shared=None)

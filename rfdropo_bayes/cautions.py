@@ -1,0 +1,74 @@
+"""What speaks against a result: a code that programs decide on, and a sentence for people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from typing import Any
+
+
+class Code(StrEnum):
+    """What a caution is about. Programs read codes; sentences may be reworded at any time."""
+
+    AT_BOUND = "at_bound"
+    """A parameter's posterior is cut off by a bound, or by an end of its prior."""
+    AGAINST_PRIOR = "against_prior"
+    """The data put parameters where their prior hardly is."""
+    BUDGET_SPENT = "budget_spent"
+    """The rollouts ran out before all data were in."""
+    PARTICLES_STUCK = "particles_stuck"
+    """The last moves left the particles near where they were."""
+    EVIDENCE_SCATTERED = "evidence_scattered"
+    """Replicates differ in their log evidence."""
+    REPLICATES_DISAGREE = "replicates_disagree"
+    """Replicates differ in where parameters lie."""
+    PASSES_DISAGREE = "passes_disagree"
+    """Two passes over the data differ in their log evidence."""
+    ROLLOUTS_EXCLUDED = "rollouts_excluded"
+    """Many rollouts got no weight."""
+    CLIMB_UNFINISHED = "climb_unfinished"
+    """The best climb stopped before its optimum."""
+    SEVERAL_OPTIMA = "several_optima"
+    """One normal distribution does not describe the posterior."""
+    TRANSITIONS_DIVERGED = "transitions_diverged"
+    """Hamiltonian steps could not follow the posterior."""
+    EVIDENCE_UNFINISHED = "evidence_unfinished"
+    """Nested sampling stopped before the evidence was in."""
+    SEARCH_EDGE = "search_edge"
+    """RF-DROPO's mean or standard deviation is at an end of its search range."""
+    NO_SPREAD = "no_spread"
+    """RF-DROPO's standard deviation is at its smallest value."""
+    RESIDUALS_CORRELATED = "residuals_correlated"
+    """Residuals last from row to row beyond the noise model."""
+    RESIDUALS_HEAVY = "residuals_heavy"
+    """More residuals are far off than the noise model allows."""
+
+
+@dataclass(frozen=True)
+class Caution:
+    """One thing that speaks against a result.
+
+    Attributes:
+        code: what it is about.
+        sentence: the same for people, with numbers and a remedy.
+        grave: the method did not arrive at its answer; the draws must not be used as they are.
+    """
+
+    code: Code
+    sentence: str
+    grave: bool = False
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: code, sentence, grave."""
+        return asdict(self)
+
+
+def grave(cautions: Iterable[Caution]) -> list[Caution]:
+    """Those that forbid to use the draws as they are."""
+    return [caution for caution in cautions if caution.grave]
+
+
+def read_cautions(rows: Iterable[dict[str, Any]]) -> list[Caution]:
+    """Cautions from the dictionaries that `Caution.as_dict` writes."""
+    return [Caution(Code(row["code"]), row["sentence"], row["grave"]) for row in rows]

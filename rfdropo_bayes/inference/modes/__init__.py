@@ -1,0 +1,1 @@
+"""Optima of a posterior: climbs, where they start, and the normal approximation around where they end."""

@@ -1,0 +1,247 @@
+"""The posterior of a problem with residuals as climbs see it: Gauss-Newton in the unconstrained space.
+
+Observation noise among the parameters. The residuals r are whitened, so the log likelihood is ``-r'r / 2 + c`` where c
+holds the log determinants and depends on noise parameters alone. Noise parameters stay in the vector that is optimised
+(they are not profiled out: their posterior and their correlation with the rest are wanted). They are found by testing
+along which coordinates ``c`` changes. Along these the gradient is taken from the log likelihood itself, by central
+differences; and since ``J'J`` holds only one half of the information about a scale (``m`` instead of ``2 m``), their
+block of the Hessian at the optimum is taken by second differences of the log likelihood. Physical parameters keep the
+Gauss-Newton block.
+
+Differences of rollouts in single precision carry rounding, whose square adds to ``J'J`` in all directions alike. Along
+a ridge, where the data say least, it can be most of what is there, and the ridge then looks shorter than it is. Where
+the posterior is roughly known, differences are therefore taken along its own axes, over a good part of its deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
+from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.modes.climb import positive_part
+
+DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order one
+BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
+
+
+class Target(NamedTuple):
+    """A posterior at one horizon, as functions of one unconstrained point (batched where marked).
+
+    Attributes:
+        density: log posterior of a batch (n, d).
+        likelihood: log likelihood of a batch (n, d).
+        prior_gradient, prior_hessian: of the log prior.
+        linearise: residuals (m,) and their Jacobian (m, d).
+        residuals: of a batch (n, d), as (n, m); zero where there are no data.
+        noise: coordinates along which the log determinant changes.
+        differences: residuals (m,), and half of what they change by (m, d) from one step against each column of a
+            matrix (d, d) to one step along it; None where derivatives are exact.
+    """
+
+    density: Callable[[np.ndarray], np.ndarray]
+    likelihood: Callable[[np.ndarray], np.ndarray]
+    prior_gradient: Callable[[np.ndarray], np.ndarray]
+    prior_hessian: Callable[[np.ndarray], np.ndarray]
+    linearise: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    residuals: Callable[[np.ndarray], np.ndarray]
+    noise: Bool[np.ndarray, " d"]
+    differences: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+
+    def along(self, axes: Float[np.ndarray, "d d"]) -> Target | None:
+        """See `Climbable.along`."""
+        differences = self.differences
+        if differences is None:
+            return None
+
+        def linearise(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            residual, changes = differences(u, axes)
+            lost = ~np.isfinite(changes).all(axis=0)
+            if lost.any():  # steps along coordinates are shorter
+                changes[:, lost] = (_known(self.linearise(u)[1]) @ axes)[:, lost]
+            return residual, np.linalg.solve(axes.T, changes.T).T
+
+        return self._replace(linearise=linearise)
+
+    def quadratic(self, u: Float[np.ndarray, " d"]) -> tuple[np.ndarray, np.ndarray]:
+        """See `Climbable.quadratic`."""
+        residual, jacobian = self.linearise(u)
+        jacobian = _known(jacobian)
+        gradient = -jacobian.T @ residual
+        curvature = jacobian.T @ jacobian
+        if self.noise.any():
+            slope = _slope(self.likelihood, u, self.noise)
+            gradient[self.noise] = np.where(np.isfinite(slope), slope, 0.0)
+            # Twice, exact in expectation for a scale: J'J has m where the information is 2 m.
+            curvature[np.ix_(self.noise, self.noise)] *= 2.0
+        return gradient + self.prior_gradient(u), curvature + positive_part(-self.prior_hessian(u))
+
+    def information(self, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
+        """See `Climbable.information`: Gauss-Newton's, with second differences where noise parameters are concerned."""
+        curvature = self.quadratic(u)[1] - positive_part(-self.prior_hessian(u))
+        if self.noise.any():
+            exact = -_noise_hessian(self.likelihood, u, self.noise)
+            index = np.flatnonzero(self.noise)
+            if np.isfinite(exact).all():
+                curvature[np.ix_(index, index)] = exact
+        return curvature
+
+
+def make_target(
+    problem: ResidualProblem,
+    horizon: int,
+    ledger: Ledger,
+    u: Float[np.ndarray, " d"],
+    prior: tuple[Callable, Callable],
+    jacobian: str = "auto",
+    noise: Bool[np.ndarray, " d"] | None = None,
+) -> Target:
+    """Posterior of the first ``horizon`` rows.
+
+    Args:
+        problem: with residuals.
+        horizon: rows to use.
+        ledger: every rollout is charged to it; a Jacobian in d directions counts as d + 1.
+        u: a point with a finite likelihood, around which noise coordinates are looked for.
+        prior: `prior_derivatives`.
+        jacobian: "forward" (JAX), "central" differences, or "auto": forward where residuals can be traced.
+        noise: noise coordinates, if known.
+    """
+
+    def likelihood(points: np.ndarray) -> np.ndarray:
+        return evaluate_rows(problem, points, horizon, ledger).sum(axis=1)
+
+    def density(points: np.ndarray) -> np.ndarray:
+        return evaluate_prior(problem, points) + likelihood(points)
+
+    residuals_at, linearise, differences = _make_linearise(problem, horizon, ledger, u, jacobian)
+    physical = getattr(problem, "physical_names", problem.names)
+    if noise is None and len(physical) < len(problem.names):
+        noise = np.array([name not in physical for name in problem.names])
+    if noise is None:
+        ledger.charge(problem, 2 * len(u) + 1, horizon)
+        noise = _noise_coordinates(
+            lambda points: likelihood(points) + 0.5 * np.sum(residuals_at(points) ** 2, axis=1), u
+        )
+
+    def residuals(points: np.ndarray) -> np.ndarray:
+        ledger.charge(problem, len(points), horizon)
+        return residuals_at(points)
+
+    return Target(density, likelihood, *prior, linearise, residuals, noise, differences)
+
+
+def prior_derivatives(problem: Problem) -> tuple[Callable, Callable]:
+    """Gradient and Hessian of the log prior at one point; the same at every horizon, so compiled once."""
+
+    def single(u: Array) -> Array:
+        return jnp.asarray(problem.log_prior(u[None]))[0]
+
+    own = getattr(problem, "prior_derivatives", None)
+    gradient, hessian = own or (jax.jit(jax.grad(single)), jax.jit(jax.hessian(single)))
+    return (lambda u: np.asarray(gradient(u))), (lambda u: np.asarray(hessian(u)))
+
+
+def _make_linearise(
+    problem: ResidualProblem, horizon: int, ledger: Ledger, u: np.ndarray, jacobian: str
+) -> tuple[Callable, Callable, Callable | None]:
+    """Residuals of a batch of points, not charged; residuals and Jacobian at one point, charged; and
+    `Target.differences`."""
+
+    def residuals(u: Array) -> Any:
+        values = problem.from_unconstrained(u[None])
+        return problem.residuals({name: value[0] for name, value in values.items()}, horizon)
+
+    if jacobian == "auto":
+        jacobian = getattr(problem, "jacobian", "auto")
+    in_batches = getattr(problem, "residual_batch", None) if jacobian == "central" else None
+    width = BATCH_DIFFERENCE if in_batches else DIFFERENCE
+    batched = None
+    if in_batches is None and _works(lambda f, u: f(u), residuals, u):
+        batched = jax.jit(jax.vmap(residuals))
+
+    def at(points: np.ndarray) -> np.ndarray:
+        if in_batches:
+            return np.asarray(in_batches(problem.from_unconstrained(jnp.asarray(points)), horizon))
+        if batched:
+            return np.asarray(batched(jnp.asarray(points)))
+        return np.stack([np.asarray(residuals(jnp.asarray(point))) for point in points])
+
+    def differences(u: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ledger.charge(problem, 2 * len(u) + 1, horizon)
+        values = at(np.concatenate([u[None], u + axes.T, u - axes.T]))
+        upper, lower = values[1 : len(u) + 1], values[len(u) + 1 :]
+        return values[0], 0.5 * (upper - lower).T
+
+    def central(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        residual, changes = differences(u, width * np.eye(len(u)))
+        return residual, changes / width
+
+    @jax.jit
+    def both(u: Array) -> tuple[Array, Array]:
+        return jax.vmap(lambda e: _directional(residuals, u, e), out_axes=(None, 1))(jnp.eye(len(u)))
+
+    def forward(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        ledger.charge(problem, len(u) + 1, horizon)
+        value, columns = both(jnp.asarray(u))
+        return np.asarray(value), np.asarray(columns)
+
+    if jacobian == "auto":
+        jacobian = "forward" if _works(_directional, residuals, u) else "central"
+    return (at, forward, None) if jacobian == "forward" else (at, central, differences)
+
+
+def _directional(residuals: Callable, u: Array, direction: Array | None = None) -> tuple[Array, Array]:
+    """Residuals and their derivative along a direction."""
+    return jax.jvp(residuals, (u,), (jnp.ones_like(u) if direction is None else direction,))
+
+
+def _works(transform: Callable, residuals: Callable, u: np.ndarray) -> bool:
+    """Whether JAX can trace something of the residuals; a host callback has no derivative, plain NumPy no trace."""
+    try:
+        jax.eval_shape(lambda u: transform(residuals, u), jnp.asarray(u))
+    except (jax.errors.JAXTypeError, TypeError, ValueError, NotImplementedError):
+        return False
+    return True
+
+
+def _noise_coordinates(determinant: Callable, u: np.ndarray, width: float = 0.05) -> np.ndarray:
+    """Coordinates along which the log determinant ``c`` changes.
+
+    It is the log likelihood plus ``r'r / 2`` of the SAME rollouts, whose errors cancel, single precision included.
+    """
+    steps = width * np.eye(len(u))
+    values = determinant(np.concatenate([u[None], u + steps, u - steps]))
+    changes = np.abs(values[1:] - values[0]).reshape(2, len(u))
+    # A rollout that fails says nothing; its other side does.
+    return np.max(np.where(np.isfinite(changes), changes, 0.0), axis=0) > 1e-2 + 1e-6 * abs(values[0])
+
+
+def _known(jacobian: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
+    """Where a neighbour's rollout is lost there is no derivative: that coordinate stays where it is for a step."""
+    return np.where(np.isfinite(jacobian).all(axis=0), jacobian, 0.0)
+
+
+def _slope(likelihood: Callable, u: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    steps = DIFFERENCE * np.eye(len(u))[chosen]
+    values = likelihood(np.concatenate([u + steps, u - steps]))
+    upper, lower = values[: len(steps)], values[len(steps) :]
+    return (upper - lower) / (2.0 * DIFFERENCE)
+
+
+def _noise_hessian(likelihood: Callable, u: np.ndarray, noise: np.ndarray, width: float = 1e-2) -> np.ndarray:
+    """Second differences of the log likelihood along the noise coordinates.
+
+    The width is large for a difference because the log likelihood itself is: 1e5 nats leave 1e-11, over 1e-4.
+    """
+    steps = width * np.eye(len(u))[noise]
+    k = len(steps)
+    points = [u + si * a + sj * b for a in steps for b in steps for si in (1, -1) for sj in (1, -1)]
+    values = likelihood(np.stack(points)).reshape(k, k, 2, 2)
+    return (values[..., 0, 0] - values[..., 0, 1] - values[..., 1, 0] + values[..., 1, 1]) / (4.0 * width**2)

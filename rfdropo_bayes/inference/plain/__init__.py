@@ -1,0 +1,1 @@
+"""Plain numpyro models: as a problem, and sampled in two passes."""

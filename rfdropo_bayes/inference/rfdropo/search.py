@@ -1,0 +1,370 @@
+"""RF-DROPO: the distribution over simulator parameters that best explains a trajectory, without resets.
+
+phi holds a mean and a standard deviation per parameter; it maximises the likelihood of growing prefixes of the data
+(eq. 2 and 3) under Monte-Carlo rollouts, by a gradient-free optimiser. Three flaws of the published pipeline are mended
+unless ``mended = false``: the horizon ends at the last row; the finalists (the best of every stage) are scored again
+at the FULL horizon with common random numbers, because losses at different horizons cannot be compared; and what is
+measured has noise, whose variance is added to the rollouts', which phi would have to make up for otherwise.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from rfdropo_bayes.bayes.problem import Problem, RolloutProblem
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
+from rfdropo_bayes.inference.evaluations import Ledger
+from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
+from rfdropo_bayes.inference.result import InferenceResult, exclusion_cautions
+from rfdropo_bayes.inference.rfdropo.candidates import Plan, Simulated, row_scores, simulate, target_features, uniforms
+from rfdropo_bayes.inference.rfdropo.families import FAMILIES, make_family
+from rfdropo_bayes.inference.rfdropo.optimisers import OPTIMISERS, default_population, make_optimiser
+from rfdropo_bayes.inference.rfdropo.randomisation import WIDTH, search_space
+from rfdropo_bayes.inference.rfdropo.reuse import bootstrap, make_pool, refine
+from rfdropo_bayes.inference.rfdropo.trajectory_match import motion_scale
+from rfdropo_bayes.inference.schedules import adaptive_horizon, linear_horizon, paper_horizon
+from rfdropo_bayes.inference.smc.moves import host_generator
+
+HORIZONS = ("paper", "linear", "adaptive", "full")
+AGREEING = 0.5  # share of effective candidates that an adaptive horizon keeps
+FINAL = 10**6  # key of the finalists' random numbers, beyond any generation's
+DRAWS = FINAL + 1
+
+
+@dataclass(frozen=True)
+class RfdropoConfig:
+    """RF-DROPO: phi, the distribution to randomise over, by a search along a growing horizon.
+
+    Attributes:
+        rollouts: budget in full-length rollouts, which then decides the number of generations.
+        evaluations: candidates tried, where no budget is given (paper: 5000).
+        rollouts_per_candidate: Monte-Carlo rollouts behind each loss (paper: 100).
+        optimiser: "cma" or "cem".
+        population: candidates per generation; None for 4 + floor(3 ln d), or 5 d for "cem".
+        sigma: initial step, as a share of the search range.
+        horizon: schedule "paper", "linear", "full", or "adaptive": as far as the candidates of a generation agree, so
+            that half of them stay effective when weighted by what lies beyond the present horizon, and at least on the
+            straight line that over the second half of the generations leads to the last row.
+        levels: rollouts are simulated to one of this many horizons, the shortest that is long enough.
+        variance_floor: added to the variances, in squared units of the trajectory's root mean square motion; mended,
+            the observation noise at the prior's medians is added as well.
+        finalists: candidates scored again at the full horizon.
+        parameters: names to search; empty for all that rollouts depend on.
+        search: ranges that differ from the central 99 % of the prior, by name.
+        family: "independent" truncated normals (the paper's), "full" covariance, or "mixture" of two.
+        polish: distributions tried at the end on the finalists' own rollouts, re-weighted; none costs a rollout.
+        bootstrap: repetitions of that with the recordings drawn again, for the scatter of phi; needs two recordings.
+        draws: draws of the final distribution.
+        mended: False gives the published schedule (99 of 100 rows), takes measurements for exact, and returns the
+            lowest loss at any horizon.
+    """
+
+    rollouts: float | None = None
+    evaluations: int = 5000
+    rollouts_per_candidate: int = 100
+    optimiser: str = "cma"
+    population: int | None = None
+    sigma: float = 0.3
+    horizon: str = "paper"
+    levels: int = 8
+    variance_floor: float = 1e-5
+    finalists: int = 10
+    parameters: tuple[str, ...] = ()
+    search: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    family: str = "independent"
+    polish: int = 0
+    bootstrap: int = 0
+    draws: int = 2000
+    mended: bool = True
+
+    def __post_init__(self) -> None:
+        where = "[inference]"
+        if self.optimiser not in OPTIMISERS:
+            raise InputError(f"unknown optimiser {self.optimiser!r}", where=where, remedy=f"one of {OPTIMISERS}")
+        if self.horizon not in HORIZONS:
+            raise InputError(f"unknown horizon {self.horizon!r}", where=where, remedy=f"one of {HORIZONS}")
+        least = {"evaluations": 1, "rollouts_per_candidate": 4, "levels": 1, "finalists": 1, "draws": 1}
+        for name, lowest in least.items():
+            if getattr(self, name) < lowest:
+                raise InputError(f"{name} = {getattr(self, name)} is less than {lowest}", where=where)
+        if self.family not in FAMILIES:
+            raise InputError(f"unknown family {self.family!r}", where=where, remedy=f"one of {', '.join(FAMILIES)}")
+        if self.polish < 0 or self.bootstrap < 0 or self.bootstrap == 1:
+            raise InputError("polish must be 0 or more, bootstrap 0 or 2 and more", where=where)
+        if self.population is not None and self.population < 4:
+            raise InputError(f"population = {self.population} is less than 4", where=where)
+        if self.variance_floor <= 0.0 or self.sigma <= 0.0:
+            raise InputError("variance_floor and sigma must be positive", where=where)
+
+
+class SearchState(NamedTuple):
+    """What was tried so far; the optimiser is a function of it.
+
+    Attributes:
+        candidates: of every generation done.
+        losses: theirs, each generation at its own horizon.
+        horizons: of every generation done, and of the next one.
+        ledger, trace, seconds: as in every method.
+    """
+
+    candidates: Float[np.ndarray, "generation population k"]
+    losses: Float[np.ndarray, "generation population"]
+    horizons: tuple[int, ...]
+    ledger: Ledger
+    trace: list[dict[str, Any]]
+    seconds: float
+
+
+def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray) -> Plan:
+    """Search space, population and the horizon of every generation, within the budget.
+
+    Raises:
+        InputError: the budget does not allow a single generation, or the search space is ill-defined.
+    """
+    prior = {name: np.asarray(values) for name, values in problem.sample_prior(key, 1000).items()}
+    names = config.parameters or tuple(getattr(problem, "physical_names", problem.names))
+    space = make_family(config.family, search_space(problem, names, config.search, prior))
+    population = config.population or default_population(config.optimiser, space.dimension)
+    fixed = {name: float(np.median(prior[name])) for name in problem.names if name not in names}
+    scale = motion_scale(np.asarray(problem.observed, dtype=float), np.asarray(problem.observed_mask))
+    finalists = config.finalists if config.mended else 0
+    generations = max(1, config.evaluations // population)
+    if config.rollouts is not None:
+        generations = _affordable_generations(problem.n_rows, population, finalists, config)
+    horizons = _horizons(generations, problem.n_rows, config)
+    floor = np.full(np.asarray(problem.observed_mask).shape[1], config.variance_floor)
+    if config.mended and hasattr(problem, "noise_deviation"):
+        middle = {name: float(np.median(values)) for name, values in prior.items()}
+        floor = floor + (np.asarray(problem.noise_deviation(middle), dtype=float) / scale) ** 2
+    return Plan(space, population, horizons, min(finalists, generations + 1), fixed, scale, floor)
+
+
+def _horizons(generations: int, n_rows: int, config: RfdropoConfig) -> tuple[int, ...]:
+    if config.horizon == "full":
+        return (n_rows,) * generations
+    if config.horizon == "adaptive":
+        first = generations // 2
+        return (1,) * first + tuple(linear_horizon(i, generations - first, n_rows) for i in range(generations - first))
+    if config.horizon == "linear":
+        return tuple(linear_horizon(i, generations, n_rows) for i in range(generations))
+    return tuple(paper_horizon(i, generations, n_rows, mended=config.mended) for i in range(generations))
+
+
+def _simulated(horizon: int, n_rows: int, levels: int) -> int:
+    """The shortest of ``levels`` even horizons that covers one: few shapes, so that little is compiled."""
+    level = -(-horizon * levels // n_rows)
+    return min(n_rows, -(-level * n_rows // levels))
+
+
+def _affordable_generations(n_rows: int, population: int, finalists: int, config: RfdropoConfig) -> int:
+    assert config.rollouts is not None
+    # One more candidate than finalists: the optimiser's centre may be among them, and is counted.
+    budget = config.rollouts / config.rollouts_per_candidate - finalists
+
+    def cost(generations: int) -> float:
+        # How far an adaptive schedule looks is not known before: it may be all the way.
+        taus = (n_rows,) * generations if config.horizon == "adaptive" else _horizons(generations, n_rows, config)
+        return population * sum(_simulated(tau, n_rows, config.levels) for tau in taus) / n_rows
+
+    if cost(1) > budget:
+        least = config.rollouts_per_candidate * (finalists + cost(1))
+        raise InputError(
+            f"{config.rollouts:g} rollouts do not allow one generation of {population} candidates",
+            where="[inference] rollouts",
+            remedy=f"allow at least {least:.0f}, or fewer rollouts_per_candidate or finalists",
+        )
+    low, high = 1, 2
+    while cost(high) <= budget:
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if cost(middle) <= budget else (low, middle)
+    return low
+
+
+def step(
+    key: PRNGKeyArray, state: SearchState, problem: RolloutProblem, plan: Plan, config: RfdropoConfig, asked: np.ndarray
+) -> SearchState:
+    """Score one generation at its horizon, and set that of the next."""
+    began = time.monotonic()
+    i, n = len(state.losses), problem.n_rows
+    m, d, horizon = config.rollouts_per_candidate, plan.space.columns, state.horizons[-1]
+    uniform = uniforms(jax.random.fold_in(key, i), m, d, stratified=config.mended)
+    adaptive = config.horizon == "adaptive"
+    simulated = _simulated(min(horizon + 1, n) if adaptive else horizon, n, config.levels)
+    found = simulate(problem, plan, asked, uniform, simulated, state.ledger)
+    rows = row_scores(problem, plan, found, simulated if adaptive else horizon)
+    values = -rows[:, :horizon].sum(axis=1)
+    facts = {"generation": i, "horizon": horizon, "loss": float(values.min())}
+    state.trace.append(facts | {"rollouts": state.ledger.rollouts})
+    planned = plan.horizons[min(i + 1, len(plan.horizons) - 1)]
+    following = max(adaptive_horizon(rows, horizon, AGREEING), planned) if adaptive else planned
+    return state._replace(
+        candidates=np.concatenate([state.candidates, asked[None]]),
+        losses=np.concatenate([state.losses, values[None]]),
+        horizons=(*state.horizons, following),
+        seconds=state.seconds + time.monotonic() - began,
+    )
+
+
+def choose_finalists(state: SearchState, plan: Plan, centre: Float[np.ndarray, " k"]) -> Float[np.ndarray, "c k"]:
+    """Best candidates of evenly spread stages, and where the optimiser ended; a stage is a run of generations.
+
+    Within a stage candidates are compared by loss per row, horizons there being nearly the same.
+    """
+    stages = np.array_split(np.arange(len(state.losses)), max(1, plan.finalists - 1))
+    chosen = [centre]
+    per_row = state.losses / np.asarray(state.horizons[: len(state.losses)])[:, None]
+    for members in stages:
+        if len(members):
+            generation, index = np.unravel_index(np.argmin(per_row[members]), per_row[members].shape)
+            chosen.append(state.candidates[members[generation], index])
+    return np.stack(chosen[: max(1, plan.finalists)] if plan.finalists > 1 else chosen[1:2])
+
+
+def run(
+    problem: Problem,
+    config: RfdropoConfig,
+    key: PRNGKeyArray,
+    logbook: Logbook = UNRECORDED,
+) -> InferenceResult:
+    """Search phi and draw from the distribution found.
+
+    Raises:
+        InputError: a problem without rollouts, a budget that is too small, every rollout of the search failed.
+    """
+    if not isinstance(problem, RolloutProblem):
+        raise InputError("this problem has no rollouts", where="[inference] method", remedy='use method = "smc"')
+    prior_key, search_key = jax.random.split(key)
+    plan = make_plan(problem, config, prior_key)
+    digest = run_digest(problem, "rfdropo", config, key)
+    checkpoint = logbook.checkpoint("rfdropo", digest)
+    state, centre = _search(problem, config, plan, search_key, checkpoint, logbook)
+    if not np.isfinite(state.losses).any():
+        raise InputError(
+            f"no candidate had half of its rollouts end well ({dict(state.ledger.excluded)})",
+            where="[inference] search",
+            remedy="narrow the search ranges to parameters that the simulator can handle",
+        )
+    chosen, details = _choose(problem, config, plan, state, centre, search_key)
+    uniform = uniforms(jax.random.fold_in(search_key, DRAWS), config.draws, plan.space.columns, stratified=False)
+    draws = plan.space.draw(chosen, uniform)
+    ledger = state.ledger
+    return InferenceResult(
+        method="rfdropo",
+        draws={name: draws[None, :, j] for j, name in enumerate(plan.space.names)},
+        trace=state.trace,
+        rollouts=ledger.rollouts,
+        evaluations=ledger.evaluations,
+        excluded=dict(ledger.excluded),
+        cautions=[*plan.space.edge_cautions(chosen), *exclusion_cautions(ledger.excluded, ledger.evaluations)],
+        seconds=state.seconds,
+        phi=plan.space.describe(chosen, problem.units),
+        held=dict(plan.fixed),
+        details=details,
+    )
+
+
+def _search(
+    problem: RolloutProblem,
+    config: RfdropoConfig,
+    plan: Plan,
+    key: PRNGKeyArray,
+    checkpoint: Checkpoint,
+    logbook: Logbook,
+) -> tuple[SearchState, np.ndarray]:
+    """All generations; a resumed optimiser is told again what it knew."""
+    k = plan.space.dimension
+    seed = int(host_generator(key).integers(2**31))
+    optimiser = make_optimiser(
+        config.optimiser, k, high=WIDTH, sigma=config.sigma, population=plan.population, seed=seed
+    )
+    saved = checkpoint.load()
+    nothing = np.empty((0, plan.population, k)), np.empty((0, plan.population))
+    empty = SearchState(*nothing, plan.horizons[:1], Ledger(), [], 0.0)
+    state = empty if saved is None else _unpack(*saved)
+    for known in state.losses:
+        optimiser.tell(optimiser.ask(), known)
+    while len(state.losses) < len(plan.horizons):
+        asked = optimiser.ask()
+        state = step(key, state, problem, plan, config, asked)
+        optimiser.tell(asked, state.losses[-1])
+        checkpoint.save(*_pack(state))
+        logbook.stage(len(state.losses) / len(plan.horizons), method="rfdropo", **state.trace[-1])
+    return state, np.clip(optimiser.centre, 0.0, WIDTH)
+
+
+def _choose(
+    problem: RolloutProblem,
+    config: RfdropoConfig,
+    plan: Plan,
+    state: SearchState,
+    centre: np.ndarray,
+    key: PRNGKeyArray,
+) -> tuple[np.ndarray, dict[str, Any]]:
+    best = np.unravel_index(np.argmin(state.losses), state.losses.shape)
+    details: dict[str, Any] = {"generations": len(state.losses), "feature_scale": plan.scale}
+    details["lowest_loss_ever"] = {"loss": float(state.losses[best]), "horizon": state.horizons[int(best[0])]}
+    if not config.mended:
+        return state.candidates[best], details
+    finalists = choose_finalists(state, plan, centre)
+    m, n = config.rollouts_per_candidate, problem.n_rows
+    uniform = uniforms(jax.random.fold_in(key, FINAL), m, plan.space.columns, stratified=True)
+    found = simulate(problem, plan, finalists, uniform, n, state.ledger)
+    scores = -row_scores(problem, plan, found, n).sum(axis=1)
+    details["finalist_losses"] = scores.tolist()
+    state.trace.append({"horizon": n, "loss": float(scores.min()), "rollouts": state.ledger.rollouts, "final": True})
+    best_finalist = finalists[int(np.argmin(scores))]
+    if config.polish or config.bootstrap:
+        generator = host_generator(jax.random.fold_in(key, FINAL + 2))
+        return _reuse(problem, config, plan, finalists, found, best_finalist, generator, details), details
+    return best_finalist, details
+
+
+def _reuse(
+    problem: RolloutProblem,
+    config: RfdropoConfig,
+    plan: Plan,
+    finalists: np.ndarray,
+    found: Simulated,
+    best: np.ndarray,
+    generator: np.random.Generator,
+    details: dict[str, Any],
+) -> np.ndarray:
+    """Polish phi, and measure its scatter over recordings, on the finalists' rollouts alone."""
+    recordings = int(getattr(problem, "n_recordings", 1))
+    observed, mask = target_features(problem, plan, problem.n_rows)
+    pool = make_pool(plan.space, finalists, *found, observed, mask, recordings, plan.floor)
+    counts = np.ones(recordings)
+    before = pool.loss(best, counts)
+    polished = refine(pool, best, counts, config.polish, int(generator.integers(2**31))) if config.polish else best
+    details["reuse"] = {
+        "rollouts": len(pool.values),
+        "effective_sample_size": pool.weights(polished)[1],
+        "loss": [before, pool.loss(polished, counts)],
+    }
+    if config.bootstrap and recordings < 2:
+        details["bootstrap"] = "needs two recordings or more"
+    elif config.bootstrap:
+        tried = config.polish or 10 * plan.space.dimension
+        details["bootstrap"] = bootstrap(pool, polished, config.bootstrap, tried, generator)
+    return polished
+
+
+def _pack(state: SearchState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    arrays = {"candidates": state.candidates, "losses": state.losses, "horizons": np.asarray(state.horizons)}
+    return arrays, {"ledger": state.ledger.record(), "trace": state.trace, "seconds": state.seconds}
+
+
+def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SearchState:
+    ledger = Ledger.from_record(meta["ledger"])
+    horizons = tuple(arrays["horizons"].tolist())
+    return SearchState(arrays["candidates"], arrays["losses"], horizons, ledger, meta["trace"], meta["seconds"])

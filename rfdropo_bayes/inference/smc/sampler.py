@@ -1,0 +1,402 @@
+"""Sequential Monte Carlo whose stages lengthen the horizon: prior, posterior given h1 rows, ..., given all rows.
+
+Inside a block of rows the path is followed row by row, a row being brought in by shares where it says too much at
+once, so that every target is the posterior of a prefix (or nearly), and the evidence of EVERY prefix falls out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.errors import InputError, NoLikelihoodError
+from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
+from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows, representable_draws
+from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
+from rfdropo_bayes.inference.result import (
+    InferenceResult,
+    chains,
+    exclusion_cautions,
+    prior_cautions,
+    replicate_cautions,
+    stage_cautions,
+)
+from rfdropo_bayes.inference.schedules import SPACINGS, block_boundaries
+from rfdropo_bayes.inference.smc.hamiltonian import MOST_LEAPS, Flow, chosen_kernel, flow_of
+from rfdropo_bayes.inference.smc.moves import KERNELS, initial_scale
+from rfdropo_bayes.inference.smc.tempering import Population, StageInfo, Tuning, prolong, refresh, stage
+
+PARTICLES_WITHOUT_BUDGET = 1000
+ROLLOUTS_PER_PARTICLE = 20.0
+FEWEST_PARTICLES = 50
+WORTH_A_REPLICATE = 100  # particles
+MOST_REPLICATES = 4
+STARTS = ("auto", "prior", "optimum")
+NOT_REPRESENTABLE = "not_representable"
+
+
+@dataclass(frozen=True)
+class SmcConfig:
+    """Horizon SMC: posterior and evidence of every block of rows, by sampling ever longer prefixes.
+
+    Attributes:
+        rollouts: budget in full-length rollouts, of all replicates together; None for no limit.
+        particles: per replicate; None takes as many as the budget serves, or 1000 without one.
+        replicates: independent repetitions; they become chains, and their scatter is the evidence's deviation. None
+            takes as many as the budget serves, up to four, and one without a budget: see `decided`.
+        blocks: number of times the horizon is lengthened.
+        spacing: of the blocks: "geometric", "linear" or "every" (row).
+        target_ess: share of effective particles kept from one target to the next; closer to 1 is slower and more exact.
+        kernel: "crank_nicolson" (adapts between independent draws and small steps), "random_walk", "hamiltonian"
+            (follows gradients), or "auto": see `hamiltonian.chosen_kernel`.
+        degrees: degrees of freedom of the Student-t behind "crank_nicolson".
+        acceptance: acceptance rate that the step size is adapted to.
+        correlation: moves of a stage end once no direction is more correlated than this with its start.
+        max_moves: most moves in a stage.
+        start: "prior", "optimum", or "auto": see `starts`; this module always starts at the prior.
+        draws: fewer particles, of all replicates together, move on with the rest of a budget: see `tempering.prolong`.
+    """
+
+    rollouts: float | None = None
+    particles: int | None = None
+    replicates: int | None = None
+    blocks: int = 6
+    spacing: str = "geometric"
+    target_ess: float = 0.5
+    kernel: str = "auto"
+    degrees: float = 8.0
+    acceptance: float = 0.3
+    correlation: float = 0.3
+    max_moves: int = 20
+    start: str = "auto"
+    draws: int = 400
+
+    def __post_init__(self) -> None:
+        where = "[inference]"
+        if self.start not in STARTS:
+            raise InputError(f"unknown start {self.start!r}", where=where, remedy=f"one of {', '.join(STARTS)}")
+        if self.kernel not in KERNELS:
+            raise InputError(f"unknown kernel {self.kernel!r}", where=where, remedy=f"one of {', '.join(KERNELS)}")
+        if self.spacing not in SPACINGS:
+            raise InputError(f"unknown spacing {self.spacing!r}", where=where, remedy=f"one of {', '.join(SPACINGS)}")
+        for name in ("target_ess", "acceptance", "correlation"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise InputError(f"{name} = {getattr(self, name)} is not between 0 and 1", where=where)
+        for name in ("replicates", "blocks", "max_moves", "draws"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"{name} = {getattr(self, name)} is less than 1", where=where)
+        if self.particles is not None and self.particles < 10:
+            raise InputError(f"particles = {self.particles} is less than 10", where=where)
+        if self.degrees <= 0.0 or (self.rollouts is not None and self.rollouts <= 0.0):
+            raise InputError("degrees and rollouts must be positive", where=where)
+
+    @property
+    def chains(self) -> int:
+        """Replicates that were asked for, or one."""
+        return self.replicates or 1
+
+    @property
+    def tuning(self) -> Tuning:
+        """What a stage needs of this."""
+        return Tuning(self.target_ess, self.kernel, self.degrees, self.acceptance, self.correlation, self.max_moves)
+
+
+class Plan(NamedTuple):
+    """Sizes that are fixed before a replicate starts.
+
+    Attributes:
+        particles: number of particles.
+        horizons: prefix lengths at the ends of the blocks.
+        budget: rollouts of this replicate; infinite for no limit.
+        flow: of trajectories; None for moves without gradients.
+    """
+
+    particles: int
+    horizons: tuple[int, ...]
+    budget: float
+    flow: Flow | None = None
+
+
+class SmcState(NamedTuple):
+    """Everything a replicate needs to go on.
+
+    Attributes:
+        population: particles; their rows reach to the end of the present block.
+        block: index of the present block; -1 before the first.
+        stage: number of stages done; random keys derive from it.
+        log_evidence: log p(rows passed).
+        prefix_log_evidence: at every prefix passed, NaN elsewhere.
+        ledger: cost and exclusions.
+        trace: one dictionary per stage.
+        seconds: time spent.
+        finished: the last stage is done.
+    """
+
+    population: Population
+    block: int
+    stage: int
+    log_evidence: float
+    prefix_log_evidence: Float[np.ndarray, " n_rows"]
+    ledger: Ledger
+    trace: list[dict[str, Any]]
+    seconds: float
+    finished: bool
+
+
+def decided(n_rows: int, config: SmcConfig) -> SmcConfig:
+    """The settings with a number of replicates: as many as the budget serves with enough particles each."""
+    if config.replicates is not None or config.rollouts is None:
+        return config
+    looks = sum(block_boundaries(n_rows, config.blocks, config.spacing)) / n_rows
+    one = (config.particles or WORTH_A_REPLICATE) * max(ROLLOUTS_PER_PARTICLE, 2.0 * looks)
+    return replace(config, replicates=int(np.clip(config.rollouts / one, 1, MOST_REPLICATES)))
+
+
+def make_plan(problem: Problem, config: SmcConfig) -> Plan:
+    """Fix particles and blocks so that the budget can be kept.
+
+    Raises:
+        InputError: the budget does not even allow every particle one look at every block and one last move.
+    """
+    horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
+    budget = np.inf if config.rollouts is None else config.rollouts / config.chains
+    looks = sum(horizons) / problem.n_rows
+    if config.particles is not None:
+        particles = config.particles
+    elif config.rollouts is None:
+        particles = PARTICLES_WITHOUT_BUDGET
+    else:
+        particles = int(budget / max(ROLLOUTS_PER_PARTICLE, 2.0 * looks))
+    least = max(particles, FEWEST_PARTICLES if config.particles is None else 1)
+    if least * (looks + 1.0) > budget:
+        raise InputError(
+            f"{config.rollouts:g} rollouts are too few for {least} particles over {len(horizons)} blocks",
+            where="[inference] rollouts",
+            remedy=f"allow at least {config.chains * least * (looks + 1.0):.0f}, or use fewer particles",
+        )
+    return Plan(least, horizons, budget, flow_of(problem) if config.kernel == "hamiltonian" else None)
+
+
+def init(key: PRNGKeyArray, problem: Problem, plan: Plan, config: SmcConfig) -> SmcState:
+    """Prior draws, no rollouts yet.
+
+    Draws that their coordinates cannot hold keep their share of the prior, without weight.
+    """
+    n = plan.particles
+    u, base, drawn = representable_draws(problem, key, n)
+    if len(base) == 0:
+        raise InputError(
+            f"none of {drawn} prior draws has a finite prior density",
+            where="[model.priors]",
+            remedy="look at the priors",
+        )
+    ledger = Ledger(excluded=Counter({NOT_REPRESENTABLE: drawn - len(base)} if len(base) < drawn else {}))
+    share, alive = len(base) / drawn, min(n, len(base))
+    weights = np.where(np.arange(n) < alive, np.log(share / alive), -np.inf)
+    stand_in = np.minimum(np.arange(n), alive - 1)
+    scale = initial_scale(config.kernel, u.shape[1])
+    population = Population(u[stand_in], base[stand_in], np.zeros((n, 0)), weights, 0.0, scale)
+    return SmcState(population, -1, 0, 0.0, np.full(problem.n_rows, np.nan), ledger, [], 0.0, False)
+
+
+def step(
+    key: PRNGKeyArray, state: SmcState, problem: Problem, plan: Plan, config: SmcConfig
+) -> tuple[SmcState, StageInfo]:
+    """One stage: look further ahead if the block is used up, reweight, resample, move.
+
+    Args:
+        key: key of the whole replicate; the stage's own is derived from it, which makes a resumed run exact.
+        state: of the replicate.
+        problem: to be sampled.
+        plan: sizes.
+        config: settings.
+    """
+    began = time.monotonic()
+    key = jax.random.fold_in(key, state.stage)
+    if state.block < 0 or state.population.progress == plan.horizons[state.block]:
+        state = _extend(state, problem, plan.horizons[state.block + 1])
+    horizon = plan.horizons[state.block]
+    evaluate = partial(_evaluate, problem, horizon, state.ledger)
+    moves = _affordable_moves(state, plan, horizon, problem.n_rows)
+    tuning = config.tuning
+    if plan.flow is not None:
+        charge = partial(state.ledger.charge, problem, horizon=horizon)
+        tuning = tuning._replace(follow=partial(plan.flow, charge=charge))
+    population, info = stage(key, state.population, float(horizon), evaluate, tuning, moves)
+    if not np.isfinite(info.log_evidence_increment):
+        raise _nothing_left(state, horizon)
+    finished = population.progress == problem.n_rows
+    evidence = state.log_evidence + info.log_evidence_increment
+    prefix = state.prefix_log_evidence.copy()
+    prefix[info.passed - 1] = state.log_evidence + info.row_log_evidence
+    facts = {"horizon": horizon, "budget_exhausted": moves == 0, **_facts(info), "log_evidence": evidence}
+    state.trace.append(facts | {"rollouts": state.ledger.rollouts})
+    if finished:
+        moves = max(1, _affordable_moves(state, plan, horizon, problem.n_rows, last=True))
+        last_key = jax.random.fold_in(key, 1)
+        population, done = refresh(last_key, population, info, evaluate, tuning, moves)
+        left = _affordable_moves(state, plan, horizon, problem.n_rows, last=True) if np.isfinite(plan.budget) else 0
+        rounds = min(left // done.moves, -(-config.draws // (plan.particles * config.chains)) - 1)
+        population = prolong(last_key, population, evaluate, tuning, done.moves, rounds)
+        state.trace.append(facts | _facts(done) | {"rollouts": state.ledger.rollouts, "final": True})
+    state = state._replace(
+        population=population,
+        stage=state.stage + 1,
+        log_evidence=evidence,
+        prefix_log_evidence=prefix,
+        seconds=state.seconds + time.monotonic() - began,
+        finished=finished,
+    )
+    return state, info
+
+
+def _extend(state: SmcState, problem: Problem, horizon: int) -> SmcState:
+    """Roll every particle out to the next horizon; the rows it has already are kept as they are."""
+    known = state.population.rows
+    rows = evaluate_rows(problem, state.population.position, horizon, state.ledger)
+    rows = np.concatenate([known, rows[:, known.shape[1] :]], axis=1)
+    return state._replace(population=state.population._replace(rows=rows), block=state.block + 1)
+
+
+def _evaluate(problem: Problem, horizon: int, ledger: Ledger, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return evaluate_prior(problem, u), evaluate_rows(problem, u, horizon, ledger)
+
+
+def _affordable_moves(state: SmcState, plan: Plan, horizon: int, n_rows: int, *, last: bool = False) -> int:
+    """Moves a stage may make. What the rest of the run cannot do without is held back first, and a stage takes at most
+    half of what is then left, so that later stages find something."""
+    if not np.isfinite(plan.budget):
+        return 10**9
+    looks = sum(plan.horizons[state.block + 1 :]) / n_rows
+    left = plan.budget - state.ledger.rollouts - (0.0 if last else plan.particles * (looks + 1.0))
+    cost = plan.particles * horizon / n_rows * (1 if plan.flow is None else MOST_LEAPS + 2)
+    if left < cost:
+        return 0
+    return max(1, int((left if last else 0.5 * left) / cost + 1e-9))
+
+
+def _facts(info: StageInfo) -> dict[str, Any]:
+    kept = ("progress", "log_evidence_increment", "ess", "moves", "acceptance", "scale", "correlation")
+    return {name: getattr(info, name) for name in kept}
+
+
+def _nothing_left(state: SmcState, horizon: int) -> NoLikelihoodError:
+    return NoLikelihoodError(
+        "the prior excludes the data: no parameter set has a positive likelihood "
+        f"up to row {horizon} ({state.ledger.reasons})",
+        where="[model.priors]",
+        remedy="widen the priors, or look at what the simulator reports for them",
+    )
+
+
+def run(
+    problem: Problem,
+    config: SmcConfig,
+    key: PRNGKeyArray,
+    logbook: Logbook = UNRECORDED,
+) -> InferenceResult:
+    """Sample a problem's posterior with independent replicates.
+
+    Raises:
+        InputError: a budget that is too small, a prior that excludes the data, a checkpoint of another run.
+    """
+    digest = run_digest(problem, "smc", config, key)
+    config = replace(decided(problem.n_rows, config), kernel=chosen_kernel(config.kernel, problem, config.rollouts))
+    plan = make_plan(problem, config)
+    states = []
+    for replicate in range(config.chains):
+        checkpoint = logbook.checkpoint(f"smc_{replicate}", digest)
+
+        def report(state: SmcState, replicate: int = replicate) -> None:
+            done = (replicate + state.population.progress / problem.n_rows) / config.chains
+            logbook.stage(done, method="smc", replicate=replicate, stage=state.stage, **state.trace[-1])
+
+        states.append(_replicate(problem, config, plan, jax.random.fold_in(key, replicate), checkpoint, report))
+    return _result(problem, config, plan, states)
+
+
+def _replicate(
+    problem: Problem,
+    config: SmcConfig,
+    plan: Plan,
+    key: PRNGKeyArray,
+    checkpoint: Checkpoint,
+    report: Callable[[SmcState], None],
+) -> SmcState:
+    init_key, stage_key = jax.random.split(key)
+    saved = checkpoint.load()
+    state = init(init_key, problem, plan, config) if saved is None else unpack(*saved)
+    while not state.finished:
+        state, _ = step(stage_key, state, problem, plan, config)
+        checkpoint.save(*pack(state))
+        report(state)
+    return state
+
+
+def pack(state: SmcState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays of a state and the rest of it, for a checkpoint."""
+    population = state.population
+    arrays = {name: getattr(population, name) for name in ("position", "base", "rows", "log_weights")}
+    meta = {name: getattr(state, name) for name in ("block", "stage", "log_evidence", "trace", "seconds", "finished")}
+    meta |= {"progress": population.progress, "scale": population.scale, "ledger": state.ledger.record()}
+    return {**arrays, "prefix_log_evidence": state.prefix_log_evidence}, meta
+
+
+def unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SmcState:
+    """The state that `pack` took apart."""
+    own = {name: arrays[name] for name in ("position", "base", "rows", "log_weights")}
+    population = Population(**own, progress=meta["progress"], scale=meta["scale"])
+    named = {name: meta[name] for name in ("block", "stage", "log_evidence", "trace", "seconds", "finished")}
+    prefixes, ledger = arrays["prefix_log_evidence"], Ledger.from_record(meta["ledger"])
+    return SmcState(population, prefix_log_evidence=prefixes, ledger=ledger, **named)
+
+
+def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcState]) -> InferenceResult:
+    count = min(len(state.population.position) for state in states)  # some had rollouts left for another round
+    draws = chains(problem, [state.population.position[:count] for state in states])
+    values = np.array([state.log_evidence for state in states])
+    prefixes = np.stack([state.prefix_log_evidence for state in states])
+    excluded: Counter[str] = sum((state.ledger.excluded for state in states), Counter())
+    evaluations = sum(state.ledger.evaluations for state in states)
+    trace = [{"replicate": index, **row} for index, state in enumerate(states) for row in state.trace]
+    sd = float(values.std(ddof=1)) if len(values) > 1 else float("nan")
+    return InferenceResult(
+        method="smc",
+        draws=draws,
+        log_evidence=(float(np.mean(values)), sd),
+        prefix_log_evidence=prefixes.mean(axis=0),
+        block_scores=_block_scores(plan.horizons, prefixes),
+        log_likelihood=np.stack([state.population.rows[:count] for state in states]),
+        trace=trace,
+        rollouts=sum(state.ledger.rollouts for state in states),
+        evaluations=evaluations,
+        excluded=dict(excluded),
+        cautions=[
+            *prior_cautions(problem, draws),
+            *exclusion_cautions(excluded, evaluations),
+            *stage_cautions(trace, config.rollouts, config.correlation),
+            *replicate_cautions(draws, values),
+        ],
+        seconds=sum(state.seconds for state in states),
+        details={"log_evidence_replicates": values.tolist(), "particles": plan.particles, "horizons": plan.horizons},
+    )
+
+
+def _block_scores(horizons: tuple[int, ...], prefixes: Float[np.ndarray, "r n_rows"]) -> list[dict[str, Any]]:
+    scores, first = [], 0
+    for last in horizons:
+        block = prefixes[:, last - 1] - (prefixes[:, first - 1] if first else 0.0)
+        sd = float(block.std(ddof=1)) if len(block) > 1 else float("nan")
+        scores.append({"first_row": first + 1, "last_row": last, "log_score": float(block.mean()), "sd": sd})
+        first = last
+    return scores
