@@ -16,10 +16,12 @@ from rfdropo_bayes.deployment.settings import Deployment, SafetyTable
 from rfdropo_bayes.deployment.simulation import SimulationTable, simulated_drives
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.workflow.assembly import build_simulator
 from rfdropo_bayes.workflow.audit import run_audit
 from rfdropo_bayes.workflow.calibration import run_calibration
 from rfdropo_bayes.workflow.commands import random_walk
-from rfdropo_bayes.workflow.experiment import CommandsTable
+from rfdropo_bayes.workflow.experiment import CommandsTable, Experiment
+from rfdropo_bayes.workflow.plant import trunk
 
 NOISE = 2e-4  # [m]
 TRUTH = {"young_modulus": 2.9e6, "trunk_mass": 0.07, "rayleigh_stiffness": 0.07}
@@ -111,6 +113,27 @@ def experiment(folder: Path, fit: list[str], test: list[str]) -> Path:
         text = text.replace(key, ", ".join(f'"{name}.nc"' for name in names))
     (folder / "experiment.toml").write_text(text)
     return folder / "experiment.toml"
+
+
+@pytest.mark.slow
+def test_the_plant_moves_as_a_rollout_of_the_same_commands() -> None:
+    """Drums that follow the ramps of a rollout, asked 8 to 12 ms at a time: at the end all is where the rollout is."""
+    robot = load_robot("motor_arm")
+    robot = robot.model_copy(update={"command": robot.command.model_copy(update={"dead_time_s": 0.0})})
+    command = np.array([[0.006, 0.0, 0.0, -0.002], [0.002, 0.004, 0.0, 0.001]])
+    simulator = build_simulator(Experiment(robot="motor_arm"), robot)
+    end = 0.3
+    commands = simulator.commands(np.array([0.0, 0.05]), command, np.zeros(4), np.array([0.0, end]))
+    expected = simulator.rollout({"young_modulus": np.array(3e6)}, commands)
+    plant = trunk(robot, young_modulus=3e6)
+    plant.advance(np.zeros(4), 0.0)
+    for step in range(1, round(end / 0.01) + 1):
+        instant = 0.01 * step
+        share = np.clip((instant - np.array([0.0, 0.05])) / robot.command.ramp_s, 0.0, 1.0)
+        length = share @ np.diff(command, axis=0, prepend=np.zeros((1, 4)))
+        state = plant.advance(length, 0.012 if step % 2 else 0.008)
+    np.testing.assert_allclose(state.position, np.asarray(expected.position)[-1], atol=1e-9)
+    np.testing.assert_allclose(state.tension, np.asarray(expected.tension)[-1], atol=1e-6)
 
 
 @pytest.mark.slow
