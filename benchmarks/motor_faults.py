@@ -263,7 +263,7 @@ def session(name: str, channel: str, port: int, folder: Path) -> None:
                     button.write_text("0")
             if case.by == "policy":
                 if case.what == "raise":
-                    self._session = None
+                    self._network = None
                 if case.what == "hang":
                     time.sleep(1.5)
                 if case.what in ("nan", "outside"):

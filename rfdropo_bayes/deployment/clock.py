@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import gc
 import math
 import os
@@ -17,6 +18,7 @@ from jaxtyping import Float
 
 PRIORITY = 50  # SCHED_FIFO: above every ordinary process, below the kernel's own interrupt threads
 PLANT_PRIORITY = 30  # of a simulated robot: after everything that has a deadline
+_LOCK_ALL = 7  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT
 _SWITCH = 5e-4  # [s]: other threads of this process give the interpreter back after so long; 5 ms by default
 
 
@@ -62,16 +64,30 @@ def schedule_fifo(thread: int = 0, priority: int = PRIORITY) -> bool:
     return True
 
 
+def lock_memory(locked: bool) -> bool:
+    """Keep the pages that this process has touched in memory, or let them go; False where that is not permitted.
+
+    A page that the system has taken back is read from the disk again, which takes milliseconds.
+    """
+    try:
+        system = ctypes.CDLL(None)
+        return (system.mlockall(_LOCK_ALL) if locked else system.munlockall()) == 0
+    except (OSError, AttributeError):
+        return False
+
+
 @contextlib.contextmanager
 def steady_interpreter() -> Iterator[None]:
-    """No pauses of the garbage collector, and short turns for the other threads."""
+    """No pauses of the garbage collector or for lost pages, and short turns for the other threads."""
     switch, collecting = sys.getswitchinterval(), gc.isenabled()
     gc.collect()
     gc.disable()
     sys.setswitchinterval(_SWITCH)
+    lock_memory(True)
     try:
         yield
     finally:
+        lock_memory(False)
         sys.setswitchinterval(switch)
         if collecting:
             gc.enable()

@@ -117,7 +117,7 @@ class OnnxPolicy:
         self._low, self._high = np.array(self.layout.low), np.array(self.layout.high)
         self._input = self._session.get_inputs()[0]
         self._check_shapes(where)
-        self._run = _bound(self._session, self.layout.size, len(self._reach))
+        self._network = _bound(self._session, self.layout.size, len(self._reach))
         nowhere, still = np.zeros((len(robot.marker_names), 3)), np.zeros(len(robot.channel_names))
         self._last = Scene(nowhere, nowhere, still, still, still)
 
@@ -151,6 +151,9 @@ class OnnxPolicy:
             "tensions": scene.tension,
         }
         return self.layout.assemble(parts)
+
+    def _run(self, observation: Float[np.ndarray, " feature"]) -> Float[np.ndarray, " channel"]:
+        return self._network(observation)
 
     def _answer(self, scene: Scene) -> tuple[Float[np.ndarray, " feature"], Float[np.ndarray, " channel"]]:
         """Observation, and what the network makes of it."""

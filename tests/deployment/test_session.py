@@ -95,8 +95,11 @@ def test_the_log_is_a_recording_of_what_the_policy_did(dry_run, robot: Robot) ->
     # One per mille of torque is 0.03 N; a cycle that comes 0.5 ms early or late adds 0.01 N at 50 mm/s and 300 N/m.
     apart = np.abs(recording.tension - np.maximum(0.0, 3.0 + 300.0 * length))
     assert np.percentile(apart, 90) < 0.05
-    model = recording.command_at(recording.time - 0.1)
-    assert np.corrcoef(model[:, 0], length[:, 0])[0, 1] > 0.9
+    # Every change takes the robot's ramp_s of 0.1 s; drives lag 1 ms, and their acceleration is limited.
+    changes = np.diff(recording.command, axis=0, prepend=recording.initial_command[None])
+    share = np.clip((recording.time[:, None] - recording.command_time) / 0.1, 0.0, 1.0)
+    behind = np.abs(recording.initial_command + share @ changes - length)
+    assert np.percentile(behind, 90) < 2e-4
 
 
 def test_increments_follow_the_policy(dry_run, robot: Robot) -> None:

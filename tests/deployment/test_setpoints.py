@@ -20,15 +20,16 @@ def points(robot: Robot, length: float = 0.0) -> SetPoints:
 @settings(max_examples=60, deadline=None)
 @given(goals=st.lists(st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4), min_size=1, max_size=8), data=st.data())
 def test_limits_hold_for_any_goals(goals: list[list[float]], data: st.DataObject) -> None:
-    """Goals change at any moment; length, rate and acceleration stay within the limits to rounding."""
+    """Goals change at any moment, ramps lead anywhere; length, rate and acceleration stay within the limits."""
     robot = load_robot("motor_arm")
     made = points(robot)
-    lengths, rates = [made.length], [made.rate]
+    lengths, rates, ramp = [made.length], [made.rate], None
     for goal in goals:
         wanted = made.clamp(np.array(goal))
         for _ in range(data.draw(st.integers(1, 60))):
-            lengths.append(made.towards(wanted).copy())
+            lengths.append(made.towards(wanted, ramp).copy())
             rates.append(made.rate.copy())
+        ramp = wanted if data.draw(st.booleans()) else None  # that of the goal before
     tiny = 1e-12
     assert np.all(np.array(lengths) >= made.low - tiny)
     assert np.all(np.array(lengths) <= made.high + tiny)
@@ -121,3 +122,13 @@ def test_motors_follow_the_channels(robot: Robot) -> None:
     twice = [motor | {"node": 1} for motor in table["motors"]]
     with pytest.raises(ValueError, match="share a node"):
         Robot.model_validate(table | {"motors": twice})
+
+
+def test_a_ramp_is_followed_beyond_its_goal(robot: Robot) -> None:
+    """Ramps of two commands overlap: on to 1.2 mm by the first, back to 0.4 mm by the second."""
+    made = points(robot)
+    goal = np.full(4, 4e-4)
+    ramp = 2e-4 * np.array([1, 2, 3, 4, 5, 6, 5, 4, 3, 2, 2, 2, 2, 2])
+    path = np.array([made.towards(goal, np.full(4, place)).copy() for place in ramp])
+    assert np.abs(path[:, 0] - ramp).max() <= 2 * 2.5 * PERIOD**2  # it takes two cycles to turn at 2.5 m/s2
+    np.testing.assert_allclose(path[-1], goal, atol=1e-9)
