@@ -150,10 +150,13 @@ def _parameter(name: str, table: Parameter | Mapping[str, Any]) -> Parameter:
     if isinstance(table, Parameter):
         return table
     fields = {"unit": "-", "description": name.replace("_", " "), **table}
-    if "low" in fields and "high" in fields:
-        fields.setdefault("nominal", 0.5 * (fields["low"] + fields["high"]))
-        fields.setdefault("prior", {"distribution": "Uniform", "low": fields["low"], "high": fields["high"]})
-    return parse_table(Parameter, fields, where=f"parameter {name!r} of a black box")
+    where = f"parameter {name!r} of a black box"
+    for key in ("low", "high"):
+        if key not in fields:
+            raise InputError(f"the key {key!r} is missing", where=where, remedy="give both hard bounds")
+    fields.setdefault("nominal", 0.5 * (fields["low"] + fields["high"]))
+    fields.setdefault("prior", {"distribution": "Uniform", "low": fields["low"], "high": fields["high"]})
+    return parse_table(Parameter, fields, where=where)
 
 
 class Moved(NamedTuple):

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rfdropo_bayes.posteriors import InferenceData
 
 SHOWN_PAIRS = 4  # parameters of the picture in a notebook
+LABELS = 0.18  # share of the axes that labels beside and below a pair plot take
 
 
 @dataclass(frozen=True)
@@ -103,8 +104,9 @@ class Calibration:
         if ax is None:
             return pair_figure(self.record, chosen)
         ax.set_axis_off()
-        n, room = len(chosen), 0.9 / len(chosen)
-        cells = [[(j / n, 1.0 - (i + 1) / n + 0.1 / n, room, room) for j in range(n)] for i in range(n)]
+        size = (1.0 - LABELS) / len(chosen)
+        places = LABELS + size * np.arange(len(chosen))
+        cells = [[(left, low, 0.92 * size, 0.92 * size) for left in places] for low in places[::-1]]
         draw_pairs(
             self.record, chosen, np.array([[ax.inset_axes(cell) for cell in row] for row in cells], dtype=object)
         )
@@ -117,7 +119,8 @@ class Calibration:
         axes = axes_or_new(ax)
         derived = name in {product.name for product in self.record.derived}
         draw_before_and_after(axes, info, self.record.flat(name), self.record.prior.get(name), log=derived)
-        axes.legend()
+        handles, labels = axes.get_legend_handles_labels()
+        axes.legend(dict(zip(labels, handles, strict=True)).values(), dict.fromkeys(labels))
         return axes
 
     def plot_fit(
