@@ -59,7 +59,7 @@ SWITCHED = {  # channels beside the markers, by the key of [model] that makes th
 }
 
 
-def find_robot(experiment: Experiment, folder: Path) -> Workpiece:
+def find_workpiece(experiment: Experiment, folder: Path) -> Workpiece:
     """The robot an experiment names: one that comes with the package, or a file relative to the experiment's.
 
     One that was put together in Python holds its robot or black box itself.
@@ -68,6 +68,18 @@ def find_robot(experiment: Experiment, folder: Path) -> Workpiece:
         return experiment.robot
     beside = folder / experiment.robot
     return load_robot(beside if beside.suffix == ".toml" and beside.is_file() else experiment.robot)
+
+
+def find_robot(experiment: Experiment, folder: Path) -> Robot:
+    """The same where only a robot will do.
+
+    Raises:
+        InputError: a black box.
+    """
+    found = find_workpiece(experiment, folder)
+    if isinstance(found, BlackBox):
+        raise InputError("a black box has no body", where=found.name, remedy="use a robot")
+    return found
 
 
 @overload

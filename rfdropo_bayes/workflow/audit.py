@@ -42,7 +42,7 @@ from rfdropo_bayes.workflow.assembly import (
     AnySimulator,
     build_simulator,
     expand_groups,
-    find_robot,
+    find_workpiece,
     fixed_values,
     load_data,
     measurement_specs,
@@ -192,7 +192,7 @@ def build_question(
     ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names`` are the candidates,
     where it is not all.
     """
-    robot = find_robot(experiment, folder)
+    robot = find_workpiece(experiment, folder)
     trajectories = [*fitted, *tested]
     left_out: dict[str, str] = {}
     if names is None:

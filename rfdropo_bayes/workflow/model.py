@@ -24,7 +24,7 @@ from rfdropo_bayes.workflow.assembly import (
     build_problem,
     build_simulator,
     expand_groups,
-    find_robot,
+    find_workpiece,
     fixed_values,
     measurement_specs,
 )
@@ -89,7 +89,7 @@ class Model:
 
     def _set(self, experiment: Experiment, folder: Path) -> None:
         self.experiment, self.folder = experiment, folder
-        self.robot = find_robot(experiment, folder)
+        self.robot = find_workpiece(experiment, folder)
 
     @classmethod
     def of_experiment(cls, experiment: Experiment, folder: Path) -> Model:

@@ -20,7 +20,6 @@ from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.robots import OBJECT
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
-from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.training.config import TrainingTable
@@ -236,10 +235,7 @@ def _training(experiment: Experiment, folder: Path) -> tuple[TrainingTable, Task
         task = replace(task, goal_low=table.goals[0], goal_high=table.goals[1])
     simulator_table = experiment.simulator.model_copy(update={"push": task.push})
     experiment = experiment.model_copy(update={"simulator": simulator_table})
-    robot = find_robot(experiment, folder)
-    if isinstance(robot, BlackBox):
-        raise InputError("a black box has no tasks", where="training", remedy="use a robot")
-    return table, task, build_simulator(experiment, robot, folder)
+    return table, task, build_simulator(experiment, find_robot(experiment, folder), folder)
 
 
 def _randomisation(
