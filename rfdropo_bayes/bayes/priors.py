@@ -131,3 +131,34 @@ def _check_inside(spec: ParameterSpec, family: str, numbers: Mapping[str, float]
         inside = bell.cdf(spec.high) - bell.cdf(spec.low)
     if inside < 0.5:
         raise InputError(f"only {100 * inside:.0f} % of the prior lies within the bounds", where=where, remedy=bounds)
+
+
+def table_of(prior: Any, *, where: str) -> dict[str, Any]:
+    """The table of a prior that is given as one, or as a distribution of numpyro; None asks for the default, ``{}``.
+
+    Raises:
+        InputError: neither, or a distribution of another family.
+    """
+    if prior is None or isinstance(prior, Mapping):
+        return dict(prior or {})
+    for family, kind in KINDS.items():
+        if type(prior) is kind:
+            found = {name: float(getattr(prior, name)) for name in kind.arg_constraints if hasattr(prior, name)}
+            if family == "LogNormal":
+                found = {"median": math.exp(found["loc"]), "sigma": found["scale"]}
+            return {"distribution": family, **{name: found[name] for name in FAMILIES[family][1]}}
+    raise InputError(
+        f"{type(prior).__name__} cannot be a prior",
+        where=where,
+        remedy=f"give a scalar {', '.join(FAMILIES)}, or a table; priors end at the hard bounds by themselves",
+    )
+
+
+KINDS: dict[str, type] = {
+    "Normal": dist.Normal,
+    "HalfNormal": dist.HalfNormal,
+    "LogNormal": dist.LogNormal,
+    "Uniform": dist.Uniform,
+    "LogUniform": dist.LogUniform,
+}
+"""Distributions of numpyro that say the same as a table."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -62,6 +63,8 @@ def separate(
     base: Base = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
     """Say which mechanisms the recordings tell apart: writes separation.json, separation.md and separation.png."""
@@ -69,16 +72,19 @@ def separate(
     folder = folder_for("separate", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.workflow.separation import TABLE, run_separation
 
-    run_separation(
+    found = run_separation(
         experiment,
         folder,
         overrides=overrides or [],
         base=base,
         resume=resume,
         overwrite=overwrite,
-        report=say_progress(),
+        report=say_progress(quiet),
     )
-    typer.echo((folder / TABLE).read_text(encoding="utf-8"))
+    if as_json:
+        typer.echo(json.dumps(found, indent=2))
+    elif not quiet:
+        typer.echo((folder / TABLE).read_text(encoding="utf-8"))
 
 
 def design(
@@ -87,6 +93,8 @@ def design(
     base: Base = None,
     seed: Seed = None,
     overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
     """Propose the commands that best separate the leading explanations: writes next_commands.csv and design.json."""
@@ -95,10 +103,18 @@ def design(
     from rfdropo_bayes.workflow.design import COMMANDS, run_design
 
     found = run_design(
-        experiment, folder, overrides=overrides or [], base=base, seed=seed, overwrite=overwrite, report=say_progress()
+        experiment,
+        folder,
+        overrides=overrides or [],
+        base=base,
+        seed=seed,
+        overwrite=overwrite,
+        report=say_progress(quiet),
     )
-    typer.echo(found["sentence"])
-    typer.echo(f"commands: {folder / COMMANDS}")
+    if as_json:
+        typer.echo(json.dumps(found, indent=2))
+    elif not quiet:
+        typer.echo(f"{found['sentence']}\ncommands: {folder / COMMANDS}")
 
 
 def benchmark_audit(

@@ -80,7 +80,7 @@ def calibrate(
         return
     from rfdropo_bayes.workflow.calibration import run_calibration
 
-    run_calibration(
+    found = run_calibration(
         experiment,
         folder,
         overrides=overrides or [],
@@ -89,7 +89,7 @@ def calibrate(
         start=start,
         show=False if quiet else None,
     )
-    show_calibration(folder, quiet=quiet, as_json=as_json)
+    show_calibration(found, quiet=quiet, as_json=as_json)
 
 
 @app.command()

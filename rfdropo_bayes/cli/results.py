@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from rfdropo_bayes.cautions import read_cautions
+if TYPE_CHECKING:
+    from rfdropo_bayes.workflow.calibrated import Calibration
 
 GOOD, FAIR, BAD = "green", "yellow", "red"
 COLOURS = {
@@ -31,26 +32,25 @@ AUDITED = ("verdict", "sentence", "findings", "gain", "next_experiment")
 MOST_ROWS = 20
 
 
-def show_calibration(folder: Path, *, quiet: bool, as_json: bool) -> None:
-    """Print the result of a finished calibration."""
-    if quiet and not as_json:
-        return
-    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+def show_calibration(found: Calibration, *, quiet: bool, as_json: bool) -> None:
+    """Print the result of a finished calibration: headline, table of parameters, cautions, and where the report is."""
+    summary, folder = found.content, found.folder or Path()
     report = folder / "report.html"
     if as_json:
         chosen = {key: summary[key] for key in CALIBRATED if key in summary}
         typer.echo(json.dumps({**chosen, "folder": str(folder), "report": str(report)}, indent=2))
         return
+    if quiet:
+        return
     console = Console(highlight=False)
-    judged = summary.get("randomisation", {})
     for sentence in summary["headline"]:
-        own = sentence == judged.get("sentence")
-        console.print(Text(sentence, style=COLOURS.get(judged.get("verdict", ""), "") if own else ""), soft_wrap=True)
+        style = COLOURS[found.verdict] if sentence == found.sentence else ""
+        console.print(Text(sentence, style=style), soft_wrap=True)
     rows = [(name, row, "derived" if row.get("derived") else "") for name, row in summary["parameters"].items()]
     console.print(_parameters(rows[:MOST_ROWS]))
     if len(rows) > MOST_ROWS:
         console.print(f"and {len(rows) - MOST_ROWS} more in {folder / 'summary.json'}", soft_wrap=True)
-    for caution in read_cautions(summary.get("cautions", [])):
+    for caution in found.cautions:
         console.print(Text(f"caution: {caution.sentence}", style=BAD if caution.grave else FAIR), soft_wrap=True)
     console.print(f"report: {report}", soft_wrap=True)
 

@@ -139,6 +139,21 @@ class CsvTable:
         self.frame.columns = [str(name).strip() for name in self.frame.columns]
         self.require(required)
 
+    @classmethod
+    def of_frame(cls, frame: pd.DataFrame, name: str, required: Sequence[str]) -> CsvTable:
+        """A table that is in memory; ``name`` stands for its path.
+
+        Raises:
+            InputError: no rows, or a missing column.
+        """
+        table = cls.__new__(cls)
+        table.path, table.decimal = Path(name), "."
+        table.frame = frame.rename(columns=str).reset_index(drop=True)
+        if len(frame) == 0:
+            raise InputError("has no rows", where=name)
+        table.require(required)
+        return table
+
     def __len__(self) -> int:
         return len(self.frame)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -23,8 +24,8 @@ from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 
 FORMAT = "csv"
-_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-_COMMANDS = {name: ("m", factor) for name, factor in _METRES.items()} | {
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "rad": ("rad", 1.0),
     "deg": ("rad", np.pi / 180.0),
 }
@@ -157,19 +158,35 @@ def read_plain_csv(
     Raises:
         InputError: on a damaged file (see ``CsvTable``), a column that is not there, or files that do not fit together.
     """
-    coordinates = [name for point in columns.positions for name in point]
-    table = CsvTable(path, coordinates, machine_written=False)
-    rotation, metres = axes_matrix(columns.axes), _METRES[columns.position_unit]
+    table = CsvTable(path, _coordinates(columns), machine_written=False)
+    source = None if commands is None else CsvTable(commands, columns.commands, machine_written=False)
+    return _recording(table, source or table, columns, mask_missing)
+
+
+def read_frame(frame: pd.DataFrame, columns: CsvColumns, name: str, *, mask_missing: bool = False) -> Trajectory:
+    """One recording from a table in memory; otherwise as `read_plain_csv`."""
+    table = CsvTable.of_frame(frame, name, _coordinates(columns))
+    return _recording(table, table, columns, mask_missing)
+
+
+def _coordinates(columns: CsvColumns) -> list[str]:
+    return [name for point in columns.positions for name in point]
+
+
+def _recording(table: CsvTable, source: CsvTable, columns: CsvColumns, mask_missing: bool) -> Trajectory:
+    """The recording in a table, whose commands are in ``source``."""
+    coordinates = _coordinates(columns)
+    rotation, metres = axes_matrix(columns.axes), METRES[columns.position_unit]
     position = metres * table.points(coordinates, allow_missing=mask_missing) @ rotation.T
     time = _times(table, columns)
     faults = find_faults(time, position)
-    command = _commands(table, commands, columns)
+    command = _commands(table, source, columns)
     angle = None
     if columns.motor_angles is not None:
         degree = np.pi / 180.0 if columns.motor_angle_unit == "deg" else 1.0
         angle = degree * table.numbers(columns.motor_angles, allow_missing=True)
     return Trajectory.build(
-        name=path.name.removesuffix(".gz").removesuffix(".csv"),
+        name=table.path.name.removesuffix(".gz").removesuffix(".csv"),
         robot=columns.robot,
         format=FORMAT,
         time=time,
@@ -178,13 +195,13 @@ def read_plain_csv(
         marker_names=columns.markers or [f"m{marker}" for marker in range(1, len(columns.positions) + 1)],
         command_time=time[: len(command)],
         command=command,
-        command_unit=_COMMANDS[columns.command_unit][0],
+        command_unit=COMMAND_UNITS[columns.command_unit][0],
         initial_command=command[0],
         cable_names=columns.cables or columns.commands,
         tension=None if columns.tensions is None else table.numbers(columns.tensions, allow_missing=True),
         motor_angle=angle,
         object_pose=_pose(table, columns),
-        provenance=path.name,
+        provenance=table.path.name,
         settings={"faults": faults.counts} | ({} if angle is None else {"motor_angle_hold": hold_time(time, angle)}),
     )
 
@@ -213,10 +230,10 @@ def read_csv_start(path: Path, columns: CsvColumns, start: Path | None, row: int
         points = CsvTable(start, coordinates, machine_written=False).points(coordinates, allow_missing=True)
         if len(points) != 1 and row >= len(points):
             raise InputError(f"has no row {row} to start from", where=str(start), remedy="choose other --rows")
-        first = _METRES[columns.position_unit] * points[min(row, len(points) - 1)] @ axes_matrix(columns.axes).T
+        first = METRES[columns.position_unit] * points[min(row, len(points) - 1)] @ axes_matrix(columns.axes).T
         seen = np.isfinite(first).all(axis=1)
         position[:], mask[row] = np.where(seen[:, None], first, 0.0), seen
-    command = _commands(table, None, columns)
+    command = _commands(table, table, columns)
     return Trajectory.build(
         name=path.name.removesuffix(".gz").removesuffix(".csv"),
         robot=columns.robot,
@@ -227,7 +244,7 @@ def read_csv_start(path: Path, columns: CsvColumns, start: Path | None, row: int
         marker_names=columns.markers or [f"m{marker}" for marker in range(1, markers + 1)],
         command_time=time[:-1],
         command=command,
-        command_unit=_COMMANDS[columns.command_unit][0],
+        command_unit=COMMAND_UNITS[columns.command_unit][0],
         initial_command=command[0],
         cable_names=columns.cables or columns.commands,
         provenance=path.name,
@@ -240,7 +257,7 @@ def command_columns(
 ) -> dict[str, Float[np.ndarray, " rows"]]:
     """Times [s] and commands [m or rad] as the columns of a file that this table describes."""
     stamped = {} if columns.time is None else {columns.time: time * (1e3 if columns.time_unit == "ms" else 1.0)}
-    return stamped | dict(zip(columns.commands, command.T / _COMMANDS[columns.command_unit][1], strict=True))
+    return stamped | dict(zip(columns.commands, command.T / COMMAND_UNITS[columns.command_unit][1], strict=True))
 
 
 def holds_commands_alone(path: Path, columns: CsvColumns) -> bool:
@@ -257,13 +274,12 @@ def _times(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " rows"]:
     return time - time[0]
 
 
-def _commands(table: CsvTable, path: Path | None, columns: CsvColumns) -> Float[np.ndarray, "rows cable"]:
-    source = table if path is None else CsvTable(path, columns.commands, machine_written=False)
-    values = _COMMANDS[columns.command_unit][1] * source.numbers(columns.commands)
+def _commands(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows cable"]:
+    values = COMMAND_UNITS[columns.command_unit][1] * source.numbers(columns.commands)
     if len(values) not in (len(table), len(table) - 1):
         raise InputError(
             f"{len(table)} observations do not fit {len(values)} commands: give as many, or one fewer",
-            where=f"{table.path} with {path}",
+            where=f"{table.path} with {source.path}",
             remedy="pair the files that were recorded together",
         )
     return values
@@ -273,6 +289,6 @@ def _pose(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows 7"] |
     if columns.object_pose is None:
         return None
     pose = table.numbers(columns.object_pose, allow_missing=True) * np.array(
-        [_METRES[columns.position_unit]] * 3 + [1.0] * 4
+        [METRES[columns.position_unit]] * 3 + [1.0] * 4
     )
     return rotate_pose(pose, axes_matrix(columns.axes), np.zeros(3))

@@ -118,6 +118,27 @@ class Trajectory:
         }
         return cls(dataset)
 
+    @classmethod
+    def from_arrays(cls, **given: Any) -> Trajectory:
+        """A recording from arrays in any unit; see `in_memory.from_arrays`."""
+        from rfdropo_bayes.data.in_memory import from_arrays
+
+        return from_arrays(**given)
+
+    @classmethod
+    def from_pandas(cls, frame: Any, columns: Any, name: str = "recording", **options: Any) -> Trajectory:
+        """A recording from a table whose columns are named; see `in_memory.from_pandas`."""
+        from rfdropo_bayes.data.in_memory import from_pandas
+
+        return from_pandas(frame, columns, name, **options)
+
+    @classmethod
+    def from_xarray(cls, dataset: xr.Dataset, name: str = "recording", **options: Any) -> Trajectory:
+        """A recording from a labelled data set; see `in_memory.from_xarray`."""
+        from rfdropo_bayes.data.in_memory import from_xarray
+
+        return from_xarray(dataset, name, **options)
+
     @property
     def name(self) -> str:
         """What the report calls this recording."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -216,15 +216,25 @@ def read_posterior(path: Path, specs: Sequence[ParameterSpec]) -> tuple[Draws, t
     path = Path(path)
     file = path / POSTERIOR if path.is_dir() else path
     record = PosteriorRecord.load(file)
+    drawn = drawn_rows(record, specs, where=str(file))
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    return replace(drawn, sha256=digest), tuple(info.name for info in record.free if info.name not in drawn.names)
+
+
+def drawn_rows(record: PosteriorRecord, specs: Sequence[ParameterSpec], *, where: str = "posterior") -> Draws:
+    """Rows of a posterior, of the parameters that the simulator has.
+
+    Raises:
+        InputError: it shares no parameter with the simulator.
+    """
     known = {spec.name for spec in specs}
     names = tuple(info.name for info in record.free if info.name in known)
     if not names:
         raise InputError(
-            "the posterior shares no parameter with the simulator", where=str(file), remedy="use one of this robot"
+            "the posterior shares no parameter with the simulator", where=where, remedy="use one of this robot"
         )
     rows = np.stack([record.flat(name) for name in names], axis=1)
-    digest = hashlib.sha256(file.read_bytes()).hexdigest()
-    return Draws(names, rows, digest), tuple(info.name for info in record.free if info.name not in known)
+    return Draws(names, rows, hashlib.sha256(np.ascontiguousarray(rows).tobytes()).hexdigest())
 
 
 def read_phi(path: Path, specs: Sequence[ParameterSpec]) -> Phi:

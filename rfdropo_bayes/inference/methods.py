@@ -63,6 +63,19 @@ def method_named(name: str) -> Method:
     return METHODS[name]
 
 
+def method_of(config: Any) -> str:
+    """Name of the method that a configuration belongs to.
+
+    Raises:
+        InputError: it is no method's configuration.
+    """
+    for name, method in METHODS.items():
+        if isinstance(config, method.config):
+            return name
+    known = ", ".join(method.config.__name__ for method in METHODS.values())
+    raise InputError(f"{config!r} is no method", where="method", remedy=f"give one of {known}")
+
+
 def make_config(name: str, options: Mapping[str, Any]) -> Any:
     """Configuration of a method from a table of options, as an experiment file has them.
 

@@ -89,11 +89,11 @@ def run(
     def potential(u: Float[Array, " d"]) -> Float[Array, ""]:
         return -(prior(u) + likelihood(u))
 
+    _check_gradient(potential, len(problem.names))
     began = time.monotonic()
     screen_key, run_key = jax.random.split(key)
     ledger = Ledger()
     start = _starts(problem, config, screen_key, ledger)
-    _check_gradient(potential, start[0])
     kernel = NUTS(potential_fn=potential, target_accept_prob=config.target_accept)
     sampler = MCMC(
         kernel,
@@ -144,10 +144,11 @@ def _starts(problem: Problem, config: NutsConfig, key: PRNGKeyArray, ledger: Led
     return u[best]
 
 
-def _check_gradient(potential: Callable[[Array], Any], u: Float[np.ndarray, " d"]) -> None:
+def _check_gradient(potential: Callable[[Array], Any], dimension: int) -> None:
     try:
-        jax.eval_shape(jax.grad(potential), jnp.asarray(u))
-    except (jax.errors.JAXTypeError, TypeError, ValueError, NotImplementedError) as error:
+        jax.eval_shape(jax.grad(potential), jnp.zeros(dimension))
+    # RuntimeError: only derivatives along a direction are known, as of compiled rollouts.
+    except (jax.errors.JAXTypeError, TypeError, ValueError, NotImplementedError, RuntimeError) as error:
         raise InputError(
             "NUTS needs the gradient of the simulator, which this engine does not have",
             where="[inference] method",

@@ -42,6 +42,7 @@ from rfdropo_bayes.mechanisms.spool_growth import SpoolGrowth
 from rfdropo_bayes.mechanisms.surroundings import QuadraticDrag, WallContact
 from rfdropo_bayes.mechanisms.travel_stop import TravelStop
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.parameters import nearest
 
@@ -94,8 +95,8 @@ ACTS = {
 
 
 def mechanisms_named(
-    names: Iterable[str],
-    robot: Robot | None = None,
+    names: Iterable[Any],
+    robot: Robot | BlackBox | None = None,
     *,
     folder: Path = Path(),
     where: str = "[model] mechanisms",
@@ -103,7 +104,7 @@ def mechanisms_named(
     """The mechanisms of an experiment file, in its order.
 
     Args:
-        names: of the registry, or ``module:ClassName`` of a user's own.
+        names: of the registry, ``module:ClassName`` of a user's own, or a mechanism itself, as a class or an object.
         robot: that they are for; one with parameters per cable (a class method ``for_robot``) is made for it.
         folder: that files of a user's own are relative to.
         where: the names stand, for messages.
@@ -113,11 +114,19 @@ def mechanisms_named(
     """
     chosen = []
     for name in names:
+        if not isinstance(name, str):
+            _check_kind(name if isinstance(name, type) else type(name), str(getattr(name, "name", name)), where)
+            chosen.append(_made(name, robot) if isinstance(name, type) else name)
+            continue
         kind = _imported(name, folder, where) if ":" in name else REGISTRY.get(name)
         if kind is None:
             raise InputError(f"unknown mechanism {name!r}", where=where, remedy=nearest(name, REGISTRY))
-        chosen.append(kind.for_robot(robot) if robot is not None and hasattr(kind, "for_robot") else kind())
+        chosen.append(_made(kind, robot))
     return tuple(chosen)
+
+
+def _made(kind: Any, robot: Robot | BlackBox | None) -> Mechanism:
+    return kind.for_robot(robot) if robot is not None and hasattr(kind, "for_robot") else kind()
 
 
 def _imported(name: str, folder: Path, where: str) -> Any:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from arviz import InferenceData
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.errors import InputError
@@ -163,18 +164,14 @@ class PosteriorRecord:
             self.attrs,
         )
 
-    def save(self, path: Path) -> None:
-        """Write `posterior.nc`.
-
-        Raises:
-            InputError: if the file cannot be written.
-        """
+    def inference_data(self) -> InferenceData:
+        """The same in ArviZ's layout."""
         infos = {info.name: info for info in self.parameters}
         products = [
             {"name": p.name, "unit": p.unit, "powers": dict(p.powers), "description": p.description}
             for p in self.derived
         ]
-        data = to_inference_data(
+        return to_inference_data(
             self.posterior,
             prior=self.prior,
             posterior_predictive=_predictions(self.recordings),
@@ -188,7 +185,14 @@ class PosteriorRecord:
             descriptions={name: info.description for name, info in infos.items()},
             attrs={"attributes": dict(self.attrs), "derived": products, "names": list(self.posterior)},
         )
-        save_posterior(data, path)
+
+    def save(self, path: Path) -> None:
+        """Write `posterior.nc`.
+
+        Raises:
+            InputError: if the file cannot be written.
+        """
+        save_posterior(self.inference_data(), path)
 
     @classmethod
     def load(cls, path: Path) -> PosteriorRecord:

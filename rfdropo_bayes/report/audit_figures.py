@@ -16,6 +16,8 @@ from rfdropo_bayes.report.units import display_name
 MILLIMETRES = 1e3
 BINS = 12
 
+SIGNS = 3  # place of the panel whose abscissa is a sign
+
 
 @dataclass(frozen=True)
 class Residuals:
@@ -52,7 +54,7 @@ def _strongest(series: np.ndarray, main: np.ndarray) -> int:
 def panels_figure(residuals: Residuals) -> Figure:
     """The residual against time, command, rate, sign of rate, position and tension, with the mean in bins."""
     main = MILLIMETRES * residuals.main
-    channel, cable = _strongest(residuals.rate, main), _strongest(residuals.tension, main)
+    channel = _strongest(residuals.rate, main)
     held = _strongest(residuals.command, main)
     figure = Figure(figsize=(style.WIDTH, 5.2))
     panels = [
@@ -61,10 +63,15 @@ def panels_figure(residuals: Residuals) -> Figure:
         (f"rate of {residuals.channels[channel]} [{residuals.unit}/s]", residuals.rate[:, channel]),
         (f"sign of the rate of {residuals.channels[channel]} [-]", np.sign(residuals.rate[:, channel])),
         ("position along the pattern [mm]", MILLIMETRES * residuals.position),
-        (f"tension of {residuals.cables[cable]} [N]", residuals.tension[:, cable]),
     ]
-    for axes, (label, values) in zip(figure.subplots(2, 3, sharey=True).ravel(), panels, strict=True):
-        signs = label.startswith("sign")
+    if residuals.cables:  # a black box may have none
+        cable = _strongest(residuals.tension, main)
+        panels.append((f"tension of {residuals.cables[cable]} [N]", residuals.tension[:, cable]))
+    grid = figure.subplots(2, 3, sharey=True).ravel()
+    for axes in grid[len(panels) :]:
+        style.empty(axes)
+    for place, (axes, (label, values)) in enumerate(zip(grid, panels, strict=False)):
+        signs = place == SIGNS
         spread = 0.12 * np.random.default_rng(0).standard_normal(len(values)) if signs else 0.0
         axes.scatter(values + spread, main, s=4, color=style.PRIOR, alpha=0.4, linewidths=0)
         centre, mean, error = _binned(values, main, 3 if signs else BINS)

@@ -84,19 +84,19 @@ def residuals_of(answer: Answer) -> figures.Residuals:
     values, vectors = np.linalg.eigh(flat.T @ flat)
     pattern = vectors[:, -1]
     times = np.asarray(measured.time)
-    step = forward.lanes.simulator.description["time_step_s"]
-    command, rate = [], []
+    command = []
     for group in range(len(times)):
         sent = np.vstack([forward.commands.initial[group][None], forward.commands.step[group]])
         command.append(sent[np.minimum(forward.commands.sample_step[group], len(sent) - 1)])
-        moved = np.vstack([np.zeros((1, sent.shape[1])), np.diff(sent, axis=0) / float(str(step))])
-        rate.append(moved[np.minimum(forward.commands.sample_step[group], len(sent) - 1)])
+    # Over the time between rows: commands that are held jump between two of them.
+    apart = np.maximum(np.diff(times, axis=1), 1e-9)[..., None]
+    rate = np.concatenate([np.zeros_like(command)[:, :1], np.diff(command, axis=1) / apart], axis=1)
     return figures.Residuals(
         flat @ pattern,
         float(values[-1] / max(values.sum(), 1e-300)),
         times[rows],
         np.stack(command)[rows],
-        np.stack(rate)[rows],
+        rate[rows],
         forward.tension(answer.base.x)[rows],
         (position - position[:, :1])[rows] @ pattern,
         tuple(forward.lanes.simulator.channel_names),

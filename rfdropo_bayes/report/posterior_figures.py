@@ -86,7 +86,14 @@ def pair_figure(record: PosteriorRecord, names: Sequence[str]) -> Figure:
     n = len(names)
     size = min(style.WIDTH, 2.6 + 1.75 * n) if n < 5 else style.WIDTH
     figure = Figure(figsize=(size, 0.92 * size))
-    grid = figure.subplots(n, n, squeeze=False)
+    draw_pairs(record, names, figure.subplots(n, n, squeeze=False))
+    figure.align_labels()
+    return figure
+
+
+def draw_pairs(record: PosteriorRecord, names: Sequence[str], grid: np.ndarray) -> None:
+    """The panels of `pair_figure` on a square grid of axes."""
+    n = len(names)
     infos = {info.name: info for info in record.parameters}
     draws = {name: record.flat(name) for name in names}
     scales = {name: _Scale(infos[name], draws[name]) for name in names}
@@ -110,8 +117,6 @@ def pair_figure(record: PosteriorRecord, names: Sequence[str]) -> Figure:
                 axes.set_ylabel(_wrapped(scales[row].label))
             elif i != j:
                 axes.tick_params(labelleft=False)
-    figure.align_labels()
-    return figure
 
 
 def _wrapped(label: str, width: int = 20) -> str:
@@ -209,7 +214,7 @@ def prior_posterior_figure(record: PosteriorRecord, names: Sequence[str]) -> Fig
     infos = {info.name: info for info in record.parameters}
     logarithmic = {p.name for p in record.derived}
     for axes, name in zip(grid, names, strict=False):
-        _before_and_after(axes, infos[name], record.flat(name), record.prior.get(name), log=name in logarithmic)
+        draw_before_and_after(axes, infos[name], record.flat(name), record.prior.get(name), log=name in logarithmic)
     for axes in grid[len(names) :]:
         style.empty(axes)
     handles, labels = grid[0].get_legend_handles_labels()
@@ -217,9 +222,10 @@ def prior_posterior_figure(record: PosteriorRecord, names: Sequence[str]) -> Fig
     return figure
 
 
-def _before_and_after(
+def draw_before_and_after(
     axes: Axes, info: ParameterInfo, draws: np.ndarray, prior: np.ndarray | None, *, log: bool
 ) -> None:
+    """Marginal densities of one parameter before and after the data."""
     if log and prior is not None and np.all(prior > 0):
         info = ParameterInfo(info.name, info.unit, info.low, info.high, {"distribution": "LogDerived"})
     scale = _Scale(info, draws if prior is None else np.concatenate([draws, prior]))

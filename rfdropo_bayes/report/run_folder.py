@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_text
 from rfdropo_bayes.posteriors import PosteriorRecord
-from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.page import render_page
-from rfdropo_bayes.report.summary import build_summary, read_summary, write_summary
+from rfdropo_bayes.report.summary import read_summary, write_summary
 
 POSTERIOR, SUMMARY, CONFIG, REPORT = "posterior.nc", "summary.json", "config.toml", "report.html"
 
 
-def write_run(folder: Path, record: PosteriorRecord, facts: RunFacts, config: str) -> Path:
+def write_run(folder: Path, record: PosteriorRecord, summary: Mapping[str, Any], config: str) -> Path:
     """Write all four files and return the path of the report.
 
     The numbers are written before the pictures are drawn, so that a run that is stopped there has lost nothing.
@@ -29,7 +30,6 @@ def write_run(folder: Path, record: PosteriorRecord, facts: RunFacts, config: st
         raise InputError(
             f"cannot be made ({error.strerror or error})", where=str(folder), remedy="choose a writable folder"
         ) from None
-    summary = build_summary(record, facts)
     record.save(folder / POSTERIOR)
     write_summary(summary, folder / SUMMARY)
     write_text(folder / CONFIG, config)

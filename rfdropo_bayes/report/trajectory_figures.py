@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.report import style
-from rfdropo_bayes.report.coverage import Bands, predictive_bands
+from rfdropo_bayes.report.coverage import predictive_bands
 from rfdropo_bayes.report.scores import MILLIMETRES
 
 MOST_MARKERS = 4
@@ -28,20 +28,12 @@ def shown_markers(count: int) -> list[int]:
 def bands_figure(recording: RecordingPrediction) -> Figure:
     """Each coordinate of each shown marker over time, with the 50 % and 90 % predictive bands."""
     markers = shown_markers(len(recording.marker_names))
-    rows = style.thin(len(recording.time))
-    bands = Bands(*(MILLIMETRES * q for q in predictive_bands(recording.predicted[:, rows])))
-    measured = np.where(recording.mask[..., None], MILLIMETRES * recording.observed, np.nan)[rows]
     figure = Figure(figsize=(style.WIDTH, 0.75 + 1.75 * len(markers)))
     grid = figure.subplots(len(markers), 3, sharex=True, squeeze=False)
     for row, marker in enumerate(markers):
         for axis in range(3):
             axes = grid[row, axis]
-            _band(axes, recording.time[rows], bands, marker, axis)
-            axes.plot(
-                recording.time[rows], measured[:, marker, axis], color=style.MEASURED, linewidth=1.1, label="measured"
-            )
-            _at_least(axes, LEAST_SPAN)
-            axes.set_ylabel(f"{recording.marker_names[marker]} {AXES[axis]} [mm]")
+            draw_band(axes, recording, marker, axis)
             axes.tick_params(labelbottom=True)  # each can be seen by itself
             if row == len(markers) - 1:
                 axes.set_xlabel("time [s]")
@@ -51,11 +43,19 @@ def bands_figure(recording: RecordingPrediction) -> Figure:
     return figure
 
 
-def _band(axes: Axes, time: np.ndarray, bands: Bands, marker: int, axis: int) -> None:
-    low90, low50, median, high50, high90 = (q[:, marker, axis] for q in bands)
+def draw_band(axes: Axes, recording: RecordingPrediction, marker: int, axis: int) -> None:
+    """One coordinate of one marker [mm] over time [s]: measured, and its 50 % and 90 % predictive bands."""
+    rows = style.thin(len(recording.time))
+    time, measured = recording.time[rows], MILLIMETRES * recording.observed[rows, marker, axis]
+    drawn = recording.predicted[:, rows, marker, axis][:, :, None, None]
+    low90, low50, median, high50, high90 = (MILLIMETRES * q[:, 0, 0] for q in predictive_bands(drawn))
     axes.fill_between(time, low90, high90, color=style.POSTERIOR, alpha=0.22, linewidth=0, label="90 % band")
     axes.fill_between(time, low50, high50, color=style.POSTERIOR, alpha=0.38, linewidth=0, label="50 % band")
     axes.plot(time, median, color=style.POSTERIOR, linewidth=1.0, label="predicted median")
+    seen = np.where(recording.mask[rows, marker], measured, np.nan)
+    axes.plot(time, seen, color=style.MEASURED, linewidth=1.1, label="measured")
+    _at_least(axes, LEAST_SPAN)
+    axes.set_ylabel(f"{recording.marker_names[marker]} {AXES[axis]} [mm]")
 
 
 def _at_least(axes: Axes, span: float) -> None:

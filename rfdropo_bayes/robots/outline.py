@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, section_profile
+from rfdropo_bayes.robots.robot import Robot
+from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, body_tables, section_profile
+from rfdropo_bayes.tables import parse_table
 
 SILICONE = 1070.0
 """Density [kg/m3] where no mass is given: that of most silicone rubbers."""
@@ -124,6 +127,17 @@ def robot_text(outline: RobotOutline) -> str:
     return "\n".join(
         [*_head(outline), *_channels(outline), *_cables(outline), *_markers(outline), *_parameters(outline)]
     )
+
+
+def outlined_robot(**answers: Any) -> Robot:
+    """The robot that a `RobotOutline` with these answers describes.
+
+    Raises:
+        InputError: answers that make no robot.
+    """
+    tables = tomllib.loads(robot_text(RobotOutline(**answers)))
+    tables["body"] = body_tables(tables["body"], "outline")
+    return parse_table(Robot, tables, where="outline")
 
 
 def _head(o: RobotOutline) -> list[str]:

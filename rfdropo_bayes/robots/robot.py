@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -138,6 +139,20 @@ class Robot(Table):
             outside = (place[:, 2] < station[0] - 1e-9) | (place[:, 2] > station[-1] + 1e-9)
             if np.any(outside) or np.any(np.abs(place[:, :2]) > width + 1e-9):
                 raise ValueError(f"a {name} lies outside the body")
+
+    @classmethod
+    def load(cls, name_or_path: str | Path) -> Robot:
+        """A robot that comes with the package, by name, or one from a file; see `load_robot`."""
+        from rfdropo_bayes.robots.catalogue import load_robot
+
+        return load_robot(name_or_path)
+
+    @classmethod
+    def outline(cls, **answers: Any) -> Robot:
+        """A robot from a few answers, such as its length, radius, cables and markers; see `RobotOutline`."""
+        from rfdropo_bayes.robots.outline import outlined_robot
+
+        return outlined_robot(**answers)
 
     def without_command_timing(self) -> Robot:
         """The same robot, carrying every command out at once: no ramp, no dead time."""

@@ -23,6 +23,8 @@ Values = Mapping[str, Float[Array, ""]]
 STAGES = ("actuation", "body", "contact", "sensing")
 BODIES = ("layered", "tetrahedra")
 ENGINES = ("jax", "numba")
+BLACK_BOX = "black box"
+"""In the place of body and engine: a program whose inside nobody reaches."""
 
 
 class Mechanism(Protocol):
@@ -177,6 +179,8 @@ def engines_of(mechanism: Mechanism | type) -> tuple[str, ...]:
 
 def obstacle(mechanism: Mechanism, body: str, engine: str) -> str | None:
     """Why a mechanism does not run on a body or on an engine; None where it runs."""
+    if body == BLACK_BOX:
+        return None if mechanism.stage in ("actuation", "sensing") else f"it acts on the {mechanism.stage}, inside"
     if body not in bodies_of(mechanism):
         return f"it acts on {' and '.join(bodies_of(mechanism))} bodies only"
     if engine not in engines_of(mechanism):

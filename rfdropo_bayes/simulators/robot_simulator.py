@@ -17,16 +17,12 @@ from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
 from rfdropo_bayes.simulators.engine import Motion
+from rfdropo_bayes.simulators.extended import ExtendedSimulator
 from rfdropo_bayes.simulators.mechanisms import (
-    ActuationMechanism,
     Mechanism,
-    SensingMechanism,
-    TimedSensingMechanism,
     code_of,
-    inside_drive,
-    settled,
 )
-from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Values = Mapping[str, Float[Array, ""]]
@@ -52,7 +48,7 @@ class Wound(NamedTuple):
     sent: Float[Array, " channel"]  # last command that reached them [m or rad]
 
 
-class RobotSimulator:
+class RobotSimulator(ExtendedSimulator):
     """Base of simulators that move a robot's body by cables; mechanisms act before, in and after the body.
 
     Attributes:
@@ -150,36 +146,6 @@ class RobotSimulator:
         """Command channels of the robot."""
         return self.robot.channel_names
 
-    def complete(self, parameters: Values) -> dict[str, Array]:
-        """All values by name; those left out are nominal.
-
-        Raises:
-            InputError: a name that is not a parameter of this simulator.
-        """
-        check_names(parameters, self.parameters, where="rollout")
-        return {spec.name: jnp.asarray(spec.nominal) for spec in self.parameters} | dict(parameters)
-
-    def actuated(
-        self, values: Values, commands: Commands, time_step: float, *, drives_only: bool = False
-    ) -> tuple[Float[Array, " channel"], Float[Array, "step channel"]]:
-        """Commands that reach the cables before the first step and at the end of every step; or the drives, before the
-        transmission."""
-        command = jnp.asarray(commands.step)
-        initial = jnp.asarray(commands.initial, command.dtype)
-        for mechanism in self.mechanisms:
-            if isinstance(mechanism, ActuationMechanism) and (inside_drive(mechanism) or not drives_only):
-                command = mechanism.actuate(values, command, initial, time_step)
-                initial = settled(mechanism, values, initial)
-        return initial, command
-
-    def driven(self, values: Values, commands: Commands, time_step: float) -> Float[Array, "time channel"]:
-        """Where the drives stand at the observation times, in the unit of the commands.
-
-        Limits of the cables' displacements are no part of it. Whoever does not look at it pays nothing under ``jit``.
-        """
-        initial, command = self.actuated(values, commands, time_step, drives_only=True)
-        return sample(jnp.concatenate([initial[None], command]), commands)
-
     def pretension(self, values: Values) -> Float[Array, " cable"]:
         """Cable displacements at zero command [m]."""
         return jnp.stack([values[name] for name in self.robot.initial_displacement_names])
@@ -209,33 +175,9 @@ class RobotSimulator:
         level = jnp.clip(drives.level + move, limits[:, 0], limits[:, 1])
         return Wound(level, sent), level + self.pretension(values)
 
-    def steps_seen(
-        self, values: Values, commands: Commands, time_step: float, steps: Int[Array, ""] | None
-    ) -> Int[Array, ""] | None:
-        """Time steps to simulate so that all rows within the first ``steps`` are measured as in a whole rollout.
-
-        Mechanisms of sensing may look at later rows, as cameras on a clock that is late do. How far is found from what
-        they make of positions that are unknown from some row on.
-        """
-        if steps is None or not any(isinstance(mechanism, TimedSensingMechanism) for mechanism in self.mechanisms):
-            return steps
-        values = {name: jax.lax.stop_gradient(value) for name, value in values.items()}
-        end = jnp.asarray(commands.sample_step + (commands.sample_fraction > 0))
-        time, rows = observed_at(commands, time_step), len(end)
-        wanted = end <= steps
-        place = jnp.asarray(self.robot.marker_points())
-
-        def suffices(later: Array) -> Array:
-            known = jnp.arange(rows) < wanted.sum() + later
-            position = jnp.where(known[:, None, None], place, jnp.nan)
-            seen = jnp.isfinite(self.measured(values, position, time)).all(axis=(1, 2))
-            return jnp.all(seen | ~wanted)
-
-        later = jnp.concatenate([jnp.zeros(1, int), 2 ** jnp.arange(max(rows - 1, 1).bit_length() + 1)])
-        enough = jax.vmap(suffices)(later)
-        found = jnp.where(enough.any(), later[jnp.argmax(enough)], rows)
-        last = jnp.clip(wanted.sum() + found - 1, 0, rows - 1)
-        return jnp.where(found > 0, jnp.maximum(steps, end[last]), steps)
+    def marker_points(self) -> Float[np.ndarray, "marker 3"]:
+        """Markers of the undeformed robot [m]."""
+        return self.robot.marker_points()
 
     def measured(
         self,
@@ -243,10 +185,6 @@ class RobotSimulator:
         position: Float[Array, "time marker 3"],
         time: Float[Array, " time"],
     ) -> Float[Array, "time marker 3"]:
-        """Marker positions as they are measured [m], given the true ones and when they are seen [s]."""
-        for mechanism in self.mechanisms:
-            if isinstance(mechanism, SensingMechanism):
-                position = mechanism.sense(values, position)
-            elif isinstance(mechanism, TimedSensingMechanism):
-                position = mechanism.sense_over_time(values, position, time)
+        """See `ExtendedSimulator.measured`; the offset of the measuring frame is added last."""
+        position = super().measured(values, position, time)
         return position + jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])

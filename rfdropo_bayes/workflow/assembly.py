@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal, TypeVar, overload
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.robots import Robot, load_robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
+from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
 from rfdropo_bayes.simulators.engine import Engine
 from rfdropo_bayes.simulators.mesh_body import assemble_mesh
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
@@ -44,9 +45,10 @@ from rfdropo_bayes.simulators.pushing import pushing
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 from rfdropo_bayes.workflow.engines import backend
-from rfdropo_bayes.workflow.experiment import Experiment, ModelTable, matching
+from rfdropo_bayes.workflow.experiment import Experiment, ModelTable, Workpiece, matching
 
 Entry = TypeVar("Entry")
+AnySimulator = RobotSimulator | BlackBoxSimulator
 
 KNOWN = (REPEATS, STATED)  # noise of the positions that is not inferred
 
@@ -57,15 +59,46 @@ SWITCHED = {  # channels beside the markers, by the key of [model] that makes th
 }
 
 
-def find_robot(experiment: Experiment, folder: Path) -> Robot:
-    """The robot an experiment names: one that comes with the package, or a file relative to the experiment's."""
+def find_workpiece(experiment: Experiment, folder: Path) -> Workpiece:
+    """The robot an experiment names: one that comes with the package, or a file relative to the experiment's.
+
+    One that was put together in Python holds its robot or black box itself.
+    """
+    if not isinstance(experiment.robot, str):
+        return experiment.robot
     beside = folder / experiment.robot
     return load_robot(beside if beside.suffix == ".toml" and beside.is_file() else experiment.robot)
 
 
-def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path()) -> RobotSimulator:
+def find_robot(experiment: Experiment, folder: Path) -> Robot:
+    """The same where only a robot will do.
+
+    Raises:
+        InputError: a black box.
+    """
+    found = find_workpiece(experiment, folder)
+    if isinstance(found, BlackBox):
+        raise InputError("a black box has no body", where=found.name, remedy="use a robot")
+    return found
+
+
+@overload
+def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path()) -> RobotSimulator: ...
+
+
+@overload
+def build_simulator(
+    experiment: Experiment, robot: Workpiece, folder: Path = Path()
+) -> RobotSimulator | BlackBoxSimulator: ...
+
+
+def build_simulator(
+    experiment: Experiment, robot: Workpiece, folder: Path = Path()
+) -> RobotSimulator | BlackBoxSimulator:
     """Robot, body, engine and mechanisms; ``folder`` is that of the experiment file, for the mesh of a body."""
     table = experiment.simulator
+    if isinstance(robot, BlackBox):
+        return BlackBoxSimulator(robot, mechanisms_named(experiment.model.mechanisms, robot, folder=folder))
     if table.drives == "direct":
         robot = robot.without_command_timing()
     time_step = table.time_step or robot.time_step_s
@@ -92,7 +125,7 @@ def measurement_specs(table: ModelTable) -> tuple[ParameterSpec, ...]:
     return (*noise, *(s for s in further if table.noise != REPEATS or s == TENSION_GAIN))
 
 
-def fixed_values(experiment: Experiment, simulator: RobotSimulator) -> dict[str, float]:
+def fixed_values(experiment: Experiment, simulator: AnySimulator) -> dict[str, float]:
     """Values of [model.fixed], checked against names and hard bounds."""
     table = experiment.model
     specs = simulator.parameters + measurement_specs(table)
@@ -102,7 +135,7 @@ def fixed_values(experiment: Experiment, simulator: RobotSimulator) -> dict[str,
     return {name: check_value(by_name[name], value, where="[model.fixed]") for name, value in given.items()}
 
 
-def check_used(names: Iterable[str], experiment: Experiment, simulator: RobotSimulator, *, where: str) -> None:
+def check_used(names: Iterable[str], experiment: Experiment, simulator: AnySimulator, *, where: str) -> None:
     """Raise InputError for a parameter that the model does not have, and say what would bring it in."""
     table = experiment.model
     specs = simulator.parameters + measurement_specs(table)
@@ -152,9 +185,7 @@ def pooling(
     return {name: Pooled(spread, known) for name, spread in spreads.items()}
 
 
-def build_model(
-    experiment: Experiment, simulator: RobotSimulator, trajectories: Sequence[Trajectory]
-) -> TrajectoryModel:
+def build_model(experiment: Experiment, simulator: AnySimulator, trajectories: Sequence[Trajectory]) -> TrajectoryModel:
     """The probabilistic program of an experiment for the given recordings.
 
     The noise parameters are always inferred, unless [model.fixed] holds them; the gain of tensions with a prior only.
@@ -190,7 +221,7 @@ def build_model(
 
 
 def gather_channels(
-    experiment: Experiment, simulator: RobotSimulator, trajectories: Sequence[Trajectory], recordings: RecordingSet
+    experiment: Experiment, simulator: AnySimulator, trajectories: Sequence[Trajectory], recordings: RecordingSet
 ) -> tuple[Channel, ...]:
     """What was measured and is to be used, markers first and weighed parts last."""
     table, length = experiment.model, recordings.time.shape[1]

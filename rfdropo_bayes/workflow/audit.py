@@ -1,9 +1,9 @@
-"""``rfdropo audit``: what the simulator lacks, by name; audit.json, extended.toml and report.html."""
+"""What a simulator lacks, by name: ``audit``, and ``rfdropo audit`` for an experiment file."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,101 +18,162 @@ from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
 from rfdropo_bayes.audit.fit import widening
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
 from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.pipeline import Answer, Question, audit
+from rfdropo_bayes.audit.pipeline import Answer, Question
+from rfdropo_bayes.audit.pipeline import audit as ask
 from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import ParameterSpace, build_space
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import write_text
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.audit_page import render_audit
 from rfdropo_bayes.report.summary import combined_hash
 from rfdropo_bayes.robots import Robot, robot_shape
+from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.engine import effects_costly
-from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, obstacle
+from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechanism, obstacle
 from rfdropo_bayes.simulators.parameters import nearest
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
+from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.workflow.assembly import (
+    AnySimulator,
     build_simulator,
     expand_groups,
-    find_robot,
+    find_workpiece,
     fixed_values,
     load_data,
     measurement_specs,
     pooling,
 )
-from rfdropo_bayes.workflow.experiment import Experiment, load_experiment, matching
+from rfdropo_bayes.workflow.audited import Audit
+from rfdropo_bayes.workflow.calibrated import Calibration
+from rfdropo_bayes.workflow.experiment import AuditTable, Experiment, NoiseTable, Workpiece, load_experiment, matching
 from rfdropo_bayes.workflow.experiment_file import code_placed, describe, self_contained
 from rfdropo_bayes.workflow.files import hashes, run_folder
+from rfdropo_bayes.workflow.model import Model, source_of
 
 Workshop = dict[str, Lanes]
 
-AUDIT, EXTENDED, REPORT, JOURNAL = "audit.json", "extended.toml", "report.html", "checkpoints/audit"
+JOURNAL = "checkpoints/audit"
 FINER = 2
 
 
-def run_audit(
-    path: Path,
-    out: Path,
+def audit(
+    model: Model,
+    runs: Sequence[Trajectory],
     *,
-    overrides: Sequence[str] = (),
-    base: Path | None = None,
-    seed: int | None = None,
+    test: Sequence[Trajectory] = (),
+    seed: int = 0,
+    base: Calibration | Path | None = None,
+    noise: Mapping[str, float] | None = None,
+    out: Path | str | None = None,
+    title: str = "",
     resume: bool = False,
     overwrite: bool = False,
     workshop: Workshop | None = None,
     report: Callable[[str], None] = lambda line: None,
     inspect: Callable[[Answer], None] = lambda answer: None,
-) -> dict[str, Any]:
-    """Audit an experiment and write what was found.
+    tables: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Audit:
+    """Say what a model lacks, by name, and measure what it gains with that.
 
     Args:
-        path: the experiment file; its ``fit`` recordings are fitted and screened, its ``test`` recordings measure the
-            gain.
-        out: folder to write to.
-        overrides: assignments that replace entries of the file.
-        base: folder of an earlier calibration, from whose optimum the base model starts.
-        seed: of the audit; that of the file by default.
+        model: what is simulated and inferred.
+        runs: recordings that are fitted and screened.
+        test: unseen recordings, which measure the gain.
+        seed: of all that is random. The same seed gives the same answer.
+        base: an earlier calibration, or its folder, from whose posterior means the base model starts.
+        noise: ``{"standard_deviation": m}`` of the positions, perhaps with a ``correlation_time`` [s]; it counts where
+            nothing was repeated.
+        out: folder that gets audit.json, extended.toml and report.html; None writes nothing.
+        title: heading of the report; the robot's name by default.
         resume: go on from what an interrupted audit has left in ``out``.
         overwrite: start anew whatever ``out`` holds.
         workshop: see `build_question`.
         report: called with a line of words now and then.
         inspect: called with the answer.
-
-    Returns:
-        the content of audit.json.
+        tables: of the experiment file that the model was read from, for the record.
+        options: keys of an experiment file's [audit]: ``candidates`` (names, or classes of one's own), ``exclude``,
+            ``bootstraps``, ``minutes``.
 
     Raises:
         InputError: bad input, before anything long has started.
     """
-    experiment, tables = load_experiment(path, overrides)
+    model = _asked(model, noise, options)
+    experiment, folder, title = model.experiment, model.folder, title or model.name
     deadline = Deadline(experiment.audit.minutes)
-    folder = Path(path).resolve().parent
-    fitted, tested = (load_data(experiment, folder, role) for role in ("fit", "test"))
-    chosen = experiment.seed if seed is None else seed
-    question = build_question(experiment, folder, fitted, tested, chosen, start=start_values(base), workshop=workshop)
-    settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes([*fitted, *tested])}
-    options = {"base": base, "seed": chosen}
-    with run_folder(out, "audit", **settings, options=options, resume=resume, overwrite=overwrite) as out:
-        answer = audit(question, report, Journal(out / JOURNAL, resume=resume), deadline)
+    question = build_question(experiment, folder, runs, test, seed, start=start_values(base), workshop=workshop)
+    tables = {**model.tables(), "title": title, "seed": seed} if tables is None else tables
+
+    def found(out: Path | None) -> Audit:
+        journal = None if out is None else Journal(out / JOURNAL, resume=resume)
+        answer = ask(question, report, journal, deadline)
         inspect(answer)
         content = record(
             answer,
             versions=software_versions(),
-            data_sha256=combined_hash([trajectory.sha256 for trajectory in [*fitted, *tested]]),
+            data_sha256=combined_hash([trajectory.sha256 for trajectory in [*runs, *test]]),
             next_experiment=next_experiment(answer),
         )
-        write_text(out / AUDIT, json.dumps(content, indent=2, allow_nan=False) + "\n")
-        write_text(out / EXTENDED, describe(extended_tables(tables, answer, folder, out)))
-        shape = robot_shape(find_robot(experiment, folder))
-        page = render_audit(answer, content, experiment.title or path.stem, describe(tables), shape)
-        write_text(out / REPORT, page)
-    return content
+        shape = robot_shape(model.robot) if isinstance(model.robot, Robot) else None
+        page = render_audit(answer, content, title, describe(tables), shape)
+        extended = extended_tables(dict(tables), answer, folder, out)
+        made = None if isinstance(experiment.robot, str) else experiment.robot
+        return Audit(content, extended, page, made, out or folder, out)
+
+    if out is None:
+        return found(None)
+    settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes([*runs, *test])}
+    start = base.folder if isinstance(base, Calibration) else base
+    settings |= {"options": {"base": start, "seed": seed}, "texts": model.texts()}
+    with run_folder(Path(out), "audit", **settings, resume=resume, overwrite=overwrite) as place:
+        answered = found(place)
+        answered.save(place)
+    return answered
+
+
+def _asked(model: Model, noise: Mapping[str, float] | None, options: Mapping[str, Any]) -> Model:
+    """The model with the tables [audit] and [noise] of a call."""
+    changes: dict[str, Any] = {}
+    if options:
+        chosen = {**model.experiment.audit.model_dump(exclude_unset=True), **options}
+        if "candidates" in chosen:
+            chosen["candidates"] = [source_of(candidate) for candidate in chosen["candidates"]]
+        changes["audit"] = parse_table(AuditTable, chosen, where="audit")
+    if noise is not None:
+        changes["noise"] = parse_table(NoiseTable, noise, where="audit, noise")
+    return Model.of_experiment(model.experiment.model_copy(update=changes), model.folder) if changes else model
+
+
+def run_audit(
+    path: Path, out: Path, *, overrides: Sequence[str] = (), seed: int | None = None, **options: Any
+) -> dict[str, Any]:
+    """`audit` what an experiment file says; return the content of audit.json.
+
+    Args:
+        path: the experiment file.
+        out: folder to write to.
+        overrides: assignments that replace entries of the file.
+        seed: of the audit; that of the file by default.
+        options: further arguments of `audit`.
+    """
+    experiment, tables = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    found = audit(
+        Model.of_experiment(experiment, folder),
+        load_data(experiment, folder, "fit"),
+        test=load_data(experiment, folder, "test"),
+        seed=experiment.seed if seed is None else seed,
+        out=out,
+        title=experiment.title or path.stem,
+        tables=tables,
+        **options,
+    )
+    return dict(found.content)
 
 
 def build_question(
@@ -131,7 +192,7 @@ def build_question(
     ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names`` are the candidates,
     where it is not all.
     """
-    robot = find_robot(experiment, folder)
+    robot = find_workpiece(experiment, folder)
     trajectories = [*fitted, *tested]
     left_out: dict[str, str] = {}
     if names is None:
@@ -166,10 +227,9 @@ def build_question(
         shop[key] = found
         return found, commands
 
-    finer = _finer(experiment, robot)
     return Question(
         lanes(experiment)[0],
-        lanes(finer),
+        None if isinstance(robot, BlackBox) else lanes(_finer(experiment, robot)),
         coordinates,
         recordings,
         list(fitted),
@@ -199,7 +259,7 @@ def candidate_names(experiment: Experiment) -> list[str]:
 
 
 def obstacles(
-    experiment: Experiment, names: Sequence[str], robot: Robot, folder: Path, recording: Trajectory
+    experiment: Experiment, names: Sequence[str], robot: Workpiece, folder: Path, recording: Trajectory
 ) -> dict[str, str]:
     """Which of the candidates cannot run on the experiment's body and engine, and why.
 
@@ -211,8 +271,8 @@ def obstacles(
     found = {}
     for name in names:
         (mechanism,) = mechanisms_named([name], robot, folder=folder, where="[audit] candidates")
-        table = experiment.simulator
-        why = obstacle(mechanism, table.body, engine)
+        body = BLACK_BOX if isinstance(robot, BlackBox) else experiment.simulator.body
+        why = obstacle(mechanism, body, engine)
         if why is None and name not in REGISTRY:
             why = _refusal(build_simulator(_with(experiment, [name]), robot, folder), commands)
         if why is not None:
@@ -220,7 +280,7 @@ def obstacles(
     return found
 
 
-def _refusal(simulator: RobotSimulator, commands: Commands) -> str | None:
+def _refusal(simulator: AnySimulator, commands: Commands) -> str | None:
     """What a simulator says against rollouts of its mechanisms, before anything is computed."""
     try:
         jax.eval_shape(jax.vmap(lambda given: simulator.rollout({}, given)), commands)
@@ -238,7 +298,7 @@ def _with(experiment: Experiment, names: Sequence[str]) -> Experiment:
 def _lanes(
     experiment: Experiment,
     names: Sequence[str],
-    robot: Robot,
+    robot: Workpiece,
     folder: Path,
     trajectories: Sequence[Trajectory],
     coordinates: Coordinates,
@@ -260,7 +320,7 @@ def _lanes(
     return routed, recordings.commands
 
 
-def _brisk(simulator: RobotSimulator, marker_index: np.ndarray) -> Lanes:
+def _brisk(simulator: AnySimulator, marker_index: np.ndarray) -> Lanes:
     """Lanes with one-sided differences where there are any: they are exact enough for climbs and scores."""
     if isinstance(simulator, TrunkSimulator) and simulator.engine.backend.name == "numba":
         quick = simulator.with_backend(simulator.engine.backend._replace(one_sided=True))
@@ -291,7 +351,7 @@ def _finer(experiment: Experiment, robot: Robot) -> Experiment:
 
 def _space(
     experiment: Experiment,
-    simulator: RobotSimulator,
+    simulator: AnySimulator,
     candidates: Sequence[Mechanism],
     fitted: Sequence[str],
     others: Sequence[str],
@@ -329,10 +389,12 @@ def _stated(experiment: Experiment, markers: int, first: Trajectory) -> Autoregr
     return Autoregression(np.full(3 * markers, noise.standard_deviation), np.array([1.0, *memory]), STATED, np.inf)
 
 
-def start_values(base: Path | None) -> dict[str, float] | None:
-    """Posterior means of an earlier calibration."""
+def start_values(base: Calibration | Path | None) -> dict[str, float] | None:
+    """Posterior means of an earlier calibration, or of its folder."""
     if base is None:
         return None
+    if isinstance(base, Calibration):
+        return {name: float(row["mean"]) for name, row in base.content["parameters"].items()}
     path = Path(base) / "summary.json"
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))

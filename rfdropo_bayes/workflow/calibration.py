@@ -1,9 +1,10 @@
-"""``rfdropo calibrate``: recordings in; posterior.nc, summary.json and report.html out."""
+"""Recordings and a model in, a posterior out: ``calibrate``, and ``rfdropo calibrate`` for an experiment file."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +16,21 @@ from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.pooling import Patterns
 from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference.methods import make_config, method_named, run
+from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
-from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, software_versions, write_run
+from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, build_summary, software_versions
 from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
 from rfdropo_bayes.report.run_folder import POSTERIOR
-from rfdropo_bayes.robots import robot_shape
-from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
-from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
+from rfdropo_bayes.robots import Robot, robot_shape
+from rfdropo_bayes.workflow.assembly import load_data
+from rfdropo_bayes.workflow.calibrated import Calibration
+from rfdropo_bayes.workflow.experiment import Experiment, InferenceTable, load_experiment
+from rfdropo_bayes.workflow.experiment_file import describe
 from rfdropo_bayes.workflow.files import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
+from rfdropo_bayes.workflow.model import Model
 from rfdropo_bayes.workflow.prediction import (
     BEGUN,
     FITTED,
@@ -48,6 +52,87 @@ START_DRAWS = 1000
 CLIMBING = ("laplace", "bridge", "smc")  # smc where it starts at the optima
 
 
+def calibrate(
+    model: Model,
+    runs: Sequence[Trajectory],
+    method: Any = None,
+    *,
+    test: Sequence[Trajectory] = (),
+    seed: int = 0,
+    out: Path | str | None = None,
+    start: Calibration | Path | None = None,
+    title: str = "",
+    resume: bool = False,
+    overwrite: bool = False,
+    show: bool | None = None,
+    tables: Mapping[str, Any] | None = None,
+) -> Calibration:
+    """Fit a model to recordings.
+
+    Args:
+        model: what is simulated, inferred and measured.
+        runs: recordings that are fitted.
+        method: options of a method, such as ``SMC(rollouts=5000)``; SMC with 20000 rollouts by default.
+        test: recordings that no fit sees; the report says how well they are predicted.
+        seed: of all that is random. The same seed gives the same draws.
+        out: folder that gets posterior.nc, summary.json, report.html and checkpoints; None writes nothing.
+        start: an earlier calibration of the same robot, or its folder, perhaps with fewer mechanisms or other
+            recordings: climbs start from its posterior. What is inferred, and from which data, does not change.
+        title: heading of the report; the robot's name by default.
+        resume: go on from the checkpoint of an interrupted run of the same experiment in ``out``.
+        overwrite: start anew whatever ``out`` holds.
+        show: whether to show progress, see `Progress`.
+        tables: of the experiment file that the model was read from, for the record.
+
+    Raises:
+        InputError: bad input, before anything long has started.
+    """
+    config = make_config("smc", {"rollouts": InferenceTable().rollouts}) if method is None else method
+    name = method_of(config)
+    problem = model.problem(runs, earlier_draws(start, name))
+    recordings, title = [*runs, *test], title or model.name
+    if tables is None:
+        options = {key: value for key, value in dataclasses.asdict(config).items() if value is not None}
+        tables = {**model.tables(), "title": title, "seed": seed, "inference": {"method": name, **options}}
+    fit = partial(_fit, model, problem, config, runs, test, seed, title)
+    if out is None:
+        return fit(None, describe(tables), resume=False, show=show)
+    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(recordings)}
+    settings |= {"options": {"from": start.folder if isinstance(start, Calibration) else start}, "texts": model.texts()}
+    with run_folder(Path(out), "calibrate", **settings, resume=resume, overwrite=overwrite) as folder:
+        found = fit(folder, (folder / CONFIG).read_text(encoding="utf-8"), resume=resume, show=show)
+        found.save(folder)
+    return found
+
+
+def _fit(
+    model: Model,
+    problem: CalibrationProblem,
+    config: Any,
+    runs: Sequence[Trajectory],
+    test: Sequence[Trajectory],
+    seed: int,
+    title: str,
+    out: Path | None,
+    text: str,
+    *,
+    resume: bool,
+    show: bool | None,
+) -> Calibration:
+    """Run the method; ``text`` is the experiment as TOML, ``out`` the folder for log and checkpoints."""
+    method = method_of(config)
+    key, predicting = jax.random.split(jax.random.key(seed))
+    log, kept = (None, None) if out is None else (out / LOG, out / CHECKPOINTS)
+    with Progress(method, show=show, log=log, budget=getattr(config, "rollouts", None)) as progress:
+        problem.watch = progress.spend
+        result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
+    problem = problem.holding(result.held)
+    attributes = {**_attributes(model.name, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
+    record = record_posterior(problem, result, test, predicting, attributes, model.experiment.model.groups)
+    facts = gather_facts(title, seed, problem, result, runs, test, record)
+    return Calibration(record, build_summary(record, facts), text, model, out)
+
+
 def run_calibration(
     path: Path,
     out: Path,
@@ -57,56 +142,33 @@ def run_calibration(
     overwrite: bool = False,
     start: Path | None = None,
     show: bool | None = None,
-) -> Path:
-    """Fit an experiment and write what it found.
-
-    Args:
-        path: the experiment file.
-        out: folder to write to; checkpoints go to its folder ``checkpoints``.
-        overrides: assignments that replace entries of the file.
-        resume: go on from the checkpoint of an interrupted run of the same experiment.
-        overwrite: start anew whatever ``out`` holds.
-        start: folder of an earlier calibration of the same robot, perhaps with fewer mechanisms or other recordings:
-            climbs start from its posterior. What is inferred, and from which data, does not change.
-        show: whether to show progress, see `Progress`.
-
-    Returns:
-        path of report.html.
-
-    Raises:
-        InputError: bad input, before anything long has started.
-    """
+) -> Calibration:
+    """`calibrate` what an experiment file says; ``overrides`` are assignments that replace entries of the file."""
     experiment, tables = load_experiment(path, overrides)
     folder = Path(path).resolve().parent
-    fitted = load_data(experiment, folder, "fit")
-    tested = load_data(experiment, folder, "test")
-    simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
-    method = experiment.inference.method
-    problem = build_problem(build_model(experiment, simulator, fitted), earlier_draws(start, method))
-    config = make_config(method, inference_options(experiment))
-    recordings = [*fitted, *tested]
-    key, predicting = jax.random.split(jax.random.key(experiment.seed))
-    settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes(recordings)}
-    settings["options"] = {"from": start}
-    with run_folder(out, "calibrate", **settings, resume=resume, overwrite=overwrite) as out:
-        with Progress(method, show=show, log=out / LOG, budget=getattr(config, "rollouts", None)) as progress:
-            problem.watch = progress.spend
-            kept = out / CHECKPOINTS
-            result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
-        problem = problem.holding(result.held)
-        attributes = {**_attributes(experiment, recordings), BEGUN: common_beginning(fitted)}
-        record = record_posterior(problem, result, tested, predicting, attributes, experiment.model.groups)
-        facts = gather_facts(experiment, path.stem, problem, result, fitted, tested, record)
-        return write_run(out, record, facts, (out / CONFIG).read_text(encoding="utf-8"))
+    return calibrate(
+        Model.of_experiment(experiment, folder),
+        load_data(experiment, folder, "fit"),
+        make_config(experiment.inference.method, inference_options(experiment)),
+        test=load_data(experiment, folder, "test"),
+        seed=experiment.seed,
+        out=out,
+        start=start,
+        title=experiment.title or path.stem,
+        resume=resume,
+        overwrite=overwrite,
+        show=show,
+        tables=tables,
+    )
 
 
-def earlier_draws(folder: Path | None, method: str) -> Batch | None:
-    """Draws of an earlier calibration, chains joined; None without one.
+def earlier_draws(start: Calibration | Path | None, method: str) -> Batch | None:
+    """Draws of an earlier calibration, or of its folder, chains joined; None without one.
 
     Raises:
         InputError: a folder that holds no posterior, or a method that does not climb.
     """
-    if folder is None:
+    if start is None:
         return None
     if method not in CLIMBING:
         raise InputError(
@@ -114,7 +176,7 @@ def earlier_draws(folder: Path | None, method: str) -> Batch | None:
             where="--from",
             remedy=f"leave it out, or use one of {', '.join(CLIMBING)}",
         )
-    record = PosteriorRecord.load(Path(folder) / POSTERIOR)
+    record = start.record if isinstance(start, Calibration) else PosteriorRecord.load(Path(start) / POSTERIOR)
     return thin({info.name: record.posterior[info.name] for info in record.free}, START_DRAWS)
 
 
@@ -207,8 +269,8 @@ def scale_free_ratios(names: Sequence[str]) -> list[ProductOfPowers]:
 
 
 def gather_facts(
-    experiment: Experiment,
-    name: str,
+    title: str,
+    seed: int,
     problem: CalibrationProblem,
     result: InferenceResult,
     fitted: Sequence[Trajectory],
@@ -218,16 +280,16 @@ def gather_facts(
     """What the report says beside the posterior."""
     unseen = [prediction for prediction in record.recordings if prediction.split == "test"]
     description = problem.model.simulator.description
-    robot = getattr(problem.model.simulator, "robot", None)
+    robot: Any = getattr(problem.model.simulator, "robot", None)
     checks = check_fit(problem, record)
     floor = noise_floor([*fitted, *tested])
     return RunFacts(
-        title=experiment.title or name,
+        title=title,
         robot=str(description["robot"]),
         method=result.method,
         engine=f"{description['engine']} {description['precision']}",
         status="done",
-        seed=experiment.seed,
+        seed=seed,
         rollouts=float(result.rollouts),
         seconds=result.seconds,
         evaluations=result.evaluations,
@@ -241,7 +303,7 @@ def gather_facts(
         ],
         model={
             "noise": problem.model.noise,
-            "mechanisms": ", ".join(experiment.model.mechanisms) or "none",
+            "mechanisms": ", ".join(mechanism.name for mechanism in problem.model.simulator.mechanisms) or "none",
             "fixed": ", ".join(f"{k} = {v:g}" for k, v in problem.model.fixed.items())
             or "nothing beyond the nominal values",
             **{key: str(value) for key, value in description.items() if key not in ("mechanisms", "robot")},
@@ -253,7 +315,7 @@ def gather_facts(
         objects=score_objects(unseen, [*fitted, *tested]),
         versions=software_versions(),
         details=result.details,
-        outline=robot_shape(robot) if robot is not None else None,
+        outline=robot_shape(robot) if isinstance(robot, Robot) else None,
     )
 
 
@@ -263,10 +325,10 @@ def known_noise(problem: CalibrationProblem) -> dict[str, Any]:
     return {} if known is None else {KNOWN_NOISE: {"markers": list(markers), **known.as_dict()}}
 
 
-def _attributes(experiment: Experiment, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
+def _attributes(robot: str, seed: int, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
     return {
-        "seed": experiment.seed,
-        "robot": experiment.robot,
+        "seed": seed,
+        "robot": robot,
         "data_sha256": [trajectory.sha256 for trajectory in trajectories],
         "versions": software_versions(),
     }

@@ -1,12 +1,14 @@
-"""``rfdropo design``: the next command sequence, as a CSV, and what it will decide."""
+"""The next command sequence, and what it will decide: ``design``, and ``rfdropo design``."""
 
 from __future__ import annotations
 
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +27,10 @@ from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.workflow.assembly import load_data
 from rfdropo_bayes.workflow.audit import build_question, start_values
+from rfdropo_bayes.workflow.calibrated import Calibration
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
 from rfdropo_bayes.workflow.files import hashes, run_folder
+from rfdropo_bayes.workflow.model import Model
 
 COMMANDS, DESIGN = "next_commands.csv", "design.json"
 SEQUENCES, HYPOTHESES, KINDS = 24, 4, 4
@@ -56,74 +60,78 @@ class Clock(Deadline):
             self.share = math.inf
 
 
-def run_design(
-    path: Path,
-    out: Path,
+@dataclass(frozen=True)
+class Design:
+    """The commands to record next, and what they will decide.
+
+    Attributes:
+        content: of design.json.
+        commands: the proposal, a column for the time and one for each channel, as the recordings have them.
+    """
+
+    content: Mapping[str, Any]
+    commands: pd.DataFrame
+
+    @property
+    def sentence(self) -> str:
+        """What to record, and what it will tell."""
+        return str(self.content["sentence"])
+
+    def save(self, folder: Path | str) -> Path:
+        """Write next_commands.csv and design.json; return the path of the commands."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        with whole(folder / COMMANDS) as partial:
+            self.commands.to_csv(partial, index=False, float_format="%.6f")
+        write_text(folder / DESIGN, json.dumps({**self.content, "commands": str(folder / COMMANDS)}, indent=2) + "\n")
+        return folder / COMMANDS
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(self.sentence)}</p>{self.commands.head().to_html()}"
+
+
+def design(
+    model: Model,
+    runs: Sequence[Trajectory],
     *,
-    overrides: Sequence[str] = (),
-    base: Path | None = None,
-    seed: int | None = None,
-    overwrite: bool = False,
+    base: Calibration | Path | None = None,
+    seed: int = 0,
+    minutes: float | None = None,
     report: Callable[[str], None] = lambda line: None,
-) -> dict[str, Any]:
-    """Propose the commands that best separate the leading explanations of an experiment's recordings.
+) -> Design:
+    """Propose the commands that best separate the leading explanations of what a model lacks.
 
     The proposals stay within the range of commands that the recordings have used, are as long as the first recording
     and of four kinds: random walks, holds, slow loops and chirps. Where no candidate is significant, the sequence that
-    tells most about the base parameters is proposed. When the time of [design] minutes is up, it is the best of the
-    sequences, and the leading one of the explanations, that have been looked at.
+    tells most about the base parameters is proposed. When the time is up, it is the best of the sequences, and the
+    leading one of the explanations, that have been looked at.
 
     Args:
-        path: the experiment file.
-        out: folder to write to.
-        overrides: assignments that replace entries of the file.
-        base: folder of an earlier calibration, from whose optimum the base model starts.
-        seed: of proposals and climbs; that of the experiment by default.
-        overwrite: write whatever ``out`` holds.
-        report: told how far it is.
-
-    Returns:
-        the content of design.json.
+        model: what is simulated and inferred.
+        runs: recordings.
+        base: an earlier calibration, or its folder, from whose posterior means the base model starts.
+        seed: of all that is random.
+        minutes: bound of the whole run; that of the model's experiment, 10 by default.
+        report: called with a line of words now and then.
 
     Raises:
         InputError: bad input, or a base model that was not fitted in half of the time.
     """
-    experiment, tables = load_experiment(path, overrides)
-    folder = Path(path).resolve().parent
-    fitted = load_data(experiment, folder, "fit")
-    chosen = experiment.seed if seed is None else seed
-    question = build_question(experiment, folder, fitted, [], chosen, start=start_values(base))
-    options = {"base": base, "seed": chosen}
-    settings = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": options}
-    with run_folder(out, "design", **settings, overwrite=overwrite) as out:
-        content = _designed(experiment, question, fitted, out, report)
-        write_text(out / DESIGN, json.dumps(content, indent=2) + "\n")
-    return content
-
-
-def _designed(
-    experiment: Experiment,
-    question: Question,
-    fitted: Sequence[Trajectory],
-    out: Path,
-    report: Callable[[str], None],
-) -> dict[str, Any]:
-    """Write the proposal; return the content of design.json."""
-    clock = Clock(experiment.design.minutes)
+    experiment = model.experiment
+    question = build_question(experiment, model.folder, runs, [], seed, start=start_values(base))
+    clock = Clock(experiment.design.minutes if minutes is None else minutes)
     rng = np.random.default_rng(question.seed)
     clock.share = FITTED_BY
     target, base = base_model(question, question.seed, report=report, deadline=clock)
     report("base model fitted")
     hypotheses = _hypotheses(Inquiry(target, question.candidates, question.rules, question.seed), base, clock, report)
-    proposals = list(_proposals(fitted[0], fitted, rng))
-    outlook = _outlooks(question, target, base, hypotheses, fitted[0], proposals, clock, report)
+    proposals = list(_proposals(runs[0], runs, rng))
+    outlook = _outlooks(question, target, base, hypotheses, runs[0], proposals, clock, report)
     chosen = best(outlook, len(hypotheses) > 1)
     kind, times, value = proposals[chosen]
-    _write_commands(experiment, fitted[0], times, value, out / COMMANDS)
     now = at_hand(target, hypotheses)
-    return {
+    content = {
         "sentence": _sentence(kind, outlook[chosen], now) + _unfinished(clock),
-        "commands": str(out / COMMANDS),
         "kind": kind,
         "hypotheses": [h.name for h in hypotheses],
         "separation_now": {" / ".join(pair): value for pair, value in now.items()},
@@ -139,6 +147,29 @@ def _designed(
         "seed": question.seed,
         "schema_version": 1,
     }
+    return Design(content, _table(experiment, runs[0], times, value))
+
+
+def run_design(
+    path: Path,
+    out: Path,
+    *,
+    overrides: Sequence[str] = (),
+    base: Path | None = None,
+    seed: int | None = None,
+    overwrite: bool = False,
+    report: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """`design` what an experiment file says, and write design.json and next_commands.csv; return the former."""
+    experiment, tables = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    fitted = load_data(experiment, folder, "fit")
+    chosen = experiment.seed if seed is None else seed
+    options = {"base": base, "seed": chosen}
+    settings = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": options}
+    with run_folder(out, "design", **settings, overwrite=overwrite) as out:
+        found = design(Model.of_experiment(experiment, folder), fitted, base=base, seed=chosen, report=report)
+        return {**found.content, "commands": str(found.save(out))}
 
 
 def _hypotheses(inquiry: Inquiry, base: Fit, clock: Clock, report: Callable[[str], None]) -> list[Hypothesis]:
@@ -183,14 +214,12 @@ def _outlooks(
     return outlook
 
 
-def _write_commands(experiment: Experiment, first: Trajectory, time: np.ndarray, value: np.ndarray, path: Path) -> None:
+def _table(experiment: Experiment, first: Trajectory, time: np.ndarray, value: np.ndarray) -> pd.DataFrame:
     """The proposal in the columns of the experiment's recordings."""
     if experiment.data is not None and experiment.data.columns is not None:
-        columns = command_columns(experiment.data.columns, time, value)
-    else:
-        columns = {"time_s": time} | {f"{c}_{first.command_unit}": value[:, k] for k, c in enumerate(first.cable_names)}
-    with whole(path) as partial:
-        pd.DataFrame(columns).to_csv(partial, index=False, float_format="%.6f")
+        return pd.DataFrame(command_columns(experiment.data.columns, time, value))
+    channels = {f"{c}_{first.command_unit}": value[:, k] for k, c in enumerate(first.cable_names)}
+    return pd.DataFrame({"time_s": time, **channels})
 
 
 def _shaped(sequences: Sequence[Commands], like: Commands) -> list[Commands]:

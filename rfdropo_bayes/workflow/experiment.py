@@ -10,10 +10,15 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rfdropo_bayes.data import DataSpec
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.training.config import TrainingTable
 from rfdropo_bayes.workflow.experiment_file import override, read_tables
+
+Workpiece = Robot | BlackBox
+"""What is simulated."""
 
 
 class Table(BaseModel):

@@ -75,6 +75,7 @@ def run_folder(
     folder: Path = Path(),
     options: Mapping[str, Any] | None = None,
     data: Mapping[str, str] | None = None,
+    texts: Mapping[str, str] | None = None,
     resume: bool = False,
     overwrite: bool = False,
 ) -> Iterator[Path]:
@@ -89,6 +90,7 @@ def run_folder(
         tables: of the experiment, where there is one; folder: that of its file.
         options: settings of the command line that results depend on.
         data: hashes of the recordings, by their names.
+        texts: files that the tables name and no folder holds, such as the description of a robot made in Python.
         resume: go on with the run that the folder holds, if any.
         overwrite: start anew whatever the folder holds.
 
@@ -103,6 +105,8 @@ def run_folder(
     earlier = _read(out / RUN)
     settings: dict[str, Any] = {"experiment": {}, "options": dict(options or {}), "data": dict(data or {})}
     check_folder(out, command, resume=resume, overwrite=overwrite)
+    for name, text in (texts or {}).items():
+        write_text(out / name, text)
     if tables is not None:
         contained = self_contained(tables, folder, out)
         settings["experiment"] = contained

@@ -1,11 +1,11 @@
-"""``rfdropo simulate``: the motion an experiment's commands produce, as files, and its distance to the recording."""
+"""The motion that commands produce: ``simulate``, and ``rfdropo simulate`` with its distance to the recordings."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -16,19 +16,97 @@ from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.data import Trajectory, check_channels, shared_markers
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_text
+from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.protocol import Result
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
-from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values, load_data
+from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.workflow.assembly import AnySimulator, build_simulator, find_robot, fixed_values, load_data
 from rfdropo_bayes.workflow.balance import append_balance
 from rfdropo_bayes.workflow.commands import random_walk
 from rfdropo_bayes.workflow.experiment import CommandsTable, Experiment, NoiseTable, load_experiment
 from rfdropo_bayes.workflow.files import output_folder, run_folder
+from rfdropo_bayes.workflow.model import Model
 
 # Number that the first marker's column carries in each source.
 FIRST_COLUMN = {"sofa-csv": 0, "optitrack-csv": 1, "asl-csv": 1}
 CUBE_COLUMNS = tuple(f"cube_{name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw"))
 """Of the cube's pose, as in SOFA's and OptiTrack's recordings."""
+
+
+class Simulated(NamedTuple):
+    """A rollout of one recording's commands."""
+
+    source: Trajectory
+    markers: tuple[str, ...]
+    position: Float[np.ndarray, "time marker 3"]
+    pose: Float[np.ndarray, "time 7"] | None
+    result: Result
+    commands: Commands
+
+
+def simulate(
+    model: Model,
+    commands: Sequence[Trajectory] | Mapping[str, Any],
+    *,
+    parameters: Mapping[str, float] | None = None,
+    noise: Mapping[str, float] | None = None,
+    seed: int = 0,
+) -> list[Trajectory]:
+    """Simulate what a robot does under commands.
+
+    Args:
+        model: that is simulated; its fixed values hold, and all else is nominal.
+        commands: recordings that are replayed; or the keys of an experiment file's [commands], for random ones.
+        parameters: values beside the model's own.
+        noise: ``{"standard_deviation": m}``, perhaps with a ``correlation_time`` [s], that is added to the positions.
+        seed: of noise and random commands.
+
+    Returns:
+        recordings that say that they are synthetic, with the true parameters among their settings.
+
+    Raises:
+        InputError: bad input, or a rollout that diverged.
+    """
+    changes: dict[str, Any] = {"seed": seed}
+    if not isinstance(commands, Sequence):
+        changes["commands"] = parse_table(CommandsTable, commands, where="simulate, commands")
+    if noise is not None:
+        changes["noise"] = parse_table(NoiseTable, noise, where="simulate, noise")
+    if parameters:
+        fixed = {**model.experiment.model.fixed, **parameters}
+        changes["model"] = model.experiment.model.model_copy(update={"fixed": fixed})
+    experiment = model.experiment.model_copy(update=changes)
+    simulator = build_simulator(experiment, model.robot, model.folder)
+    values = _physical(experiment, simulator)
+    sources = commands if isinstance(commands, Sequence) else _sources(experiment, model.folder, simulator)
+    return [
+        _as_trajectory(found, simulator, experiment, values, index)
+        for index, found in enumerate(_rollouts(simulator, values, sources))
+    ]
+
+
+def _physical(experiment: Experiment, simulator: AnySimulator) -> dict[str, float]:
+    """Fixed values that the simulator is given."""
+    known = {spec.name for spec in simulator.parameters}
+    return {name: value for name, value in fixed_values(experiment, simulator).items() if name in known}
+
+
+def _rollouts(
+    simulator: AnySimulator, values: Mapping[str, float], sources: Sequence[Trajectory]
+) -> Iterator[Simulated]:
+    """Roll out the commands of every recording."""
+    rollout = jax.jit(simulator.rollout)
+    for source in sources:
+        markers = shared_markers([source], simulator.marker_names)
+        check_channels(source, simulator.channel_names, simulator.command_unit)
+        commands = simulator.commands(source.command_time, source.command, source.initial_command, source.time)
+        observation = jax.device_get(rollout({k: np.asarray(v) for k, v in values.items()}, commands))
+        chosen = [simulator.marker_names.index(name) for name in markers]
+        result = Result(int(observation.status))
+        if result is Result.DIVERGED:
+            raise InputError(f"the rollout of {source.name} diverged", where="simulate", remedy=result.remedy)
+        pose = None if observation.object_pose is None else np.asarray(observation.object_pose)
+        yield Simulated(source, markers, np.asarray(observation.position)[:, chosen], pose, result, commands)
 
 
 def run_simulation(
@@ -61,38 +139,26 @@ def simulate_all(experiment: Experiment, folder: Path, out: Path, balance: bool 
         InputError: bad input, or a rollout that did not end well.
     """
     simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
-    values = fixed_values(experiment, simulator)
-    physical = {spec.name for spec in simulator.parameters}
-    values = {name: value for name, value in values.items() if name in physical}
+    values = _physical(experiment, simulator)
     sources = _sources(experiment, folder, simulator)
     out = output_folder(out)
-    rollout = jax.jit(simulator.rollout)
     report: dict[str, Any] = {"simulator": simulator.description, "parameters": values, "recordings": {}}
     distances = []
-    for index, source in enumerate(sources):
-        markers = shared_markers([source], simulator.marker_names)
-        check_channels(source, simulator.channel_names, simulator.command_unit)
-        commands = simulator.commands(source.command_time, source.command, source.initial_command, source.time)
-        observation = jax.device_get(rollout({k: np.asarray(v) for k, v in values.items()}, commands))
-        chosen = [simulator.marker_names.index(name) for name in markers]
-        position = np.asarray(observation.position)[:, chosen]
-        result = Result(int(observation.status))
-        if result is Result.DIVERGED:
-            raise InputError(f"the rollout of {source.name} diverged", where="simulate", remedy=result.remedy)
+    for index, found in enumerate(_rollouts(simulator, values, sources)):
+        source, pose = found.source, found.pose
         stem = "trajectory" if len(sources) == 1 else source.name
-        pose = None if observation.object_pose is None else np.asarray(observation.object_pose)
-        simulated = _as_trajectory(source, position, pose, markers, simulator, experiment, values, index)
+        simulated = _as_trajectory(found, simulator, experiment, values, index)
         simulated.save(out / f"{stem}.nc")
         with whole(out / f"{stem}.csv") as partial:
             _table(source, simulated).to_csv(partial, index=False, float_format="%.6f")
-        distances.append(_distance(source, position, markers))
+        distances.append(_distance(source, found.position, found.markers))
         report["recordings"][source.name] = {
-            "status": result.name.lower(),
+            "status": found.result.name.lower(),
             "files": [str(out / f"{stem}.nc"), str(out / f"{stem}.csv")],
             "error_mm": _errors([distances[-1]]) if experiment.data else None,
         }
         if balance:
-            written = append_balance(simulator, values, commands, source.time, out / f"{stem}.nc")
+            written = append_balance(simulator, values, found.commands, source.time, out / f"{stem}.nc")
             report["recordings"][source.name]["balance"] = written
         if pose is not None and source.object_pose is not None:
             report["recordings"][source.name]["object_error"] = _object_errors(pose, source.object_pose)
@@ -101,7 +167,7 @@ def simulate_all(experiment: Experiment, folder: Path, out: Path, balance: bool 
     return report
 
 
-def _sources(experiment: Experiment, folder: Path, simulator: RobotSimulator) -> Sequence[Trajectory]:
+def _sources(experiment: Experiment, folder: Path, simulator: AnySimulator) -> Sequence[Trajectory]:
     if experiment.commands is None:
         return [*load_data(experiment, folder, "fit"), *load_data(experiment, folder, "test")]
     if experiment.data is not None:
@@ -113,12 +179,12 @@ def _sources(experiment: Experiment, folder: Path, simulator: RobotSimulator) ->
     ]
 
 
-def _generated(table: CommandsTable, name: str, simulator: RobotSimulator, rng: np.random.Generator) -> Trajectory:
+def _generated(table: CommandsTable, name: str, simulator: AnySimulator, rng: np.random.Generator) -> Trajectory:
     """A recording of random commands whose positions are still to be simulated."""
     command_time, command = random_walk(table, len(simulator.channel_names), rng)
     time = table.sample_time * np.arange(round(table.duration / table.sample_time) + 1)
     markers = _known_markers(table.markers or simulator.marker_names, simulator)
-    places = simulator.robot.marker_points()[[simulator.marker_names.index(name) for name in markers]]
+    places = simulator.marker_points()[[simulator.marker_names.index(name) for name in markers]]
     return Trajectory.build(
         name=name,
         robot=simulator.robot.name,
@@ -127,14 +193,14 @@ def _generated(table: CommandsTable, name: str, simulator: RobotSimulator, rng: 
         position=np.tile(places, (len(time), 1, 1)),
         command_time=command_time,
         command=command,
-        command_unit=simulator.robot.command_unit,
+        command_unit=simulator.command_unit,
         marker_names=markers,
         cable_names=simulator.channel_names,
         synthetic=True,
     )
 
 
-def _known_markers(names: Sequence[str], simulator: RobotSimulator) -> list[str]:
+def _known_markers(names: Sequence[str], simulator: AnySimulator) -> list[str]:
     for name in names:
         if name not in simulator.marker_names:
             remedy = nearest(name, simulator.marker_names)
@@ -143,16 +209,14 @@ def _known_markers(names: Sequence[str], simulator: RobotSimulator) -> list[str]
 
 
 def _as_trajectory(
-    source: Trajectory,
-    position: Float[np.ndarray, "time marker 3"],
-    pose: Float[np.ndarray, "time 7"] | None,
-    markers: Sequence[str],
-    simulator: RobotSimulator,
+    found: Simulated,
+    simulator: AnySimulator,
     experiment: Experiment,
     values: Mapping[str, float],
     index: int,
 ) -> Trajectory:
     """The simulated motion as a recording that says it is synthetic, and how it was made."""
+    source, position = found.source, found.position
     if experiment.noise is not None:
         key = jax.random.fold_in(jax.random.key(experiment.seed), index)
         position = position + _noise(experiment.noise, key, source.time, position.shape[1])
@@ -170,12 +234,12 @@ def _as_trajectory(
         format="netcdf",
         time=source.time,
         position=position,
-        object_pose=pose,
+        object_pose=found.pose,
         command_time=source.command_time,
         command=source.command,
         command_unit=source.command_unit,
         initial_command=source.initial_command,
-        marker_names=markers,
+        marker_names=found.markers,
         cable_names=source.cable_names,
         synthetic=True,
         provenance="synthetic: made by rfdropo simulate",

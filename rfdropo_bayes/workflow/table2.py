@@ -23,7 +23,8 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.report import software_versions
-from rfdropo_bayes.workflow.audit import EXTENDED, run_audit
+from rfdropo_bayes.workflow.audit import run_audit
+from rfdropo_bayes.workflow.audited import EXTENDED
 from rfdropo_bayes.workflow.calibration import run_calibration
 from rfdropo_bayes.workflow.experiment_file import describe, read_tables, self_contained
 from rfdropo_bayes.workflow.files import LOG, output_folder, run_ended, run_folder
@@ -130,7 +131,8 @@ def run_table2(
         audit: experiment file of the audit that extends the model.
         out: folder to write to; one folder for each experiment in it.
         size: see `Size`.
-        rows: names of `ROWS`; by default all where there is a cube, and `WITHOUT_CUBE` elsewhere.
+        rows: names of `ROWS` to do, in this order; by default all where there is a cube, and `WITHOUT_CUBE` elsewhere.
+            The tables hold all that is done.
         resume: keep what an interrupted study has done.
         only_done: tables of the cells that are done; nothing is computed.
         command: for the record.
@@ -158,7 +160,8 @@ def run_table2(
                     except InputError as error:  # a method that cannot is a row with its reason
                         failed[" ".join(map(str, job))] = str(error)
                     progress.stage((count + 1) / len(jobs), task=job[0], row=job[1], seed=job[2])
-        found = [cell for job in jobs if (cell := _cell(study, *job)) is not None]
+        known = [(task, row, seed) for task in study.experiments for row in ROWS for seed in range(size.seeds)]
+        found = [cell for job in known if (cell := _cell(study, *job)) is not None]
         content = {
             "schema_version": 1,
             "command": command,
@@ -166,7 +169,7 @@ def run_table2(
             "cells": found,
             "rows": [summarise(task, row, found) for task, row in dict.fromkeys((c["task"], c["row"]) for c in found)],
             "failed": failed,
-            "not_done": len(jobs) - len(found),
+            "not_done": sum(_cell(study, *job) is None for job in list_jobs(study)),
             "paper": PAPER,
             "versions": software_versions(),
         }
@@ -182,8 +185,7 @@ def list_jobs(study: Study, rows: Sequence[str] = ()) -> list[tuple[str, str, in
     jobs = []
     for seed in range(study.size.seeds):
         for task, path in study.experiments.items():
-            chosen = rows or (ROWS if has_cube(read_tables(path)) else WITHOUT_CUBE)
-            jobs += [(task, row, seed) for row in ROWS if row in chosen]
+            jobs += [(task, row, seed) for row in rows or (ROWS if has_cube(read_tables(path)) else WITHOUT_CUBE)]
     return jobs
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rfdropo_bayes.envs.episodes import Episodes, Settings
-from rfdropo_bayes.envs.randomisation import Layers, Point, Randomisation, Uniform, read_phi, read_posterior
+from rfdropo_bayes.envs.randomisation import Layers, Point, Randomisation, Uniform, drawn_rows, read_phi, read_posterior
 from rfdropo_bayes.envs.rendering import picture
 from rfdropo_bayes.envs.tasks import Task, observed_of, task_named
 from rfdropo_bayes.envs.vec_env import TrunkVecEnv
@@ -21,6 +21,7 @@ from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.robots import OBJECT
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.training.config import TrainingTable
 from rfdropo_bayes.training.evaluation import (
     Case,
@@ -36,8 +37,10 @@ from rfdropo_bayes.training.export import ExportedPolicy, export_policy, latency
 from rfdropo_bayes.training.figures import curve_figure, save_animation, success_figure
 from rfdropo_bayes.training.run import Trained, train
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values
+from rfdropo_bayes.workflow.calibrated import Calibration
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
 from rfdropo_bayes.workflow.files import run_folder
+from rfdropo_bayes.workflow.model import Model
 
 POLICY, CARD, SUMMARY, CURVE = "policy.onnx", "card.md", "summary.json", "curve.png"
 EVALUATION, TABLE, CSV, FIGURE = "evaluation.json", "evaluation.md", "episodes.csv", "success.png"
@@ -46,15 +49,49 @@ EVALUATION_SEED = 2_000_003  # none of the seeds that training or its evaluation
 SCHEMA_VERSION = 1
 
 
-def run_training(
-    path: Path, out: Path, *, overrides: Sequence[str] = (), resume: bool = False, overwrite: bool = False
-) -> dict[str, Any]:
-    """Train a policy on an experiment's simulator, and export it.
+def make_vec(
+    task: str, model: Model, *, posterior: Calibration | Path | None = None, n: int = 64, **options: Any
+) -> TrunkVecEnv:
+    """Environments of a task, side by side, for Stable-Baselines3.
 
     Args:
-        path: experiment file with a table [training].
+        task: "TrunkReach-v0" or "TrunkPush-v0".
+        model: that is simulated; its fixed values hold.
+        posterior: whose draws the episodes' parameters are, or its folder; nominal values without.
+        n: how many environments.
+        options: further keys of an experiment file's [training], such as ``observation`` or ``period``.
+
+    Raises:
+        InputError: an unknown task or key, or a posterior of another robot.
+    """
+    experiment = _with_training(model, {"task": task, **options})
+    table, chosen, simulator = _training(experiment, model.folder)
+    randomisation = _randomisation(table, experiment, simulator, model.folder, posterior)
+    return TrunkVecEnv(Episodes(simulator, chosen, n, randomisation, _settings(table)))
+
+
+def train_policy(
+    model: Model,
+    out: Path | str,
+    *,
+    posterior: Calibration | Path | None = None,
+    seed: int = 0,
+    resume: bool = False,
+    overwrite: bool = False,
+    tables: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> dict[str, Any]:
+    """Train a policy on a model, and export it.
+
+    Args:
+        model: that is simulated; its fixed values hold.
         out: folder to write to: policy.onnx, card.md, summary.json, curve.png, episodes.jsonl, TensorBoard's files and
             checkpoints.
+        posterior: whose draws the episodes' parameters are, or its folder.
+        seed: of all that is random.
+        resume: go on from the checkpoint of an interrupted run in ``out``; overwrite: start anew whatever it holds.
+        tables: of the experiment file that the model was read from, for the record.
+        options: keys of an experiment file's [training].
 
     Returns:
         the content of summary.json.
@@ -62,19 +99,20 @@ def run_training(
     Raises:
         InputError: bad input, before anything long has started.
     """
-    experiment, tables = load_experiment(path, overrides)
-    folder = Path(path).resolve().parent
+    experiment = _with_training(model, options)
+    folder = model.folder
+    if tables is None:
+        tables = {**Model.of_experiment(experiment, folder).tables(), "seed": seed}
     table, task, simulator = _training(experiment, folder)
-    randomisation = _randomisation(table, experiment, simulator, folder)
-    settings = Settings(actions=table.actions, observed=table.observation, period=table.period, noise=table.noise)
+    randomisation = _randomisation(table, experiment, simulator, folder, posterior)
+    settings = _settings(table)
     known = {"randomisation": randomisation.sha256, "simulator": simulator.description["content_sha256"]}
 
     def environments(lanes: int) -> TrunkVecEnv:
         return TrunkVecEnv(Episodes(simulator, task, lanes, randomisation, settings))
 
-    options: dict[str, Any] = {"tables": tables, "folder": folder, "data": known}
-    with run_folder(out, "train", **options, resume=resume, overwrite=overwrite) as out:
-        seed = experiment.seed
+    record: dict[str, Any] = {"tables": tables, "folder": folder, "data": known, "texts": model.texts()}
+    with run_folder(Path(out), "train", **record, resume=resume, overwrite=overwrite) as out:
         found = train(environments, table, out, seed=seed, gamma=task.gamma, resume=resume, fingerprint=known)
         layout = found.model.get_env().get_attr("layout")[0]
         facts = {
@@ -93,22 +131,46 @@ def run_training(
     return summary
 
 
-def run_evaluation(
-    path: Path,
+def run_training(path: Path, out: Path, *, overrides: Sequence[str] = (), **options: Any) -> dict[str, Any]:
+    """`train_policy` on what an experiment file with a table [training] says."""
+    experiment, tables = load_experiment(path, overrides)
+    model = Model.of_experiment(experiment, Path(path).resolve().parent)
+    return train_policy(model, out, seed=experiment.seed, tables=tables, **options)
+
+
+def _with_training(model: Model, options: Mapping[str, Any]) -> Experiment:
+    """The model's experiment with further keys of [training]."""
+    if not options:
+        return model.experiment
+    own = model.experiment.training
+    known = {} if own is None else own.model_dump(exclude_unset=True)
+    table = parse_table(TrainingTable, {**known, **options}, where="training")
+    return model.experiment.model_copy(update={"training": table})
+
+
+def _settings(table: TrainingTable) -> Settings:
+    return Settings(actions=table.actions, observed=table.observation, period=table.period, noise=table.noise)
+
+
+def evaluate_policies(
+    model: Model,
     policies: Sequence[Path],
-    out: Path,
+    out: Path | str,
     *,
+    posterior: Calibration | Path | None = None,
     episodes: int = 200,
     lanes: int = 64,
     seed: int = 0,
     film: bool = True,
-    overrides: Sequence[str] = (),
     overwrite: bool = False,
+    tables: Mapping[str, Any] | None = None,
+    **options: Any,
 ) -> dict[str, Any]:
-    """Play exported policies on the same episodes of an experiment's simulator.
+    """Play exported policies on the same episodes of a model.
 
     Args:
-        path: experiment file; its table [training] says which task and from where parameters are drawn.
+        model: that is simulated.
+        posterior: whose draws the episodes' parameters are, or its folder.
         policies: policy.onnx, or folders that hold one; named after their folders.
         out: folder to write to: evaluation.json, evaluation.md, episodes.csv, success.png, and a GIF of each policy's
             median episode.
@@ -116,6 +178,9 @@ def run_evaluation(
         lanes: episodes that are simulated at once.
         seed: of the cases.
         film: whether to draw the animations.
+        overwrite: start anew whatever ``out`` holds.
+        tables: of the experiment file that the model was read from, for the record.
+        options: keys of an experiment file's [training], such as the task.
 
     Returns:
         the content of evaluation.json.
@@ -123,13 +188,15 @@ def run_evaluation(
     Raises:
         InputError: bad input, or a policy for another layout.
     """
-    experiment, tables = load_experiment(path, overrides)
-    folder = Path(path).resolve().parent
+    experiment, folder = _with_training(model, options), model.folder
+    if tables is None:
+        tables = Model.of_experiment(experiment, folder).tables()
     table, task, simulator = _training(experiment, folder)
-    randomisation = _randomisation(table, experiment, simulator, folder)
+    randomisation = _randomisation(table, experiment, simulator, folder, posterior)
     loaded = {_name(p): ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies}
-    options: dict[str, Any] = {"tables": tables, "folder": folder, "options": {"episodes": episodes, "seed": seed}}
-    with run_folder(out, "evaluate", **options, overwrite=overwrite) as out:
+    chosen = {"episodes": episodes, "seed": seed}
+    record: dict[str, Any] = {"tables": tables, "folder": folder, "options": chosen, "texts": model.texts()}
+    with run_folder(Path(out), "evaluate", **record, overwrite=overwrite) as out:
         cases: list[Case] = []
         found: dict[str, list[Episode]] = {}
         for name, policy in loaded.items():
@@ -148,6 +215,15 @@ def run_evaluation(
     return content
 
 
+def run_evaluation(
+    path: Path, policies: Sequence[Path], out: Path, *, overrides: Sequence[str] = (), **options: Any
+) -> dict[str, Any]:
+    """`evaluate_policies` on what an experiment file with a table [training] says."""
+    experiment, tables = load_experiment(path, overrides)
+    model = Model.of_experiment(experiment, Path(path).resolve().parent)
+    return evaluate_policies(model, policies, out, tables=tables, **options)
+
+
 def _training(experiment: Experiment, folder: Path) -> tuple[TrainingTable, Task, RobotSimulator]:
     if experiment.training is None:
         raise InputError(
@@ -163,7 +239,11 @@ def _training(experiment: Experiment, folder: Path) -> tuple[TrainingTable, Task
 
 
 def _randomisation(
-    table: TrainingTable, experiment: Experiment, simulator: RobotSimulator, folder: Path
+    table: TrainingTable,
+    experiment: Experiment,
+    simulator: RobotSimulator,
+    folder: Path,
+    posterior: Calibration | Path | None = None,
 ) -> Randomisation:
     """Where parameters come from: values that are held, what is randomised, and what differs between episodes.
 
@@ -175,7 +255,11 @@ def _randomisation(
     fixed = fixed_values(experiment.model_copy(update={"model": held}), simulator)
     known = {spec.name for spec in simulator.parameters}
     parts: list[Randomisation] = [Point({name: value for name, value in fixed.items() if name in known})]
-    if table.randomisation != "none":
+    if isinstance(posterior, Calibration):
+        parts.append(drawn_rows(posterior.record, simulator.parameters))
+    elif posterior is not None:
+        parts.append(read_posterior(Path(posterior), simulator.parameters)[0])
+    elif table.randomisation != "none":
         parts.append(_randomised(table, simulator, folder))
     kind = parts[-1].kind
     start = {name: ends for name, ends in table.start.items() if name not in absent}

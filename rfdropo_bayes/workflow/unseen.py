@@ -1,11 +1,12 @@
-"""``rfdropo predict``: what a calibrated simulator expects of commands that were never run."""
+"""What a calibrated simulator expects of commands that were never run: ``predict``, and ``rfdropo predict``."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -20,21 +21,144 @@ from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
-from rfdropo_bayes.data import load_unseen, start_is_known
+from rfdropo_bayes.data import Trajectory, first_row_only, load_unseen, start_is_known
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.report.run_folder import POSTERIOR
+from rfdropo_bayes.report.trajectory_figures import draw_band
 from rfdropo_bayes.simulators.parameters import ParameterSpec
-from rfdropo_bayes.workflow.assembly import KNOWN, build_simulator, find_robot, fixed_values, measurement_specs
+from rfdropo_bayes.workflow.assembly import KNOWN, fixed_values, measurement_specs
+from rfdropo_bayes.workflow.calibrated import Calibration, axes_or_new
 from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.files import hashes, run_folder
+from rfdropo_bayes.workflow.model import Model
 from rfdropo_bayes.workflow.prediction import BEGUN, FITTED, HELD, KNOWN_NOISE, MARKER_ERRORS, NOISE, predict_new, thin
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 DRAWS = 200
 LEVELS = {"q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
 SCHEMA_VERSION = 1
 OBJECT, POSE_UNITS = "object", "m, m, m, and unit quaternion x, y, z, w"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a calibrated simulator expects of commands that were never run.
+
+    Attributes:
+        bands: mean and 5, 25, 75 and 95 % quantiles [m] of what would be measured, (time, marker, axis).
+        drawn: the same as draws.
+    """
+
+    bands: xr.Dataset
+    drawn: RecordingPrediction
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """One row per time [s]; columns ``<marker>_<axis>_<statistic>`` [m]."""
+        return _columns(self.bands)
+
+    def plot(self, marker: str | int = -1, axis: str = "x", ax: Axes | None = None) -> Axes:
+        """Draw one coordinate of one marker over time, with its 50 % and 90 % bands."""
+        names = self.drawn.marker_names
+        index = names.index(marker) if isinstance(marker, str) else range(len(names))[marker]
+        axes = axes_or_new(ax)
+        draw_band(axes, self.drawn, index, "xyz".index(axis))
+        axes.set_xlabel("time [s]")
+        axes.legend()
+        return axes
+
+    def save(self, folder: Path | str) -> list[Path]:
+        """Write prediction.nc and prediction.csv; return their paths."""
+        files = [Path(folder) / "prediction.nc", Path(folder) / "prediction.csv"]
+        files[0].parent.mkdir(parents=True, exist_ok=True)
+        with whole(files[0]) as partial:
+            self.bands.to_netcdf(partial, engine="h5netcdf")
+        with whole(files[1]) as partial:
+            self.frame.to_csv(partial, index=False, float_format="%.6f")
+        return files
+
+    def _repr_html_(self) -> str:
+        return self.bands._repr_html_()
+
+
+def predict(
+    fit: Calibration,
+    commands: Trajectory | tuple[Any, Any],
+    *,
+    start: Any = None,
+    draws: int = DRAWS,
+    seed: int = 0,
+) -> Prediction:
+    """Predict what the markers will do under given commands, from at most the start pose.
+
+    Args:
+        fit: a calibration, with its model.
+        commands: a recording, of which nothing but the commands and the first row is looked at; or a pair of times [s]
+            and commands (time, channel), in the robot's unit.
+        start: positions of the markers in the first row [m], (marker, 3), beside such a pair; unknown by default.
+        draws: of the posterior that are rolled out.
+        seed: of what is random.
+
+    Raises:
+        InputError: a calibration without its model, or commands of another robot.
+    """
+    model, record = fit.model, fit.record
+    if model is None:
+        raise InputError("the calibration has no model", where="predict", remedy="give the one that calibrate returned")
+    simulator, table = model.simulator, model.experiment.model
+    _check_noise(record, table.noise)
+    unseen = first_row_only(commands) if isinstance(commands, Trajectory) else _commanded(model, *commands, start)
+    fixed = {**fixed_values(model.experiment, simulator), **record.attrs.get(HELD, {})}
+    space = _fitted_space(record, simulator.parameters + measurement_specs(table))
+    recordings = gather_recordings(simulator, [unseen])
+    channels = (_markers(recordings, table.noise, record.attrs.get(KNOWN_NOISE)),)
+    program = TrajectoryModel(simulator, space, fixed, recordings, channels)
+    values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
+    belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
+    fitted, errors = record.attrs.get(FITTED, belonging), record.attrs.get(MARKER_ERRORS)
+    predicted = predict_new(
+        program,
+        [unseen],
+        values,
+        jax.random.key(seed),
+        chunk=simulator.lanes,
+        fitted=fitted,
+        errors=errors,
+        groups=table.groups,
+    )[0]
+    bands = summarise(predicted)
+    bands.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": model.name, "recording": unseen.name}
+    return Prediction(bands, predicted)
+
+
+def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
+    """Commands as a recording whose measurements are unknown, but for the start pose."""
+    clock, sent = np.asarray(time, dtype=float), np.asarray(command, dtype=float)
+    simulator = model.simulator
+    clock = np.append(clock, clock[-1] + (float(np.median(np.diff(clock))) if len(clock) > 1 else 1.0))
+    position = np.zeros((len(clock), len(simulator.marker_names), 3))
+    mask = np.zeros(position.shape[:2], dtype=bool)
+    if start is not None:
+        position[:], mask[0] = np.asarray(start, dtype=float), True
+    return Trajectory.build(
+        name="commands",
+        robot=model.name,
+        format="memory",
+        time=clock,
+        position=position,
+        position_mask=mask,
+        marker_names=simulator.marker_names,
+        command_time=clock[:-1],
+        command=sent,
+        command_unit=simulator.command_unit,
+        initial_command=sent[0],
+        cable_names=simulator.channel_names,
+        settings={"unseen": True},
+    )
 
 
 def run_prediction(
@@ -49,7 +173,7 @@ def run_prediction(
     seed: int | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Predict what the markers will do under given commands, from at most the start pose.
+    """Predict what the markers will do under the commands of a file, from at most the start pose.
 
     Writes ``prediction.nc`` (mean and the 5, 25, 75 and 95 % quantiles of what would be measured, in metres, in the
     robot's base frame), ``prediction.csv`` (the same, one row per time) and ``prediction.json``. Where the robot pushes
@@ -73,25 +197,9 @@ def run_prediction(
     if experiment.data is None:
         raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format the commands are")
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
-    _check_noise(record, experiment.model.noise)
     unseen = load_unseen(experiment.data, folder, commands, start, rows, record.attrs.get(BEGUN))
-    simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
-    fixed = {**fixed_values(experiment, simulator), **record.attrs.get(HELD, {})}
-    specs = simulator.parameters + measurement_specs(experiment.model)
-    space = _fitted_space(record, specs)
-    recordings = gather_recordings(simulator, [unseen])
-    channels = (_markers(recordings, experiment.model.noise, record.attrs.get(KNOWN_NOISE)),)
-    model = TrajectoryModel(simulator, space, fixed, recordings, channels)
-    values = thin({info.name: record.posterior[info.name] for info in record.free}, DRAWS)
-    key = jax.random.key(experiment.seed if seed is None else seed)
-    belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
-    fitted, errors = record.attrs.get(FITTED, belonging), record.attrs.get(MARKER_ERRORS)
-    groups = experiment.model.groups
-    predicted = predict_new(
-        model, [unseen], values, key, chunk=simulator.lanes, fitted=fitted, errors=errors, groups=groups
-    )[0]
-    table = summarise(predicted)
-    table.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": simulator.robot.name, "recording": unseen.name}
+    fit = Calibration(record, {}, "", Model.of_experiment(experiment, folder))
+    found = predict(fit, unseen, seed=experiment.seed if seed is None else seed)
     options = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
     settings: dict[str, Any] = {"tables": tables, "folder": folder, "options": options, "data": hashes([unseen])}
     with run_folder(out, "predict", **settings, overwrite=overwrite) as out:
@@ -102,17 +210,13 @@ def run_prediction(
             "commands": commands,
             "start_pose_known": start_is_known(unseen),
             "first_command": unseen.first_command,
-            "rows": len(predicted.time),
-            "draws": int(predicted.predicted.shape[0]),
+            "rows": len(found.drawn.time),
+            "draws": int(found.drawn.predicted.shape[0]),
             "unit": "m",
             "frame": unseen.dataset.attrs["frame"],
-            "simulator": simulator.description,
-            "files": [str(out / "prediction.nc"), str(out / "prediction.csv")],
+            "simulator": fit.model.simulator.description if fit.model else {},
+            "files": [str(file) for file in found.save(out)],
         }
-        with whole(out / "prediction.nc") as partial:
-            table.to_netcdf(partial, engine="h5netcdf")
-        with whole(out / "prediction.csv") as partial:
-            _columns(table).to_csv(partial, index=False, float_format="%.6f")
         write_text(out / "prediction.json", json.dumps(facts, indent=2) + "\n")
     return facts
 

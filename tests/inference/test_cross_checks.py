@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
@@ -41,6 +42,27 @@ def conjugate(y):
 def test_a_likelihood_that_cannot_be_traced_is_refused(method):
     with pytest.raises(InputError, match="no likelihood that JAX can trace"):
         methods.run(Decay(), method, {}, KEY)
+
+
+@jax.custom_jvp
+def compiled(x):
+    """As compiled rollouts are: not traced, with differences along a direction for its derivative."""
+    return jax.pure_callback(np.asarray, jax.ShapeDtypeStruct(jnp.shape(x), x.dtype), x, vmap_method="broadcast_all")
+
+
+@compiled.defjvp
+def _compiled_differences(primals, tangents):
+    (x,), (direction,) = primals, tangents
+    step = 1e-5 / jnp.maximum(jnp.abs(direction), 1e-12)
+    return compiled(x), (compiled(x + step * direction) - compiled(x)) / step
+
+
+def test_nuts_refuses_rollouts_whose_derivatives_are_differences():
+    def model(y):
+        numpyro.sample("y", dist.Normal(compiled(numpyro.sample("mu", dist.Normal(0.7, 1.5))), 0.8), obs=y)
+
+    with pytest.raises(InputError, match=r'NUTS needs the gradient .* simulator.engine = "jax"'):
+        methods.run(problem_from_numpyro(model, args=(np.array([0.1, 0.4]),)), "nuts", {}, KEY)
 
 
 @pytest.mark.parametrize(("method", "wrong"), [("nuts", {"chains": 0}), ("nested", {"live": 3})])

@@ -33,7 +33,7 @@ def record(run: Any) -> PosteriorRecord:
 @pytest.fixture(scope="module")
 def folder(run: Any, record: PosteriorRecord, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "new"
-    write_run(folder, record, run.facts, CONFIG)
+    write_run(folder, record, build_summary(record, run.facts), CONFIG)
     return folder
 
 
@@ -201,7 +201,7 @@ def test_an_unwritable_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     record, facts = bare()
     with pytest.raises(InputError, match="cannot be made"):
-        write_run(tmp_path / "file" / "run", record, facts, "")
+        write_run(tmp_path / "file" / "run", record, build_summary(record, facts), "")
 
 
 def test_numbers_for_people() -> None:

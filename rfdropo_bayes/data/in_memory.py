@@ -1,0 +1,157 @@
+"""Recordings from what a program holds: arrays, a table of pandas, a data set of xarray; units are converted here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from jaxtyping import Float
+
+from rfdropo_bayes.data.faults import fill_missing, find_faults
+from rfdropo_bayes.data.plain_csv import COMMAND_UNITS, METRES, CsvColumns, read_frame
+from rfdropo_bayes.data.trajectory import AXES, Trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.tables import nearest, parse_table
+
+FORMAT = "memory"
+
+
+def from_arrays(
+    *,
+    time: Float[Any, " time"],
+    position: Float[Any, "time marker 3"],
+    command: Float[Any, "command channel"],
+    markers: Sequence[str],
+    channels: Sequence[str],
+    command_time: Float[Any, " command"] | None = None,
+    initial_command: Float[Any, " channel"] | None = None,
+    position_unit: str = "m",
+    command_unit: str = "m",
+    tension: Float[Any, "time channel"] | None = None,
+    motor_angle: Float[Any, "time channel"] | None = None,
+    object_pose: Float[Any, "time 7"] | None = None,
+    name: str = "recording",
+    robot: str = "",
+) -> Trajectory:
+    """A recording from arrays.
+
+    Args:
+        time: of the observations [s].
+        position: of the markers, in the robot's base frame: x, y across, z along the axis away from the base. Positions
+            that are not a number are left out and counted.
+        command: cumulative commands, pull > 0, each in force until the next.
+        markers, channels: their names, in the order of the arrays.
+        command_time: from when each command is in force [s]; the first times of the observations by default.
+        initial_command: in force before the first one; the first one by default.
+        position_unit: "m", "cm" or "mm"; also of ``object_pose``.
+        command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor.
+        tension: [N]; not a number where it is missing.
+        motor_angle: [rad]; not a number where it is missing.
+        object_pose: centre and unit quaternion x, y, z, w of a pushed body.
+        name: of the recording; robot: that was recorded.
+
+    Raises:
+        InputError: an unknown unit, shapes that do not fit, times that do not increase, or lengths that cannot be
+            in the unit that was given.
+    """
+    metres, (unit, factor) = _unit(position_unit, METRES, name), _unit(command_unit, COMMAND_UNITS, name)
+    clock, place = np.asarray(time, dtype=float), metres * np.asarray(position, dtype=float)
+    sent = factor * np.asarray(command, dtype=float)
+    if place.shape != (len(clock), len(markers), 3):
+        wanted = f"({len(clock)} times, {len(markers)} markers, 3)"
+        raise InputError(f"positions have the shape {place.shape}, and not {wanted}", where=name)
+    stamps = clock[: len(sent)] if command_time is None else np.asarray(command_time, dtype=float)
+    if sent.shape != (len(stamps), len(channels)):
+        wanted = f"({len(stamps)} times, {len(channels)} channels)"
+        raise InputError(f"commands have the shape {sent.shape}, and not {wanted}", where=name)
+    faults = find_faults(clock, place)
+    pose = None if object_pose is None else np.asarray(object_pose, dtype=float) * np.repeat([metres, 1.0], [3, 4])
+    return Trajectory.build(
+        name=name,
+        robot=robot,
+        format=FORMAT,
+        time=clock,
+        position=fill_missing(clock, place),
+        position_mask=faults.mask,
+        marker_names=markers,
+        command_time=stamps,
+        command=sent,
+        command_unit=unit,
+        initial_command=sent[0] if initial_command is None else factor * np.asarray(initial_command, dtype=float),
+        cable_names=channels,
+        tension=None if tension is None else np.asarray(tension, dtype=float),
+        motor_angle=None if motor_angle is None else np.asarray(motor_angle, dtype=float),
+        object_pose=pose,
+        settings={"faults": faults.counts},
+    )
+
+
+def from_pandas(
+    frame: pd.DataFrame, columns: CsvColumns | Mapping[str, Any], name: str = "recording", *, mask_missing: bool = True
+) -> Trajectory:
+    """A recording from a table.
+
+    Args:
+        frame: one row per observation.
+        columns: what each column is, as in an experiment file's [data.columns]; see `CsvColumns`.
+        name: of the recording.
+        mask_missing: leave out and count positions that are not a number; else they are an error.
+
+    Raises:
+        InputError: a column that is not there or is no number, or columns that do not fit together.
+    """
+    if not isinstance(columns, CsvColumns):
+        columns = parse_table(CsvColumns, _as_lists(columns), where="columns")
+    return read_frame(frame, columns, name, mask_missing=mask_missing)
+
+
+def from_xarray(dataset: xr.Dataset, name: str = "recording", *, robot: str = "") -> Trajectory:
+    """A recording from a data set with ``position(time, marker, axis)`` and ``command(time, channel)``.
+
+    Dimensions may be in any order; ``command`` may have a clock of its own, ``command_time``. Markers and channels are
+    named by their coordinates, units stand in the variables' attribute ``units`` ("m" where it is missing). Further
+    variables are ``initial_command``, ``tension``, ``motor_angle`` and ``object_pose``.
+
+    Raises:
+        InputError: a variable, dimension or coordinate that is missing, or see `from_arrays`.
+    """
+    if "schema" in dataset.attrs:  # one of ours
+        return Trajectory(dataset)
+    channel = "cable" if "cable" in dataset.dims else "channel"
+    for key in ("position", "command", "marker", channel, "time"):
+        if key not in dataset.variables:
+            raise InputError(f"has no {key}", where=name, remedy="see Trajectory.from_xarray for the names")
+    clock = "command_time" if "command_time" in dataset["command"].dims else "time"
+    if list(dataset.indexes.get("axis", AXES)) != list(AXES):
+        raise InputError("the coordinates of axis are not x, y, z", where=name)
+    dims = {"position": ("time", "marker", "axis"), "command": (clock, channel), "initial_command": (channel,)}
+    dims |= {"tension": ("time", channel), "motor_angle": ("time", channel), "object_pose": ("time", "pose")}
+    known = {key: wanted for key, wanted in dims.items() if key in dataset}
+    for key, wanted in known.items():
+        if set(dataset[key].dims) != set(wanted):
+            raise InputError(f"{key} has the dimensions {dataset[key].dims}, and not {wanted}", where=name)
+    arrays = {key: dataset[key].transpose(*wanted).values for key, wanted in known.items()}
+    return from_arrays(
+        time=dataset["time"].values,
+        command_time=dataset[clock].values[: len(arrays["command"])],
+        markers=[str(marker) for marker in dataset["marker"].values],
+        channels=[str(value) for value in dataset[channel].values],
+        position_unit=str(dataset["position"].attrs.get("units", "m")),
+        command_unit=str(dataset["command"].attrs.get("units", "m")),
+        name=name,
+        robot=robot,
+        **arrays,
+    )
+
+
+def _unit(unit: str, known: Mapping[str, Any], where: str) -> Any:
+    if unit not in known:
+        raise InputError(f"unknown unit {unit!r}", where=where, remedy=nearest(unit, known))
+    return known[unit]
+
+
+def _as_lists(columns: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: list(value) if isinstance(value, tuple) and key != "axes" else value for key, value in columns.items()}

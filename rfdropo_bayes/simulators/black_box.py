@@ -1,0 +1,353 @@
+"""Any program that turns parameters and commands into marker positions, in the place of a robot's simulator."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots.parameter import Parameter
+from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
+from rfdropo_bayes.simulators.differences import LENGTH, with_differences
+from rfdropo_bayes.simulators.engine import distinct, flattened, padded
+from rfdropo_bayes.simulators.extended import ExtendedSimulator, Values
+from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, Mechanism, check_mechanisms, code_of, obstacle
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.process import ProcessSimulation
+from rfdropo_bayes.simulators.protocol import Observation, Result
+from rfdropo_bayes.tables import parse_table
+
+ANGLE = 0.1  # [rad]: size that perturbations of a motor's command are relative to
+SMALLEST_SHARE = 1e-3  # of its range: least size that perturbations of a parameter are relative to
+PROBED_ROWS = 3
+
+Batch = Mapping[str, Float[np.ndarray, " n"]]
+
+
+@dataclass(frozen=True)
+class BlackBox:
+    """A simulator of one's own; mechanisms of actuation and sensing act around it.
+
+    ``function(parameters, command)`` gets a dictionary of numbers and an array (row, channel). Row 0 of the command is
+    in force before the first step; row k is reached at the end of step k. It returns the marker positions [m] of the
+    same rows, (row, marker, 3); or a dictionary with ``position`` and, where ``cables`` are named, ``tension`` [N],
+    (row, cable). With ``batched`` it gets arrays (n,) and (n, row, channel) and returns (n, row, marker, 3). A list of
+    words in its place is a command line; `ProcessSimulation` says what that process reads and writes.
+
+    A rollout that raises, or returns a number that is not finite, counts as diverged. The same arguments must give the
+    same answer. Derivatives are central differences.
+
+    Args:
+        function: what simulates.
+        parameters: by name, each a `Parameter` or its fields. ``low`` and ``high`` must be there; ``unit`` is "-",
+            ``nominal`` the middle and ``prior`` uniform between the bounds where they are left out.
+        markers, channels, cables: names of the markers, of the command channels, and of the cables with a tension.
+        time_step: between rows of the command [s].
+        command_unit: "m" of cable, or "rad" of a motor.
+        name: of the simulator, for reports.
+        batched: whether the function takes many parameter sets at once.
+        lanes: parameter sets that it is given at once.
+        difference: relative step of derivatives; larger where the motion is rough on small scales.
+
+    Raises:
+        InputError: a parameter that is not described well, no marker or channel, or a time step that is not positive.
+    """
+
+    function: Callable[..., Any] | Sequence[str]
+    parameters: Mapping[str, Any]
+    markers: Sequence[str]
+    channels: Sequence[str]
+    time_step: float
+    command_unit: Literal["m", "rad"] = "m"
+    cables: Sequence[str] = ()
+    name: str = "black box"
+    batched: bool = False
+    lanes: int = 64
+    difference: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.markers or not self.channels or not self.time_step > 0.0:
+            raise InputError("needs a marker, a channel and a positive time step", where=self.name)
+        tables = {name: _parameter(name, table) for name, table in self.parameters.items()}
+        object.__setattr__(self, "parameters", tables)
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Markers, as mechanisms ask a robot for them."""
+        return tuple(self.markers)
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Command channels, as mechanisms ask a robot for them."""
+        return tuple(self.channels)
+
+    @property
+    def cable_names(self) -> tuple[str, ...]:
+        """Cables whose tension is returned."""
+        return tuple(self.cables)
+
+    @property
+    def gravity(self) -> Float[np.ndarray, "3"]:
+        """Along z, for mechanisms of the body, which ask any robot for it; none of them acts on a black box."""
+        return np.array([0.0, 0.0, -9.81])
+
+    @property
+    def specs(self) -> tuple[ParameterSpec, ...]:
+        """Its parameters."""
+        return tuple(
+            ParameterSpec(name, p.unit, p.low, p.high, p.nominal, p.prior, p.description)
+            for name, p in self.parameters.items()
+        )
+
+    @cached_property
+    def simulate(self) -> Callable[[Batch, np.ndarray], list[Any]]:
+        """Simulate a batch: what the function returned for each parameter set; None where it raised."""
+        function = self.function if callable(self.function) else ProcessSimulation(tuple(self.function), self.time_step)
+
+        def single(values: Mapping[str, float], command: np.ndarray) -> Any:
+            try:
+                return function(values, command)
+            except Exception:  # whatever a user's program raises for parameters that it cannot handle
+                return None
+
+        def one_by_one(values: Batch, commands: np.ndarray) -> list[Any]:
+            sets = [{name: float(column[k]) for name, column in values.items()} for k in range(len(commands))]
+            return [single(given, command) for given, command in zip(sets, commands, strict=True)]
+
+        def together(values: Batch, commands: np.ndarray) -> list[Any]:
+            try:
+                found = function(values, commands)
+            except Exception:
+                rows = [
+                    ({n: c[k : k + 1] for n, c in values.items()}, commands[k : k + 1]) for k in range(len(commands))
+                ]
+                return [None] if len(rows) == 1 else [answer for row in rows for answer in together(*row)]
+            parts = found if isinstance(found, Mapping) else {"position": found}
+            return [{name: np.asarray(part)[k] for name, part in parts.items()} for k in range(len(commands))]
+
+        return together if self.batched else one_by_one
+
+    @property
+    def digest(self) -> str:
+        """Digest of the source, as far as it can be read, and of the parameters."""
+        try:
+            source = inspect.getsource(self.function) if callable(self.function) else repr(tuple(self.function))
+        except (OSError, TypeError):
+            source = repr(getattr(self.function, "__qualname__", type(self.function).__qualname__))
+        return hashlib.sha256(repr((source, self.specs, self.time_step)).encode()).hexdigest()
+
+
+def _parameter(name: str, table: Parameter | Mapping[str, Any]) -> Parameter:
+    if isinstance(table, Parameter):
+        return table
+    fields = {"unit": "-", "description": name.replace("_", " "), **table}
+    where = f"parameter {name!r} of a black box"
+    for key in ("low", "high"):
+        if key not in fields:
+            raise InputError(f"the key {key!r} is missing", where=where, remedy="give both hard bounds")
+    fields.setdefault("nominal", 0.5 * (fields["low"] + fields["high"]))
+    fields.setdefault("prior", {"distribution": "Uniform", "low": fields["low"], "high": fields["high"]})
+    return parse_table(Parameter, fields, where=where)
+
+
+class Moved(NamedTuple):
+    """What a rollout returned, one row per row of the command."""
+
+    position: Float[Array, "row marker 3"]
+    tension: Float[Array, "row cable"]
+    failed: Bool[Array, ""]
+
+
+@dataclass(frozen=True)
+class BlackBoxSimulator(ExtendedSimulator):
+    """A `BlackBox` behind the `Simulator` protocol.
+
+    Attributes:
+        box: what simulates.
+        mechanisms: extensions of actuation and sensing, applied in the order given within each stage.
+
+    Raises:
+        InputError: a mechanism that acts on a body.
+    """
+
+    box: BlackBox
+    mechanisms: Sequence[Mechanism] = field(default_factory=tuple)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mechanisms", check_mechanisms(self.mechanisms))
+        for mechanism in self.mechanisms:
+            why = obstacle(mechanism, BLACK_BOX, BLACK_BOX)
+            if why is not None:
+                raise InputError(f"{mechanism.name} does not run here: {why}", where=self.box.name)
+
+    @property
+    def robot(self) -> BlackBox:
+        """What stands in the robot's place."""
+        return self.box
+
+    @property
+    def time_step(self) -> float:  # type: ignore[override]
+        """That of the box."""
+        return self.box.time_step
+
+    @property
+    def lanes(self) -> int:
+        """Parameter sets that it is given at once."""
+        return self.box.lanes
+
+    @property
+    def command_unit(self) -> str:
+        """Unit of the commands."""
+        return self.box.command_unit
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Markers of the box."""
+        return self.box.marker_names
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Command channels of the box."""
+        return self.box.channel_names
+
+    @property
+    def cable_names(self) -> tuple[str, ...]:
+        """Cables of the box."""
+        return self.box.cable_names
+
+    @cached_property
+    def parameters(self) -> tuple[ParameterSpec, ...]:
+        """Parameters of the box, then those of the mechanisms."""
+        return self.box.specs + tuple(spec for mechanism in self.mechanisms for spec in mechanism.parameters)
+
+    @property
+    def description(self) -> dict[str, object]:
+        """Engine, time step and mechanisms, with a digest of the source."""
+        return {
+            "engine": "function" if callable(self.box.function) else "process",
+            "precision": "float64",
+            "robot": self.box.name,
+            "time_step_s": self.time_step,
+            "mechanisms": [mechanism.name for mechanism in self.mechanisms],
+            "content_sha256": hashlib.sha256(self.box.digest.encode() + code_of(self.mechanisms)).hexdigest(),
+        }
+
+    def marker_points(self) -> Float[np.ndarray, "marker 3"]:
+        """Places one after the other along z: nobody knows where an undeformed black box has its markers."""
+        return np.arange(1.0, len(self.marker_names) + 1.0)[:, None] * np.array([0.0, 0.0, LENGTH])
+
+    def commands(
+        self,
+        time: Float[np.ndarray, " command"],
+        value: Float[np.ndarray, "command channel"],
+        initial: Float[np.ndarray, " channel"],
+        observation_time: Float[np.ndarray, " time"],
+    ) -> Commands:
+        """Recorded commands on the box's clock.
+
+        Raises:
+            InputError: the function fails on the first rows of them, at the nominal parameters.
+        """
+        found = commands_on_grid(time, value, initial, observation_time, time_step=self.time_step)
+        self._probe(np.concatenate([np.asarray(found.initial)[None], found.step])[:PROBED_ROWS])
+        return found
+
+    def _probe(self, command: Float[np.ndarray, "row channel"]) -> None:
+        """Raise InputError where the function does not do what a box's function must."""
+        values = {spec.name: spec.nominal for spec in self.box.specs}
+        remedy = "return positions (row, marker, 3) [m]; see BlackBox"
+        try:
+            if self.box.batched or not callable(self.box.function):
+                columns = {name: np.array([value]) for name, value in values.items()}
+                found = self.box.simulate(columns, command[None])[0]
+            else:
+                found = self.box.function(values, command)
+        except Exception as error:
+            raise InputError(f"raises {type(error).__name__}: {error}", where=self.box.name, remedy=remedy) from error
+        if found is None:
+            raise InputError("fails at its nominal parameters", where=self.box.name, remedy=remedy)
+        position, tension = self._parts(found)
+        wanted = (len(command), len(self.marker_names), 3), (len(command), len(self.cable_names))
+        if (position.shape, tension.shape) != wanted:
+            shapes = f"positions {position.shape}" + (f", tensions {tension.shape}" if self.cable_names else "")
+            raise InputError(f"returned {shapes}, and not {wanted}", where=self.box.name, remedy=remedy)
+
+    def _parts(self, found: Any) -> tuple[np.ndarray, np.ndarray]:
+        parts = found if isinstance(found, Mapping) else {"position": found}
+        position = np.asarray(parts["position"], dtype=float)
+        none = np.zeros((len(position), 0)) if not self.cable_names else np.zeros((0, 0))
+        return position, np.asarray(parts.get("tension", none), dtype=float)
+
+    def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
+        """Simulate from the initial state to the last observation, or so many time steps.
+
+        Raises:
+            InputError: a name that is not a parameter of this simulator.
+        """
+        values = self.complete(parameters)
+        steps = self.steps_seen(values, commands, self.time_step, steps)
+        own = {spec.name: jnp.asarray(values[spec.name], jnp.float64) for spec in self.box.specs}
+        initial, reached = self.actuated(values, commands, self.time_step)
+        command = jnp.concatenate([initial[None], reached]).astype(jnp.float64)
+        limit = jnp.asarray(len(command) - 1 if steps is None else steps, jnp.float64)
+        moved = self._differentiable((own, command), limit)
+        position = self.measured(values, sample(moved.position, commands), observed_at(commands, self.time_step))
+        status = jnp.where(moved.failed, int(Result.DIVERGED), int(Result.OK))
+        angle = self.driven(values, commands, self.time_step)
+        return Observation(position, sample(moved.tension, commands), None, status, angle)
+
+    @cached_property
+    def _differentiable(self) -> Any:
+        sizes = {
+            spec.name: SMALLEST_SHARE * (spec.high - spec.low) if np.isfinite(spec.high - spec.low) else 1e-12
+            for spec in self.box.specs
+        }
+        stroke = LENGTH if self.command_unit == "m" else ANGLE
+
+        def size(inputs: tuple[dict[str, Array], Array]) -> tuple[dict[str, Array], Array]:
+            own, command = inputs
+            return {name: jnp.abs(v) + sizes[name] for name, v in own.items()}, jnp.full_like(command, stroke)
+
+        return with_differences(self._call, size, "float64", difference=self.box.difference)
+
+    def _call(self, inputs: tuple[dict[str, Array], Array], limit: Array) -> Moved:
+        """One callback for the whole batch."""
+        rows = inputs[1].shape[0]
+        shapes = Moved(
+            jax.ShapeDtypeStruct((rows, len(self.marker_names), 3), jnp.float64),
+            jax.ShapeDtypeStruct((rows, len(self.cable_names)), jnp.float64),
+            jax.ShapeDtypeStruct((), jnp.bool_),
+        )
+        return jax.pure_callback(self._on_host, shapes, inputs, limit, vmap_method="broadcast_all")
+
+    def _on_host(self, inputs: tuple[dict[str, Array], Array], limit: Array) -> Moved:
+        """Flatten whatever batch axes vmap has added, simulate what differs, and restore them."""
+        batch, rows = inputs[1].shape[:-2], inputs[1].shape[-2]
+        count, steps = int(np.prod(batch)), int(np.max(limit))
+        given = jax.tree.map(lambda value: flattened(np.asarray(value), len(batch), count), inputs)
+        chosen, place = distinct(jax.tree.leaves(given))
+        values, command = jax.tree.map(lambda value: value[chosen], given)
+        found = self._rolled(values, command[:, : steps + 1])
+        position, tension, failed = (part[place].reshape((*batch, *part.shape[1:])) for part in found)
+        return Moved(padded(position, len(batch), rows), padded(tension, len(batch), rows), failed)
+
+    def _rolled(self, values: Batch, command: Float[np.ndarray, "n row channel"]) -> Moved:
+        """Rollouts of a batch; those that failed are zero."""
+        count, rows = command.shape[:2]
+        position = np.zeros((count, rows, len(self.marker_names), 3))
+        tension, failed = np.zeros((count, rows, len(self.cable_names))), np.zeros(count, dtype=bool)
+        for k, found in enumerate(self.box.simulate(values, command)):
+            own, pull = self._parts(found) if found is not None else (np.full(1, np.nan), np.zeros(0))
+            failed[k] = not (own.shape == position[k].shape and np.isfinite(own).all() and np.isfinite(pull).all())
+            if not failed[k]:
+                position[k], tension[k] = own, pull
+        return Moved(position, tension, failed)

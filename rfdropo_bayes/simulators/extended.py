@@ -1,0 +1,116 @@
+"""What every simulator that mechanisms may extend has: drives before what moves, and measurement after it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
+from rfdropo_bayes.simulators.mechanisms import (
+    ActuationMechanism,
+    Mechanism,
+    SensingMechanism,
+    TimedSensingMechanism,
+    inside_drive,
+    settled,
+)
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
+
+Values = Mapping[str, Float[Array, ""]]
+
+
+class ExtendedSimulator:
+    """Base of simulators whose mechanisms act on the commands before the motion and on its measurement.
+
+    Attributes:
+        mechanisms: extensions, applied in the order given within each stage.
+        time_step: of the simulation [s].
+    """
+
+    mechanisms: Sequence[Mechanism]
+    time_step: float
+
+    @property
+    def parameters(self) -> tuple[ParameterSpec, ...]:
+        """Every parameter that may be given to ``rollout``, those of the mechanisms last."""
+        raise NotImplementedError
+
+    def marker_points(self) -> Float[np.ndarray, "marker 3"]:
+        """Any place that the markers can have [m]."""
+        raise NotImplementedError
+
+    def complete(self, parameters: Values) -> dict[str, Array]:
+        """All values by name; those left out are nominal.
+
+        Raises:
+            InputError: a name that is not a parameter of this simulator.
+        """
+        check_names(parameters, self.parameters, where="rollout")
+        return {spec.name: jnp.asarray(spec.nominal) for spec in self.parameters} | dict(parameters)
+
+    def actuated(
+        self, values: Values, commands: Commands, time_step: float, *, drives_only: bool = False
+    ) -> tuple[Float[Array, " channel"], Float[Array, "step channel"]]:
+        """Commands that reach the cables before the first step and at the end of every step; or the drives, before the
+        transmission."""
+        command = jnp.asarray(commands.step)
+        initial = jnp.asarray(commands.initial, command.dtype)
+        for mechanism in self.mechanisms:
+            if isinstance(mechanism, ActuationMechanism) and (inside_drive(mechanism) or not drives_only):
+                command = mechanism.actuate(values, command, initial, time_step)
+                initial = settled(mechanism, values, initial)
+        return initial, command
+
+    def driven(self, values: Values, commands: Commands, time_step: float) -> Float[Array, "time channel"]:
+        """Where the drives stand at the observation times, in the unit of the commands.
+
+        Limits of the cables' displacements are no part of it. Whoever does not look at it pays nothing under ``jit``.
+        """
+        initial, command = self.actuated(values, commands, time_step, drives_only=True)
+        return sample(jnp.concatenate([initial[None], command]), commands)
+
+    def steps_seen(
+        self, values: Values, commands: Commands, time_step: float, steps: Int[Array, ""] | None
+    ) -> Int[Array, ""] | None:
+        """Time steps to simulate so that all rows within the first ``steps`` are measured as in a whole rollout.
+
+        Mechanisms of sensing may look at later rows, as cameras on a clock that is late do. How far is found from what
+        they make of positions that are unknown from some row on.
+        """
+        if steps is None or not any(isinstance(mechanism, TimedSensingMechanism) for mechanism in self.mechanisms):
+            return steps
+        values = {name: jax.lax.stop_gradient(value) for name, value in values.items()}
+        end = jnp.asarray(commands.sample_step + (commands.sample_fraction > 0))
+        time, rows = observed_at(commands, time_step), len(end)
+        wanted = end <= steps
+        place = jnp.asarray(self.marker_points())
+
+        def suffices(later: Array) -> Array:
+            known = jnp.arange(rows) < wanted.sum() + later
+            position = jnp.where(known[:, None, None], place, jnp.nan)
+            seen = jnp.isfinite(self.measured(values, position, time)).all(axis=(1, 2))
+            return jnp.all(seen | ~wanted)
+
+        later = jnp.concatenate([jnp.zeros(1, int), 2 ** jnp.arange(max(rows - 1, 1).bit_length() + 1)])
+        enough = jax.vmap(suffices)(later)
+        found = jnp.where(enough.any(), later[jnp.argmax(enough)], rows)
+        last = jnp.clip(wanted.sum() + found - 1, 0, rows - 1)
+        return jnp.where(found > 0, jnp.maximum(steps, end[last]), steps)
+
+    def measured(
+        self,
+        values: Values,
+        position: Float[Array, "time marker 3"],
+        time: Float[Array, " time"],
+    ) -> Float[Array, "time marker 3"]:
+        """Marker positions as they are measured [m], given the true ones and when they are seen [s]."""
+        for mechanism in self.mechanisms:
+            if isinstance(mechanism, SensingMechanism):
+                position = mechanism.sense(values, position)
+            elif isinstance(mechanism, TimedSensingMechanism):
+                position = mechanism.sense_over_time(values, position, time)
+        return position

@@ -1,0 +1,102 @@
+"""What an audit found, as an object that shows itself and writes its files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from rfdropo_bayes.files import write_text
+from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.workflow.experiment import Experiment
+from rfdropo_bayes.workflow.experiment_file import describe
+from rfdropo_bayes.workflow.model import Model
+
+AUDIT, EXTENDED, REPORT = "audit.json", "extended.toml", "report.html"
+
+
+@dataclass(frozen=True)
+class Audit:
+    """What a simulator lacks, by name.
+
+    Attributes:
+        content: of audit.json.
+        tables: of the experiment extended by what was adopted, as a file has them.
+        page: of the report, HTML.
+        robot: that was audited: a name or path, or the object itself.
+        base: folder that paths in the tables are relative to.
+        folder: that it was written to, if any.
+    """
+
+    content: Mapping[str, Any]
+    tables: Mapping[str, Any]
+    page: str
+    robot: Any
+    base: Path
+    folder: Path | None = None
+
+    @property
+    def verdict(self) -> str:
+        """explained, equivalent, partly_explained, unexplained, no_discrepancy or no_verdict."""
+        return str(self.content["verdict"])
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words that a lab can act on."""
+        return str(self.content["sentence"])
+
+    @cached_property
+    def findings(self) -> pd.DataFrame:
+        """One row per parameter of what was named: mean, 5 and 95 % quantile, unit, and how much it explains."""
+        columns = ("explained_fraction", "adjusted_p", "log_bayes_factor")
+        rows = [
+            {"mechanism": found["mechanism"], "parameter": name, **row, **{key: found[key] for key in columns}}
+            for found in self.content["findings"]
+            for name, row in found["parameters"].items()
+        ]
+        index = ["mechanism", "parameter"]
+        return pd.DataFrame(rows).set_index(index) if rows else pd.DataFrame(columns=["mean", "unit", *columns])
+
+    @cached_property
+    def candidates(self) -> pd.DataFrame:
+        """Every mechanism that was tried, with its statistics."""
+        return pd.DataFrame(self.content["candidates"])
+
+    @property
+    def gain(self) -> Mapping[str, Any] | None:
+        """Errors on unseen recordings without and with what was found; None where nothing was found."""
+        return self.content["gain"]
+
+    @property
+    def extended(self) -> Model:
+        """The model with the mechanisms that unseen recordings support, with priors for their parameters."""
+        experiment = parse_table(Experiment, self.tables, where=EXTENDED)
+        if self.robot is not None:
+            experiment = experiment.model_copy(update={"robot": self.robot})
+        return Model.of_experiment(experiment, self.base)
+
+    def report(self, path: Path | str) -> Path:
+        """Write the report, one HTML page that needs nothing else; return its path."""
+        write_text(Path(path), self.page)
+        return Path(path)
+
+    def save(self, folder: Path | str) -> Path:
+        """Write audit.json, extended.toml and report.html; return the path of the report."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_text(folder / AUDIT, json.dumps(self.content, indent=2, allow_nan=False) + "\n")
+        write_text(folder / EXTENDED, describe(self.tables))
+        return self.report(folder / REPORT)
+
+    def _repr_html_(self) -> str:
+        table = self.findings.to_html(float_format=lambda x: f"{x:.3g}") if len(self.findings) else ""
+        return f"<p><b>{escape(self.verdict.replace('_', ' '))}</b>: {escape(self.sentence)}</p>{table}"
+
+    def __repr__(self) -> str:
+        return f"{self.verdict}: {self.sentence}"

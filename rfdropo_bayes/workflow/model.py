@@ -1,0 +1,188 @@
+"""A model: what is simulated, what is inferred, and what is measured, whether a file or a program says so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.model import TrajectoryModel
+from rfdropo_bayes.bayes.noise.autoregression import STATED
+from rfdropo_bayes.bayes.priors import table_of
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.workflow.assembly import (
+    build_model,
+    build_problem,
+    build_simulator,
+    expand_groups,
+    find_workpiece,
+    fixed_values,
+    measurement_specs,
+)
+from rfdropo_bayes.workflow.experiment import Experiment, Workpiece
+from rfdropo_bayes.workflow.experiment_file import ROBOT_COPY, describe
+from rfdropo_bayes.workflow.prediction import Batch
+
+
+class Model:
+    """Robot or black box, with mechanisms, priors and noise.
+
+    Args:
+        robot: name of a robot that comes with the package, path of a robot file, a `Robot`, or a `BlackBox`.
+        priors: what is inferred: {parameter: prior}. A prior is a numpyro distribution, a table such as
+            ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``, or ``{}`` for the parameter's default.
+            For a black box, all its parameters with their own priors by default.
+        mechanisms: effects on top of the base simulator: names of the library, ``"file.py:ClassName"``, or mechanisms
+            of one's own, as classes or objects.
+        noise: of the positions, by name as in an experiment file; or, where it is known,
+            ``{"standard_deviation": m}``, perhaps with a ``correlation_time`` [s].
+        fixed: values of parameters that are not inferred.
+        simulator: body, engine and discretisation: the keys of an experiment file's [simulator].
+        folder: that paths are relative to.
+        more: further keys of an experiment file's [model], such as ``tension = True`` or ``per_recording``.
+
+    Raises:
+        InputError: an unknown robot, key or mechanism, or a distribution that cannot be a prior. What is wrong with a
+            prior's numbers is said when recordings are there.
+    """
+
+    def __init__(
+        self,
+        robot: str | Path | Robot | BlackBox,
+        *,
+        priors: Mapping[str, Any] | None = None,
+        mechanisms: Sequence[Any] = (),
+        noise: str | Mapping[str, float] = "auto",
+        fixed: Mapping[str, float] | None = None,
+        simulator: Mapping[str, Any] | None = None,
+        folder: Path | str = Path(),
+        **more: Any,
+    ) -> None:
+        fixed = dict(fixed or {})
+        if priors is None and isinstance(robot, BlackBox):
+            priors = {name: {} for name in robot.parameters if name not in fixed}
+        given = {name: table_of(prior, where=f"priors, {name}") for name, prior in (priors or {}).items()}
+        stated = isinstance(noise, Mapping)
+        described = {"priors": given, "noise": STATED if stated else noise, "fixed": fixed, **more}
+        named = [mechanism for mechanism in mechanisms if isinstance(mechanism, str)]
+        tables: dict[str, Any] = {"robot": _name(robot), "model": {**described, "mechanisms": named}}
+        if stated:
+            tables["noise"] = dict(noise)
+        if simulator:
+            tables["simulator"] = dict(simulator)
+        experiment = parse_table(Experiment, tables, where="Model")
+        if not isinstance(robot, str | Path):
+            experiment = experiment.model_copy(update={"robot": robot})
+        if len(named) < len(mechanisms):
+            table = experiment.model.model_copy(update={"mechanisms": list(mechanisms)})
+            experiment = experiment.model_copy(update={"model": table})
+        self._set(experiment, Path(folder))
+
+    def _set(self, experiment: Experiment, folder: Path) -> None:
+        self.experiment, self.folder = experiment, folder
+        self.robot = find_workpiece(experiment, folder)
+
+    @classmethod
+    def of_experiment(cls, experiment: Experiment, folder: Path) -> Model:
+        """The model that an experiment file describes; ``folder`` is that of the file."""
+        model = cls.__new__(cls)
+        model._set(experiment, folder)
+        return model
+
+    @cached_property
+    def simulator(self) -> RobotSimulator | BlackBoxSimulator:
+        """The simulator, mechanisms included."""
+        return build_simulator(self.experiment, self.robot, self.folder)
+
+    @property
+    def name(self) -> str:
+        """That of the robot."""
+        return self.robot.name
+
+    @property
+    def mechanisms(self) -> tuple[str, ...]:
+        """Names of its mechanisms."""
+        return tuple(mechanism.name for mechanism in self.simulator.mechanisms)
+
+    @property
+    def parameters(self) -> pd.DataFrame:
+        """Every parameter of simulator and measurement: unit, hard bounds, nominal value, prior where inferred."""
+        table = self.experiment.model
+        specs = self.simulator.parameters + measurement_specs(table)
+        given = expand_groups(table.priors, specs)
+        added = {spec.name for mechanism in self.simulator.mechanisms for spec in mechanism.parameters}
+        added |= {spec.name for spec in measurement_specs(table)}
+        fixed = fixed_values(self.experiment, self.simulator)
+        rows = {}
+        for spec in specs:
+            inferred = spec.name in given or (spec.name in added and spec.name not in fixed)
+            prior = dict(given.get(spec.name) or spec.prior) if inferred else None
+            value = None if inferred else fixed.get(spec.name, spec.nominal)
+            rows[spec.name] = {"unit": spec.unit, "low": spec.low, "high": spec.high, "value": value, "prior": prior}
+        return pd.DataFrame.from_dict(rows, orient="index")
+
+    def with_mechanisms(self, *names: Any) -> Model:
+        """The same model with more mechanisms."""
+        table = self.experiment.model
+        table = table.model_copy(update={"mechanisms": [*table.mechanisms, *names]})
+        return Model.of_experiment(self.experiment.model_copy(update={"model": table}), self.folder)
+
+    def numpyro(self, runs: Sequence[Trajectory]) -> TrajectoryModel:
+        """The model of these recordings as a numpyro model: a callable with sample sites for all that is inferred.
+
+        Raises:
+            InputError: unknown names, or priors outside the bounds.
+        """
+        return build_model(self.experiment, self.simulator, runs)
+
+    def problem(self, runs: Sequence[Trajectory], earlier: Batch | None = None) -> CalibrationProblem:
+        """The posterior given these recordings, as the inference methods see it."""
+        return build_problem(self.numpyro(runs), earlier)
+
+    def tables(self) -> dict[str, Any]:
+        """The tables of an experiment file that says the same, as far as a file can."""
+        experiment = self.experiment
+        tables = experiment.model_dump(mode="json", exclude={"robot", "model"}, exclude_unset=True)
+        model = experiment.model.model_dump(mode="json", exclude={"mechanisms"}, exclude_unset=True)
+        names = [source_of(mechanism) for mechanism in experiment.model.mechanisms]
+        robot = ROBOT_COPY if self.texts() else str(getattr(experiment.robot, "name", experiment.robot))
+        model = {key: value for key, value in model.items() if value != {}}
+        return {"robot": robot, **tables, "model": {**model, "mechanisms": names}}
+
+    def texts(self) -> dict[str, str]:
+        """Files that the tables name and no folder holds: the description of a robot that was made in Python."""
+        if isinstance(self.experiment.robot, Robot):
+            return {ROBOT_COPY: describe(self.robot.model_dump(mode="json", exclude_none=True))}
+        return {}
+
+    def _repr_html_(self) -> str:
+        rows = self.parameters
+        inferred = rows[[prior is not None for prior in rows["prior"]]]
+        return f"<p><b>{self.name}</b>, {len(inferred)} of {len(rows)} parameters inferred</p>{inferred.to_html()}"
+
+
+def _name(robot: str | Path | Workpiece) -> str:
+    if isinstance(robot, str | Path):
+        return str(robot)
+    if not isinstance(robot, Robot | BlackBox):
+        raise InputError(
+            f"{type(robot).__name__} is no robot", where="Model", remedy="give a name, a path, a Robot or a BlackBox"
+        )
+    return robot.name
+
+
+def source_of(mechanism: str | type | Callable[..., Any]) -> str:
+    """Under which name a file would ask for a mechanism."""
+    if isinstance(mechanism, str):
+        return mechanism
+    kind = mechanism if isinstance(mechanism, type) else type(mechanism)
+    return f"{kind.__module__}:{kind.__qualname__}"
