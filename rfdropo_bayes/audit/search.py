@@ -1,8 +1,8 @@
 """The base model's optimum, looked for as `calibrate` looks for it: climbs from screened draws over growing horizons.
 
 Under a long recording the likelihood has many small summits, on which climbs of the whole end. `BaseProblem` shows the
-base model's posterior to `inference.laplace`, whose climbs begin at short prefixes; `better_nearby` then asks rollouts,
-not derivatives, whether the summit that was found is one.
+base model's posterior to `inference.find_modes`, whose climbs begin at short prefixes; `better_nearby` then asks
+rollouts, not derivatives, whether the summit that was found is one.
 """
 
 from __future__ import annotations

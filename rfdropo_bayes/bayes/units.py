@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-
-import numpy as np
-from jaxtyping import Float
 
 FORCES = frozenset({"N", "kg", "Pa", "J", "W"})  # units that hold one force each
 
@@ -20,9 +16,3 @@ def force_power(unit: str) -> int:
     """
     above, *below = [sum(part in FORCES for part in re.findall(r"[A-Za-z]+", side)) for side in unit.split("/")]
     return above - sum(below)
-
-
-def common_scale(units: Mapping[str, str], names: tuple[str, ...]) -> Float[np.ndarray, " d"]:
-    """Direction, of unit length in logarithms of the parameters, of their common scale of forces; zero if none has."""
-    powers = np.array([float(force_power(units[name])) for name in names])
-    return powers / max(float(np.linalg.norm(powers)), 1.0)

@@ -19,7 +19,6 @@ from rfdropo_bayes.runtime import configure_jax
 configure_jax()
 
 if TYPE_CHECKING:
-    from rfdropo_bayes.inference.checkpoints import Checkpoint as Checkpoint
     from rfdropo_bayes.inference.methods import METHODS as METHODS
     from rfdropo_bayes.inference.methods import make_config as make_config
     from rfdropo_bayes.inference.methods import method_named as method_named
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.nested import NestedConfig as NestedConfig
     from rfdropo_bayes.inference.nuts import NutsConfig as NutsConfig
     from rfdropo_bayes.inference.plain.problem import problem_from_numpyro as problem_from_numpyro
+    from rfdropo_bayes.inference.progress import Checkpoint as Checkpoint
     from rfdropo_bayes.inference.progress import Progress as Progress
     from rfdropo_bayes.inference.result import InferenceResult as InferenceResult
     from rfdropo_bayes.inference.rfdropo.search import RfdropoConfig as RfdropoConfig
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.rivals import NpdrConfig as NpdrConfig
     from rfdropo_bayes.inference.rivals import UdrConfig as UdrConfig
     from rfdropo_bayes.inference.rivals import import_sbi as import_sbi
-    from rfdropo_bayes.inference.schedules import next_step as next_step
     from rfdropo_bayes.inference.smc.bridge import BridgeConfig as BridgeConfig
     from rfdropo_bayes.inference.smc.sampler import SmcConfig as SmcConfig
+    from rfdropo_bayes.inference.smc.tempering import next_step as next_step
 
 PUBLIC = {
-    "Checkpoint": "checkpoints",
+    "Checkpoint": "progress",
     "METHODS": "methods",
     "make_config": "methods",
     "method_named": "methods",
@@ -56,7 +56,7 @@ PUBLIC = {
     "NpdrConfig": "rivals",
     "UdrConfig": "rivals",
     "import_sbi": "rivals",
-    "next_step": "schedules",
+    "next_step": "smc.tempering",
     "BridgeConfig": "smc.bridge",
     "SmcConfig": "smc.sampler",
 }

@@ -1,7 +1,8 @@
-"""Calls of a problem's likelihood: cleaned, counted, and charged to a budget of rollouts."""
+"""Calls of a problem's likelihood over prefixes of its rows: cleaned, counted, and charged to a budget of rollouts."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,7 +14,9 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.errors import InputError
 
+SPACINGS = ("geometric", "linear", "every")
 NOT_A_NUMBER = "not_a_number"
 REDRAWS = 256  # times as many prior draws as are wanted, at most
 
@@ -98,3 +101,25 @@ def representable_draws(
         drawn, found = drawn + n, found + int(held.sum())
     positions, densities = zip(*batches, strict=True)
     return np.concatenate(positions), np.concatenate(densities), drawn
+
+
+def block_boundaries(n_rows: int, blocks: int, spacing: str = "geometric") -> tuple[int, ...]:
+    """Prefix lengths at which a sequential method looks further ahead; strictly increasing, the last one ``n_rows``.
+
+    Args:
+        n_rows: rows of data.
+        blocks: number of blocks wanted; fewer where rows do not suffice.
+        spacing: ``"geometric"`` doubles (the sum of all prefixes stays below ``2 n_rows``), ``"linear"`` has equal
+            blocks, ``"every"`` has one block per row whatever ``blocks`` says.
+    """
+    if n_rows < 1 or blocks < 1:
+        raise InputError("a schedule needs at least one row and one block", where="[inference] blocks")
+    if spacing == "every":
+        return tuple(range(1, n_rows + 1))
+    if spacing == "linear":
+        raw = [n_rows * (k + 1) / blocks for k in range(blocks)]
+    elif spacing == "geometric":
+        raw = [n_rows * 2.0 ** (k + 1 - blocks) for k in range(blocks)]
+    else:
+        raise InputError(f"unknown spacing {spacing!r}", where="[inference] spacing", remedy=f"one of {SPACINGS}")
+    return tuple(sorted({max(1, math.ceil(value - 1e-9)) for value in raw}))

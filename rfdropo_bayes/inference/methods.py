@@ -14,9 +14,8 @@ from jaxtyping import PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import nested, nuts, rivals
-from rfdropo_bayes.inference.logbook import Logbook
 from rfdropo_bayes.inference.modes import search as laplace
-from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.progress import Logbook, Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.rfdropo import search as rfdropo
 from rfdropo_bayes.inference.smc import bridge

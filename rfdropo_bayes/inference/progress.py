@@ -1,22 +1,38 @@
-"""Progress of a long inference: a bar with the time left for people, one JSON line per stage for programs."""
+"""What a long inference shows and keeps as it goes.
+
+- `Progress`: a bar with the time left for people, one JSON line per stage for programs.
+- `Checkpoint`: a killed run goes on from its last whole stage and ends with the same draws.
+- `Logbook`: both of them, for a run or a part of one.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+import os
 import sys
 import time
+import zipfile
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 
-from rfdropo_bayes.files import append_line
+from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import append_line, whole
 from rfdropo_bayes.interrupts import check_interrupt
 
+SCHEMA_VERSION = 6
+_META = "meta_json"
 SHOWN = ("horizon", "ess", "acceptance", "loss", "rollouts")
 SECONDS_BETWEEN_LINES = 30.0  # where there is no terminal
 UNFINISHED = 0.99  # what rollouts alone can fill of the bar: stages say when the work is done
@@ -128,3 +144,124 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def run_digest(problem: Problem, method: str, config: Any, key: PRNGKeyArray) -> str:
+    """Digest of everything that a run's draws depend on: problem, method, its configuration and the random key.
+
+    The problem is known by its names, units, bounds, rows, its prior's density at a few of its own draws, and its
+    ``fingerprint`` where it has one.
+    """
+    probe = problem.to_unconstrained(problem.sample_prior(jax.random.key(0), 3))
+    parts = {
+        "schema": SCHEMA_VERSION,
+        "method": method,
+        "config": repr(config),
+        "key": np.asarray(jax.random.key_data(key)).tolist(),
+        "names": list(problem.names),
+        "units": dict(problem.units),
+        "bounds": {name: [float(x) for x in problem.bounds[name]] for name in problem.names},
+        "n_rows": int(problem.n_rows),
+        "prior": [float(x).hex() for x in np.asarray(problem.log_prior(probe)).ravel()],
+        "fingerprint": getattr(problem, "fingerprint", ""),
+    }
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+class Checkpoint:
+    """One file that is replaced whole after every stage: arrays, and everything else as JSON beside them.
+
+    Args:
+        path: the file; ``None`` keeps nothing.
+        digest: `run_digest` of the run; a file of another run is refused.
+    """
+
+    def __init__(self, path: Path | None, digest: str) -> None:
+        self.path, self.digest = path, digest
+
+    def save(self, arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> None:
+        """Write atomically: a kill leaves the previous file or this one, never half of one."""
+        if self.path is None:
+            return
+        text = json.dumps({"digest": self.digest, "schema_version": SCHEMA_VERSION, **meta})
+        entries: dict[str, Any] = {_META: np.frombuffer(text.encode(), dtype=np.uint8), **arrays}
+        with whole(self.path) as partial:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with partial.open("wb") as file:
+                np.savez(file, allow_pickle=False, **entries)
+                file.flush()
+                os.fsync(file.fileno())
+
+    def load(self) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
+        """Arrays and the rest of the last whole stage, or None where there is no checkpoint yet.
+
+        Raises:
+            InputError: the file is damaged, or belongs to another run.
+        """
+        if self.path is None or not self.path.exists():
+            return None
+        try:
+            with self.path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files if name != _META}
+                meta = json.loads(file[_META].tobytes())
+            digest = meta["digest"]
+        except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile) as error:
+            raise InputError(
+                "the checkpoint is damaged", where=str(self.path), remedy="delete it and start without --resume"
+            ) from error
+        if digest != self.digest:
+            raise InputError(
+                "the checkpoint belongs to a run with other data, priors, settings or seed",
+                where=str(self.path),
+                remedy="resume with the experiment it was made by, or start without --resume",
+            )
+        return arrays, meta
+
+
+def open_checkpoint(folder: Path | None, name: str, digest: str, *, resume: bool) -> Checkpoint:
+    """Checkpoint ``folder/name.npz`` of a run; unless resumed, one left by an earlier run is removed."""
+    if folder is None:
+        return Checkpoint(None, digest)
+    path = Path(folder) / f"{name}.npz"
+    if not resume:
+        path.unlink(missing_ok=True)
+    return Checkpoint(path, digest)
+
+
+UNSAVED = Checkpoint(None, "")
+
+
+@dataclass(frozen=True)
+class Logbook:
+    """Checkpoints and progress of a run; the empty one keeps and shows nothing.
+
+    Attributes:
+        folder: for checkpoints; None keeps none.
+        resume: go on from the checkpoints found there.
+        progress: where stages are reported.
+        begin, end: shares of the whole work that are done before this part of it and after.
+    """
+
+    folder: Path | None = None
+    resume: bool = False
+    progress: Progress | None = None
+    begin: float = 0.0
+    end: float = 1.0
+
+    def checkpoint(self, name: str, digest: str) -> Checkpoint:
+        """Checkpoint of a part of the run, see `open_checkpoint`."""
+        return open_checkpoint(self.folder, name, digest, resume=self.resume)
+
+    def part(self, begin: float, end: float, folder: str | None = None) -> Logbook:
+        """Of a part of the work, from one share of it to another, in a folder of its own where one is named."""
+        own = self.folder if self.folder is None or folder is None else self.folder / folder
+        width = self.end - self.begin
+        return Logbook(own, self.resume, self.progress, self.begin + begin * width, self.begin + end * width)
+
+    def stage(self, share: float, **facts: Any) -> None:
+        """Report the end of a stage, see `Progress.stage`."""
+        if self.progress is not None:
+            self.progress.stage(self.begin + share * (self.end - self.begin), **facts)
+
+
+UNRECORDED = Logbook()

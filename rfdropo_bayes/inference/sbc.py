@@ -22,8 +22,7 @@ from scipy.stats import chisquare
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.checkpoints import run_digest
-from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.progress import Progress, run_digest
 from rfdropo_bayes.posteriors import central_interval
 
 DRAWS = 99  # of each posterior, thinned: ranks run from 0 to 99

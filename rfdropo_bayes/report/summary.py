@@ -78,6 +78,7 @@ def build_summary(record: PosteriorRecord, facts: RunFacts) -> dict[str, Any]:
     summary = {
         "schema_version": SCHEMA_VERSION,
         **{key: getattr(facts, key) for key in ("title", "status", "robot", "method", "engine", "seed")},
+        "algorithm": facts.details.get("algorithm", facts.method),
         "seconds": facts.seconds,
         "rollouts": facts.rollouts,
         "evaluations": facts.evaluations,

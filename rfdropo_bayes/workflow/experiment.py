@@ -45,7 +45,8 @@ class ModelTable(Table):
     noise: Literal["auto", "white", "ar1", "student-t", "repeats", "stated"] = Field(
         default="auto",
         description="noise of the positions: white and lasting (auto), white, lasting (ar1), heavy-tailed (student-t);"
-        " of all that is measured, what repeats differ by (repeats); what [noise] says (stated); see docs/inference.md",
+        " of all that is measured, what repeats differ by (repeats); what [noise] says (stated);"
+        " see docs/likelihood.md",
     )
     priors: dict[str, dict[str, Any]] = Field(
         default_factory=dict,

@@ -89,11 +89,7 @@ def test_resumed_after_a_kill_at_any_stage(method, options, tmp_path):
     problem, counting = problem_for(method), Counting()
     whole = methods.run(problem, method, options, KEY, progress=counting)
     assert counting.count >= 3
-    every = (
-        range(counting.count)
-        if method == "smc" or "survey" in options
-        else (0, counting.count // 2, counting.count - 1)
-    )
+    every = range(counting.count) if method == "smc" else (0, counting.count // 2, counting.count - 1)
     for stages in every:
         folder = tmp_path / str(stages)
         with pytest.raises(Killed):
@@ -244,7 +240,7 @@ def test_a_damaged_checkpoint_is_refused(damage, tmp_path):
 def test_a_damaged_checkpoint_of_climbs_does_not_start_them_over(part, tmp_path):
     """They fall back to the prior, but only where no draw to climb from has a likelihood."""
     (tmp_path / f"{part}.npz").write_bytes(b"")
-    options = {"rollouts": 6000.0, "particles": 60}
+    options = {"rollouts": 6000.0, "particles": 60, "start": "optimum"}
     with pytest.raises(InputError, match="damaged"):
         methods.run(decay(), "smc", options, KEY, checkpoint_dir=tmp_path, resume=True)
 

@@ -13,8 +13,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.rivals import StandardPrior
-from rfdropo_bayes.inference.summaries import cross_correlation_summary, informative, thinned_summary
+from rfdropo_bayes.inference.rivals import StandardPrior, cross_correlation_summary, informative, thinned_summary
 
 from .toys import LinearGaussian, Spring
 

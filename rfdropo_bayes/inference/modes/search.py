@@ -1,54 +1,51 @@
-"""Calibration of long recordings: several Levenberg-Marquardt climbs over growing horizons, then Laplace."""
+"""Where modes are searched: climbs from the best of many prior draws, over growing horizons, then Laplace.
+
+1. Climbs start at draws from the prior that explain a short prefix of the data: the best one, and others of the best
+   quarter that lie far apart. Where a budget allows it, a survey takes their place: particles tempered from the prior
+   to the posteriors of short prefixes. A climb ends on the first of many small summits, and the best of some prior
+   draws need not lie near the highest. A population that is cooled slowly ends in the basins that hold the mass, at
+   horizons at which rollouts are cheap.
+2. Each climb is a Levenberg-Marquardt search at growing horizons. Short prefixes come first, because a long recording
+   has many local optima.
+3. From one horizon to the next goes one climb of each optimum, the better half of them, and every rival of the best.
+4. Around each optimum stands a normal distribution (Laplace's approximation), whose integral estimates its evidence.
+"""
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
-from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
+from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, Values
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
-from rfdropo_bayes.inference.checkpoints import UNSAVED, Checkpoint, run_digest
-from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.modes.basins import OneSummit, one_point, one_ridge
-from rfdropo_bayes.inference.modes.climb import (
-    Climbable,
-    Laplace,
-    LevenbergState,
-    climb_cost,
-    laplace,
-    maximise,
-    normal_at,
+from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.modes.climb import Climbable, Laplace, LevenbergState, climb_cost, laplace, maximise
+from rfdropo_bayes.inference.modes.targets import (
+    SmoothTarget,
+    log_likelihood_derivatives,
+    make_target,
+    prior_derivatives,
 )
-from rfdropo_bayes.inference.modes.climbs import RIVAL, Climbs, begin, go_on, pack, record, unpack, with_starts
-from rfdropo_bayes.inference.modes.first_climbs import screened, surveyed
-from rfdropo_bayes.inference.modes.newton import SmoothTarget, log_likelihood_derivatives
-from rfdropo_bayes.inference.modes.plateaus import climbs_from, plateaus
-from rfdropo_bayes.inference.modes.restarts import affordable_generations, astray, search
-from rfdropo_bayes.inference.modes.survey import survey
-from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
+from rfdropo_bayes.inference.progress import UNRECORDED, UNSAVED, Checkpoint, Logbook, run_digest
 from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_cautions, prior_cautions
-from rfdropo_bayes.inference.schedules import block_boundaries
-from rfdropo_bayes.inference.smc.mixture import prior_moments
-from rfdropo_bayes.inference.smc.moves import squared_distance
+from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc.moves import StraightProblem, squared_distance
 from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES
 
 JACOBIANS = ("auto", "forward", "central")
+SAME = 0.02  # largest difference of any coordinate between two climbs that ended at one point
+RIVAL = 30.0  # nats below the best optimum, beyond which another matters to no posterior: exp(-30) is 1e-13
 SURVEY_OF_CLIMBS = 0.6  # share of the budget of climbs that a survey before them may take, and of their progress
-# Horizons of climbs after a survey, as shares of the recording. From half of it to all of it in one step most climbs of
-# a push, where contacts begin and end, came to rest on the way.
-CONTINUED = (0.75, 0.875, 1.0)
-FOR_PLATEAUS = 0.1  # share of the budget of climbs, and of a survey, that is held back for plateaus
-FOR_SEARCH = 0.1  # the same for climbs that begin again, see `restarts`, unless none could be made otherwise
+SURVEYS = 2  # of the last prefixes, whose particles climbs start from; as many horizons of climbs come after
+SURVEY_MOVES = 8  # of a stage, at most: climbs need a place in the right basins, not a fair sample of them
 FEWEST_STEPS = 4.0  # of a climb that is worth its start
 
 
@@ -61,11 +58,9 @@ class LaplaceConfig:
             every rival of the best.
         screen: draws, from the prior or from where the problem says that climbs may start, judged at the first
             horizon: the best is the first start, the others lie apart from it among the best quarter.
-        survey: particles of a tempered population that finds the starts instead, for posteriors with many summits; it
-            takes the place of the climbs at short horizons, and those at longer ones begin at `CONTINUED`; then
-            plateaus are looked for, see `plateaus`; 0 for none. Only for problems with residuals.
-        blocks: horizons of a climb, or of the survey, doubling; short ones first, because a long recording has many
-            local optima.
+        survey: particles of the tempered population that finds the starts instead; 0 for none. Only for problems with
+            residuals.
+        blocks: horizons of a climb, or of the survey, doubling; climbs after a survey have two.
         max_steps: most steps of a climb at one horizon.
         tolerance: a climb ends when a step promises less [nat].
         jacobian: "forward", "central" or "auto".
@@ -98,6 +93,29 @@ class LaplaceConfig:
             )
 
 
+class Climbs(NamedTuple):
+    """State of several climbs over growing horizons.
+
+    Attributes:
+        positions: where each climb stands.
+        log_density: log posterior there, at the horizon of the climb's last visit.
+        converged: of the climb at that horizon.
+        level: index of the present horizon; done: climbs done at it.
+        noise: noise coordinates.
+        ledger, trace, seconds: as in every method.
+    """
+
+    positions: Float[np.ndarray, "start d"]
+    log_density: Float[np.ndarray, " start"]
+    converged: Bool[np.ndarray, " start"]
+    level: int
+    done: int
+    noise: Bool[np.ndarray, " d"] | None
+    ledger: Ledger
+    trace: list[dict[str, Any]]
+    seconds: float
+
+
 class Modes(NamedTuple):
     """Distinct optima at the full horizon, best evidence first, with what it took to find them."""
 
@@ -114,14 +132,14 @@ def find_modes(
     logbook: Logbook = UNRECORDED,
     ledger: Ledger | None = None,
 ) -> Modes:
-    """Climb from the best of some prior draws, or from the particles of a survey, to the optima of the full posterior.
+    """Climb from the best of some prior draws to the optima of the full posterior.
 
     Args:
         problem: to be climbed.
         config: settings.
         key: random key.
         checkpoint: of the climbs.
-        logbook: of the survey before them, and where stages are reported.
+        logbook: for the checkpoint of a survey, and where stages are reported.
         ledger: is charged; after an error it knows what was spent in vain.
 
     Raises:
@@ -129,42 +147,284 @@ def find_modes(
         NoLikelihoodError: none of the draws has a positive likelihood.
     """
     horizons, target_at = _targets(problem, config)
-    same: OneSummit = one_point
-    began_at = 0.0
-    if config.survey and isinstance(problem, ResidualProblem):
-        same, began_at = one_ridge(problem, key), SURVEY_OF_CLIMBS
     saved = checkpoint.load()
     if saved is None:
+        began = time.monotonic()
         ledger = Ledger() if ledger is None else ledger
-        climbs = _first(problem, config, key, horizons[0], ledger, logbook.part(0.0, began_at))
+        if config.survey and isinstance(problem, ResidualProblem):
+            starts = surveyed(problem, config, horizons[0], key, ledger, logbook.part(0.0, SURVEY_OF_CLIMBS))
+        else:
+            starts = screened(problem, config.screen, horizons[0], config.starts, key, ledger)
+        climbs = begin(*starts, ledger, time.monotonic() - began)
     else:
-        climbs = unpack(*saved)
+        climbs = _unpack(*saved)
     target = None
     while climbs.level < len(horizons):
-        began = time.monotonic()
+        began, horizon = time.monotonic(), horizons[climbs.level]
         if target is None:
-            target = target_at(horizons[climbs.level], climbs.ledger, climbs.positions[0], climbs.noise)
+            target = target_at(horizon, climbs.ledger, climbs.positions[0], climbs.noise)
         allowed = _affordable_steps(problem.n_rows, config, climbs, horizons, int(target.noise.sum()))
         state, steps = maximise(target, climbs.positions[climbs.done], max_steps=allowed, tolerance=config.tolerance)
-        climbs = record(climbs, state, len(steps), horizons[climbs.level], target)
-        if climbs.level_done and config.survey and isinstance(problem, ResidualProblem):
-            climbs = _with_search(problem, config, climbs, horizons, target_at, target, key)
-        if climbs.level_done:
-            _check_heights(climbs, horizons[climbs.level])
-            climbs = go_on(climbs, target, one_point if horizons[climbs.level] == horizons[-1] else same)
-            target = None
+        climbs = _record(climbs, state, len(steps), horizon, target)
+        if climbs.done == len(climbs.positions):
+            climbs, target = _go_on(climbs, horizon), None
         climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
-        checkpoint.save(*pack(climbs))
+        checkpoint.save(*_pack(climbs))
         share = (climbs.level + climbs.done / len(climbs.positions)) / len(horizons)
-        logbook.part(began_at, 1.0).stage(share, method="laplace", **climbs.trace[-1])
+        logbook.part(SURVEY_OF_CLIMBS * (config.survey > 0), 1.0).stage(share, method="laplace", **climbs.trace[-1])
     assert climbs.noise is not None
-    target = target_at(problem.n_rows, climbs.ledger, climbs.positions[0], climbs.noise)
-    on_plateaus: list[Laplace] = []
-    if config.survey and isinstance(problem, ResidualProblem):
-        began = time.monotonic()
-        on_plateaus = _on_plateaus(problem, config, climbs, target, key)
-        climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
-    return _collect(climbs, target, on_plateaus)
+    return _collect(climbs, target_at(problem.n_rows, climbs.ledger, climbs.positions[0], climbs.noise))
+
+
+def screened(
+    problem: Problem, screen: int, horizon: int, count: int, key: PRNGKeyArray, ledger: Ledger
+) -> tuple[Float[np.ndarray, "start d"], Float[np.ndarray, " start"]]:
+    """Some of many draws from the prior, or from where the problem says that climbs may start.
+
+    Args:
+        problem: to be climbed.
+        screen: number of draws.
+        horizon: at which draws are judged.
+        count: of starts wanted; there may be fewer.
+        key: random key.
+        ledger: is charged.
+
+    Returns:
+        unconstrained points, the best first, and their log posterior at the horizon.
+
+    Raises:
+        NoLikelihoodError: none of the draws has a positive likelihood.
+    """
+    draw = getattr(problem, "sample_starts", problem.sample_prior)
+    u = np.asarray(problem.to_unconstrained(draw(key, max(screen, count))), dtype=float)
+    density = _heights(problem, u, horizon, ledger)
+    order = _spread(u, density, count)
+    return u[order], density[order]
+
+
+def surveyed(
+    problem: ResidualProblem, config: LaplaceConfig, horizon: int, key: PRNGKeyArray, ledger: Ledger, logbook: Logbook
+) -> tuple[Float[np.ndarray, "start d"], Float[np.ndarray, " start"]]:
+    """Particles of the last prefixes of a survey, as many of each; the answer is that of `screened`.
+
+    The longest prefix knows best where the summit is, unless all its particles lie in one basin and the summit in
+    another; when those of a shorter one were drawn there was less between the two.
+    """
+    prefixes = block_boundaries(problem.n_rows, config.blocks + 1)
+    found = survey(problem, config, prefixes[:-1] or prefixes, key, ledger, logbook)[-SURVEYS:]
+    chosen = []
+    for index, (position, density) in enumerate(reversed(found)):
+        wanted = config.starts // len(found) + (index < config.starts % len(found))
+        chosen.append(position[_spread(position, density, wanted)[:wanted]])
+    u = np.concatenate(chosen)
+    density = _heights(problem, u, horizon, ledger)
+    order = np.argsort(-density, kind="stable")[: np.isfinite(density).sum()]
+    return u[order], density[order]
+
+
+def _heights(problem: Problem, u: Float[np.ndarray, "n d"], horizon: int, ledger: Ledger) -> Float[np.ndarray, " n"]:
+    """Log posterior of a prefix at some points.
+
+    Raises:
+        NoLikelihoodError: none has a positive likelihood.
+    """
+    density = evaluate_prior(problem, u) + evaluate_rows(problem, u, horizon, ledger).sum(axis=1)
+    if not np.isfinite(density).any():
+        raise NoLikelihoodError(
+            f"none of {len(u)} draws has a positive likelihood up to row {horizon} ({ledger.reasons})",
+            where="[model.priors]",
+            remedy="widen the priors, or look at what the simulator reports for them",
+        )
+    return density
+
+
+def _spread(u: Float[np.ndarray, "n d"], density: Float[np.ndarray, " n"], count: int) -> Int[np.ndarray, " k"]:
+    """The best draw, and then always the one of the best quarter that is farthest from those chosen.
+
+    The best few alone often lie together, and then all climb to one optimum of several.
+    """
+    order = np.argsort(-density, kind="stable")
+    order = order[np.isfinite(density[order]) & np.isfinite(u[order]).all(axis=1)]
+    if len(order) == 0:
+        return order
+    spread = u[order].std(axis=0)
+    order = order[: max(count, len(u) // 4)]
+    scaled = u[order] / np.maximum(spread, 1e-300)
+    chosen = [0]
+    while len(chosen) < min(count, len(order)):
+        distance = np.linalg.norm(scaled[:, None] - scaled[chosen], axis=2).min(axis=1)
+        chosen.append(int(np.argmax(distance)))
+    return order[chosen]
+
+
+class BlockProblem:
+    """Blocks of a problem's rows as its rows, which a sampler brings in by shares: it tempers a whole block at once."""
+
+    def __init__(self, problem: StraightProblem, horizons: tuple[int, ...]) -> None:
+        self.problem, self.horizons = problem, horizons
+        self.names, self.units, self.bounds = problem.names, problem.units, problem.bounds
+        self.status_names = problem.status_names
+        self.fingerprint = f"{problem.fingerprint} {horizons}"
+        self.n_rows = len(horizons)
+        self.sample_prior, self.log_prior = problem.sample_prior, problem.log_prior
+        self.to_unconstrained, self.from_unconstrained = problem.to_unconstrained, problem.from_unconstrained
+
+    def row_log_likelihood(self, values: Values, horizon: int) -> tuple[Float[Any, "n horizon"], Int[Any, " n"]]:
+        """Log density of the rows of each block together."""
+        rows, status = self.problem.row_log_likelihood(values, self.horizons[horizon - 1])
+        return np.add.reduceat(np.asarray(rows), [0, *self.horizons[: horizon - 1]], axis=1), status
+
+
+def survey(
+    problem: ResidualProblem,
+    config: LaplaceConfig,
+    horizons: tuple[int, ...],
+    key: PRNGKeyArray,
+    ledger: Ledger,
+    logbook: Logbook,
+) -> list[tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]]:
+    """Temper particles to the posteriors of growing prefixes.
+
+    Args:
+        problem: to be climbed.
+        config: with the number of particles.
+        horizons: the prefixes.
+        key: random key.
+        ledger: is charged.
+        logbook: for the checkpoint, and where stages are reported.
+
+    Returns:
+        for each prefix the particles that have arrived at its posterior, and not been moved there yet: unconstrained
+        positions, and their log posterior.
+
+    Raises:
+        NoLikelihoodError: no particle has a positive likelihood.
+    """
+    straight_key, run_key = jax.random.split(key)
+    blocks = BlockProblem(StraightProblem(problem, straight_key), horizons)
+    # The sampler takes blocks for rows of equal cost, which is more than short ones cost.
+    whole = None if config.rollouts is None else SURVEY_OF_CLIMBS * config.rollouts * problem.n_rows / horizons[-1]
+    sampling = horizon_smc.SmcConfig(
+        rollouts=whole,
+        particles=config.survey,
+        kernel="crank_nicolson",
+        blocks=len(horizons),
+        spacing="linear",
+        max_moves=SURVEY_MOVES,
+        draws=1,
+    )
+    checkpoint = logbook.checkpoint("survey", run_digest(blocks, "survey", sampling, run_key))
+    populations, state = _populations(blocks, sampling, run_key, checkpoint, logbook)
+    _charge(problem, horizons, state.trace, ledger)
+    ledger.excluded.update(state.ledger.excluded)
+    found = []
+    for block, (position, rows) in enumerate(populations, start=1):
+        values = blocks.from_unconstrained(jnp.asarray(position))
+        u = np.asarray(problem.to_unconstrained(values), dtype=float)
+        found.append((u, evaluate_prior(problem, u) + rows[:, :block].sum(axis=1)))
+    return found
+
+
+def _populations(
+    blocks: BlockProblem, config: horizon_smc.SmcConfig, key: PRNGKeyArray, checkpoint: Checkpoint, logbook: Logbook
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], horizon_smc.SmcState]:
+    """Positions and rows of the particles at the end of each block, and the sampler's last state."""
+    init_key, stage_key = jax.random.split(key)
+    plan = horizon_smc.make_plan(blocks, config)
+    ends: list[tuple[np.ndarray, np.ndarray]] = []
+    saved = checkpoint.load()
+    if saved is None:
+        state = horizon_smc.init(init_key, blocks, plan, config)
+    else:
+        arrays, meta = saved
+        state = horizon_smc.unpack(arrays, meta)
+        ends = [(arrays[f"positions_{block}"], arrays[f"rows_{block}"]) for block in range(meta["ends"])]
+    while not state.finished:
+        state, _ = horizon_smc.step(stage_key, state, blocks, plan, config)
+        population = state.population
+        if population.progress == len(ends) + 1:
+            ends.append((population.position, population.rows))
+        arrays, meta = horizon_smc.pack(state)
+        for block, (position, rows) in enumerate(ends):
+            arrays |= {f"positions_{block}": position, f"rows_{block}": rows}
+        checkpoint.save(arrays, meta | {"ends": len(ends)})
+        facts = {name: state.trace[-1][name] for name in ("ess", "acceptance", "moves")}
+        share, horizon = population.progress / blocks.n_rows, blocks.horizons[state.block]
+        logbook.stage(share, method="survey", stage=state.stage, horizon=horizon, **facts)
+    return ends, state
+
+
+def _charge(problem: ResidualProblem, horizons: tuple[int, ...], trace: list[dict[str, Any]], ledger: Ledger) -> None:
+    """What the sampler counted in blocks, in rows."""
+    before = 0.0
+    for stage in trace:
+        block, spent = stage["horizon"], stage["rollouts"]
+        ledger.charge(problem, round((spent - before) * len(horizons) / block), horizons[block - 1])
+        before = spent
+
+
+def begin(
+    positions: Float[np.ndarray, "start d"], log_density: Float[np.ndarray, " start"], ledger: Ledger, seconds: float
+) -> Climbs:
+    """Climbs at their starts."""
+    return Climbs(positions, log_density, np.zeros(len(positions), dtype=bool), 0, 0, None, ledger, [], seconds)
+
+
+def _record(climbs: Climbs, state: LevenbergState, steps: int, horizon: int, target: Climbable) -> Climbs:
+    """Put down one finished climb."""
+    positions, density, converged = climbs.positions.copy(), climbs.log_density.copy(), climbs.converged.copy()
+    positions[climbs.done], density[climbs.done] = state.position, state.log_density
+    converged[climbs.done] = state.converged
+    facts = {"horizon": horizon, "start": climbs.done, "steps": steps, "log_density": state.log_density}
+    climbs.trace.append(facts | {"converged": state.converged, "rollouts": climbs.ledger.rollouts})
+    return climbs._replace(
+        positions=positions, log_density=density, converged=converged, done=climbs.done + 1, noise=target.noise
+    )
+
+
+def _go_on(climbs: Climbs, horizon: int) -> Climbs:
+    """Keep one climb of each optimum and go to the next horizon.
+
+    Of the climbs of a horizon the better half goes on (successive halving), and every rival of the best.
+
+    Raises:
+        NoLikelihoodError: no climb has a likelihood.
+    """
+    positions, density = climbs.positions, climbs.log_density
+    if not np.isfinite(density).any():
+        raise NoLikelihoodError(
+            f"no climb has a positive likelihood up to row {horizon} ({climbs.ledger.reasons})",
+            where="[inference]",
+            remedy="look at what the simulator reports there, or allow more starts",
+        )
+    kept: list[int] = []
+    for index in np.argsort(-density, kind="stable"):
+        if all(np.max(np.abs(positions[index] - positions[other])) > SAME for other in kept):
+            kept.append(int(index))
+    order = np.array(kept)
+    order = order[(2 * np.arange(len(order)) < len(order)) | (density[order] > density[order[0]] - RIVAL)]
+    return climbs._replace(
+        positions=positions[order],
+        log_density=density[order],
+        converged=climbs.converged[order],
+        level=climbs.level + 1,
+        done=0,
+    )
+
+
+def _pack(climbs: Climbs) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays of the climbs and the rest of them, for a checkpoint."""
+    assert climbs.noise is not None
+    meta = {name: getattr(climbs, name) for name in ("level", "done", "trace", "seconds")}
+    arrays = {name: getattr(climbs, name) for name in ("positions", "log_density", "converged", "noise")}
+    return arrays, meta | {"ledger": climbs.ledger.record()}
+
+
+def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Climbs:
+    """The climbs that `_pack` took apart."""
+    named = {name: meta[name] for name in ("level", "done", "trace", "seconds")}
+    saved: dict[str, Any] = {**arrays, **named}
+    return Climbs(ledger=Ledger.from_record(meta["ledger"]), **saved)
 
 
 def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], Callable[..., Climbable]]:
@@ -175,10 +435,7 @@ def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], 
         def by_residuals(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
             return make_target(problem, horizon, ledger, u, prior, config.jacobian, noise)
 
-        horizons = block_boundaries(problem.n_rows, config.blocks)
-        if config.survey:
-            horizons = tuple(math.ceil(share * problem.n_rows) for share in CONTINUED)
-        return tuple(sorted(set(horizons))), by_residuals
+        return block_boundaries(problem.n_rows, SURVEYS if config.survey else config.blocks), by_residuals
     if hasattr(problem, "log_likelihood_at"):
         derivatives = log_likelihood_derivatives(problem)
 
@@ -196,7 +453,7 @@ def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], 
 def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizons: tuple[int, ...], noise: int) -> int:
     """Steps the present climb may take: what is left of the budget is shared among climbs by their horizons.
 
-    Of the climbs of a horizon half are expected at the next, see `go_on`.
+    Of the climbs of a horizon half are expected at the next, see `_go_on`.
     """
     if config.rollouts is None:
         return config.max_steps
@@ -206,103 +463,13 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
     waiting = starts - climbs.done
     share = now * waiting / (now * waiting + later)
     grid, step = climb_cost(d, noise)
-    left = max(_for_climbs(config) - climbs.ledger.rollouts, 0.0) * n_rows / now
-    held = FOR_SEARCH * config.rollouts * (config.survey > 0 and len(climbs.earlier) > 0) * n_rows / now
-    if climbs.done == 0 and left - held < grid + FEWEST_STEPS * step:
-        held = 0.0  # a climb rather than a search from where there was none
-    rows = max(left - held, 0.0) * share
-    if climbs.begins_again:
-        rows = max(rows, min(left, grid + FEWEST_STEPS * step))
+    rows = max(config.rollouts - climbs.ledger.rollouts, 0.0) * n_rows / now * share
     # More rivals than expected may have come to the last horizon: the best climb on, rather than none.
     served = waiting if later else int(np.clip(rows / (grid + FEWEST_STEPS * step), 1, waiting))
     return int(np.clip((rows / served - grid) / step, 0, config.max_steps))
 
 
-def _for_climbs(config: LaplaceConfig) -> float:
-    """Rollouts of a survey and of climbs, but for those on plateaus."""
-    return math.inf if config.rollouts is None else config.rollouts * (1.0 - FOR_PLATEAUS * (config.survey > 0))
-
-
-def _first(
-    problem: Problem, config: LaplaceConfig, key: PRNGKeyArray, horizon: int, ledger: Ledger, logbook: Logbook
-) -> Climbs:
-    """Climbs at their starts."""
-    began = time.monotonic()
-    if config.survey and isinstance(problem, ResidualProblem):
-        budget = None if config.rollouts is None else SURVEY_OF_CLIMBS * config.rollouts
-        prefixes = block_boundaries(problem.n_rows, config.blocks + 1)
-        found = survey(problem, prefixes[:-1] or prefixes, config.survey, budget, key, ledger, logbook)
-        u, density = surveyed(problem, found, horizon, config.starts, ledger)
-    else:
-        u, density = screened(problem, config.screen, horizon, config.starts, key, ledger)
-    return begin(u, density, ledger, time.monotonic() - began)
-
-
-def _with_search(
-    problem: ResidualProblem,
-    config: LaplaceConfig,
-    climbs: Climbs,
-    horizons: tuple[int, ...],
-    target_at: Callable[..., Climbable],
-    target: Climbable,
-    key: PRNGKeyArray,
-) -> Climbs:
-    """A further climb at a horizon at which even the best went astray, once, if the budget allows; see `restarts`."""
-    if len(climbs.earlier) == 0:
-        return climbs
-    rows, (d, noise) = horizons[climbs.level - 1], (climbs.positions.shape[1], int(target.noise.sum()))
-    grid, step = climb_cost(d, noise)
-    # A climb from what is found, and one at each horizon to come.
-    kept = (grid + FEWEST_STEPS * step) * sum(horizons[climbs.level :]) / problem.n_rows
-    left = (_for_climbs(config) - climbs.ledger.rollouts - kept) * problem.n_rows / horizons[climbs.level]
-    generations = affordable_generations(left, d, noise)
-    if not generations:
-        return climbs
-    before, after = climbs.earlier[0], climbs.positions[int(np.argmax(climbs.log_density))].copy()
-    after[target.noise] = before[target.noise]
-    shorter = target_at(rows, climbs.ledger, before, climbs.noise)
-    assert isinstance(shorter, Target)
-    assert isinstance(target, Target)
-    # Residuals know nothing of a rollout that ended before its time.
-    lost = not np.isfinite(climbs.log_density).any()
-    if not lost and not astray(shorter.residuals(before[None])[0], target.residuals(after[None])[0]):
-        return climbs
-    mode = normal_at(shorter, LevenbergState(before, math.nan, 0.0, True))
-    return with_starts(climbs, search(problem, mode, target, generations, jax.random.fold_in(key, rows)))
-
-
-def _check_heights(climbs: Climbs, horizon: int) -> None:
-    if not np.isfinite(climbs.log_density).any():
-        raise NoLikelihoodError(
-            f"no climb has a positive likelihood up to row {horizon} ({climbs.ledger.reasons})",
-            where="[inference]",
-            remedy="look at what the simulator reports there, or allow more starts",
-        )
-
-
-def _on_plateaus(
-    problem: Problem, config: LaplaceConfig, climbs: Climbs, target: Climbable, key: PRNGKeyArray
-) -> list[Laplace]:
-    """Normal approximations on plateaus beside the best of the climbs."""
-    best = int(np.argmax(climbs.log_density))
-    state = LevenbergState(climbs.positions[best], float(climbs.log_density[best]), 0.0, bool(climbs.converged[best]))
-    widths = np.sqrt(np.diag(prior_moments(problem, key)[1]))
-    places = plateaus(target, normal_at(target, state), widths, RIVAL)
-    left = math.inf if config.rollouts is None else config.rollouts - climbs.ledger.rollouts
-    modes = []
-    for place, end in zip(places, climbs_from(target, places, config.tolerance, left), strict=False):
-        facts = {"horizon": problem.n_rows, "plateau": place.coordinate, "log_density": end.log_density}
-        climbs.trace.append(facts | {"converged": end.converged, "rollouts": climbs.ledger.rollouts})
-        if end.log_density > state.log_density - RIVAL:
-            mode = laplace(target, end)
-            assert mode.slope is not None
-            # No summit along that coordinate: its likelihood is level, whatever the slope of the prior.
-            slope = np.where(np.arange(len(mode.mean)) == place.coordinate, 0.0, mode.slope)
-            modes.append(mode._replace(slope=slope))
-    return modes
-
-
-def _collect(climbs: Climbs, target: Climbable, on_plateaus: list[Laplace]) -> Modes:
+def _collect(climbs: Climbs, target: Climbable) -> Modes:
     """Laplace at every optimum that could matter, in the order of their evidence."""
     cautions = []
     modes: list[Laplace] = []
@@ -313,7 +480,6 @@ def _collect(climbs: Climbs, target: Climbable, on_plateaus: list[Laplace]) -> M
         if state.log_density > climbs.log_density.max() - RIVAL and _apart(state.position, modes):
             mode = laplace(target, state)
             modes += [mode] if _apart(mode.mean, modes) else []
-    modes += [mode for mode in on_plateaus if _apart(mode.mean, modes)]
     modes.sort(key=lambda mode: -mode.log_evidence)
     best = np.argmin(np.max(np.abs(climbs.positions - modes[0].mean), axis=1))
     if not climbs.converged[best]:

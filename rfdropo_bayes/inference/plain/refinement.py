@@ -29,11 +29,10 @@ from rfdropo_bayes.bayes.problem import Values
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
 from rfdropo_bayes.inference.modes.climb import Laplace
 from rfdropo_bayes.inference.modes.search import LaplaceConfig, Modes, find_modes
-from rfdropo_bayes.inference.plain.centring import CentredProblem, centred
-from rfdropo_bayes.inference.plain.problem import NumpyroProblem
+from rfdropo_bayes.inference.plain.problem import CentredProblem, NumpyroProblem, centred
+from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import (
     InferenceResult,
     exclusion_cautions,
@@ -41,12 +40,11 @@ from rfdropo_bayes.inference.result import (
     replicate_cautions,
 )
 from rfdropo_bayes.inference.smc import sampler as horizon_smc
-from rfdropo_bayes.inference.smc.bridge import BridgeConfig, BridgedProblem
-from rfdropo_bayes.inference.smc.hamiltonian import SlopedProblem, chosen_kernel
-from rfdropo_bayes.inference.smc.mixture import ModeMixture
-from rfdropo_bayes.inference.smc.moves import fit_reference, host_generator
+from rfdropo_bayes.inference.smc.bridge import BridgeConfig, BridgedProblem, ModeMixture
+from rfdropo_bayes.inference.smc.moves import SlopedProblem, chosen_kernel, fit_reference, host_generator
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
+TWO_PASSES = "smc_in_two_passes"
 MOST_ROWS = 5000  # that a first pass takes one after the other, at the cost of all of them each time
 REPLICATES = 4  # instead of a single one, whose evidence would have no deviation
 FORGOTTEN, MOST_MOVES = 0.1, 40  # correlation with its start that a stage of the second pass goes on to, if it can
@@ -267,6 +265,7 @@ def _joined(
         seconds=first.seconds + second.seconds,
         details=first.details
         | {
+            "algorithm": TWO_PASSES,
             "horizons": tuple(block["last_row"] for block in blocks),
             "log_evidence_replicates": replicates.tolist(),
             "log_evidence_first_pass": first.log_evidence,

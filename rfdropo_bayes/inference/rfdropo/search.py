@@ -9,10 +9,12 @@ measured has noise, whose variance is added to the rollouts', which phi would ha
 
 from __future__ import annotations
 
+import math
 import time
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -20,23 +22,30 @@ from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, RolloutProblem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
+from rfdropo_bayes.inference.progress import UNRECORDED, Checkpoint, Logbook, run_digest
 from rfdropo_bayes.inference.result import InferenceResult, exclusion_cautions
-from rfdropo_bayes.inference.rfdropo.candidates import Plan, Simulated, row_scores, simulate, target_features, uniforms
-from rfdropo_bayes.inference.rfdropo.families import FAMILIES, make_family
-from rfdropo_bayes.inference.rfdropo.optimisers import OPTIMISERS, default_population, make_optimiser
-from rfdropo_bayes.inference.rfdropo.randomisation import WIDTH, search_space
-from rfdropo_bayes.inference.rfdropo.reuse import bootstrap, make_pool, refine
-from rfdropo_bayes.inference.rfdropo.trajectory_match import motion_scale
-from rfdropo_bayes.inference.schedules import adaptive_horizon, linear_horizon, paper_horizon
+from rfdropo_bayes.inference.rfdropo.families import FAMILIES, WIDTH, make_family, search_space
+from rfdropo_bayes.inference.rfdropo.scores import (
+    Plan,
+    Pool,
+    Simulated,
+    make_pool,
+    motion_scale,
+    row_scores,
+    simulate,
+    target_features,
+    uniforms,
+)
 from rfdropo_bayes.inference.smc.moves import host_generator
+from rfdropo_bayes.inference.smc.tempering import log_effective_sample_size
 
+OPTIMISERS = ("cma", "cem")
 HORIZONS = ("paper", "linear", "adaptive", "full")
 AGREEING = 0.5  # share of effective candidates that an adaptive horizon keeps
 FINAL = 10**6  # key of the finalists' random numbers, beyond any generation's
 DRAWS = FINAL + 1
+TRUST = 0.05  # initial step of the search, as a share of its range: the pool knows the neighbourhood only
 
 
 @dataclass(frozen=True)
@@ -368,3 +377,205 @@ def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SearchState:
     ledger = Ledger.from_record(meta["ledger"])
     horizons = tuple(arrays["horizons"].tolist())
     return SearchState(arrays["candidates"], arrays["losses"], horizons, ledger, meta["trace"], meta["seconds"])
+
+
+def paper_horizon(iteration: int, iterations: int, n_rows: int, *, mended: bool = True) -> int:
+    """Horizon of RF-DROPO at one iteration, ``max(1, floor(n (1 - exp(-(2 / K) ln(10) i))))``.
+
+    Args:
+        iteration: i, from 0 to K.
+        iterations: K, the number of iterations.
+        n_rows: n, rows of data.
+        mended: as published the last horizon is 99 of 100 rows, so that the whole recording is never looked at;
+            mended, the curve is stretched by 1 / 0.99 and ends at n when ``i = K - 1``.
+    """
+    if not mended:
+        return max(1, math.floor(n_rows * (1.0 - 10.0 ** (-2.0 * iteration / iterations))))
+    last = max(iterations - 1, 1)
+    share = (1.0 - 10.0 ** (-2.0 * min(iteration / last, 1.0))) / 0.99
+    return min(n_rows, max(1, math.floor(n_rows * share + 1e-9)))
+
+
+def linear_horizon(iteration: int, iterations: int, n_rows: int) -> int:
+    """Horizon that grows evenly from 1 and is ``n_rows`` at the last iteration, ``iterations - 1``."""
+    return min(n_rows, max(1, math.ceil(n_rows * (iteration + 1) / iterations)))
+
+
+def adaptive_horizon(row_scores: Float[np.ndarray, "n rows"], horizon: int, target: float) -> int:
+    """Longest horizon at which candidates still agree: weighted by the likelihood of the rows after ``horizon``, the
+    share ``target`` of them is effective.
+
+    Args:
+        row_scores: log likelihood of each row for each candidate; minus infinity for those that failed.
+        horizon: present one; the answer is not shorter.
+        target: share of effective candidates among those that did not fail.
+    """
+    alive = row_scores[np.isfinite(row_scores).all(axis=1)]
+    if len(alive) == 0:
+        return horizon
+    ahead = np.cumsum(alive[:, horizon:], axis=1)
+    for rows, weights in enumerate(ahead.T):
+        if log_effective_sample_size(weights) < math.log(target * len(weights)):
+            return horizon + rows
+    return horizon + ahead.shape[1]
+
+
+def refine(
+    pool: Pool, start: Float[np.ndarray, " k"], counts: Float[np.ndarray, " recordings"], evaluations: int, seed: int
+) -> Float[np.ndarray, " k"]:
+    """The best distribution near ``start`` that the pool can judge, without a single further rollout."""
+    k = len(start)
+    population = default_population("cma", k)
+    optimiser = make_optimiser("cma", k, high=WIDTH, sigma=TRUST, population=population, seed=seed, start=start)
+    best, lowest = start, pool.loss(start, counts)
+    for _ in range(max(1, evaluations // population)):
+        asked = np.clip(optimiser.ask(), 0.0, WIDTH)
+        losses = np.array([pool.loss(vector, counts) for vector in asked])
+        optimiser.tell(asked, losses)
+        if losses.min() < lowest:
+            best, lowest = asked[int(np.argmin(losses))], float(losses.min())
+    return best
+
+
+def bootstrap(
+    pool: Pool, start: Float[np.ndarray, " k"], repeats: int, evaluations: int, generator: np.random.Generator
+) -> dict[str, dict[str, Any]]:
+    """Scatter of each parameter's mean when the recordings are drawn again with replacement."""
+    means, effective = [], []
+    for _ in range(repeats):
+        counts = np.bincount(generator.integers(pool.recordings, size=pool.recordings), minlength=pool.recordings)
+        found = refine(pool, start, counts.astype(float), evaluations, int(generator.integers(2**31)))
+        table = pool.family.describe(found, dict.fromkeys(pool.family.names, ""))
+        means.append([table[name]["mean"] for name in pool.family.names])
+        effective.append(pool.weights(found)[1])
+    drawn = np.array(means)
+    low, high = np.quantile(drawn, [0.05, 0.95], axis=0)
+    return {
+        name: {"sd": float(drawn[:, j].std(ddof=1)), "q05": float(low[j]), "q95": float(high[j])}
+        for j, name in enumerate(pool.family.names)
+    } | {"effective_sample_size": {"mean": float(np.mean(effective)), "least": float(np.min(effective))}}
+
+
+@runtime_checkable
+class Optimiser(Protocol):
+    """Minimises a noisy loss over a box."""
+
+    def ask(self) -> Float[np.ndarray, "population d"]:
+        """Candidates of the next generation, inside the box."""
+        ...
+
+    def tell(self, candidates: Float[np.ndarray, "population d"], losses: Float[np.ndarray, " population"]) -> None:
+        """Losses of the candidates last asked for; infinite ones rank last."""
+        ...
+
+    @property
+    def centre(self) -> Float[np.ndarray, " d"]:
+        """Where the search distribution now stands."""
+        ...
+
+
+def default_population(name: str, d: int) -> int:
+    """``4 + floor(3 ln d)``, Hansen's default for CMA-ES; the cross-entropy method wants 5 d, it keeps little."""
+    hansen = 4 + math.floor(3.0 * math.log(d))
+    return max(hansen, 5 * d) if name == "cem" else hansen
+
+
+def make_optimiser(
+    name: str,
+    d: int,
+    *,
+    high: float,
+    sigma: float,
+    population: int,
+    seed: int,
+    start: Float[np.ndarray, " d"] | None = None,
+) -> Optimiser:
+    """An optimiser over ``[0, high]^d`` that starts in the middle, or at ``start`` (CMA-ES only).
+
+    Args:
+        name: "cma" or "cem".
+        d: dimension.
+        high: upper edge of the box.
+        sigma: initial step, as a share of the box.
+        population: candidates per generation.
+        seed: of its random numbers.
+    """
+    if name == "cma":
+        return CovarianceAdaptation(d, high, sigma * high, population, seed, start)
+    if name == "cem":
+        return CrossEntropy(d, high, sigma * high, population, seed)
+    raise InputError(f"unknown optimiser {name!r}", where="[inference]", remedy=f"one of {', '.join(OPTIMISERS)}")
+
+
+class CrossEntropy:
+    """Cross-entropy method: refit a diagonal normal to the best candidates of each generation.
+
+    Args:
+        d, high, sigma, population, seed: as in `make_optimiser`, sigma in the box's units.
+        elite: share of the candidates that the refit uses.
+        smoothing: weight of the new fit; the rest stays with the old one, which keeps the spread from collapsing.
+    """
+
+    def __init__(
+        self, d: int, high: float, sigma: float, population: int, seed: int, elite: float = 0.3, smoothing: float = 0.7
+    ) -> None:
+        self.high, self.population, self.smoothing = high, population, smoothing
+        self.elites = max(2, round(elite * population))
+        self.mean, self.sd = np.full(d, 0.5 * high), np.full(d, sigma)
+        self._generator = np.random.default_rng(seed)
+
+    def ask(self) -> Float[np.ndarray, "population d"]:
+        """Normal candidates; what falls outside is reflected, so that the edges do not collect mass."""
+        z = self._generator.standard_normal((self.population, len(self.mean)))
+        folded = np.mod(self.mean + self.sd * z, 2.0 * self.high)
+        return np.minimum(folded, 2.0 * self.high - folded)
+
+    def tell(self, candidates: Float[np.ndarray, "population d"], losses: Float[np.ndarray, " population"]) -> None:
+        """Refit to the elite; the spread is taken about the OLD mean, so that it cannot collapse on the way."""
+        best = candidates[np.argsort(losses, kind="stable")[: self.elites]]
+        spread = np.sqrt(np.mean((best - self.mean) ** 2, axis=0))
+        self.mean = self.smoothing * best.mean(axis=0) + (1.0 - self.smoothing) * self.mean
+        self.sd = self.smoothing * spread + (1.0 - self.smoothing) * self.sd
+
+    @property
+    def centre(self) -> Float[np.ndarray, " d"]:
+        """Mean of the normal."""
+        return self.mean
+
+
+class CovarianceAdaptation:
+    """CMA-ES of pycma, with random numbers of its own instead of numpy's global ones."""
+
+    def __init__(
+        self, d: int, high: float, sigma: float, population: int, seed: int, start: np.ndarray | None = None
+    ) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # pycma warns of optional plotting packages when imported
+            import cma
+
+        generator = np.random.default_rng(seed)
+        options = {
+            "bounds": [0.0, high],
+            "popsize": population,
+            "seed": np.nan,
+            "randn": lambda *shape: generator.standard_normal(shape),
+            "verbose": -9,
+            "tolfun": 0.0,  # the number of generations is the schedule's to decide, not a tolerance's
+            "tolx": 0.0,
+        }
+        self._strategy = cma.CMAEvolutionStrategy(np.full(d, 0.5 * high) if start is None else start, sigma, options)
+
+    def ask(self) -> Float[np.ndarray, "population d"]:
+        """Candidates of the next generation."""
+        return np.asarray(self._strategy.ask())
+
+    def tell(self, candidates: Float[np.ndarray, "population d"], losses: Float[np.ndarray, " population"]) -> None:
+        """Update the search distribution; pycma wants finite losses."""
+        finite = losses[np.isfinite(losses)]
+        worst = (finite.max() if len(finite) else 0.0) + 1e6
+        self._strategy.tell(list(candidates), np.where(np.isfinite(losses), losses, worst).tolist())
+
+    @property
+    def centre(self) -> Float[np.ndarray, " d"]:
+        """Mean of the search distribution, inside the box."""
+        return np.asarray(self._strategy.result.xfavorite)

@@ -1,16 +1,35 @@
-"""Metropolis proposals that a population of particles tunes by itself."""
+"""How SMC moves its particles: proposals that the population tunes by itself, and coordinates that suit them.
+
+- `propose`: random walks and preconditioned Crank-Nicolson steps, shaped by the covariance of the particles.
+- `Flow`: trajectories along the gradient of the posterior, for many parameters.
+- `StraightProblem`: logarithms of positive parameters, in which ridges are straight.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy.linalg import solve_triangular
+
+from rfdropo_bayes.bayes.batches import padded
+from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, Values
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.modes.climb import Laplace
 
 KERNELS = ("auto", "crank_nicolson", "random_walk", "hamiltonian")
 FOLLOWED = 0.75  # acceptance that trajectories are adapted to
+WORTHWHILE = 15  # parameters from which on "auto" follows gradients; with fewer, moves by the covariance cost less
+TRAVEL = 1.5  # length of a trajectory in deviations: about a quarter of an orbit, which forgets the start
+MOST_LEAPS = 24
+FASTEST = 1e6  # momentum in deviations of what is still a trajectory
+POSITIVE_DRAWS = 1000  # from the prior, which tell which parameters are positive
+JITTER = 0.2  # of step lengths, so that no direction's orbit is met at its period
 
 
 class Reference(NamedTuple):
@@ -124,3 +143,189 @@ def slowest_correlation(
 def squared_distance(factor: Float[np.ndarray, "d d"], centred: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
     """Of each point from the centre, in deviations of the covariance whose Cholesky factor is given."""
     return np.sum(solve_triangular(factor, centred.T, lower=True) ** 2, axis=0)
+
+
+@runtime_checkable
+class SlopedProblem(Problem, Protocol):
+    """A problem whose posterior on the way to it JAX can differentiate."""
+
+    def path_density(self, u: Float[Array, " d"], shares: Float[Array, " n_rows"]) -> Float[Array, ""]:
+        """Log prior plus the log density of every row times its share, at one unconstrained point; traceable."""
+        ...
+
+
+def chosen_kernel(kernel: str, problem: Problem, rollouts: float | None) -> str:
+    """What "auto" means for a problem: gradients where there are some, many parameters, and no budget of rollouts."""
+    if kernel != "auto":
+        return kernel
+    sloped = isinstance(problem, SlopedProblem) and len(problem.names) >= WORTHWHILE and rollouts is None
+    return "hamiltonian" if sloped else "crank_nicolson"
+
+
+def flow_of(problem: Problem) -> Flow:
+    """Trajectories of a problem.
+
+    Raises:
+        InputError: JAX cannot differentiate its posterior.
+    """
+    if not isinstance(problem, SlopedProblem):
+        raise InputError(
+            'kernel = "hamiltonian" follows gradients, which this problem does not have',
+            where="[inference] kernel",
+            remedy='kernel = "auto"',
+        )
+    return Flow(problem)
+
+
+class Flow:
+    """Trajectories of a problem's particles under one target of its path.
+
+    Args:
+        problem: its derivatives are compiled once per number of particles.
+    """
+
+    def __init__(self, problem: SlopedProblem) -> None:
+        self.n_rows = problem.n_rows
+        slope = jax.vmap(jax.grad(problem.path_density), in_axes=(0, None))
+
+        def leap(
+            u: Array, momentum: Array, shares: Array, factors: Array, second: Array, steps: Array, leaps: Array
+        ) -> tuple[Array, Array]:
+            def whitened(gradient: Array) -> Array:
+                return jnp.where(second, gradient @ factors[1], gradient @ factors[0])
+
+            def coloured(momentum: Array) -> Array:
+                return jnp.where(second, momentum @ factors[1].T, momentum @ factors[0].T)
+
+            def once(_: Any, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+                u, momentum, push = state
+                momentum = momentum + 0.5 * steps * push
+                u = u + steps * coloured(momentum)
+                push = whitened(slope(u, shares))
+                return u, momentum + 0.5 * steps * push, push
+
+            u, momentum, _ = jax.lax.fori_loop(0, leaps, once, (u, momentum, whitened(slope(u, shares))))
+            return u, momentum
+
+        self._leap = jax.jit(leap)
+
+    def __call__(
+        self,
+        generator: np.random.Generator,
+        position: Float[np.ndarray, "n d"],
+        progress: float,
+        references: tuple[Reference, Reference],
+        second: Bool[np.ndarray, " n"],
+        scale: float,
+        charge: Callable[[int], None],
+    ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
+        """Propose for all particles.
+
+        Args:
+            generator: of momenta.
+            position: unconstrained particles.
+            progress: rows of the path that are in, the last perhaps by a share.
+            references: of the two halves; their covariances are the inverse mass.
+            second: particles of the second half.
+            scale: step length in deviations.
+            charge: is told how many gradients were taken.
+
+        Returns:
+            where the particles arrive, and the log of the momenta's part of the acceptance ratio.
+        """
+        leaps = leaps_of(scale)
+        charge((leaps + 1) * len(position))
+        momentum = generator.standard_normal(position.shape)
+        steps = scale * (1.0 + JITTER * generator.uniform(-1.0, 1.0, (len(position), 1)))
+        shares = np.clip(progress - np.arange(self.n_rows), 0.0, 1.0)
+        factors = np.stack([reference.cholesky for reference in references])
+        arrived, left = (
+            np.asarray(part)
+            for part in self._leap(position, momentum, shares, factors, second[:, None], steps, jnp.asarray(leaps))
+        )
+        # A step too long for the slope flies off: such a trajectory is refused, whatever its numbers.
+        good = np.isfinite(arrived).all(axis=1) & (np.abs(left) < FASTEST).all(axis=1)
+        ratio = 0.5 * np.sum(momentum**2, axis=1) - 0.5 * np.sum(np.where(good[:, None], left, 0.0) ** 2, axis=1)
+        return np.where(good[:, None], arrived, position), np.where(good, ratio, -np.inf)
+
+
+def leaps_of(scale: float) -> int:
+    """Steps of a trajectory."""
+    return int(np.clip(np.ceil(TRAVEL / scale), 1, MOST_LEAPS))
+
+
+class StraightProblem:
+    """The same posterior in other coordinates: logarithms of what is positive, the problem's own for the rest.
+
+    Args:
+        problem: whose unconstrained coordinates belong to one parameter each.
+        key: for the prior draws that tell which parameters are positive.
+    """
+
+    def __init__(self, problem: ResidualProblem, key: PRNGKeyArray) -> None:
+        self.problem = problem
+        self.names, self.units, self.bounds, self.n_rows = problem.names, problem.units, problem.bounds, problem.n_rows
+        self.fingerprint = getattr(problem, "fingerprint", "")
+        self.status_names = getattr(problem, "status_names", {})
+        drawn = problem.sample_prior(key, POSITIVE_DRAWS)
+        self.logarithmic = np.array([np.min(np.asarray(drawn[name])) > 0.0 for name in self.names])
+        self._stand_in = {name: float(np.median(np.asarray(drawn[name]))) for name in self.names}
+
+    def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
+        """Independent prior draws."""
+        return self.problem.sample_prior(key, n)
+
+    def to_unconstrained(self, values: Values) -> Float[Any, "n d"]:
+        """Logarithms where they are taken."""
+        own = jnp.asarray(self.problem.to_unconstrained(values))
+        value = jnp.stack([jnp.asarray(values[name]) for name in self.names], axis=-1)
+        return jnp.where(self.logarithmic, jnp.log(jnp.where(self.logarithmic, value, 1.0)), own)
+
+    def from_unconstrained(self, v: Float[Any, "n d"]) -> dict[str, Float[Any, " n"]]:
+        """Inverse of `to_unconstrained`; values beyond a bound are returned as they are."""
+        v = jnp.asarray(v)
+        own = self.problem.from_unconstrained(jnp.where(self.logarithmic, 0.0, v))
+        return {name: jnp.exp(v[:, j]) if self.logarithmic[j] else own[name] for j, name in enumerate(self.names)}
+
+    def log_prior(self, v: Float[Any, "n d"]) -> Float[Any, " n"]:
+        """Log density in these coordinates; not a number beyond a bound."""
+        own, slope = self._own_and_slope(v)
+        with np.errstate(divide="ignore"):
+            return np.asarray(self.problem.log_prior(jnp.asarray(own))) + np.log(slope).sum(axis=1)
+
+    def row_log_likelihood(self, values: Values, horizon: int) -> tuple[Float[Any, "n horizon"], Int[Any, " n"]]:
+        """The problem's; minus infinity for values beyond a bound, which are not simulated."""
+        inside = np.isfinite(np.asarray(self.problem.to_unconstrained(values))).all(axis=1)
+        safe = {name: np.where(inside, np.asarray(values[name]), self._stand_in[name]) for name in self.names}
+        rows, status = self.problem.row_log_likelihood(safe, horizon)
+        return np.where(inside[:, None], np.asarray(rows), -np.inf), np.where(inside, np.asarray(status), 0)
+
+    def mode(self, mode: Laplace) -> Laplace:
+        """A normal approximation of the problem in these coordinates."""
+        v = np.asarray(
+            self.to_unconstrained(self.problem.from_unconstrained(jnp.asarray(mode.mean[None]))), dtype=float
+        )
+        slope = np.asarray(self._own_and_slope(v)[1], dtype=float)[0]
+        information = None if mode.information is None else mode.information * np.outer(slope, slope)
+        return Laplace(
+            v[0],
+            mode.covariance / np.outer(slope, slope),
+            mode.log_density + float(np.log(slope).sum()),
+            information,
+            None if mode.slope is None else mode.slope * slope,
+        )
+
+    def _own_and_slope(self, v: Float[Any, "n d"]) -> tuple[Float[Any, "n d"], Float[Any, "n d"]]:
+        """The problem's own coordinates, and the derivative of each by the one here."""
+        return padded(self._compiled, v)
+
+    @cached_property
+    def _compiled(self) -> Callable:
+        def own(v: Array) -> Array:
+            return jnp.asarray(self.problem.to_unconstrained(self.from_unconstrained(v)))
+
+        def both(v: Array) -> tuple[Array, Array]:
+            value, slope = jax.jvp(own, (v,), (jnp.ones_like(v),))
+            return value, jnp.abs(slope)
+
+        return jax.jit(both)

@@ -19,9 +19,15 @@ from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
-from rfdropo_bayes.inference.checkpoints import Checkpoint, run_digest
-from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows, representable_draws
-from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
+from rfdropo_bayes.inference.evaluations import (
+    SPACINGS,
+    Ledger,
+    block_boundaries,
+    evaluate_prior,
+    evaluate_rows,
+    representable_draws,
+)
+from rfdropo_bayes.inference.progress import UNRECORDED, Checkpoint, Logbook, run_digest
 from rfdropo_bayes.inference.result import (
     InferenceResult,
     chains,
@@ -30,9 +36,7 @@ from rfdropo_bayes.inference.result import (
     replicate_cautions,
     stage_cautions,
 )
-from rfdropo_bayes.inference.schedules import SPACINGS, block_boundaries
-from rfdropo_bayes.inference.smc.hamiltonian import MOST_LEAPS, Flow, chosen_kernel, flow_of
-from rfdropo_bayes.inference.smc.moves import KERNELS, initial_scale
+from rfdropo_bayes.inference.smc.moves import KERNELS, MOST_LEAPS, Flow, chosen_kernel, flow_of, initial_scale
 from rfdropo_bayes.inference.smc.tempering import Population, StageInfo, Tuning, prolong, refresh, stage
 
 PARTICLES_WITHOUT_BUDGET = 1000
@@ -42,6 +46,7 @@ WORTH_A_REPLICATE = 100  # particles
 MOST_REPLICATES = 4
 STARTS = ("auto", "prior", "optimum")
 NOT_REPRESENTABLE = "not_representable"
+FROM_PRIOR = "smc_from_prior"
 
 
 @dataclass(frozen=True)
@@ -388,7 +393,12 @@ def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcSta
             *replicate_cautions(draws, values),
         ],
         seconds=sum(state.seconds for state in states),
-        details={"log_evidence_replicates": values.tolist(), "particles": plan.particles, "horizons": plan.horizons},
+        details={
+            "algorithm": FROM_PRIOR,
+            "log_evidence_replicates": values.tolist(),
+            "particles": plan.particles,
+            "horizons": plan.horizons,
+        },
     )
 
 

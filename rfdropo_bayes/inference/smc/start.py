@@ -1,51 +1,67 @@
-"""Sequential Monte Carlo from where it can be afforded: the prior, or the optima of a sharp posterior.
+"""Where SMC starts: at the prior where the budget covers that way, else at the optima of a sharp posterior.
 
 From a prior that is thousands of times wider than the posterior the way takes dozens of stages, and a budget that is
-used up on it ends in a leap that leaves a few particles alive. A posterior that sharp is close to its Laplace
-approximation, which costs some hundred rollouts to find: the sampler then starts there, inflated, with a share of
-particles at the prior, and the evidence is as exact as before. What a start at the prior passes on its way, the
-evidence of the blocks of rows, is then taken by importance sampling around the optima of the prefixes.
+used up on it ends in a leap that leaves a few particles alive. Some fifty rollouts tell beforehand: the likelihood's
+information at the best of some prior draws says how many stages there are (`way_from_prior`). Where they cost too much,
+climbs look for the optima, and the sampler starts around these (`bridge`). What a start at the prior passes on its way,
+the evidence of the blocks of rows, is then taken by importance sampling around the optima of the prefixes.
+
+**The length of the way.** A sampler that keeps a share e of effective particles between targets takes steps of length
+sqrt(ln 1/e) in the metric Var(log weight). In coordinates whitened by the prior, where direction j holds the
+information ``lambda_j`` about a value ``m_j`` prior deviations away, a likelihood brought in to the share b changes the
+log weights at the rate
+
+    g(b) = sum_j [ lambda_j^2 / (2 (1 + b lambda_j)^2) + lambda_j^2 m_j^2 / (1 + b lambda_j)^3 ],
+
+so that the number of stages is the integral of sqrt(g / ln(1/e)) over b from 0 to 1. With information that accrues
+evenly along the data, b is also the prefix that a stage needs, which sets its cost.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from typing import TypeGuard
+from typing import Any, NamedTuple, TypeGuard
 
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
+from scipy.special import logsumexp
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
-from rfdropo_bayes.inference.checkpoints import run_digest
-from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.logbook import UNRECORDED, Logbook
-from rfdropo_bayes.inference.modes.search import LaplaceConfig, Modes, find_modes
+from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.modes.climb import Laplace, laplace, maximise
+from rfdropo_bayes.inference.modes.search import LaplaceConfig, Modes, find_modes, screened
+from rfdropo_bayes.inference.modes.targets import make_target, prior_derivatives
 from rfdropo_bayes.inference.plain import refinement
 from rfdropo_bayes.inference.plain.problem import NumpyroProblem
+from rfdropo_bayes.inference.progress import UNRECORDED, Logbook, run_digest
 from rfdropo_bayes.inference.result import InferenceResult
-from rfdropo_bayes.inference.schedules import block_boundaries
 from rfdropo_bayes.inference.smc import bridge
 from rfdropo_bayes.inference.smc import sampler as horizon_smc
-from rfdropo_bayes.inference.smc.prefix_scores import PrefixEvidence, block_scores, prefix_evidence
+from rfdropo_bayes.inference.smc.bridge import ModeMixture
 from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES, MOST_REPLICATES, WORTH_A_REPLICATE, SmcConfig
-from rfdropo_bayes.inference.smc.sharpness import Way, way_from_prior
+from rfdropo_bayes.inference.smc.tempering import log_effective_sample_size
 
 CLIMBING = 0.25  # share of the budget that climbs to optima may take
 SURVEY_OF_ALL = 0.4  # and the survey before them
 PER_SURVEYOR = 32.0  # rollouts that a particle of the survey takes, typically
 # With fewer, more than half of the surveys of a rugged ridge missed the summit.
 MOST_SURVEYORS, FEWEST_SURVEYORS = 128, 64
+SURVEYED_STEPS = 7.0  # of the length of the whole recording that a climb after a survey takes, typically
 CLOSE = 1e-2  # nats below its optimum that a climb may end: the sampler starts from a wider distribution
 STEPS = 12.0  # that a climb takes at each horizon, typically
-SURVEYED_STEPS = 7.0  # of the length of the whole recording that a climb after a survey takes, typically
-SURVEYED_STARTS = 8  # at most
 CLIMBED = 0.6  # share of the work that is done when climbs have ended, for a progress bar
-SCORING = 0.1  # and the evidence of the blocks
+SCORING = 0.1  # share of the budget for the evidence of the blocks
+SCREEN = 64  # prior draws, the best of which tells the likelihood's information
 MARGIN = 3.0  # what real posteriors cost over the estimate, which takes them to be normal and data to be even
 ENOUGH = 200  # particles per replicate that a start at the prior must allow
+MOVES = 4.0  # of a stage: about 3 where the posterior is normal, more where it is not
+FARTHEST = 5.0  # prior deviations that a value is taken to be away; farther ones are a prior at odds with the data
+INFLATION, DEGREES, PRIOR_SHARE = 1.3, 5.0, 0.2  # a short prefix says little: its posterior is near the prior
+MOST_STEPS = 12  # of the climb from the optimum of all rows to that of a prefix
+MOST_DRAWS, FEWEST_DRAWS = 400, 30
 
 
 def run(
@@ -61,7 +77,7 @@ def run(
     """
     if _refinable(problem, config):
         return refinement.run(problem, config, key, logbook)
-    if config.start == "prior" or (config.start == "auto" and not _worth_climbing(problem, config)):
+    if config.start == "prior" or (config.start == "auto" and not _worth_judging(problem, config)):
         return horizon_smc.run(problem, config, key, logbook)
     if not isinstance(problem, ResidualProblem):
         raise InputError(
@@ -69,27 +85,32 @@ def run(
             where="[inference] start",
             remedy='start = "prior", or method = "bridge"',
         )
-    climb_key, way_key, sample_key = jax.random.split(key, 3)
-    climbing = _climbing(problem, config)
-    digest = run_digest(problem, "smc_climbs", config, key)
-    checkpoint = logbook.checkpoint("smc_climbs", digest)
+    judge_key, climb_key, sample_key = jax.random.split(key, 3)
     spent = Ledger()
+    way = found = None
     try:
-        found = find_modes(problem, climbing, climb_key, checkpoint, logbook.part(0.0, CLIMBED), spent)
+        if config.start == "auto":
+            way = expected_way(problem, config, judge_key, spent)
+        if way is None or not _affordable(way, config, _left(config, spent)):
+            checkpoint = logbook.checkpoint("smc_climbs", run_digest(problem, "smc_climbs", config, key))
+            climbing, climbs_log = _climbing(problem, config), logbook.part(0.0, CLIMBED)
+            found = find_modes(problem, climbing, climb_key, checkpoint, climbs_log, spent)
     except NoLikelihoodError:
         if config.start == "optimum":
             raise
         # No draw to climb from had a likelihood: whether the prior excludes the data is for more particles to say.
-        left = None if config.rollouts is None else config.rollouts - spent.rollouts
-        return _with_cost(horizon_smc.run(problem, replace(config, rollouts=left), key, logbook), spent)
-    logbook = logbook.part(CLIMBED, 1.0)
-    horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
-    way = way_from_prior(problem, found.modes[0], horizons, config.target_ess, way_key)
-    left = None if config.rollouts is None else config.rollouts - found.climbs.ledger.rollouts
-    if config.start == "auto" and _affordable(way, config, left):
-        result = horizon_smc.run(problem, _several(way, config, left), sample_key, logbook)
-        return _with_climbs(result, found, way)
-    return _from_optima(problem, config, found, way, sample_key, logbook)
+        left = replace(config, rollouts=_left(config, spent))
+        return _with_cost(horizon_smc.run(problem, left, key, logbook), spent)
+    if found is not None:
+        return _from_optima(problem, config, found, way, sample_key, logbook.part(CLIMBED, 1.0))
+    assert way is not None
+    result = horizon_smc.run(problem, _several(way, config, _left(config, spent)), sample_key, logbook)
+    facts = {"expected_stages": way.stages, "information_nats": way.information}
+    return replace(_with_cost(result, spent), details=result.details | facts)
+
+
+def _left(config: SmcConfig, spent: Ledger) -> float | None:
+    return None if config.rollouts is None else config.rollouts - spent.rollouts
 
 
 def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
@@ -101,10 +122,9 @@ def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
     if surveyors < FEWEST_SURVEYORS or getattr(problem, "earlier", None):
         surveyors = 0
     budget = CLIMBING * config.rollouts
-    # Three horizons that double cost 1.75 times the last; after a survey few summits are left at the second of them. A
-    # step is a Jacobian by differences and 6 dampings.
-    steps, most = (SURVEYED_STEPS, SURVEYED_STARTS) if surveyors else (1.75 * STEPS, LaplaceConfig().starts)
-    starts = int(np.clip(budget / (steps * (4.0 * len(problem.names) + 7.0)), 1, most))
+    # Three horizons that double cost 1.75 times the last. A step is a Jacobian by differences and 6 dampings.
+    steps = SURVEYED_STEPS if surveyors else 1.75 * STEPS
+    starts = int(np.clip(budget / (steps * (4.0 * len(problem.names) + 7.0)), 1, LaplaceConfig().starts))
     limit = budget + surveyors * PER_SURVEYOR
     return LaplaceConfig(starts=starts, survey=surveyors, tolerance=CLOSE, rollouts=limit)
 
@@ -114,7 +134,7 @@ def _refinable(problem: Problem, config: SmcConfig) -> TypeGuard[NumpyroProblem]
     return config.start == "auto" and config.rollouts is None and isinstance(problem, NumpyroProblem)
 
 
-def _worth_climbing(problem: Problem, config: SmcConfig) -> bool:
+def _worth_judging(problem: Problem, config: SmcConfig) -> bool:
     """Without a budget a start at the prior never leaps; a small one is better spent on particles than on climbs."""
     if not isinstance(problem, ResidualProblem) or config.rollouts is None:
         return False
@@ -139,14 +159,6 @@ def _several(way: Way, config: SmcConfig, left: float | None) -> SmcConfig:
     return replace(config, replicates=replicates)
 
 
-def _with_climbs(result: InferenceResult, found: Modes, way: Way) -> InferenceResult:
-    return replace(
-        _with_cost(result, found.climbs.ledger),
-        seconds=result.seconds + found.climbs.seconds,
-        details=result.details | {"start": "prior", "expected_stages": way.stages, "information_nats": way.information},
-    )
-
-
 def _with_cost(result: InferenceResult, ledger: Ledger) -> InferenceResult:
     """What was spent before the sampler began, too."""
     return replace(
@@ -161,12 +173,12 @@ def _from_optima(
     problem: ResidualProblem,
     config: SmcConfig,
     found: Modes,
-    way: Way,
+    way: Way | None,
     key: PRNGKeyArray,
     logbook: Logbook,
 ) -> InferenceResult:
     sample_key, score_key = jax.random.split(key)
-    left = None if config.rollouts is None else config.rollouts - found.climbs.ledger.rollouts
+    left = _left(config, found.climbs.ledger)
     prefixed = len(block_boundaries(problem.n_rows, config.blocks, config.spacing)) > 1
     scoring = None if left is None else SCORING * prefixed * config.rollouts  # type: ignore[operator]
     sampling = None if left is None else left - scoring  # type: ignore[operator]
@@ -193,9 +205,7 @@ def _from_optima(
         evaluations=result.evaluations + ledger.evaluations,
         details=result.details
         | {
-            "start": "optimum",
-            "expected_stages": way.stages,
-            "information_nats": way.information,
+            **({} if way is None else {"expected_stages": way.stages, "information_nats": way.information}),
             "prefix_ess": [prefix.ess for prefix in prefixes],
         },
     )
@@ -211,3 +221,153 @@ def _prefixes(
     if not horizons:
         return [], ledger
     return prefix_evidence(problem, found.modes[0], found.climbs.noise, horizons, scoring, key, ledger), ledger
+
+
+class Way(NamedTuple):
+    """From the prior to the posterior.
+
+    Attributes:
+        stages: expected number of targets in between.
+        rollouts: full-length rollouts that each particle needs for it.
+        information: entropy lost on the way if both ends are normal [nat].
+    """
+
+    stages: float
+    rollouts: float
+    information: float
+
+
+def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray, ledger: Ledger) -> Way:
+    """The way to a posterior that is as sharp as the likelihood at the best of `SCREEN` prior draws.
+
+    Noise is taken at its prior's median: with the noise that fits such a draw the likelihood would be far too flat.
+    About log scales of noise, m residuals hold the information 2 m.
+
+    Args:
+        problem: to be sampled.
+        config: of the sampler.
+        key: random key.
+        ledger: is charged.
+
+    Raises:
+        NoLikelihoodError: none of the draws has a positive likelihood.
+    """
+    draw_key, prior_key, way_key = jax.random.split(key, 3)
+    best = screened(problem, SCREEN, block_boundaries(problem.n_rows, 3)[0], 1, draw_key, ledger)[0][0]
+    target = make_target(problem, problem.n_rows, ledger, best, prior_derivatives(problem))
+    mean, covariance = bridge.prior_moments(problem, prior_key)
+    point = np.where(target.noise, mean, best)
+    residuals, jacobian = target.linearise(point)
+    jacobian = np.where(target.noise | ~np.isfinite(jacobian).all(axis=0), 0.0, jacobian)
+    information = jacobian.T @ jacobian + np.diag(np.where(target.noise, 2.0 * np.count_nonzero(residuals), 0.0))
+    mode = Laplace(point, bridge.joint_covariance(information, covariance), 0.0)
+    horizons = block_boundaries(problem.n_rows, config.blocks, config.spacing)
+    return way_from_prior(problem, mode, horizons, config.target_ess, way_key)
+
+
+def way_from_prior(
+    problem: Problem, mode: Laplace, horizons: tuple[int, ...], target_ess: float, key: PRNGKeyArray, n: int = 1000
+) -> Way:
+    """Expected stages and rollouts of a sampler that starts at the prior and brings the data in at ``horizons``."""
+    prior = np.asarray(problem.to_unconstrained(problem.sample_prior(key, n)), dtype=float)
+    information, offset = _whitened(prior.mean(axis=0), np.atleast_2d(np.cov(prior.T)), mode)
+    share = np.geomspace(1e-3 / max(float(information.max()), 1.0), 1.0, 2000)
+    growth = 1.0 + share[:, None] * information
+    speed = 0.5 * (information / growth) ** 2 + (information * offset) ** 2 / growth**3
+    rate = np.sqrt(speed.sum(axis=1) / np.log(1.0 / target_ess))
+    stages = 0.5 * (rate[1:] + rate[:-1]) * np.diff(share)
+    prefix = np.asarray(horizons) / problem.n_rows
+    cost = prefix[np.minimum(np.searchsorted(prefix, share[1:] - 1e-12), len(prefix) - 1)]
+    rollouts = float(prefix.sum() + MOVES * (stages @ cost) + MOVES)
+    return Way(float(stages.sum()), rollouts, float(0.5 * np.log1p(information).sum()))
+
+
+def _whitened(
+    mean: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"], mode: Laplace
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    """Information of the likelihood and distance of its optimum from the prior mean, along its own directions."""
+    inverse = np.linalg.inv(np.linalg.cholesky(covariance))
+    precision, vectors = np.linalg.eigh(np.linalg.inv(inverse @ mode.covariance @ inverse.T))
+    information = np.maximum(precision - 1.0, 0.0)
+    moved = vectors.T @ (inverse @ (mode.mean - mean))
+    offset = np.where(information > 0.1, moved * (1.0 + information) / np.maximum(information, 0.1), 0.0)
+    return information, np.clip(offset, -FARTHEST, FARTHEST)
+
+
+class PrefixEvidence(NamedTuple):
+    """Log evidence of a prefix, its Monte-Carlo deviation, and the share of effective draws behind it."""
+
+    horizon: int
+    value: float
+    sd: float
+    ess: float
+
+
+def prefix_evidence(
+    problem: ResidualProblem,
+    mode: Laplace,
+    noise: np.ndarray,
+    horizons: tuple[int, ...],
+    budget: float | None,
+    key: PRNGKeyArray,
+    ledger: Ledger,
+) -> list[PrefixEvidence]:
+    """Evidence of the prefixes ``horizons``, longest first in the work and shortest first in the answer.
+
+    Args:
+        problem: with residuals.
+        mode: of all rows, from which the climbs to the prefixes' optima start.
+        noise: noise coordinates.
+        horizons: prefix lengths.
+        budget: full-length rollouts for all of it, half for climbs and half for draws; None for no limit.
+        key: random key.
+        ledger: is charged.
+
+    Returns:
+        nothing where the budget does not allow it.
+    """
+    steps, draws = _affordable_scores(problem, noise, horizons, budget)
+    if steps < 1 or draws < FEWEST_DRAWS:
+        return []
+    prior, start, found = prior_derivatives(problem), mode.mean, []
+    for horizon in sorted(horizons, reverse=True):
+        target = make_target(problem, horizon, ledger, start, prior, "auto", noise)
+        state, _ = maximise(target, start, max_steps=steps, tolerance=1e-2)
+        start = state.position
+        mixture = ModeMixture(problem, [laplace(target, state)], INFLATION, DEGREES, PRIOR_SHARE)
+        u = mixture.sample(jax.random.fold_in(key, horizon), draws)
+        density = evaluate_prior(problem, u) + evaluate_rows(problem, u, horizon, ledger).sum(axis=1)
+        found.append(_estimate(horizon, density - mixture.log_density(u)))
+    return found[::-1]
+
+
+def _affordable_scores(
+    problem: ResidualProblem, noise: np.ndarray, horizons: tuple[int, ...], budget: float | None
+) -> tuple[int, int]:
+    """Steps of each climb, and draws for each prefix."""
+    if budget is None or not horizons:
+        return MOST_STEPS, MOST_DRAWS
+    share = 0.5 * budget * problem.n_rows / sum(horizons)  # rollouts of a prefix, climb and draws each
+    d, k = len(noise), int(noise.sum())
+    step = 4.0 * d + 7.0  # a Jacobian by differences, noise coordinates, six dampings
+    around = 3.0 * step + 8.0 * k**2  # the normal approximation at the end, twice: the second along its own axes
+    return min(MOST_STEPS, int((share - around) / step)), min(MOST_DRAWS, int(share))
+
+
+def _estimate(horizon: int, log_weights: Float[np.ndarray, " n"]) -> PrefixEvidence:
+    n = len(log_weights)
+    value = float(logsumexp(log_weights) - np.log(n))
+    if not np.isfinite(value):
+        return PrefixEvidence(horizon, -np.inf, float("nan"), 0.0)
+    share = float(np.exp(log_effective_sample_size(log_weights))) / n
+    return PrefixEvidence(horizon, value, float(np.sqrt(max(1.0 / share - 1.0, 0.0) / n)), share)
+
+
+def block_scores(prefixes: list[PrefixEvidence]) -> list[dict[str, Any]]:
+    """Scores of the blocks between consecutive prefixes, as samplers that pass them report them."""
+    scores, before = [], PrefixEvidence(0, 0.0, 0.0, 1.0)
+    for now in prefixes:
+        score, sd = now.value - before.value, float(np.hypot(now.sd, before.sd))
+        scores.append({"first_row": before.horizon + 1, "last_row": now.horizon, "log_score": score, "sd": sd})
+        before = now
+    return scores

@@ -7,6 +7,7 @@ weights never mix two targets. Log-likelihood rows travel with their particles, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from blackjax.smc import resampling
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
+from scipy.optimize import brentq
 from scipy.special import logsumexp
 
-from rfdropo_bayes.inference.schedules import log_effective_sample_size, next_step
 from rfdropo_bayes.inference.smc.moves import (
     Reference,
     accept,
@@ -313,3 +314,40 @@ def prolong(
     }
     count = len(joined["base"])
     return population._replace(log_weights=np.full(count, -np.log(count)), **joined)
+
+
+def next_step(
+    log_weights_at: Callable[[float], Float[np.ndarray, " n"]], longest: float, target: float
+) -> tuple[float, bool]:
+    """Longest step along a path of targets that keeps the effective sample size.
+
+    Args:
+        log_weights_at: log weights of the particles after a step of the given length; 0 gives the present ones.
+        longest: length of the step to the end of the path.
+        target: effective sample size to keep, as a share of the particles that have weight at the end of the path.
+
+    Returns:
+        the length, and whether it reaches the end of the path with the target kept.
+    """
+    end = log_weights_at(longest)
+    alive = np.isfinite(end)
+    if not alive.any():
+        return longest, False
+    now = log_weights_at(0.0)
+    survivors = log_effective_sample_size(np.where(alive, now, -np.inf))
+    # Carried weights may already be just above the target, or below it once dead particles are gone: always advance.
+    wanted = min(math.log(target * max(alive.sum(), 1)), survivors + math.log(0.95))
+
+    def excess(step: float) -> float:
+        return log_effective_sample_size(log_weights_at(step)) - wanted
+
+    if excess(longest) >= 0.0:
+        return longest, True
+    # Relative, not absolute, precision: precise data make the first steps as short as 1e-8 of the path.
+    return float(brentq(excess, 0.0, longest, xtol=1e-300, rtol=1e-6, maxiter=500)), False
+
+
+def log_effective_sample_size(log_weights: Float[np.ndarray, " n"]) -> float:
+    """Logarithm of ``(sum w)^2 / sum w^2``; minus infinity when no weight is left."""
+    top = logsumexp(log_weights)
+    return float(2.0 * top - logsumexp(2.0 * log_weights)) if np.isfinite(top) else -math.inf

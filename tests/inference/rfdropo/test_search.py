@@ -9,12 +9,11 @@ from scipy.stats import multivariate_normal
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.rfdropo import search as rfdropo
-from rfdropo_bayes.inference.rfdropo.optimisers import default_population, make_optimiser
-from rfdropo_bayes.inference.rfdropo.randomisation import search_space
-from rfdropo_bayes.inference.rfdropo.search import RfdropoConfig
-from rfdropo_bayes.inference.rfdropo.trajectory_match import motion_scale, step_log_likelihood
+from rfdropo_bayes.inference.rfdropo.families import search_space
+from rfdropo_bayes.inference.rfdropo.scores import motion_scale, step_log_likelihood
+from rfdropo_bayes.inference.rfdropo.search import RfdropoConfig, default_population, make_optimiser
 
-from .toys import Spring
+from ..toys import Spring
 
 KEY = jax.random.key(9)
 

@@ -17,7 +17,7 @@ from rfdropo_bayes.inference.plain.problem import problem_from_numpyro
 from rfdropo_bayes.inference.smc import sampler as horizon_smc
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
-from .toys import LinearGaussian
+from ..toys import LinearGaussian
 
 KEY = jax.random.key(6)
 SCHOOLS = {

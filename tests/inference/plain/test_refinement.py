@@ -13,12 +13,11 @@ from scipy.stats import multivariate_normal, multivariate_t
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.modes.climb import Laplace
 from rfdropo_bayes.inference.plain import refinement
-from rfdropo_bayes.inference.plain.centring import CentredProblem, centred
-from rfdropo_bayes.inference.plain.problem import problem_from_numpyro
+from rfdropo_bayes.inference.plain.problem import CentredProblem, centred, problem_from_numpyro
 from rfdropo_bayes.inference.plain.refinement import _clusters
-from rfdropo_bayes.inference.smc.mixture import ModeMixture
+from rfdropo_bayes.inference.smc.bridge import ModeMixture
 
-from .test_numpyro_problem import SCHOOLS, schools_by_quadrature
+from .test_problem import SCHOOLS, schools_by_quadrature
 
 KEY = jax.random.key(8)
 SD, NOISE = 100.0, 0.5

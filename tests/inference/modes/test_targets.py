@@ -18,7 +18,7 @@ from rfdropo_bayes.inference.smc import sampler as horizon_smc
 from rfdropo_bayes.inference.smc.bridge import BridgeConfig
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
-from .toys import Decay, LinearGaussian, Spring, TwoModes
+from ..toys import Decay, LinearGaussian, Spring, TwoModes
 
 KEY = jax.random.key(4)
 

@@ -8,11 +8,11 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.rfdropo.families import make_family
-from rfdropo_bayes.inference.rfdropo.randomisation import SearchSpace
-from rfdropo_bayes.inference.rfdropo.reuse import LEAST_ESS, bootstrap, make_pool, refine
+from rfdropo_bayes.inference.rfdropo.families import SearchSpace, make_family
+from rfdropo_bayes.inference.rfdropo.scores import LEAST_ESS, make_pool
+from rfdropo_bayes.inference.rfdropo.search import bootstrap, refine
 
-from .toys import Spring
+from ..toys import Spring
 
 SPACE = SearchSpace(
     ("a", "b", "c"),

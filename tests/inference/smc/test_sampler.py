@@ -15,7 +15,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.smc import sampler as horizon_smc
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
-from .toys import Decay, LinearGaussian, TwoModes
+from ..toys import Decay, LinearGaussian, TwoModes
 
 KEY = jax.random.key(20)
 

@@ -8,9 +8,9 @@ import pytest
 from scipy.stats import ortho_group
 
 from rfdropo_bayes.inference.modes.climb import Laplace
-from rfdropo_bayes.inference.smc.mixture import NARROWEST, ModeMixture, covering, joint_covariance, prior_moments
+from rfdropo_bayes.inference.smc.bridge import NARROWEST, ModeMixture, covering, joint_covariance, prior_moments
 
-from .toys import LinearGaussian
+from ..toys import LinearGaussian
 
 KEY = jax.random.key(31)
 
