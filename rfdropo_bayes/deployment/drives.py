@@ -302,7 +302,7 @@ class Drive:
             with self._sdo:
                 pdo.read()
                 # Off under its own identifier first: only an invalid PDO may change it.
-                pdo.com_record[1].raw = pdo.com_record[1].raw | objects.PDO_INVALID
+                pdo.com_record[1].raw = int(pdo.com_record[1].raw) | objects.PDO_INVALID
                 pdo.clear()
                 for index, subindex, bits in wanted:
                     if pdo.add_variable(index, subindex, bits) is None:

@@ -133,6 +133,8 @@ class ControlLoop:
         self.markers.update(self.pulse)
         try:
             if phase is not Phase.BRAKED:
+                if self.demanded is not None:  # what follows from a stop by another thread is not its cause
+                    raise self.demanded
                 self.watch.check(tick, self._expected)
         finally:
             self._write(tick, phase, acted)

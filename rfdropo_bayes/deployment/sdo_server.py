@@ -107,7 +107,7 @@ class StrictServer(SdoServer):
 
     def segmented_download(self, command: int, request: bytearray) -> None:
         """Go on with it."""
-        size = len(self._buffer) + 7 - (command >> 1 & 7)
+        size = len(self._buffer or b"") + 7 - (command >> 1 & 7)
         beyond = self._announced is not None and size > self._announced
         if beyond or (command & NO_MORE_DATA and self._announced not in (None, size)):
             raise SdoAbortedError(WRONG_LENGTH)

@@ -202,7 +202,7 @@ def _resolved(settings: Deployment, base: Path) -> dict[str, object]:
         found["policy"] = settings.policy.model_copy(update={"file": str(base / settings.policy.file)})
     found["drives"] = settings.drives.model_copy(update={"eds": str(base / settings.drives.eds)})
     plant = settings.simulation.settings
-    files = {key: str(base / name) for key, name in plant.items() if str(name).endswith(".toml")}
+    files = {key: str(base / str(name)) for key, name in plant.items() if str(name).endswith(".toml")}
     found["simulation"] = settings.simulation.model_copy(update={"settings": plant | files})
     if settings.homing.file is not None:
         found["homing"] = settings.homing.model_copy(update={"file": str(base / settings.homing.file)})

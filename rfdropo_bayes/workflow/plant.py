@@ -18,6 +18,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import OBJECT, Robot
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.simulators.session import Session
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
 from rfdropo_bayes.workflow.experiment_file import override
@@ -113,7 +114,7 @@ class SimulatedTrunk:
         marker_noise: float = 0.0,
         seed: int = 0,
     ) -> None:
-        self._session, self._values, self._period = simulator.session(1, period), values, period
+        self._session, self._values, self._period = Session(simulator, 1, period), values, period
         self._noise, self._random = marker_noise, np.random.default_rng(seed)
         self._gain = np.array(robot.channels.gain)
         radius = np.array([motor.drum_radius_m for motor in robot.motors])

@@ -45,14 +45,14 @@ rayleigh_stiffness = {}
 method = "laplace"
 starts = 2
 [audit]
-minutes = 10
+minutes = 5
 """
 
 
 def walk(robot: Robot, name: str, seed: int) -> Trajectory:
     """Random commands of six seconds."""
     table = CommandsTable(
-        duration=6.0, interval=0.2, step=0.003, low=0.0, high=0.012, sample_time=0.1, recordings=[name]
+        duration=6.0, interval=0.2, step=0.0025, low=0.0, high=0.0075, sample_time=0.1, recordings=[name]
     )
     command_time, command = random_walk(table, len(robot.channel_names), np.random.default_rng(seed))
     time = np.array([0.0, table.duration])
@@ -104,6 +104,7 @@ def record(folder: Path, names: dict[str, int], hidden: str = "") -> None:
             )  # fmt: skip
             assert outcome.cause is Cause.FINISHED, outcome.detail
             (folder / f"{name}.nc").write_bytes((folder / name / "session.nc").read_bytes())
+    SimulatedMarkers.close(sensor)
 
 
 def experiment(folder: Path, fit: list[str], test: list[str]) -> Path:
