@@ -30,7 +30,8 @@ from rfdropo_bayes.workflow.files import hashes, run_folder
 
 COMMANDS, DESIGN = "next_commands.csv", "design.json"
 SEQUENCES, HYPOTHESES, KINDS = 24, 4, 4
-FITTED_BY, SCREENED_BY, REFITTED_BY = 0.5, 0.7, 0.85  # shares of the time by which these parts have to end
+SCREENED_BY, REFITTED_BY = 0.7, 0.85  # shares of the time by which these parts have to end
+SCREENING = "screening of the candidates"
 
 
 class Clock(Deadline):
@@ -86,7 +87,7 @@ def run_design(
         the content of design.json.
 
     Raises:
-        InputError: bad input, or a base model that was not fitted in half of the time.
+        InputError: bad input, or a base model that was not fitted in the time.
     """
     experiment, tables = load_experiment(path, overrides)
     folder = Path(path).resolve().parent
@@ -111,7 +112,7 @@ def _designed(
     """Write the proposal; return the content of design.json."""
     clock = Clock(experiment.design.minutes)
     rng = np.random.default_rng(question.seed)
-    clock.share = FITTED_BY
+    clock.share = 1.0
     target, base = base_model(question, question.seed, report=report, deadline=clock)
     report("base model fitted")
     hypotheses = _hypotheses(Inquiry(target, question.candidates, question.rules, question.seed), base, clock, report)
@@ -122,7 +123,7 @@ def _designed(
     _write_commands(experiment, fitted[0], times, value, out / COMMANDS)
     now = at_hand(target, hypotheses)
     return {
-        "sentence": _sentence(kind, outlook[chosen], now) + _unfinished(clock),
+        "sentence": _sentence(kind, outlook[chosen], now, SCREENING not in clock.missed) + _unfinished(clock),
         "commands": str(out / COMMANDS),
         "kind": kind,
         "hypotheses": [h.name for h in hypotheses],
@@ -144,7 +145,7 @@ def _designed(
 def _hypotheses(inquiry: Inquiry, base: Fit, clock: Clock, report: Callable[[str], None]) -> list[Hypothesis]:
     """The leading significant candidates, each refitted."""
     found = None
-    with clock.part(SCREENED_BY, "screening of the candidates"):
+    with clock.part(SCREENED_BY, SCREENING):
         found, _ = inquiry.look_at(base)
     if found is None:
         return []
@@ -254,10 +255,11 @@ def _unfinished(clock: Clock) -> str:
     )
 
 
-def _sentence(kind: str, outlook: Outlook, now: dict[tuple[str, str], float]) -> str:
+def _sentence(kind: str, outlook: Outlook, now: dict[tuple[str, str], float], screened: bool) -> str:
     if not outlook.pairs:
+        found = "No candidate is significant." if screened else "There was no time for the candidates."
         return (
-            f"No candidate is significant. The {kind} in {COMMANDS} would tell most about the base parameters: "
+            f"{found} The {kind} in {COMMANDS} would tell most about the base parameters: "
             f"{outlook.information:.1f} nats."
         )
     pair = min(outlook.pairs, key=lambda p: outlook.pairs[p])
