@@ -111,9 +111,8 @@ class BlackBox:
     @cached_property
     def simulate(self) -> Callable[[Batch, np.ndarray], list[Any]]:
         """Simulate a batch: what the function returned for each parameter set; None where it raised."""
-        function: Callable[..., Any]
         own = self.function
-        function = own if callable(own) else ProcessSimulation(tuple(own), self.time_step)
+        function: Any = own if callable(own) else ProcessSimulation(tuple(own), self.time_step)
 
         def single(values: Mapping[str, float], command: np.ndarray) -> Any:
             try:
