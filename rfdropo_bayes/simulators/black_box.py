@@ -111,7 +111,8 @@ class BlackBox:
     @cached_property
     def simulate(self) -> Callable[[Batch, np.ndarray], list[Any]]:
         """Simulate a batch: what the function returned for each parameter set; None where it raised."""
-        function = self.function if callable(self.function) else ProcessSimulation(tuple(self.function), self.time_step)
+        own = self.function
+        function: Any = own if callable(own) else ProcessSimulation(tuple(own), self.time_step)
 
         def single(values: Mapping[str, float], command: np.ndarray) -> Any:
             try:
@@ -162,9 +163,9 @@ def _parameter(name: str, table: Parameter | Mapping[str, Any]) -> Parameter:
 class Moved(NamedTuple):
     """What a rollout returned, one row per row of the command."""
 
-    position: Float[Array, "row marker 3"]
-    tension: Float[Array, "row cable"]
-    failed: Bool[Array, ""]
+    position: Float[Any, "row marker 3"]
+    tension: Float[Any, "row cable"]
+    failed: Bool[Any, ""]
 
 
 @dataclass(frozen=True)
@@ -337,7 +338,8 @@ class BlackBoxSimulator(ExtendedSimulator):
         chosen, place = distinct(jax.tree.leaves(given))
         values, command = jax.tree.map(lambda value: value[chosen], given)
         found = self._rolled(values, command[:, : steps + 1])
-        position, tension, failed = (part[place].reshape((*batch, *part.shape[1:])) for part in found)
+        parts = (np.asarray(part)[place] for part in found)
+        position, tension, failed = (part.reshape((*batch, *part.shape[1:])) for part in parts)
         return Moved(padded(position, len(batch), rows), padded(tension, len(batch), rows), failed)
 
     def _rolled(self, values: Batch, command: Float[np.ndarray, "n row channel"]) -> Moved:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from PIL import Image
 
 from rfdropo_bayes.cautions import Caution, read_cautions
 from rfdropo_bayes.errors import InputError
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from rfdropo_bayes.posteriors import InferenceData
 
 SHOWN_PAIRS = 4  # parameters of the picture in a notebook
+COLOURS = 64  # of that picture
 LABELS = 0.18  # share of the axes that labels beside and below a pair plot take
 
 
@@ -205,7 +207,8 @@ def axes_or_new(ax: Axes | None) -> Axes:
 
 
 def picture_tag(figure: Figure) -> str:
-    """A figure as an image inside HTML."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=96)
-    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode("ascii")}"/>'
+    """A figure as an image inside HTML, in few colours: a notebook keeps it."""
+    drawn, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=96)
+    Image.open(drawn).convert("RGB").quantize(COLOURS).save(small, format="png", optimize=True)
+    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(small.getvalue()).decode("ascii")}"/>'

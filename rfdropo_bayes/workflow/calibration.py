@@ -281,6 +281,7 @@ def gather_facts(
     unseen = [prediction for prediction in record.recordings if prediction.split == "test"]
     description = problem.model.simulator.description
     robot: Any = getattr(problem.model.simulator, "robot", None)
+    added: Any = description.get("mechanisms", ())
     checks = check_fit(problem, record)
     floor = noise_floor([*fitted, *tested])
     return RunFacts(
@@ -303,7 +304,7 @@ def gather_facts(
         ],
         model={
             "noise": problem.model.noise,
-            "mechanisms": ", ".join(mechanism.name for mechanism in problem.model.simulator.mechanisms) or "none",
+            "mechanisms": ", ".join(added) or "none",
             "fixed": ", ".join(f"{k} = {v:g}" for k, v in problem.model.fixed.items())
             or "nothing beyond the nominal values",
             **{key: str(value) for key, value in description.items() if key not in ("mechanisms", "robot")},

@@ -123,11 +123,11 @@ def design(
     clock = Clock(experiment.design.minutes if minutes is None else minutes)
     rng = np.random.default_rng(question.seed)
     clock.share = 1.0
-    target, base = base_model(question, question.seed, report=report, deadline=clock)
+    target, fitted = base_model(question, question.seed, report=report, deadline=clock)
     report("base model fitted")
-    hypotheses = _hypotheses(Inquiry(target, question.candidates, question.rules, question.seed), base, clock, report)
+    hypotheses = _hypotheses(Inquiry(target, question.candidates, question.rules, question.seed), fitted, clock, report)
     proposals = list(_proposals(runs[0], runs, rng))
-    outlook = _outlooks(question, target, base, hypotheses, runs[0], proposals, clock, report)
+    outlook = _outlooks(question, target, fitted, hypotheses, runs[0], proposals, clock, report)
     chosen = best(outlook, len(hypotheses) > 1)
     kind, times, value = proposals[chosen]
     now = at_hand(target, hypotheses)

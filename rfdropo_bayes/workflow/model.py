@@ -71,12 +71,12 @@ class Model:
         if priors is None and isinstance(robot, BlackBox):
             priors = {name: {} for name in robot.parameters if name not in fixed}
         given = {name: table_of(prior, where=f"priors, {name}") for name, prior in (priors or {}).items()}
-        stated = isinstance(noise, Mapping)
-        described = {"priors": given, "noise": STATED if stated else noise, "fixed": fixed, **more}
+        stated = dict(noise) if isinstance(noise, Mapping) else None
+        described = {"priors": given, "noise": noise if stated is None else STATED, "fixed": fixed, **more}
         named = [mechanism for mechanism in mechanisms if isinstance(mechanism, str)]
         tables: dict[str, Any] = {"robot": _name(robot), "model": {**described, "mechanisms": named}}
-        if stated:
-            tables["noise"] = dict(noise)
+        if stated is not None:
+            tables["noise"] = stated
         if simulator:
             tables["simulator"] = dict(simulator)
         experiment = parse_table(Experiment, tables, where="Model")
