@@ -159,5 +159,10 @@ def test_the_audit_of_the_log_names_what_is_hidden_in_the_robot(tmp_path: Path) 
     names = {"one": 1, "again": 1, "two": 2, "three": 3, "four": 4}
     record(tmp_path, names, f'model.mechanisms = ["backlash"]\nmodel.fixed.backlash = {PLAY}')
     content = run_audit(experiment(tmp_path, ["one", "again", "two"], ["three", "four"]), tmp_path / "out")
-    assert content["verdict"] in ("explained", "equivalent")
-    assert "backlash" in content["findings"][0]["equivalence_class"]
+    # Where in its play a drive stands when a session begins depends on the session before, which no log tells: the
+    # verdict may be that something remains.
+    assert content["verdict"] in ("explained", "equivalent", "partly_explained")
+    first = content["findings"][0]
+    assert first["mechanism"] == "backlash"
+    size = first["parameters"]["backlash"]
+    assert abs(size["mean"] - PLAY) < 4.0 * size["sd"] + 0.02 * PLAY
