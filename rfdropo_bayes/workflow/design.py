@@ -34,7 +34,8 @@ from rfdropo_bayes.workflow.model import Model
 
 COMMANDS, DESIGN = "next_commands.csv", "design.json"
 SEQUENCES, HYPOTHESES, KINDS = 24, 4, 4
-FITTED_BY, SCREENED_BY, REFITTED_BY = 0.5, 0.7, 0.85  # shares of the time by which these parts have to end
+SCREENED_BY, REFITTED_BY = 0.7, 0.85  # shares of the time by which these parts have to end
+SCREENING = "screening of the candidates"
 
 
 class Clock(Deadline):
@@ -115,13 +116,13 @@ def design(
         report: called with a line of words now and then.
 
     Raises:
-        InputError: bad input, or a base model that was not fitted in half of the time.
+        InputError: bad input, or a base model that was not fitted in the time.
     """
     experiment = model.experiment
     question = build_question(experiment, model.folder, runs, [], seed, start=start_values(base))
     clock = Clock(experiment.design.minutes if minutes is None else minutes)
     rng = np.random.default_rng(question.seed)
-    clock.share = FITTED_BY
+    clock.share = 1.0
     target, base = base_model(question, question.seed, report=report, deadline=clock)
     report("base model fitted")
     hypotheses = _hypotheses(Inquiry(target, question.candidates, question.rules, question.seed), base, clock, report)
@@ -131,7 +132,7 @@ def design(
     kind, times, value = proposals[chosen]
     now = at_hand(target, hypotheses)
     content = {
-        "sentence": _sentence(kind, outlook[chosen], now) + _unfinished(clock),
+        "sentence": _sentence(kind, outlook[chosen], now, SCREENING not in clock.missed) + _unfinished(clock),
         "kind": kind,
         "hypotheses": [h.name for h in hypotheses],
         "separation_now": {" / ".join(pair): value for pair, value in now.items()},
@@ -175,7 +176,7 @@ def run_design(
 def _hypotheses(inquiry: Inquiry, base: Fit, clock: Clock, report: Callable[[str], None]) -> list[Hypothesis]:
     """The leading significant candidates, each refitted."""
     found = None
-    with clock.part(SCREENED_BY, "screening of the candidates"):
+    with clock.part(SCREENED_BY, SCREENING):
         found, _ = inquiry.look_at(base)
     if found is None:
         return []
@@ -283,10 +284,11 @@ def _unfinished(clock: Clock) -> str:
     )
 
 
-def _sentence(kind: str, outlook: Outlook, now: dict[tuple[str, str], float]) -> str:
+def _sentence(kind: str, outlook: Outlook, now: dict[tuple[str, str], float], screened: bool) -> str:
     if not outlook.pairs:
+        found = "No candidate is significant." if screened else "There was no time for the candidates."
         return (
-            f"No candidate is significant. The {kind} in {COMMANDS} would tell most about the base parameters: "
+            f"{found} The {kind} in {COMMANDS} would tell most about the base parameters: "
             f"{outlook.information:.1f} nats."
         )
     pair = min(outlook.pairs, key=lambda p: outlook.pairs[p])
