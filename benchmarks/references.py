@@ -224,17 +224,19 @@ def sliding() -> Iterator[Reference]:
         gravity = GRAVITY * jnp.array([jnp.sin(angle), -jnp.cos(angle), 0.0])
         cube = Cube(jnp.asarray(0.05), side, solid_gyration_radius(side), friction)
 
-        def step(state, _):
+        def step(carry, _):
+            state, before = carry
             arm = (CORNERS * cube.side) @ rotation_matrix(state.orientation).T
             rows = jnp.concatenate([frame, jnp.cross(arm[:, None, :], frame)], axis=2).reshape(24, 6)
             twist, mass = free_twist(state, gravity, 0.0, time_step), inverse_inertia(cube)
-            contacts = Contacts((state.position[1] + arm[:, 1]) / time_step, friction)
+            contacts = Contacts((state.position[1] + arm[:, 1]) / time_step, friction, before)
             nothing = jnp.zeros(0)
             found = solve_constraints((rows * mass) @ rows.T, rows @ twist, nothing, time_step, contacts=contacts)
-            return moved(state, twist + mass * (rows.T @ found.contact.ravel()), time_step), None
+            state = moved(state, twist + mass * (rows.T @ found.contact.ravel()), time_step)
+            return (state, found.contact), None
 
         start = cube_at(jnp.array([0.0, 0.0175, 0.0]), 0.0, up)
-        return jax.lax.scan(step, start, None, length=count)[0].velocity[0]
+        return jax.lax.scan(step, (start, jnp.zeros((8, 3))), None, length=count)[0][0].velocity[0]
 
     for angle, friction in ((0.3, 0.1), (0.5, 0.3), (0.8, 0.6)):
         expected = GRAVITY * (np.sin(angle) - friction * np.cos(angle))

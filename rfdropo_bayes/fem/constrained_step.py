@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem.cable_friction import Slip
 from rfdropo_bayes.fem.constraints import Contacts, Impulses, Scalar, Slips, solve_constraints
-from rfdropo_bayes.fem.pushing import PushScene, Touch, find_contacts, opening_rates, trunk_rows
+from rfdropo_bayes.fem.pushing import PushScene, Touch, find_contacts, trunk_rows
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState, free_twist, inverse_inertia, moved
 
 Solve = Callable[[Float[Array, "columns nodes 3"]], Float[Array, "columns nodes 3"]]
@@ -33,6 +33,7 @@ class Push(NamedTuple):
     cube: Cube
     state: CubeState
     twist: Float[Array, "6"]  # velocity and spin at the end of the step without contacts
+    before: Float[Array, "pairs 3"]  # impulses of the step before, in space [N s]
 
 
 class ConstrainedStep(NamedTuple):
@@ -41,6 +42,7 @@ class ConstrainedStep(NamedTuple):
     increment: Float[Array, "nodes 3"]
     impulses: Impulses
     cube: CubeState | None
+    touch: Float[Array, "pairs 3"] | None  # impulses of all pairs that can touch, in space [N s]
 
     @property
     def converged(self) -> Bool[Array, ""]:
@@ -52,14 +54,15 @@ def meet(
     scene: PushScene,
     cube: Cube,
     state: CubeState,
+    before: Float[Array, "pairs 3"],
     position: Float[Array, "nodes 3"],
     gravity: Float[Array, "3"],
     rayleigh_mass: Scalar,
     time_step: Scalar,
 ) -> Push:
-    """The cube at the start of a step, and what it touches."""
+    """The cube at the start of a step, what it touches, and with which impulses it did so ``before``."""
     touch = find_contacts(scene, cube, state, position)
-    return Push(touch, cube, state, free_twist(state, gravity, rayleigh_mass, time_step))
+    return Push(touch, cube, state, free_twist(state, gravity, rayleigh_mass, time_step), before)
 
 
 def constrained_step(
@@ -79,7 +82,8 @@ def constrained_step(
         slips = Slips(time_step * slip.strength, slip.mobilised)
     if push is not None:
         rows.append(trunk_rows(push.touch, len(right)))
-        contacts = Contacts(opening_rates(push.touch, time_step), push.cube.friction)
+        before = jnp.einsum("cri,ci->cr", push.touch.frame, push.before[push.touch.pair])
+        contacts = Contacts(push.touch.gap / time_step, push.cube.friction, before)
     row = jnp.concatenate(rows)
     solution = solve(jnp.concatenate([right[None], row]))
     compliance = jnp.einsum("ani,bni->ab", row, solution[1:])
@@ -95,8 +99,13 @@ def constrained_step(
         compliance, free, pull.previous, time_step, give=pull.give, slips=slips, contacts=contacts
     )
     increment = solution[0] + jnp.einsum("a,ani->ni", found.all, solution[1:])
-    after = None
+    after = touching = None
     if push is not None:
         twist = push.twist + mass * (on_cube.T @ found.contact.ravel())
         after = moved(push.state, twist, time_step)
-    return ConstrainedStep(increment, found, after)
+        touching = (
+            jnp.zeros_like(push.before)
+            .at[push.touch.pair]
+            .set(jnp.einsum("cr,cri->ci", found.contact, push.touch.frame))
+        )
+    return ConstrainedStep(increment, found, after, touching)

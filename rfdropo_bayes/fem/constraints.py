@@ -5,7 +5,8 @@ velocities would be without them. Every constraint answers its own velocity, g =
 
     cable     g = max(-u, 0) / R                                 it pulls and never pushes
     slip      g = h D clip(z - h u / PRESLIDING, -1, 1)          Prandtl's element, see ``fem.cable_friction``
-    contact   y = (v - u) / R projected onto the friction cone in the norm of R, with v = (-gap / h, 0, 0)
+    contact   y = g' + (v - u) / R projected onto the friction cone in the norm of R, with v = (-gap / h, 0, 0) and g'
+              the tangential impulse of the step before: friction is a spring that slides, as Prandtl's element is
 
 (Castro, Permenter and Han 2022, IEEE Trans. Robot. 39:1301). R is small against W: the softness is that of the
 numbers, none of the material, and scales with the whole problem. P is the slope of a convex function, so that g is
@@ -30,9 +31,10 @@ CABLE_SOFTNESS = 1e-9
 BETA = 1.0
 """A contact gives way with a period of BETA time steps; see docs/architecture.md for how it was chosen."""
 NORMAL_SOFTNESS = BETA**2 / (4.0 * math.pi**2)
-"""R of a contact's normal, relative to the mean entry w of its rows on that diagonal."""
+"""R of a contact's normal, relative to the mean entry w of its rows on that diagonal, which no turn of the tangents
+changes."""
 TANGENT_SOFTNESS = 1e-3
-"""R of a contact's tangents relative to w: what sticks creeps at this share of the velocity that friction stops."""
+"""R of a contact's tangents relative to w: what sticks yields by this share of what friction stops in a step, once."""
 RIGID = 1e-12
 """Share of the largest entry on the diagonal of W below which a row counts as one of parts that cannot move."""
 APART = 1e6
@@ -56,6 +58,7 @@ class Contacts(NamedTuple):
 
     opening: Float[Array, " contacts"]  # gap over the time step [m/s]
     friction: Scalar
+    before: Float[Array, "contacts 3"]  # impulses of the step before, in the rows of this one [N s]
 
 
 class Impulses(NamedTuple):
@@ -96,7 +99,7 @@ def _contact_law(problem: _Problem, velocity: Float[Array, "contacts 3"]) -> tup
     """Impulses of contacts at a relative velocity, and minus their derivatives."""
     friction, normal, tangent = problem.contacts.friction, problem.normal, problem.tangent
     y = (-problem.contacts.opening - velocity[:, 0]) / normal
-    x = -velocity[:, 1:] / tangent[:, None]
+    x = problem.contacts.before[:, 1:] - velocity[:, 1:] / tangent[:, None]
     square = jnp.sum(x**2, axis=1)
     moving = square > 0.0
     size = jnp.sqrt(jnp.where(moving, square, 1.0))
@@ -179,7 +182,7 @@ def no_slips() -> Slips:
 
 def no_contacts() -> Contacts:
     """A body that touches nothing."""
-    return Contacts(jnp.zeros(0), 0.0)
+    return Contacts(jnp.zeros(0), 0.0, jnp.zeros((0, 3)))
 
 
 def solve_constraints(
@@ -210,7 +213,7 @@ def solve_constraints(
         return Impulses(previous, slips.mobilised, slips.impulse, jnp.zeros((0, 3)), jnp.array(True))
     compliance = compliance.at[jnp.arange(cables), jnp.arange(cables)].add(give)
     diagonal = jnp.diagonal(compliance)
-    drives, mean = diagonal[:cables], jnp.sqrt(jnp.mean(diagonal[cables + runs :].reshape(-1, 3) ** 2 + 1e-300, axis=1))
+    drives, mean = diagonal[:cables], jnp.mean(diagonal[cables + runs :].reshape(-1, 3), axis=1)
     usable = drives > RIGID * jnp.max(drives, initial=0.0)
     stiff = mean <= RIGID * jnp.max(mean, initial=0.0)
     mean = jnp.where(stiff, 1.0, mean)
@@ -219,7 +222,7 @@ def solve_constraints(
     problem = _Problem(
         compliance, free, softness, slips, contacts, NORMAL_SOFTNESS * mean, TANGENT_SOFTNESS * mean, time_step
     )
-    start = jnp.concatenate([previous, jnp.zeros(len(free) - cables)])
+    start = jnp.concatenate([previous, jnp.zeros(runs), contacts.before.ravel()])
     found, converged = lax.stop_gradient(_iterate(*lax.stop_gradient((problem, start))))
     # One more iteration, which carries the derivatives and changes the impulses by rounding only.
     law = _law(problem, free + compliance @ found)

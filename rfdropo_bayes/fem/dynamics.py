@@ -29,7 +29,7 @@ from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jaco
 from rfdropo_bayes.fem.constrained_step import Pull, Solve, constrained_step, meet
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
 from rfdropo_bayes.fem.layered import LayeredBody
-from rfdropo_bayes.fem.pushing import PushScene, unchanged
+from rfdropo_bayes.fem.pushing import PushScene, unchanged, untouched
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.surroundings import SectionLoad, section_load
 from rfdropo_bayes.fem.tension_stiffening import lateral_stiffening, layer_tension
@@ -88,6 +88,7 @@ class State(NamedTuple):
     tension: Float[Array, " cables"]  # [N]
     memory: Memory = Memory()  # of the effects; see ``remembering``
     cube: CubeState | None = None  # that the body pushes
+    touch: Float[Array, "pairs 3"] | None = None  # impulses of the step before between the pairs that can touch [N s]
 
 
 class StepInfo(NamedTuple):
@@ -223,12 +224,14 @@ def with_section_matrix(
     return BlockTridiagonal(matrix.diagonal + blocks, matrix.lower)
 
 
-def remembering(system: System, prepared: Prepared, state: State) -> State:
-    """The state with the memory that the effects start from: clock at zero, branches relaxed, friction not mobilised.
+def remembering(system: System, prepared: Prepared, state: State, scene: PushScene | None = None) -> State:
+    """The state with the memory that effects and contacts start from: clock at zero, branches relaxed, no friction.
 
     A memory that is there is kept.
     """
     effects, memory = prepared.effects, state.memory
+    if scene is not None and state.touch is None:
+        state = state._replace(touch=untouched(scene))
     if jax.tree.leaves(memory):
         return state
     if effects.softening_rate is not None:
@@ -353,13 +356,14 @@ def step(
 
     ``external_force`` [N] acts on the nodes throughout the step. With a ``scene`` and a ``cube`` the body touches them;
     the state says where the cube is. A step that is not finite leaves everything where it was, at rest and without
-    tension, and says so: a batch goes on. Where the material has effects with a memory, the state comes from
-    ``remembering``.
+    tension, and says so: a batch goes on. Where there is a scene, or the material has effects with a memory, the state
+    comes from ``remembering``.
     """
     matrix, right, memory = linearised(system, prepared, state, time_step, external_force)
     push = None
-    if scene is not None and cube is not None and state.cube is not None:
-        push = meet(scene, cube, state.cube, state.position, prepared.gravity, prepared.rayleigh_mass, time_step)
+    if scene is not None and cube is not None and state.cube is not None and state.touch is not None:
+        surroundings = state.position, prepared.gravity, prepared.rayleigh_mass
+        push = meet(scene, cube, state.cube, state.touch, *surroundings, time_step)
     slip = None
     mobilised, segment = state.memory.slip, state.memory.segment
     if mobilised is not None and segment is not None:
@@ -370,7 +374,7 @@ def step(
     if slip is not None:
         share, segment = slipped(system.cables, slip, found.impulses.share, tension)
         memory = memory._replace(slip=share, segment=segment)
-    moved = State(state.position + time_step * velocity, velocity, tension, memory, found.cube)
+    moved = State(state.position + time_step * velocity, velocity, tension, memory, found.cube, found.touch)
     return accept(system, prepared, state, moved, found.converged)
 
 
@@ -409,6 +413,7 @@ def accept(
     if state.cube is not None and moved.cube is not None:
         fine = fine & jnp.all(jnp.isfinite(moved.cube.position))
         cube = unchanged(state.cube, moved.cube, fine)
-    stopped = State(state.position, jnp.zeros_like(state.velocity), jnp.zeros_like(state.tension), state.memory)
+    still = jax.tree.map(jnp.zeros_like, (state.velocity, state.tension, state.touch))
+    stopped = State(state.position, *still[:2], state.memory, touch=still[2])
     kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), moved._replace(cube=None), stopped)
     return kept._replace(cube=cube), StepInfo(diverged=~fine, converged=converged | ~fine)

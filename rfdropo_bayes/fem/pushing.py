@@ -15,14 +15,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rfdropo_bayes.fem.constraints import APART
 from rfdropo_bayes.fem.layered import LayeredBody, attach, centre_gradient
 from rfdropo_bayes.fem.rigid_body import CORNERS, Cube, CubeState, rotation_matrix
 
 Scalar = Float[Array, ""] | float
 
-ALARM = 0.005
-"""[m] Surfaces further apart than this, beyond the contact distance, do not see each other in a step."""
 NEAREST = 24
 """Spheres that the reference engine looks at, nearest to the cube and to the plate: more than ever come near them."""
 SPHERES_PER_METRE = 230.0
@@ -56,6 +53,7 @@ class Touch(NamedTuple):
     gap: Float[Array, " contacts"]  # distance less the contact distance [m]
     frame: Float[Array, "contacts 3 3"]  # rows: normal, two tangents
     on_cube: Float[Array, "contacts 3 6"]  # relative velocity by the cube's velocity and spin
+    pair: Int[Array, " contacts"]  # that a contact is: corners on the plate, spheres on the cube, spheres on the plate
     trunk_node: Int[Array, "trunk_contacts width"]  # of the contacts that the trunk takes part in
     trunk_weight: Float[Array, "trunk_contacts 3 width"]  # of its nodes in each row
 
@@ -168,13 +166,14 @@ def find_contacts(scene: PushScene, cube: Cube, state: CubeState, position: Floa
         gap - scene.contact_distance,
         frame,
         jnp.asarray(sign)[:, None, None] * jnp.concatenate([frame, jnp.cross(arm[:, None, :], frame)], axis=2),
+        jnp.concatenate([jnp.arange(len(corner)), len(corner) + pushing, len(corner) + len(radius) + lying]),
         *_trunk_weights(spheres, chosen, normal, position),
     )
 
 
-def opening_rates(touch: Touch, time_step: Scalar) -> Float[Array, " contacts"]:
-    """Gaps over the time step [m/s]; those that are too far to touch in it stay open whatever happens."""
-    return jnp.where(touch.gap < ALARM, touch.gap / time_step, APART)
+def untouched(scene: PushScene) -> Float[Array, "pairs 3"]:
+    """Impulses of all pairs that can touch, before the first step."""
+    return jnp.zeros((len(CORNERS) + 2 * len(scene.spheres.radius), 3))
 
 
 def trunk_rows(touch: Touch, nodes: int) -> Float[Array, "rows nodes 3"]:

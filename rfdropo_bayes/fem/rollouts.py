@@ -94,7 +94,7 @@ def simulate(
         progress = _advance(system, prepared, progress, commands, time_step, around)
         return progress, _record(points, progress.state)
 
-    start = _Progress(remembering(system, prepared, state), jnp.array(False), jnp.array(True))
+    start = _Progress(remembering(system, prepared, state, scene), jnp.array(False), jnp.array(True))
     last, rows = lax.scan(row, start, displacement)
     return Rollout(rows.position, rows.tension, last.state, last.diverged, last.converged, rows.pose)
 
@@ -123,7 +123,7 @@ def simulate_prefix(
         here = _record(points, progress.state)
         return progress, jax.tree.map(lambda all_rows, one: all_rows.at[index].set(one), recorded, here)
 
-    start = _Progress(remembering(system, prepared, state), jnp.array(False), jnp.array(True))
+    start = _Progress(remembering(system, prepared, state, scene), jnp.array(False), jnp.array(True))
     empty = jax.tree.map(lambda one: jnp.zeros((rows, *one.shape)), _record(points, state))
     last, recorded = lax.fori_loop(0, jnp.minimum(horizon, rows), row, (start, empty))
     return Rollout(recorded.position, recorded.tension, last.state, last.diverged, last.converged, recorded.pose)

@@ -23,7 +23,7 @@ from rfdropo_bayes.fem.drives import DriveLimits
 from rfdropo_bayes.fem.dynamics import LOST, StepInfo
 from rfdropo_bayes.fem.layered import PointMap, point_positions
 from rfdropo_bayes.fem.levels import LevelMatrix, Levels, node_levels
-from rfdropo_bayes.fem.pushing import PushScene, unchanged
+from rfdropo_bayes.fem.pushing import PushScene, unchanged, untouched
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.tetrahedra import (
     TetrahedralBody,
@@ -65,6 +65,7 @@ class TetrahedralState(NamedTuple):
     tension: Float[Array, " cables"]  # [N]
     measured: Float[Array, " cables"]  # [m]
     cube: CubeState | None = None  # that the body pushes
+    touch: Float[Array, "pairs 3"] | None = None  # impulses of the step before between the pairs that can touch [N s]
 
 
 class TetrahedralRollout(NamedTuple):
@@ -138,13 +139,15 @@ def step(
         return jnp.zeros_like(fields).at[:, levels.order].set(solution)
 
     push = None
-    if scene is not None and cube is not None and state.cube is not None:
-        push = meet(scene, cube, state.cube, state.position, material.gravity, material.rayleigh_mass, time_step)
+    if scene is not None and cube is not None and state.cube is not None and state.touch is not None:
+        surroundings = state.position, material.gravity, material.rayleigh_mass
+        push = meet(scene, cube, state.cube, state.touch, *surroundings, time_step)
     pull = Pull(jacobian, slack, state.tension * time_step)
     found = constrained_step(solved, right, state.velocity, pull, time_step, push=push)
     velocity = state.velocity + found.increment
     tension = found.impulses.cable / time_step
-    moved = TetrahedralState(state.position + time_step * velocity, velocity, tension, shortening, found.cube)
+    position = state.position + time_step * velocity
+    moved = TetrahedralState(position, velocity, tension, shortening, found.cube, found.touch)
     return accept(system, state, moved, found.converged)
 
 
@@ -159,7 +162,8 @@ def accept(
     if state.cube is not None and moved.cube is not None:
         fine = fine & jnp.all(jnp.isfinite(moved.cube.position))
         cube = unchanged(state.cube, moved.cube, fine)
-    stopped = state._replace(velocity=jnp.zeros_like(state.velocity), tension=jnp.zeros_like(state.tension), cube=None)
+    still = jax.tree.map(jnp.zeros_like, (state.velocity, state.tension, state.touch))
+    stopped = state._replace(velocity=still[0], tension=still[1], cube=None, touch=still[2])
     kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), moved._replace(cube=None), stopped)
     return kept._replace(cube=cube), StepInfo(~fine, converged | ~fine)
 
@@ -187,6 +191,8 @@ def simulate(
         pose = None if state.cube is None else jnp.concatenate([state.cube.position, state.cube.orientation])
         return carry, (point_positions(points, state.position), state.tension, pose)
 
+    if scene is not None and state.touch is None:
+        state = state._replace(touch=untouched(scene))
     start = state, StepInfo(jnp.array(False), jnp.array(True))
     (state, info), (position, tension, pose) = lax.scan(row, start, displacement)
     return TetrahedralRollout(position, tension, state, info.diverged, info.converged, pose)

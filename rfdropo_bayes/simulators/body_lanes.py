@@ -183,7 +183,7 @@ class ReferenceLanes:
             if self._engine.from_equilibrium:
                 state, found = find_equilibrium(system, prepared, start)
                 imbalance = found.residual
-            state = remembering(system, prepared, state)
+            state = remembering(system, prepared, state, self._engine.scene)
             solid, place = (None, None) if cube is None else cube
             return _Lane(prepared, state._replace(cube=place), jnp.array(False), imbalance, jnp.array(True), solid)
 

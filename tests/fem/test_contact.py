@@ -41,7 +41,7 @@ CUBE = Cube(jnp.asarray(MASS), jnp.asarray(SIDE), solid_gyration_radius(SIDE), j
 
 def softness(rows) -> float:
     """Mean entry of a contact of the cube at rest on the diagonal of W, over its three rows."""
-    return float(np.sqrt(np.mean(np.diag((rows * inverse_inertia(CUBE)) @ rows.T).reshape(-1, 3) ** 2, axis=1))[0])
+    return float(np.mean(np.diag((rows * inverse_inertia(CUBE)) @ rows.T).reshape(-1, 3), axis=1)[0])
 
 
 class History(NamedTuple):
@@ -55,18 +55,19 @@ def on_plate(angle, friction, start: CubeState, rayleigh_mass=0.0) -> History:
     gravity = GRAVITY * jnp.array([jnp.sin(angle), -jnp.cos(angle), 0.0])
     frame = contact_frame(jnp.tile(jnp.asarray(UP), (8, 1)))
 
-    def step(state, _):
+    def step(carry, _):
+        state, before = carry
         arm = (CORNERS * CUBE.side) @ rotation_matrix(state.orientation).T
         rows = jnp.concatenate([frame, jnp.cross(arm[:, None, :], frame)], axis=2).reshape(24, 6)
         twist = free_twist(state, gravity, rayleigh_mass, TIME_STEP)
         gap = state.position[1] + arm[:, 1]
         compliance = (rows * inverse_inertia(CUBE)) @ rows.T
-        contacts = Contacts(gap / TIME_STEP, friction)
+        contacts = Contacts(gap / TIME_STEP, friction, before)
         found = solve_constraints(compliance, rows @ twist, jnp.zeros(0), TIME_STEP, contacts=contacts)
         state = moved(state, twist + inverse_inertia(CUBE) * (rows.T @ found.contact.ravel()), TIME_STEP)
-        return state, (state, found.contact, found.converged)
+        return (state, found.contact), (state, found.contact, found.converged)
 
-    return History(*jax.lax.scan(step, start, None, length=50)[1])
+    return History(*jax.lax.scan(step, (start, jnp.zeros((8, 3))), None, length=50)[1])
 
 
 rolled = jax.jit(on_plate)
@@ -98,14 +99,11 @@ def corner_rows():
 
 @pytest.mark.parametrize("friction", [0.1, 0.3, 0.7])
 def test_it_slides_exactly_when_the_slope_exceeds_the_friction(friction):
-    """Below the angle of friction it creeps, at the share of the speed that friction stops in a step; above it slides
-    away."""
+    """Below the angle of friction it heels over as far as the corners give way, and stays; above it slides away."""
     critical = np.arctan(friction)
     below, above = rolled(critical - 0.005, friction, RESTING), rolled(critical + 0.005, friction, RESTING)
-    stopped = MASS * GRAVITY * np.sin(critical) * TIME_STEP / 4 * softness(corner_rows())
-    speed = np.asarray(below.state.velocity)[:, 0]
-    assert speed[-1] < 3.0 * TANGENT_SOFTNESS * stopped
-    assert abs(speed[-1] - speed[-2]) < 1e-6 * speed[-1] + 1e-9
+    assert np.abs(below.state.velocity[-1]).max() < 1e-9
+    assert np.abs(below.state.position[-1] - RESTING.position).max() < 3e-5
     assert float(above.state.velocity[-1, 0]) > 1e-2
 
 
@@ -176,8 +174,12 @@ def test_the_solution_obeys_every_law_and_is_the_least_of_its_function(seed, fri
     size = cables + runs + 3 * contacts
     factor = rng.normal(size=(size, 2 * size))
     compliance, free = factor @ factor.T, rng.normal(size=size)
+    before = rng.normal(size=(contacts, 3))
     opening, limit, mobilised = rng.normal(size=contacts), rng.uniform(0.0, 0.1, runs), rng.uniform(-1.0, 1.0, runs)
-    slips, touching = Slips(jnp.asarray(limit), jnp.asarray(mobilised)), Contacts(jnp.asarray(opening), friction)
+    slips, touching = (
+        Slips(jnp.asarray(limit), jnp.asarray(mobilised)),
+        Contacts(jnp.asarray(opening), friction, jnp.asarray(before)),
+    )
     found = constraints(jnp.asarray(compliance), jnp.asarray(free), jnp.zeros(cables), 0.01, slips, touching)
     assert bool(found.converged)
     impulse = np.asarray(found.all)
@@ -190,10 +192,12 @@ def test_the_solution_obeys_every_law_and_is_the_least_of_its_function(seed, fri
     np.testing.assert_allclose(found.slip, limit * share, atol=1e-9)
     normal, tangent = np.asarray(found.contact)[:, 0], np.asarray(found.contact)[:, 1:]
     moving = velocity[5:].reshape(-1, 3)
-    mean = np.sqrt(np.mean(np.diag(compliance)[5:].reshape(-1, 3) ** 2, axis=1))
+    mean = np.mean(np.diag(compliance)[5:].reshape(-1, 3), axis=1)
     assert normal.min() > -1e-12
     assert np.all(np.linalg.norm(tangent, axis=1) <= friction * normal * (1 + 1e-9) + 1e-12)
-    # Friction takes energy; what touches closes its gap, or slides and is lifted; what is open exerts nothing.
+    # Friction takes energy from what slides, the stretch of its spring included; what touches closes its gap, or slides
+    # and is lifted; what is open exerts nothing.
+    moving[:, 1:] -= (TANGENT_SOFTNESS * mean)[:, None] * before[:, 1:]
     assert np.einsum("ci,ci->c", tangent, moving[:, 1:]).max() < 1e-9
     lifted = moving[:, 0] + opening - friction * np.linalg.norm(moving[:, 1:], axis=1)
     assert np.all(normal[lifted > 1e-9] < 1e-9)
@@ -219,11 +223,12 @@ def test_derivatives_are_those_of_the_solution(seed):
     change = rng.normal(size=(11, 11))
     start, shift = rng.normal(size=11), rng.normal(size=11)
     opening, along = rng.normal(size=2), rng.normal(size=2)
+    before = jnp.asarray(rng.normal(size=(2, 3)))
 
     def solved(step):
         moved = jnp.asarray(factor @ factor.T) + step * jnp.asarray(change + change.T)
         slips = Slips(jnp.asarray([0.05, 0.02]) * (1.0 + step), jnp.asarray([0.3, -0.2]) + 0.1 * step)
-        contacts = Contacts(jnp.asarray(opening) + step * jnp.asarray(along), 0.3 + 0.5 * step)
+        contacts = Contacts(jnp.asarray(opening) + step * jnp.asarray(along), 0.3 + 0.5 * step, (1.0 + step) * before)
         free = jnp.asarray(start) + step * jnp.asarray(shift)
         return constraints(moved, free, jnp.zeros(3), 0.01, slips, contacts).all
 

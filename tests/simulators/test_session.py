@@ -135,6 +135,32 @@ def test_a_cube_is_pushed_as_in_a_rollout(engine, precision, tolerance):
             assert now.status == whole.status[lane] == Result.OK
 
 
+@pytest.mark.slow
+def test_a_trunk_that_lies_still_stays_still_for_a_minute():
+    """Pulled down onto plate or cube, and aside: held there by friction, it moves by less than 0.01 mm in 60 s."""
+    model = pushing(simulator("numba"))
+    lanes = np.arange(8)
+    pull = np.array([20.0, 30.0, 15.0, 20.0, 30.0, 15.0, 20.0, 30.0]) * 1e-3
+    aside = np.array([0.0, 5.0, 0.0, 8.0, 0.0, 4.0, 0.0, 5.0]) * 1e-3
+    values = {
+        "young_modulus": np.array([4.5, 4.5, 2.0, 2.0, 7.0, 3.0, 4.5, 4.5]) * 1e6,
+        "friction": np.array([0.3, 0.3, 0.3, 1.0, 0.3, 0.1, 0.3, 0.3]),
+        "cube_x": np.where(lanes < 5, 0.3, 0.0),
+    }
+    commands = np.zeros((len(lanes), 8))
+    commands[:, 2], commands[:, 3] = pull, aside
+    session = model.session(len(lanes), 1.0)
+    session.reset(lanes, values)
+    for second in range(30):
+        before = session.act(commands * min(1.0, (second + 1) / 4))
+    for _ in range(60):
+        after = session.act(commands)
+    assert (after.status == Result.OK).all()
+    assert before.position[:, :, 1].min(axis=1).max() < -0.08, "it lies on nothing"
+    assert np.linalg.norm(after.position - before.position, axis=-1).max() < 1e-5
+    assert np.linalg.norm(after.object_pose - before.object_pose, axis=-1).max() < 1e-5
+
+
 @pytest.mark.parametrize(("engine", "tolerance"), [("numba", 1e-13), pytest.param("jax", 1e-9, marks=pytest.mark.slow)])
 def test_mechanisms_carry_their_state(engine, tolerance):
     """To rounding, as XLA rounds the same expressions differently in different programs."""

@@ -64,6 +64,7 @@ class Problem(NamedTuple):
     limit: Float[np.ndarray, "lines lanes"]  # of a run: impulse if all of its friction is mobilised
     trial: Float[np.ndarray, "lines lanes"]  # of a run: share of the friction mobilised at the start
     opening: Float[np.ndarray, "contacts lanes"]  # gap over the time step [m/s]
+    held: Float[np.ndarray, "tangents lanes"]  # of a contact: tangential impulses of the step before
     normal: Float[np.ndarray, "contacts lanes"]  # 1 / R
     tangent: Float[np.ndarray, "contacts lanes"]
     friction: Float[np.ndarray, "1 lanes"]
@@ -83,9 +84,9 @@ def problem_storage(lines: int, contacts: int, lanes: int, dtype: type) -> Probl
     sizes = {
         "matrix": rows**2, "free": rows, "impulse": rows, "before": rows, "velocity": rows, "aim": rows,
         "left": rows, "moving": rows,
-        "firmness": lines, "limit": lines, "trial": lines, "opening": contacts, "normal": contacts,
-        "tangent": contacts, "friction": 1, "sign": lines, "root": lines + 6 * contacts, "tilted": rows**2,
-        "factor": rows**2, "answer": rows, "going": 1, "share": 1,
+        "firmness": lines, "limit": lines, "trial": lines, "opening": contacts, "held": 2 * contacts,
+        "normal": contacts, "tangent": contacts, "friction": 1, "sign": lines, "root": lines + 6 * contacts,
+        "tilted": rows**2, "factor": rows**2, "answer": rows, "going": 1, "share": 1,
     }  # fmt: skip
     arrays = {name: aligned_zeros((max(size, 1), lanes), dtype) for name, size in sizes.items()}
     return Problem(**arrays, column=np.zeros(max(rows, 1), dtype=np.int64))
@@ -116,11 +117,9 @@ def soften(p, cables, runs, contacts, time_step, softness, token):
         store(p.sign, r, where_greater(zero, impulse, -one, one))
     largest = zero
     for c in range(contacts):
-        square = zero
+        mean = zero
         for i in range(lines + 3 * c, lines + 3 * c + 3):
-            value = load(p.matrix, i * n + i, token)
-            square = fma(value, value, square)
-        mean = square_root(square * (1.0 / 3.0))
+            mean = fma(load(p.matrix, i * n + i, token), 1.0 / 3.0, mean)
         store(p.normal, c, mean)
         largest = where_greater(mean, largest, mean, largest)
     for c in range(contacts):
@@ -151,7 +150,7 @@ def _contact_state(p, c, u, v, w, token):
     friction, one = load(p.friction, 0, token), fill(1.0, p.free, token)
     y = (-load(p.opening, c, token) - u) * load(p.normal, c, token)
     firm = load(p.tangent, c, token)
-    a, b = -v * firm, -w * firm
+    a, b = fnma(v, firm, load(p.held, 2 * c, token)), fnma(w, firm, load(p.held, 2 * c + 1, token))
     size = square_root(fma(a, a, b * b))
     hat = friction * RATIO
     push = fma(hat, size, y) / fma(friction, hat, one)

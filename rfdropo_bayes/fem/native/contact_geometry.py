@@ -6,14 +6,19 @@ lane has chosen it; in the other lanes it stays open.
 
 from __future__ import annotations
 
+import math
+
 from rfdropo_bayes.fem.constraints import APART
 from rfdropo_bayes.fem.native.contact_records import CORNERS
-from rfdropo_bayes.fem.native.fields import point
+from rfdropo_bayes.fem.native.fields import weighted
 from rfdropo_bayes.fem.native.simd import any_greater, fill, fma, fnma, kernel, load, square_root, store, where_greater
-from rfdropo_bayes.fem.pushing import ALARM
 
+ALARM = 0.005
+"""[m] Surfaces nearer than this, and as much more as they move in two steps, are looked at for contacts."""
 EAGER = 0.02
 """[m/s] A candidate is a contact from the start if it would open more slowly than this; it saves solves, no more."""
+HALF_DIAGONAL = 0.5 * math.sqrt(3.0)
+"""Of a cube of side one."""
 
 
 @kernel
@@ -99,10 +104,42 @@ def _list(touch, slot, pair, gap, x, y, z, token):
 
 
 @kernel
-def _list_corners(scene, touch, token):
+def _length(x, y, z):
+    return square_root(_dot(x, y, z, x, y, z))
+
+
+@kernel
+def _within(gap, reach, token):
+    """The gap, or out of all reach where it is."""
+    return where_greater(reach, gap, gap, fill(APART, gap, token))
+
+
+@kernel
+def _place_spheres(scene, touch, position, velocity, time_step, token):
+    """The spheres' centres, and how far they may reach."""
+    for sphere in range(scene.spheres):
+        first, last = scene.first[sphere], scene.within[sphere]
+        x, y, z = weighted(scene.place, scene.centre, first, last, position, token)
+        store(touch.middle, 3 * sphere, x)
+        store(touch.middle, 3 * sphere + 1, y)
+        store(touch.middle, 3 * sphere + 2, z)
+        u, v, w = weighted(scene.place, scene.centre, first, last, velocity, token)
+        store(touch.reach, sphere, 2.0 * time_step * _length(u, v, w) + ALARM)
+
+
+@kernel
+def _cube_reach(touch, time_step, token):
+    """How far any point of the cube moves in two steps."""
+    x, y, z = _column(touch.cube, 7, 1, token)
+    u, v, w = _column(touch.cube, 10, 1, token)
+    return 2.0 * time_step * fma(load(touch.values, 1, token), _length(u, v, w), _length(x, y, z))
+
+
+@kernel
+def _list_corners(scene, touch, reach, token):
     """The cube's corners that are near the plate in any lane; returns how many."""
-    one, zero = fill(1.0, touch.cube, token), fill(0.0, touch.cube, token)
-    half, slot = 0.5 * load(touch.values, 1, token), 0
+    zero = fill(0.0, touch.cube, token)
+    half, slot, reach = 0.5 * load(touch.values, 1, token), 0, reach + ALARM
     cx, cy, cz = _column(touch.cube, 0, 1, token)
     level = _height(scene, cx, cy, cz) - scene.distance
     for corner in range(CORNERS):
@@ -114,8 +151,8 @@ def _list_corners(scene, touch, token):
         az, bz, dz = _column(touch.turn, 6, 1, token)
         ax, ay, az = _dot(ax, bx, dx, x, y, z), _dot(ay, by, dy, x, y, z), _dot(az, bz, dz, x, y, z)
         gap = level + fma(ax, scene.up[0], fma(ay, scene.up[1], az * scene.up[2]))
-        if any_greater(one * ALARM, gap):
-            _list(touch, slot, corner, gap, ax, ay, az, token)
+        if any_greater(reach, gap):
+            _list(touch, slot, corner, _within(gap, reach, token), ax, ay, az, token)
             _place_frame(touch, slot, zero + scene.up[0], zero + scene.up[1], zero + scene.up[2], token)
             slot += 1
     return slot
@@ -168,21 +205,21 @@ def _place_offset(scene, touch, slot, sphere, position, token):
 
 
 @kernel
-def _list_pushing(scene, touch, position, slot, token):
+def _list_pushing(scene, touch, position, slot, reach, token):
     """The spheres that are near the cube in any lane; returns the next free slot."""
-    near, (cx, cy, cz) = fill(ALARM, touch.cube, token), _column(touch.cube, 0, 1, token)
+    (cx, cy, cz), outer = _column(touch.cube, 0, 1, token), HALF_DIAGONAL * load(touch.values, 1, token)
     for sphere in range(scene.spheres):
-        x, y, z = point(scene.first, scene.place, scene.centre, sphere, position, token)
-        store(touch.middle, 3 * sphere, x)
-        store(touch.middle, 3 * sphere + 1, y)
-        store(touch.middle, 3 * sphere + 2, z)
-        x, y, z = x - cx, y - cy, z - cz
+        x, y, z = _column(touch.middle, 3 * sphere, 1, token)
+        x, y, z, near = x - cx, y - cy, z - cz, reach + load(touch.reach, sphere, token)
+        far = outer + near + (scene.radius[sphere] + scene.distance)
+        if not any_greater(far * far, _dot(x, y, z, x, y, z)):
+            continue
         distance, nx, ny, nz = _box_distance(touch, x, y, z, token)
         gap = distance - (scene.radius[sphere] + scene.distance)
         if any_greater(near, gap):
             # The contact lies on the cube, below the sphere's centre.
             x, y, z = fnma(distance, nx, x), fnma(distance, ny, y), fnma(distance, nz, z)
-            _list(touch, slot, CORNERS + sphere, gap, x, y, z, token)
+            _list(touch, slot, CORNERS + sphere, _within(gap, near, token), x, y, z, token)
             _place_frame(touch, slot, nx, ny, nz, token)
             _place_offset(scene, touch, slot, sphere, position, token)
             slot += 1
@@ -192,12 +229,13 @@ def _list_pushing(scene, touch, position, slot, token):
 @kernel
 def _list_lying(scene, touch, position, slot, token):
     """The spheres that are near the plate in any lane; returns the next free slot."""
-    near, zero = fill(ALARM, touch.cube, token), fill(0.0, touch.cube, token)
+    zero = fill(0.0, touch.cube, token)
     for sphere in range(scene.spheres):
         x, y, z = _column(touch.middle, 3 * sphere, 1, token)
+        near = load(touch.reach, sphere, token)
         gap = _height(scene, x, y, z) - (scene.radius[sphere] + scene.distance)
         if any_greater(near, gap):
-            _list(touch, slot, CORNERS + scene.spheres + sphere, gap, zero, zero, zero, token)
+            _list(touch, slot, CORNERS + scene.spheres + sphere, _within(gap, near, token), zero, zero, zero, token)
             _place_frame(touch, slot, zero + scene.up[0], zero + scene.up[1], zero + scene.up[2], token)
             _place_offset(scene, touch, slot, sphere, position, token)
             slot += 1
@@ -272,32 +310,45 @@ def _closing(touch, slot, u, v, w, time_step, token):
 
 
 @kernel
+def _near(touch, slot, value, token):
+    """A value in the lanes that a candidate is within reach of, zero elsewhere."""
+    return where_greater(fill(0.5 * APART, value, token), load(touch.gap, slot, token), value, fill(0.0, value, token))
+
+
+@kernel
 def find_candidates(scene, position, velocity, gravity, drag, touch, time_step, token):
     """The candidates of a step, and which of them the velocities of its start would close."""
     zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
     turn_cube(touch, token)
     free_cube(touch, gravity, drag, time_step, token)
-    corners = _list_corners(scene, touch, token)
-    pushing = _list_pushing(scene, touch, position, corners, token)
+    _place_spheres(scene, touch, position, velocity, time_step, token)
+    reach = _cube_reach(touch, time_step, token)
+    corners = _list_corners(scene, touch, reach, token)
+    pushing = _list_pushing(scene, touch, position, corners, reach, token)
     last = _list_lying(scene, touch, position, pushing, token)
     touch.count[0], touch.count[1], touch.count[2] = corners, pushing - corners, last - pushing
     for slot in range(last):
         kind = kind_of(touch, slot)
         u, v, w = trunk_velocity(scene, touch, slot, kind, velocity, token)
+        store(touch.rate, 3 * slot, u)
+        store(touch.rate, 3 * slot + 1, v)
+        store(touch.rate, 3 * slot + 2, w)
         u = u + cube_velocity(touch, slot, kind, 0, touch.cube, 7, token)
         v = v + cube_velocity(touch, slot, kind, 1, touch.cube, 7, token)
         w = w + cube_velocity(touch, slot, kind, 2, touch.cube, 7, token)
-        near = where_greater(one * ALARM, load(touch.gap, slot, token), one, zero)
-        closing = where_greater(_closing(touch, slot, u, v, w, time_step, token), -EAGER * one, near, zero)
-        store(touch.chosen, slot, closing)
+        closing = where_greater(_closing(touch, slot, u, v, w, time_step, token), -EAGER * one, one, zero)
+        # What touched before may hold on by its friction.
+        x, y, z = _column(touch.memory, 3 * touch.pair[slot], 1, token)
+        closing = where_greater(_dot(x, y, z, x, y, z), zero, one, closing)
+        store(touch.chosen, slot, _near(touch, slot, closing, token))
 
 
 @kernel
 def choose_all(touch, token):
     """Choose all candidates."""
-    zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
+    one = fill(1.0, touch.cube, token)
     for slot in range(touch.count[0] + touch.count[1] + touch.count[2]):
-        store(touch.chosen, slot, where_greater(one * ALARM, load(touch.gap, slot, token), one, zero))
+        store(touch.chosen, slot, _near(touch, slot, one, token))
 
 
 @kernel
@@ -315,17 +366,19 @@ def list_contacts(touch, token):
 
 
 @kernel
-def add_missed(scene, touch, velocity, increment, time_step, missed, token):
+def add_missed(scene, touch, increment, time_step, missed, token):
     """Choose the candidates that a step's solution closes; returns whether there are any."""
     zero, one, found = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token), False
     for slot in range(touch.count[0] + touch.count[1] + touch.count[2]):
         chosen, kind = load(touch.chosen, slot, token), kind_of(touch, slot)
-        u, v, w = trunk_velocity(scene, touch, slot, kind, velocity, token)
+        near = _near(touch, slot, one - chosen, token)
+        if not any_greater(near, zero):
+            continue
+        u, v, w = _column(touch.rate, 3 * slot, 1, token)
         x, y, z = trunk_velocity(scene, touch, slot, kind, increment, token)
         u = u + x + cube_velocity(touch, slot, kind, 0, touch.after, 0, token)
         v = v + y + cube_velocity(touch, slot, kind, 1, touch.after, 0, token)
         w = w + z + cube_velocity(touch, slot, kind, 2, touch.after, 0, token)
-        near = where_greater(one * ALARM, load(touch.gap, slot, token), one - chosen, zero)
         near = where_greater(_closing(touch, slot, u, v, w, time_step, token), missed * one, near, zero)
         if any_greater(near, zero):
             found = True

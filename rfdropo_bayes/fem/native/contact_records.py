@@ -13,14 +13,20 @@ from rfdropo_bayes.fem.pushing import PushScene
 
 CUBE_STATE, CUBE_VALUES, CORNERS = 13, 4, 8
 """Rows of a cube: centre, quaternion (x, y, z, w), velocity, spin; and mass, side, radius of gyration, friction."""
+NOTHING = 1e-13
+"""Weights of a sphere's entries below this are rounding."""
 MISSED = {"float64": 1e-9, "float32": 1e-5}
 """[m/s] Velocity at which a surface may go through another that it was not taken to touch in a step."""
 
 
 class Scene(NamedTuple):
-    """What can touch; sphere s is bound to the rows ``place[k]`` of a field, k in ``first[s]:first[s + 1]``."""
+    """What can touch; sphere s is bound to the rows ``place[k]`` of a field, k in ``first[s]:first[s + 1]``.
+
+    Its centre is bound to those before ``within[s]`` only.
+    """
 
     first: Int[np.ndarray, " spheres_1"]
+    within: Int[np.ndarray, " spheres"]
     place: Int[np.ndarray, " entries"]
     centre: Float[np.ndarray, " entries"]
     gradient: Float[np.ndarray, "entries 3"]
@@ -54,11 +60,13 @@ class Touch(NamedTuple):
 
     cube: Float[np.ndarray, "13 lanes"]
     values: Float[np.ndarray, "4 lanes"]
-    memory: Float[np.ndarray, "pairs3 lanes"]  # impulses of the step before [N s]
+    memory: Float[np.ndarray, "pairs3 lanes"]  # impulses of the step before, in space [N s]
     turn: Float[np.ndarray, "9 lanes"]  # matrix of the cube's orientation, row-major
     twist: Float[np.ndarray, "6 lanes"]  # at the end of the step without contacts
     after: Float[np.ndarray, "6 lanes"]  # with them
     middle: Float[np.ndarray, "spheres3 lanes"]  # the spheres' centres [m]
+    reach: Float[np.ndarray, "spheres lanes"]  # gap within which a sphere may meet something in the step [m]
+    rate: Float[np.ndarray, "pairs3 lanes"]  # of a candidate: relative velocity by the trunk's at the start of the step
     gap: Float[np.ndarray, "pairs lanes"]  # of a candidate: distance less the contact distance [m]
     frame: Float[np.ndarray, "pairs9 lanes"]  # rows: normal, two tangents
     arm: Float[np.ndarray, "pairs3 lanes"]  # from the cube's centre to the contact [m]
@@ -81,7 +89,8 @@ def touch_storage(spheres: int, lanes: int, dtype: type) -> Touch:
     pairs = pairs_of(spheres)
     sizes = {
         "cube": CUBE_STATE, "values": CUBE_VALUES, "memory": 3 * pairs, "turn": 9, "twist": 6, "after": 6,
-        "middle": 3 * spheres, "gap": pairs, "frame": 9 * pairs, "arm": 3 * pairs, "offset": 3 * pairs,
+        "middle": 3 * spheres, "reach": spheres, "rate": 3 * pairs, "gap": pairs, "frame": 9 * pairs,
+        "arm": 3 * pairs, "offset": 3 * pairs,
         "chosen": pairs, "on_cube": 18 * pairs, "failed": 1,
     }  # fmt: skip
     arrays = {name: aligned_zeros((size, lanes), dtype) for name, size in sizes.items()}
@@ -100,20 +109,23 @@ def scene_tables(
     """
     spheres, section = scene.spheres, len(shape)
     weight = np.concatenate([spheres.centre[..., None], spheres.gradient], axis=2)
-    first, place, values = [0], [], []
+    first, within, place, values = [0], [], [], []
     for nodes, weights in zip(number[spheres.node], weight, strict=True):
         total: dict[int, np.ndarray] = {}
         for node, share in zip(nodes, weights, strict=True):
             station, member = divmod(int(node), section)
             total[station] = total.get(station, np.zeros((section, 4))) + shape[member][:, None] * share
-        for station in sorted(total):
-            used = np.flatnonzero(np.abs(total[station]).max(axis=1) > 1e-13)
-            place.extend(3 * (station * section + used))
-            values.extend(total[station][used])
+        entries = [(station * section + k, row) for station in sorted(total) for k, row in enumerate(total[station])]
+        central = [(k, row) for k, row in entries if abs(row[0]) > NOTHING]
+        others = [(k, row) for k, row in entries if abs(row[0]) <= NOTHING < np.abs(row).max()]
+        place.extend(3 * k for k, _ in central + others)
+        values.extend(row for _, row in central + others)
+        within.append(first[-1] + len(central))
         first.append(len(place))
     table = np.array(values, dtype=dtype).reshape(-1, 4)
     return Scene(
         first=np.array(first, dtype=np.int64),
+        within=np.array(within, dtype=np.int64),
         place=np.array(place, dtype=np.int64),
         centre=np.ascontiguousarray(table[:, 0]),
         gradient=np.ascontiguousarray(table[:, 1:]),

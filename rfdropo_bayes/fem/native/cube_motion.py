@@ -41,8 +41,14 @@ def add_cube(touch, p, lines, contacts, time_step, token):
                 store(touch.on_cube, 18 * c + 6 * r + k, value)
                 rate = fma(value, load(touch.twist, k, token), rate)
             store(p.free, i, where_greater(chosen, zero, rate, zero))  # others' contacts are no measure of a lane's
-            remembered = load(touch.memory, 3 * touch.pair[slot] + r, token)
-            store(p.impulse, i, where_greater(chosen, zero, remembered, zero))
+            before = zero
+            for k in range(3):
+                remembered = load(touch.memory, 3 * touch.pair[slot] + k, token)
+                before = fma(remembered, load(touch.frame, 9 * slot + 3 * r + k, token), before)
+            before = where_greater(chosen, zero, before, zero)
+            store(p.impulse, i, before)
+            if r > 0:
+                store(p.held, 2 * c + r - 1, before)
     for i in range(3 * contacts):
         for j in range(i + 1):
             value, turning = zero, zero
@@ -71,14 +77,18 @@ def stop_cube(touch, p, lines, contacts, token):
 
 @kernel
 def remember_impulses(scene, touch, p, lines, contacts, accepted, token):
-    """Keep the impulses of a step that was taken, where the next one starts."""
+    """Keep the impulses of a step that was taken, in space: the next one starts from them, and friction goes on."""
     zero, taken = fill(0.0, touch.cube, token), load(accepted, 0, token)
     for i in range(3 * (CORNERS + 2 * scene.spheres)):
         store(touch.memory, i, zero)
     for c in range(contacts):
-        for r in range(3):
-            impulse = where_greater(taken, zero, load(p.impulse, lines + 3 * c + r, token), zero)
-            store(touch.memory, 3 * touch.pair[touch.contact[c]] + r, impulse)
+        slot = touch.contact[c]
+        for k in range(3):
+            total = zero
+            for r in range(3):
+                impulse = load(p.impulse, lines + 3 * c + r, token)
+                total = fma(impulse, load(touch.frame, 9 * slot + 3 * r + k, token), total)
+            store(touch.memory, 3 * touch.pair[slot] + k, where_greater(taken, zero, total, zero))
 
 
 @kernel

@@ -16,8 +16,14 @@ def clear(rows, first, last, token):
 @kernel
 def point(first, place, weight, p, field, token):
     """Point p of a sparse list."""
+    return weighted(place, weight, first[p], first[p + 1], field, token)
+
+
+@kernel
+def weighted(place, weight, first, last, field, token):
+    """Weighted sum of a field's vectors."""
     x, y, z = fill(0.0, field, token), fill(0.0, field, token), fill(0.0, field, token)
-    for k in range(first[p], first[p + 1]):
+    for k in range(first, last):
         row, w = place[k], fill(weight[k], field, token)
         x = fma(load(field, row, token), w, x)
         y = fma(load(field, row + 1, token), w, y)

@@ -15,10 +15,8 @@ from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
 from rfdropo_bayes.fem.native.contact_geometry import (
     add_missed,
     find_candidates,
-    kind_of,
     list_contacts,
     sphere_of,
-    trunk_velocity,
     weights,
 )
 from rfdropo_bayes.fem.native.cube_motion import add_cube, remember_impulses, stop_cube, take_cube_step
@@ -78,15 +76,13 @@ def _top_station(scene, touch, contacts, size):
 
 
 @kernel
-def _gather_contacts(tables, scene, touch, rows, p, lines, contacts, first, panels, velocity, token):
+def _gather_contacts(tables, scene, touch, rows, p, lines, contacts, first, panels, token):
     """Border rows of the contacts from panel ``first`` on, and what the body's velocity adds to the problem."""
     size = 3 * tables.modes
     for c in range(contacts):
         slot, i = touch.contact[c], lines + 3 * c
-        u, v, w = trunk_velocity(scene, touch, slot, kind_of(touch, slot), velocity, token)
-        store(p.free, i, u)
-        store(p.free, i + 1, v)
-        store(p.free, i + 2, w)
+        for r in range(3):
+            store(p.free, i + r, load(touch.rate, 3 * slot + r, token))
         if c >= touch.count[3]:
             _contact_panel(scene, touch, slot, rows.border, first + c - touch.count[3], panels, size, token)
 
@@ -144,8 +140,7 @@ def _hold(tables, runs, scene, samples, factors, work, friction, touch, rows, p,
         if runs is not None:
             gather_slip(tables, runs, samples, friction, rows.border, panels, p, work, time_step, token)
         if scene is not None:
-            velocity = work.velocity
-            _gather_contacts(tables, scene, touch, rows, p, lines, contacts, slip_panels, panels, velocity, token)
+            _gather_contacts(tables, scene, touch, rows, p, lines, contacts, slip_panels, panels, token)
         if panels > 0:
             _condense(tables, rows, work, p, n, panels, slips, corners, top, token)
         if scene is not None:
@@ -208,7 +203,7 @@ def constrained_step(tables, runs, scene, samples, factors, work, friction, touc
         _hold(tables, runs, scene, samples, factors, work, friction, touch, rows, p, slips, contacts, schedule, token)
         if scene is not None:
             stop_cube(touch, p, tables.cables + slips, contacts, token)
-            again = add_missed(scene, touch, work.velocity, work.solution, time_step, schedule.missed, token)
+            again = add_missed(scene, touch, work.solution, time_step, schedule.missed, token)
     take_tensions(tables.cables, work, 1.0 / time_step, token)
     if runs is not None:
         sum_losses(tables, runs, samples, friction, p, token)

@@ -32,10 +32,8 @@ def _gather_contacts(scene, touch, work, rows, p, reached, cables, contacts, fre
         reached[node] = 0
     for c in range(contacts):
         slot, i = touch.contact[c], cables + 3 * c
-        u, v, w = trunk_velocity(scene, touch, slot, kind_of(touch, slot), work.velocity, token)
-        store(p.free, i, u)
-        store(p.free, i + 1, v)
-        store(p.free, i + 2, w)
+        for r in range(3):
+            store(p.free, i + r, load(touch.rate, 3 * slot + r, token))
         if c < touch.count[3]:
             continue
         sphere = sphere_of(scene, touch.pair[slot])
