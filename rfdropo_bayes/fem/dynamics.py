@@ -413,7 +413,7 @@ def accept(
     if state.cube is not None and moved.cube is not None:
         fine = fine & jnp.all(jnp.isfinite(moved.cube.position))
         cube = unchanged(state.cube, moved.cube, fine)
-    still = jax.tree.map(jnp.zeros_like, (state.velocity, state.tension, state.touch))
-    stopped = State(state.position, *still[:2], state.memory, touch=still[2])
+    velocity, tension, touch = jax.tree.map(jnp.zeros_like, (state.velocity, state.tension, state.touch))
+    stopped = State(state.position, velocity, tension, state.memory, touch=touch)
     kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), moved._replace(cube=None), stopped)
     return kept._replace(cube=cube), StepInfo(diverged=~fine, converged=converged | ~fine)
