@@ -48,6 +48,6 @@ def _pace(lanes: RoutedLanes, target: Target, base: Fit) -> float:
     seconds = 0.0
     for _ in range(2):
         began = time.process_time()
-        lanes.slow.roll(theta, forward.commands, lane)
+        lanes.slow.roll(theta, forward.start[lane], forward.commands.of(lane))
         seconds = time.process_time() - began
     return seconds / lanes.slow.width

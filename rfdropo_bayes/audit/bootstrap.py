@@ -11,12 +11,13 @@ from jaxtyping import Float
 
 from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.score import project_out
-from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED, Autoregression
+from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED
+from rfdropo_bayes.bayes.noise.stacked import Stacked
 
 
 def null_residuals(
     measurements: Measurements,
-    noise: Autoregression,
+    noise: Stacked,
     base: Float[np.ndarray, "n rank"],
     parameters: int,
     rng: np.random.Generator,
@@ -33,23 +34,26 @@ def null_residuals(
         count: data sets.
     """
     found = np.empty((count, len(base)))
-    drawn = noise.draw(rng, (count, *measurements.single.shape))
+    drawn = noise.draw(rng, (count, *measurements.spread.shape))
     if noise.source == RESIDUALS:
         drawn = _fitted(measurements, noise, base, drawn)
     for row, single in enumerate(drawn):
         estimated = noise
         if noise.source != STATED:
             estimated = measurements.noise(single, parameters, noise)
-        found[row] = measurements.whiten(measurements.mean_of(single), estimated)
+        found[row, : measurements.count.size] = measurements.whiten(measurements.mean_of(single), estimated)
+    weighed = measurements.size - measurements.count.size  # whose errors are known
+    found[:, measurements.count.size :] = rng.standard_normal((count, weighed))
     return project_out(base, found.T).T
 
 
-def _fitted(measurements: Measurements, noise: Autoregression, base: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+def _fitted(measurements: Measurements, noise: Stacked, base: np.ndarray, drawn: np.ndarray) -> np.ndarray:
     """What the base model leaves of data sets without repeats: where the noise is estimated from that, it is estimated
     from that here, too; the noise before a fit would be a little larger in most of them, and give itself away."""
     order = [group[0] for group in measurements.members]
     white = measurements.whiten(drawn[:, order], noise)
-    left = project_out(base, white.T).T.reshape(len(drawn), *measurements.position.shape)
+    rows = base[: measurements.count.size]
+    left = (white - white @ rows @ rows.T).reshape(len(drawn), *measurements.count.shape)
     fitted = np.empty_like(drawn)
     fitted[:, order] = noise.colour(left, measurements.valid)
     return fitted

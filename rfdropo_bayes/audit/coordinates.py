@@ -7,22 +7,25 @@ coordinate would be infinite; a parameter that means nothing at null (a time con
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import expit, logit
 
+from rfdropo_bayes.bayes.batches import padded
 from rfdropo_bayes.bayes.space import Parameter, ParameterSpace
 
 MEASURED_FROM_NULL = ("Normal", "TruncatedNormal", "HalfNormal")
 PRIOR_DRAWS = 4000
 # Prior deviations from its mean at which an unconstrained coordinate ends: a logistic is flat there.
 FAR = 8.0
+STEP = 1e-3  # of differences of log priors, in these coordinates
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class Coordinates:
         base: how many of them belong to the base model.
         physical: names of the simulator's parameters, the order in which rollouts want them; nominal: their values
             where nothing else is said.
-        fixed: values that stay, by physical name.
+        fixed: values that stay, by name.
     """
 
     space: ParameterSpace
@@ -119,7 +122,7 @@ class Coordinates:
 
     @cached_property
     def prior_mean(self) -> Float[np.ndarray, " d"]:
-        """Centre of the prior in these coordinates."""
+        """Centre of the prior in these coordinates: where searches start, no statement of its density."""
         return np.array([0.0 if a else float(u.mean()) for a, u in zip(self.affine, self._free_draws, strict=True)])
 
     @cached_property
@@ -190,11 +193,52 @@ class Coordinates:
         free = [support.slope(column) for support, column in zip(self._supports, x.T, strict=True)]
         return np.where(self.affine, self._scale, np.stack(free, axis=1))
 
+    @cached_property
+    def log_prior(self) -> Callable[[Float[np.ndarray, "n d"]], Float[np.ndarray, "n d"]]:
+        """Log density of each coordinate's prior in these coordinates."""
+        _ = self.affine, self._scale  # found by sampling, which must not be traced
+        compiled = jax.jit(jax.vmap(self._log_priors))
+        return lambda x: np.asarray(padded(compiled, x))
+
+    def prior_slopes(self, x: Float[np.ndarray, " d"]) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+        """First and second derivatives of `log_prior` at one point; each depends on its own coordinate only."""
+        # Differences of what is smooth, in double precision: compiling derivatives takes seconds in each audit.
+        behind, here, ahead = self.log_prior(x + STEP * np.array([[-1.0], [0.0], [1.0]]))
+        return (ahead - behind) / (2.0 * STEP), (ahead - 2.0 * here + behind) / STEP**2
+
+    def _log_priors(self, x: jax.Array) -> jax.Array:
+        found = []
+        for i, parameter in enumerate(self.space.parameters):
+            if self.affine[i]:
+                found.append(parameter.prior.log_prob(self._null[i] + self._scale[i] * x[i]) + np.log(self._scale[i]))
+            else:
+                value = parameter.transform(x[i])
+                jacobian = parameter.transform.log_abs_det_jacobian(x[i], value)
+                found.append(parameter.prior.log_prob(value) + jacobian)
+        return jnp.stack(found)
+
+    def gains(self, x: Float[np.ndarray, "n d"]) -> dict[str, Float[np.ndarray, " n"]]:
+        """Values of parameters that channels want and rollouts do not, inferred or fixed."""
+        return self._beside(self.values(x)) | {
+            name: np.full(len(x), value) for name, value in self.fixed.items() if name not in self.physical
+        }
+
+    def gain_tangents(
+        self, x: Float[np.ndarray, "n d"], directions: Float[np.ndarray, "n d"]
+    ) -> dict[str, Float[np.ndarray, " n"]]:
+        """Derivatives of `gains` along directions."""
+        zero = {name: np.zeros(len(x)) for name in self.fixed if name not in self.physical}
+        return self._beside(self.slopes(x) * directions) | zero
+
+    def _beside(self, columns: np.ndarray) -> dict[str, np.ndarray]:
+        named = enumerate(self.space.parameters)
+        return {p.name: columns[:, i] for i, p in named if p.physical not in self.physical}
+
     def slots(self, recordings: Sequence[str]) -> Int[np.ndarray, "recording d"]:
         """Where each coordinate goes in a recording's physical parameters; -1 for those of other recordings."""
         index = {name: i for i, name in enumerate(self.physical)}
         return np.array(
-            [[index[p.physical] if p.holds_for(r) else -1 for p in self.space.parameters] for r in recordings]
+            [[index.get(p.physical, -1) if p.holds_for(r) else -1 for p in self.space.parameters] for r in recordings]
         )
 
     def physical_values(

@@ -9,7 +9,7 @@ hypothesis is found with probability ``Phi(sqrt(lambda) / 2)``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -58,20 +58,31 @@ def outlooks(
     forward = target.forward
     stacked = stack_commands(sequences)
     names = {f"new {k}": k for k in range(len(sequences))}
-    fresh = Forward(forward.lanes, forward.coordinates, stacked, names, deadline=forward.deadline)
-    first = target.measurements.valid[0]
+    repeated = [0] * len(sequences)  # every sequence is observed as the first recording was
+    channels = tuple(channel.of_recordings(repeated) for channel in target.measurements.channels)
+    valid = target.measurements.valid[repeated]
+    fresh = replace(
+        target,
+        forward=Forward(
+            forward.lanes, forward.coordinates, stacked, names, deadline=forward.deadline, start=forward.start[repeated]
+        ),
+        measurements=replace(target.measurements, channels=channels, count=valid.astype(float), members=()),
+    )
     models = [base, *(h.fit for h in hypotheses)]
-    predicted, _ = fresh.positions(np.stack([fit.x for fit in models]))
-    slopes = [fresh.derivatives(fit.x, np.eye(len(fit.x))[fit.free]) for fit in models]
+    predicted = [-fresh.errors(fit.x) for fit in models]
+    slopes = [
+        -fresh.error_slopes(np.repeat(fit.x[None], len(fit.free), axis=0), np.eye(len(fit.x))[fit.free])[0]
+        for fit in models
+    ]
     found = []
     for k in range(len(sequences)):
 
         def whiten(series: np.ndarray, k: int = k) -> np.ndarray:
             own = series[..., k, :, :]
-            white = target.noise.whiten(own, first)
+            white = target.noise.whiten(own, valid[k])
             return white.reshape(*own.shape[:-2], -1)
 
-        news = [whiten(position) for position in predicted]
+        news = [whiten(series) for series in predicted]
         jacobians = [whiten(slope).T for slope in slopes]
         pairs = {}
         for i, one in enumerate(hypotheses, 1):

@@ -1,4 +1,4 @@
-"""Posterior modes of the base model and its extensions by Gauss-Newton within bounds, with Laplace's evidence."""
+"""Posterior modes of the base model and its extensions within bounds, with Laplace's evidence."""
 
 from __future__ import annotations
 
@@ -6,18 +6,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import least_squares
 from scipy.stats import norm
 
 from rfdropo_bayes.audit.coordinates import Coordinates
-from rfdropo_bayes.audit.forward import Forward
+from rfdropo_bayes.audit.forward import Fields, Forward
 from rfdropo_bayes.audit.journal import Arrays, Journal, digest
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.bayes.noise.autoregression import Autoregression
+from rfdropo_bayes.bayes.channels import Seen
+from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.inference import LevenbergState, maximise, normal_at
+from rfdropo_bayes.simulators.protocol import Observation
 
-FIRST, ALL = 8, 40  # evaluations of a short climb, and of one to its end
+FIRST, ALL = 8, 40  # steps of a short climb, and most of one to its end
+TOLERANCE = 0.01  # nats that a step promises at the end of a climb
 CLOSE = 1e-3  # of the squared misfit: climbs end where steps bring less than a thousandth of that
 FAILED = 1e6  # whitened residual of a rollout that did not end well: no step is ever taken there
 
@@ -29,10 +34,11 @@ class Fit:
     Attributes:
         x: coordinates of all parameters.
         free: which of them were fitted.
-        residual: whitened, without the prior's rows.
+        residual: whitened, of all channels.
         jacobian: of the whitened prediction with respect to the free coordinates.
         covariance: of the free coordinates, prior included.
-        log_evidence: Laplace's, up to the noise's normaliser, which all models under one noise share.
+        log_evidence: Laplace's, up to the noise's normaliser, which all models under one noise share; the prior counts
+            with its density and its curvature.
         promise: what a Gauss-Newton step from here still promises [nat]; see `converged`.
     """
 
@@ -65,15 +71,17 @@ class Target:
 
     forward: Forward
     measurements: Measurements
-    noise: Autoregression
+    noise: Stacked
     journal: Journal = field(default_factory=Journal)
 
     @cached_property
     def identity(self) -> str:
         """Digest of everything that a residual depends on beside the parameters."""
-        data, noise = self.measurements, self.noise
-        across = np.zeros(0) if noise.correlation is None else noise.correlation
-        return digest(self.forward.identity, data.position, data.count, noise.scale, noise.autocorrelation, across)
+        data = self.measurements
+        readings = [np.asarray(channel.measured) for channel in data.channels]
+        noise = [(part.scale, part.autocorrelation, part.correlation) for part in self.noise.parts]
+        known = [np.zeros(0) if array is None else array for part in noise for array in part]
+        return digest(self.forward.identity, *readings, data.count, *known, repr(data.weighed))
 
     def recall(self, what: str, inputs: Sequence[np.ndarray], compute: Callable[[], Arrays]) -> Arrays:
         """A computation with this target, looked up where the journal has it; its rollouts count either way."""
@@ -89,14 +97,154 @@ class Target:
 
     def residual(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n m"]:
         """Whitened residuals, measured less simulated, of a batch of points."""
-        position, fine = self.forward.positions(points)
-        white = self.measurements.whiten(self.measurements.position - position, self.noise)
-        return np.where(fine[:, None], white, FAILED)
+        return self.evaluate(points)[0]
+
+    def evaluate(
+        self, points: Float[np.ndarray, "n d"]
+    ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, " n"], np.ndarray]:
+        """Whitened residuals, the logarithms of the sizes that errors are relative to, and where rollouts ended well.
+
+        Half the sum of squares and the sum of logarithms make minus the log likelihood, up to a constant.
+        """
+        shown, fine = self.forward.observe(points)
+        rows = [self._errors({name: part[i] for name, part in shown.items()}) for i in range(len(fine))]
+        white = self._whitened(np.stack([errors for errors, _ in rows]), self.weighed(points)[0])
+        return np.where(fine[:, None], white, FAILED), np.array([float(size) for _, size in rows]), fine
+
+    def errors(self, x: Float[np.ndarray, " d"]) -> Float[np.ndarray, "group time column"]:
+        """Measured less simulated readings at one point, in the unit of the noise.
+
+        Raises:
+            InputError: a rollout there did not end well.
+        """
+        return np.asarray(self._errors(self.forward.observe_one(x))[0])
+
+    def error_slopes(
+        self, points: Float[np.ndarray, "k d"], directions: Float[np.ndarray, "k d"]
+    ) -> tuple[Float[np.ndarray, "k group time column"], Float[np.ndarray, " k"]]:
+        """Derivatives of the errors, and of the logarithms of sizes, along a direction at each point."""
+        if len(points) == 0:
+            return np.zeros((0, *self.measurements.count.shape)), np.zeros(0)
+        along = self.forward.tangents(points, directions)
+        if self._linear:  # what is shown enters errors as it is
+            shown = {name: np.zeros(part.shape[1:]) for name, part in along.items()}
+        slopes, at = [], np.zeros(0)
+        for k, point in enumerate(points):
+            tangent = {name: part[k] for name, part in along.items()}
+            if not self._linear and not np.array_equal(at, point):
+                shown, at = self.forward.observe_one(point), point
+            here = {name: jnp.asarray(shown[name], dtype=float) for name in tangent}
+            ahead = {name: jnp.asarray(part, dtype=float) for name, part in tangent.items()}
+            slopes.append(jax.jvp(self._errors, (here,), (ahead,))[1])
+        errors, sizes = zip(*slopes, strict=True)
+        return np.stack([np.asarray(part) for part in errors]), np.array([float(part) for part in sizes])
+
+    @property
+    def _linear(self) -> bool:
+        return all(channel.linear for channel in self.measurements.channels)
+
+    def _errors(self, shown: Fields) -> tuple[Float[jax.Array, "group time column"], Float[jax.Array, ""]]:
+        """Errors of all channels side by side at what one point shows, and the sum of logarithms of their sizes."""
+        seen = _seen(shown)
+        errors, sizes, channels = [], jnp.zeros(()), self.measurements.channels
+        for channel, own in zip(channels, self.measurements.columns, strict=True):
+            about = channel.expected(seen)
+            errors.append(channel.deviation(channel.measured, about))
+            size = channel.log_size(about, channel.measured)
+            if size is not None:
+                count = self.measurements.count[..., own]
+                sizes += jnp.sum(jnp.where(count > 0, size, 0.0))
+        return jnp.concatenate(errors, axis=-1), sizes
+
+    def _whitened(self, errors: np.ndarray, weighed: np.ndarray) -> np.ndarray:
+        return np.concatenate([self.measurements.whiten(errors, self.noise), weighed], axis=-1)
+
+    def weighed(
+        self, points: Float[np.ndarray, "n d"], directions: Float[np.ndarray, "n d"] | None = None
+    ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
+        """Residuals of the weighed parts, and what they lose along a direction at each point."""
+        parts, own = self.measurements.weighed, self.forward.coordinates
+        if parts is None:
+            return np.zeros((len(points), 0)), np.zeros((len(points), 0))
+        sums = np.array([[name in entry.parameters for name in own.names] for entry in parts.entries], dtype=float)
+        sd = np.array([entry.sd for entry in parts.entries])
+        left = (parts.measured - own.values(points) @ sums.T) / sd
+        along = np.zeros_like(points) if directions is None else own.slopes(points) * directions
+        return left, along @ sums.T / sd
+
+    def slopes(
+        self, points: Float[np.ndarray, "k d"], directions: Float[np.ndarray, "k d"]
+    ) -> tuple[Float[np.ndarray, "k m"], Float[np.ndarray, " k"]]:
+        """Derivatives of the whitened prediction, and of the logarithms of sizes, along a direction at each point."""
+        errors, sizes = self.error_slopes(points, directions)
+        return self._whitened(-errors, self.weighed(points, directions)[1]), sizes
 
     def jacobian(self, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]) -> Float[np.ndarray, "m free"]:
         """Derivatives of the whitened prediction."""
-        directions = np.eye(len(x))[free]
-        return self.measurements.whiten(self.forward.derivatives(x, directions), self.noise).T
+        return self.slopes(np.repeat(x[None], len(free), axis=0), np.eye(len(x))[free])[0].T
+
+
+def _seen(shown: Fields) -> Seen:
+    parts = {name: shown.get(name) for name in Observation._fields}
+    return Seen(Observation(**{**parts, "status": 0}), shown, shown["offset"])  # type: ignore[arg-type]
+
+
+@dataclass
+class _Climb:
+    """The posterior over some coordinates, the others held, as `inference.maximise` climbs it."""
+
+    target: Target
+    start: Float[np.ndarray, " d"]
+    free: Int[np.ndarray, " free"]
+
+    def __post_init__(self) -> None:
+        self.noise = np.zeros(len(self.free), dtype=bool)
+        self.bounds = tuple(bound[self.free] for bound in self.target.forward.coordinates.bounds)
+        self.linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def place(self, u: Float[np.ndarray, "n free"]) -> Float[np.ndarray, "n d"]:
+        """Points of all coordinates."""
+        points = np.repeat(self.start[None], len(u), axis=0)
+        points[:, self.free] = np.clip(u, *self.bounds)
+        return points
+
+    def density(self, u: Float[np.ndarray, "n free"]) -> Float[np.ndarray, " n"]:
+        """Log posterior, up to the noise's normaliser."""
+        points = self.place(u)
+        white, sizes, fine = self.target.evaluate(points)
+        prior = self.target.forward.coordinates.log_prior(points)[:, self.free].sum(axis=1)
+        return np.where(fine, -0.5 * np.sum(white**2, axis=1) - sizes + prior, -np.inf)
+
+    def linearise(self, u: Float[np.ndarray, " free"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals, the Jacobian of the prediction, and the slopes of the logarithms of sizes."""
+        if self.linear is None or not np.array_equal(self.linear[0], u):
+            x = self.place(u[None])
+            directions = np.eye(x.shape[1])[self.free]
+            slopes, sizes = self.target.slopes(np.repeat(x, len(self.free), axis=0), directions)
+            self.linear = u.copy(), self.target.residual(x)[0], slopes.T, sizes
+        return self.linear[1:]
+
+    def quadratic(self, u: Float[np.ndarray, " free"]) -> tuple[np.ndarray, np.ndarray]:
+        """See `modes.climb.Climbable`."""
+        residual, jacobian, sizes = self.linearise(u)
+        gradient = jacobian.T @ residual - sizes + self.prior_gradient(u)
+        return gradient, jacobian.T @ jacobian + np.diag(np.maximum(-np.diag(self.prior_hessian(u)), 0.0))
+
+    def information(self, u: Float[np.ndarray, " free"]) -> Float[np.ndarray, "free free"]:
+        """See `modes.climb.Climbable`."""
+        jacobian = self.linearise(u)[1]
+        return jacobian.T @ jacobian
+
+    def along(self, axes: Float[np.ndarray, "free free"]) -> None:
+        """Its derivatives stay as they are."""
+
+    def prior_gradient(self, u: Float[np.ndarray, " free"]) -> Float[np.ndarray, " free"]:
+        """Of the log prior."""
+        return self.target.forward.coordinates.prior_slopes(self.place(u[None])[0])[0][self.free]
+
+    def prior_hessian(self, u: Float[np.ndarray, " free"]) -> Float[np.ndarray, "free free"]:
+        """Of the log prior."""
+        return np.diag(self.target.forward.coordinates.prior_slopes(self.place(u[None])[0])[1][self.free])
 
 
 def climb(
@@ -114,51 +262,27 @@ def climb(
 
 
 def _climb(target: Target, start: np.ndarray, free: np.ndarray, evaluations: int) -> Fit:
-    coordinates = target.forward.coordinates
-    low, high = (bound[free] for bound in coordinates.bounds)
-    mean, sd = coordinates.prior_mean[free], coordinates.prior_sd[free]
-
-    def place(z: np.ndarray) -> np.ndarray:
-        x = start.copy()
-        x[free] = z
-        return x
-
-    def residual(z: np.ndarray) -> np.ndarray:
-        return np.concatenate([target.residual(place(z)[None])[0], (z - mean) / sd])
-
-    def jacobian(z: np.ndarray) -> np.ndarray:
-        return np.concatenate([-target.jacobian(place(z), free), np.diag(1.0 / sd)])
-
-    inside = np.clip(start[free], low + 1e-9 * (high - low), high - 1e-9 * (high - low))
-    found = least_squares(
-        residual, inside, jacobian, bounds=(low, high), x_scale=sd, ftol=1e-6, xtol=1e-6, gtol=1e-9,
-        max_nfev=evaluations,
-    )  # fmt: skip
-    rows = len(found.fun) - len(free)  # those after them are the prior's
-    return _around(target, place(found.x), free, found.fun[:rows], -found.jac[:rows])
+    climbed = _Climb(target, start, free)
+    low, high = climbed.bounds
+    inside = np.clip(start[free], low, high)
+    state, _ = maximise(climbed, inside, max_steps=evaluations, tolerance=TOLERANCE)
+    return _around(climbed, state)
 
 
-def _around(target: Target, x: np.ndarray, free: np.ndarray, residual: np.ndarray, jacobian: np.ndarray) -> Fit:
+def _around(climbed: _Climb, state: LevenbergState) -> Fit:
     """The normal approximation around a point that is taken for the mode."""
-    coordinates = target.forward.coordinates
-    low, high = (bound[free] for bound in coordinates.bounds)
-    mean, sd = coordinates.prior_mean[free], coordinates.prior_sd[free]
-    precision = jacobian.T @ jacobian + np.diag(1.0 / sd**2)
-    covariance = np.linalg.inv(precision)
-    z = (x[free] - mean) / sd
-    log_prior = float(np.sum(-0.5 * z**2 - np.log(sd)))  # the 2 pi cancel against those of the integral
-    spread = np.sqrt(np.diag(covariance))
-    # Where a prior ends at a bound, it is higher by what lies beyond, and only part of the peak is inside.
-    beyond = np.log(norm.cdf((high - mean) / sd) - norm.cdf((low - mean) / sd))
-    inside = np.log(np.maximum(norm.cdf((high - x[free]) / spread) - norm.cdf((low - x[free]) / spread), 1e-12))
-    evidence = -0.5 * float(residual @ residual) + log_prior + 0.5 * float(np.linalg.slogdet(covariance)[1])
-    slope = jacobian.T @ residual - (x[free] - mean) / sd**2
-    # At a bound a step leads nowhere.
-    slope = np.where(
-        ((x[free] <= low + 1e-6 * sd) & (slope < 0)) | ((x[free] >= high - 1e-6 * sd) & (slope > 0)), 0.0, slope
-    )
-    promise = 0.5 * float(slope @ covariance @ slope)
-    return Fit(x, free, residual, jacobian, covariance, evidence + float(np.sum(inside - beyond)), promise)
+    low, high = climbed.bounds
+    u, x = state.position, climbed.place(state.position[None])[0]
+    found = normal_at(climbed, state)
+    residual, jacobian, _ = climbed.linearise(u)
+    spread = np.sqrt(np.diag(found.covariance))
+    # Only part of a peak at a bound is inside.
+    inside = np.log(np.maximum(norm.cdf((high - u) / spread) - norm.cdf((low - u) / spread), 1e-12))
+    slope, _ = climbed.quadratic(u)
+    slope = np.where(((u <= low) & (slope < 0)) | ((u >= high) & (slope > 0)), 0.0, slope)
+    promise = 0.5 * float(slope @ found.covariance @ slope) if np.isfinite(state.log_density) else np.inf
+    evidence = found.log_evidence + float(np.sum(inside))
+    return Fit(x, climbed.free, residual, jacobian, found.covariance, evidence, promise)
 
 
 def best_between(
@@ -174,9 +298,17 @@ def best_between(
     points = here + shares[:, None] * (there - here)
     points[:, list(held)] = there[list(held)]
     points = np.clip(points, *coordinates.bounds)
-    residual = target.recall("shares", [points], lambda: {"residual": target.residual(points)})["residual"]
-    z = (points - coordinates.prior_mean) / coordinates.prior_sd
-    return points[int(np.argmin(np.sum(residual**2, axis=1) + np.sum(z**2, axis=1)))]
+    return points[int(np.argmax(heights(target, points, "shares")))]
+
+
+def heights(target: Target, points: Float[np.ndarray, "n d"], what: str) -> Float[np.ndarray, " n"]:
+    """Log posteriors of points, up to the noise's normaliser; kept in the journal by the name of ``what``."""
+
+    def compute() -> Arrays:
+        white, sizes, _ = target.evaluate(points)
+        return {"height": -0.5 * np.sum(white**2, axis=1) - sizes}
+
+    return target.recall(what, [points], compute)["height"] + target.forward.coordinates.log_prior(points).sum(axis=1)
 
 
 def widened(fit: Fit, coordinates: Coordinates) -> Fit:
@@ -186,8 +318,8 @@ def widened(fit: Fit, coordinates: Coordinates) -> Fit:
     size of many prior deviations would be drawn back towards null by several posterior deviations. Sizes below one
     prior deviation stay as they are.
     """
-    sd = coordinates.prior_sd[fit.free]
-    less = (1.0 - 1.0 / widening(fit, coordinates)[fit.free] ** 2) / sd**2
+    scale = 1.0 / coordinates.prior_sd[fit.free] ** 2
+    less = (1.0 - 1.0 / widening(fit, coordinates)[fit.free] ** 2) * scale
     if not less.any():
         return fit
     covariance = np.linalg.inv(np.linalg.inv(fit.covariance) - np.diag(less))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -16,6 +16,7 @@ from jaxtyping import Float
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.deadline import Deadline
 from rfdropo_bayes.audit.journal import digest
+from rfdropo_bayes.bayes.channels.object_pose import OFFSETS, Placing
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.differences import DIFFERENCE, FORWARD
@@ -27,7 +28,8 @@ WIDTH = max(8, 4 * (os.cpu_count() or 1))
 
 Thetas = Float[np.ndarray, "lane physical"]
 Points = Float[np.ndarray, "n d"]
-Series = Float[np.ndarray, "... recording time channel"]
+Fields = dict[str, np.ndarray]
+"""Parts of an `Observation` by name, with a leading axis over lanes, or over points and recordings."""
 
 
 def _no_limit() -> None:
@@ -42,23 +44,42 @@ class Lanes:
         marker_index: which of its markers are measured.
         width: lanes of one call; the last call of a batch is padded.
         slope_rollouts: what a derivative costs, that of the value included.
+        fields: parts of an observation that are data; beside the pose of an object it starts where it is told to.
     """
 
     def __init__(
-        self, simulator: Simulator, marker_index: np.ndarray, width: int = WIDTH, slope_rollouts: int = 3
+        self,
+        simulator: Simulator,
+        marker_index: np.ndarray,
+        width: int = WIDTH,
+        slope_rollouts: int = 3,
+        fields: Sequence[str] = ("position",),
     ) -> None:
         self.simulator = simulator
         self.marker_index = marker_index
         self.width = width
         self.slope_rollouts = slope_rollouts
+        self.fields = tuple(fields)
         self.physical = tuple(spec.name for spec in simulator.parameters)
 
-    def _observe(self, theta: jax.Array, commands: Commands) -> tuple[jax.Array, jax.Array, jax.Array]:
-        values = dict(zip(self.physical, theta, strict=True))
-        steps = jnp.asarray(commands.step.shape[0])
-        observation = self.simulator.rollout(values, commands, steps)
-        position = observation.position[:, self.marker_index]
-        return position.reshape(position.shape[0], -1), observation.status, observation.tension
+    def _observe(
+        self, theta: jax.Array, start: jax.Array, commands: Commands
+    ) -> tuple[dict[str, jax.Array], jax.Array]:
+        values: Any = dict(zip(self.physical, theta, strict=True))
+        if "object_pose" in self.fields:
+            assert isinstance(self.simulator, Placing)
+            values = self.simulator.with_object_at(values, start)
+        observation = self.simulator.rollout(values, commands, jnp.asarray(commands.step.shape[0]))
+        found = observation._replace(position=observation.position[:, self.marker_index])._asdict()
+        lacking = [name for name in self.fields if found[name] is None]
+        if lacking:
+            raise InputError(
+                f"the simulator does not tell its {lacking[0].replace('_', ' ')}",
+                where=f"[model] {lacking[0]}",
+                remedy="leave it out, or let its rollout return it",
+            )
+        status = found.pop("status")
+        return {name: part for name, part in found.items() if part is not None}, status
 
     @property
     def difference(self) -> float | None:
@@ -74,7 +95,7 @@ class Lanes:
         """The same with central differences over another step."""
         simulator: Any = self.simulator
         backend = simulator.engine.backend._replace(difference=step)
-        return Lanes(simulator.with_backend(backend), self.marker_index, self.width)
+        return Lanes(simulator.with_backend(backend), self.marker_index, self.width, fields=self.fields)
 
     @cached_property
     def _rolled(self) -> Any:
@@ -82,48 +103,43 @@ class Lanes:
 
     @cached_property
     def _derived(self) -> Any:
-        def one(theta: jax.Array, tangent: jax.Array, commands: Commands) -> jax.Array:
-            return jax.jvp(lambda t: self._observe(t, commands)[0], (theta,), (tangent,))[1]
+        def one(theta: jax.Array, tangent: jax.Array, start: jax.Array, commands: Commands) -> dict[str, jax.Array]:
+            def data(theta: jax.Array) -> dict[str, jax.Array]:
+                found, _ = self._observe(theta, start, commands)
+                return {name: found[name] for name in self.fields}
+
+            return jax.jvp(data, (theta,), (tangent,))[1]
 
         return jax.jit(jax.vmap(one))
 
     def roll(
-        self, theta: Thetas, commands: Commands, lane: np.ndarray, check: Callable[[], None] = _no_limit
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Marker coordinates of each set of parameters under the commands of its lane, and result codes.
+        self, theta: Thetas, start: np.ndarray, commands: Commands, check: Callable[[], None] = _no_limit
+    ) -> tuple[Fields, np.ndarray]:
+        """What each set of parameters shows under the commands of its lane, and result codes.
 
-        ``check`` is called before every batch, and may raise.
+        ``start`` (lane, 7) are the poses that an object starts from. ``check`` is called before every batch, and may
+        raise.
         """
-        parts = self._chunks(self._rolled, commands, lane, check, theta)
-        position, status = (np.concatenate([part[i] for part in parts])[: len(lane)] for i in range(2))
-        return position, status
-
-    def tension(self, theta: Thetas, commands: Commands, lane: np.ndarray) -> np.ndarray:
-        """Cable tensions [N] of each set of parameters."""
-        parts = self._chunks(self._rolled, commands, lane, _no_limit, theta)
-        return np.concatenate([part[2] for part in parts])[: len(lane)]
+        return self._chunks(self._rolled, commands, check, theta, start)
 
     def differentiate(
         self,
         theta: Thetas,
         tangent: Thetas,
+        start: np.ndarray,
         commands: Commands,
-        lane: np.ndarray,
         check: Callable[[], None] = _no_limit,
-    ) -> np.ndarray:
-        """Derivatives of the marker coordinates along tangents."""
-        return np.concatenate(self._chunks(self._derived, commands, lane, check, theta, tangent))[: len(lane)]
+    ) -> Fields:
+        """Derivatives along tangents of those parts of an observation that are data."""
+        return self._chunks(self._derived, commands, check, theta, tangent, start)
 
-    def _chunks(
-        self, function: Any, commands: Commands, lane: np.ndarray, check: Callable[[], None], *arrays: np.ndarray
-    ) -> list[Any]:
-        parts = []
-        for start in range(0, len(lane), self.width):
+    def _chunks(self, function: Any, commands: Commands, check: Callable[[], None], *arrays: np.ndarray) -> Any:
+        parts, count = [], len(arrays[0])
+        for first in range(0, count, self.width):
             check()
-            index = np.minimum(np.arange(start, start + self.width), len(lane) - 1)
-            chosen = Commands(*(np.asarray(part)[lane[index]] for part in commands))
-            parts.append(jax.device_get(function(*(a[index] for a in arrays), chosen)))
-        return parts
+            index = np.minimum(np.arange(first, first + self.width), count - 1)
+            parts.append(jax.device_get(function(*(a[index] for a in arrays), commands.of(index))))
+        return jax.tree.map(lambda *pieces: np.concatenate(pieces)[:count], *parts)
 
 
 class RoutedLanes(Lanes):
@@ -136,7 +152,7 @@ class RoutedLanes(Lanes):
     """
 
     def __init__(self, fast: Lanes, slow: Lanes, null: Mapping[str, float]) -> None:
-        super().__init__(slow.simulator, slow.marker_index, slow.width, slow.slope_rollouts)
+        super().__init__(slow.simulator, slow.marker_index, slow.width, slow.slope_rollouts, slow.fields)
         self.fast, self.slow = fast, slow
         self._kept = np.array([self.physical.index(name) for name in fast.physical])
         self._further = np.setdiff1d(np.arange(len(self.physical)), self._kept)
@@ -156,50 +172,41 @@ class RoutedLanes(Lanes):
         return ~np.isclose(theta[:, self._further], self._null, rtol=1e-6, atol=1e-12).all(axis=1)
 
     def roll(
-        self, theta: Thetas, commands: Commands, lane: np.ndarray, check: Callable[[], None] = _no_limit
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, theta: Thetas, start: np.ndarray, commands: Commands, check: Callable[[], None] = _no_limit
+    ) -> tuple[Fields, np.ndarray]:
         """See `Lanes.roll`."""
-        slow = self._needs_slow(theta)
-        parts = [
-            (~slow, self.fast, theta[:, self._kept]),
-            (slow, self.slow, theta),
-        ]
-        found = [(mask, *lanes.roll(t[mask], commands, lane[mask], check)) for mask, lanes, t in parts if mask.any()]
-        position = np.zeros((len(lane), *found[0][1].shape[1:]))
-        status = np.zeros(len(lane), dtype=int)
-        for mask, own, codes in found:
-            position[mask], status[mask] = own, codes
-        return position, status
 
-    def tension(self, theta: Thetas, commands: Commands, lane: np.ndarray) -> np.ndarray:
-        """See `Lanes.tension`."""
-        if self._needs_slow(theta).any():
-            return self.slow.tension(theta, commands, lane)
-        return self.fast.tension(theta[:, self._kept], commands, lane)
+        def run(lanes: Lanes, chosen: np.ndarray, kept: Any) -> tuple[Fields, np.ndarray]:
+            return lanes.roll(theta[chosen][:, kept], start[chosen], commands.of(chosen), check)
+
+        return self._routed(self._needs_slow(theta), run)
 
     def differentiate(
         self,
         theta: Thetas,
         tangent: Thetas,
+        start: np.ndarray,
         commands: Commands,
-        lane: np.ndarray,
         check: Callable[[], None] = _no_limit,
-    ) -> np.ndarray:
+    ) -> Fields:
         """See `Lanes.differentiate`."""
-        slow = self._needs_slow(theta) | np.any(tangent[:, self._further] != 0.0, axis=1)
-        found = []
-        for mask, lanes, kept in ((~slow, self.fast, self._kept), (slow, self.slow, slice(None))):
-            if mask.any():
-                own = lanes.differentiate(theta[mask][:, kept], tangent[mask][:, kept], commands, lane[mask], check)
-                found.append((mask, own))
-        derivative = np.zeros((len(lane), *found[0][1].shape[1:]))
-        for mask, own in found:
-            derivative[mask] = own
-        return derivative
+
+        def run(lanes: Lanes, chosen: np.ndarray, kept: Any) -> Fields:
+            points, directions = theta[chosen][:, kept], tangent[chosen][:, kept]
+            return lanes.differentiate(points, directions, start[chosen], commands.of(chosen), check)
+
+        return self._routed(self._needs_slow(theta) | np.any(tangent[:, self._further] != 0.0, axis=1), run)
+
+    def _routed(self, slow: np.ndarray, run: Callable[[Lanes, np.ndarray, Any], Any]) -> Any:
+        """What the two simulators find for the lanes that are theirs, put together again."""
+        routes = [(~slow, self.fast, self._kept), (slow, self.slow, slice(None))]
+        order = np.concatenate([np.flatnonzero(mask) for mask, _, _ in routes])
+        found = [run(lanes, np.flatnonzero(mask), kept) for mask, lanes, kept in routes if mask.any()]
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[np.argsort(order)], *found)
 
 
 class Forward:
-    """Simulated marker coordinates of a set of recordings as functions of the audit's coordinates.
+    """What a set of recordings should show, as a function of the audit's coordinates.
 
     Args:
         lanes: the simulator.
@@ -208,6 +215,7 @@ class Forward:
         chosen: which of these are simulated, by name.
         rows: observations that are wanted of each; all by default.
         deadline: of the rollouts; none by default.
+        start: poses (recording, 7) that an object starts from, where its poses are data.
     """
 
     def __init__(
@@ -218,13 +226,15 @@ class Forward:
         chosen: Mapping[str, int],
         rows: int | None = None,
         deadline: Deadline | None = None,
+        start: Float[np.ndarray, "recording 7"] | None = None,
     ) -> None:
         self.deadline = deadline or Deadline()
         self.lanes = lanes
         self.coordinates = coordinates
-        self.commands = _cut(Commands(*(np.asarray(part)[list(chosen.values())] for part in commands)), rows)
+        self.commands = _cut(commands.of(list(chosen.values())), rows)
         self.slots = coordinates.slots(list(chosen))
         self.count = len(chosen)
+        self.start = np.zeros((self.count, 7)) if start is None else start
         self.rollouts = 0
 
     @cached_property
@@ -240,6 +250,8 @@ class Forward:
             self.lanes.marker_index,
             scale,
             self.slots,
+            self.start,
+            self.lanes.fields,
             *prior,
             *map(np.asarray, self.commands),
         )
@@ -251,48 +263,59 @@ class Forward:
         changed.lanes = self.lanes.with_difference(step)
         return changed
 
-    def positions(self, points: Points) -> tuple[Series, np.ndarray]:
-        """Marker coordinates [m] of every recording, and True where all its rollouts ended well."""
-        points = np.atleast_2d(points)
-        theta, lane = self._lanes_of(points)
-        position, status = self.lanes.roll(theta, self.commands, lane, self.deadline.check)
-        self.rollouts += len(lane)
-        fine = (status == Result.OK) & np.isfinite(position).all(axis=(1, 2))
-        return position.reshape(len(points), self.count, *position.shape[1:]), fine.reshape(len(points), -1).all(axis=1)
+    def observe(self, points: Points) -> tuple[Fields, np.ndarray]:
+        """What every recording shows at each point (point, recording, ...), and True where all rollouts ended well.
 
-    def position(self, point: Float[np.ndarray, " d"]) -> Series:
-        """Marker coordinates at one point.
+        Beside the parts of an observation there are ``offset`` [m], by which measured positions are shifted against
+        simulated ones, and the parameters that channels want and rollouts do not.
+        """
+        points = np.atleast_2d(points)
+        theta = self.coordinates.physical_values(points, self.slots)
+        found, status = self.lanes.roll(*self._per_lane(theta), self.deadline.check)
+        self.rollouts += len(status)
+        fine = status == Result.OK
+        for name in self.lanes.fields:
+            fine &= np.isfinite(found[name]).reshape(len(fine), -1).all(axis=1)
+        shown = {name: part.reshape(len(points), self.count, *part.shape[1:]) for name, part in found.items()}
+        shown |= {"offset": self._offset(theta), **self.coordinates.gains(points)}
+        return shown, fine.reshape(len(points), -1).all(axis=1)
+
+    def observe_one(self, point: Float[np.ndarray, " d"]) -> Fields:
+        """What every recording shows at one point.
 
         Raises:
             InputError: a rollout there did not end well.
         """
-        position, fine = self.positions(point[None])
+        found, fine = self.observe(point[None])
         if not fine[0]:
             raise InputError("a rollout at the optimum did not end well", where="audit", remedy=Result.DIVERGED.remedy)
-        return position[0]
+        return {name: part[0] for name, part in found.items()}
 
-    def tension(self, point: Float[np.ndarray, " d"]) -> Float[np.ndarray, "recording time cable"]:
-        """Cable tensions at one point [N]."""
-        theta, lane = self._lanes_of(point[None])
-        return self.lanes.tension(theta, self.commands, lane)
-
-    def derivatives(self, point: Float[np.ndarray, " d"], directions: Points) -> Series:
-        """Derivative of the marker coordinates along each direction; one-sided where a mechanism is so at null."""
-        return self.derivatives_at(np.repeat(point[None], len(directions), axis=0), directions)
-
-    def derivatives_at(self, points: Points, directions: Points) -> Series:
-        """The same with a point of its own for every direction."""
-        if len(points) == 0:
-            return np.zeros((0, self.count, self.commands.sample_step.shape[1], 3 * len(self.lanes.marker_index)))
-        theta, lane = self._lanes_of(points)
-        tangent = self.coordinates.physical_tangents(points, directions, self.slots).reshape(theta.shape)
-        found = self.lanes.differentiate(theta, tangent, self.commands, lane, self.deadline.check)
-        self.rollouts += self.lanes.slope_rollouts * len(lane)
-        return np.nan_to_num(found).reshape(len(points), self.count, *found.shape[1:])
-
-    def _lanes_of(self, points: Points) -> tuple[np.ndarray, np.ndarray]:
+    def tangents(self, points: Points, directions: Points) -> Fields:
+        """Derivatives of `observe`, of what is data, along a direction at each point; one-sided where a mechanism is so
+        at null."""
         theta = self.coordinates.physical_values(points, self.slots)
-        return theta.reshape(-1, theta.shape[-1]), np.tile(np.arange(self.count), len(points))
+        tangent = self.coordinates.physical_tangents(points, directions, self.slots)
+        flat, start, commands = self._per_lane(theta)
+        along = tangent.reshape(flat.shape)
+        found = self.lanes.differentiate(flat, along, start, commands, self.deadline.check)
+        self.rollouts += self.lanes.slope_rollouts * len(flat)
+        shown = {
+            name: np.nan_to_num(part).reshape(len(points), self.count, *part.shape[1:]) for name, part in found.items()
+        }
+        return shown | {"offset": self._offset(tangent), **self.coordinates.gain_tangents(points, directions)}
+
+    def _offset(self, theta: np.ndarray) -> np.ndarray:
+        found = np.zeros((*theta.shape[:2], 3))
+        for axis, name in enumerate(OFFSETS):
+            if name in self.lanes.physical:
+                found[..., axis] = theta[..., self.lanes.physical.index(name)]
+        return found
+
+    def _per_lane(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, Commands]:
+        """Parameters (point, recording, physical), starts and commands of each lane."""
+        lane = np.tile(np.arange(self.count), len(theta))
+        return theta.reshape(-1, theta.shape[-1]), self.start[lane], self.commands.of(lane)
 
 
 def _cut(commands: Commands, rows: int | None) -> Commands:

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.fft import dct
 from scipy.linalg import toeplitz
 from scipy.special import logsumexp
 from scipy.stats import norm
 
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
+from rfdropo_bayes.bayes.noise.stacked import Stacked
 
 DIFFERENCE_FROM = 6  # trajectories below which an ELPD difference has no standard error worth stating
 RESAMPLES = 2000
@@ -23,21 +24,35 @@ LEVELS = (0.5, 0.9)
 
 
 class Prediction(NamedTuple):
-    """Simulated marker coordinates of unseen trajectories under draws of one model, without noise."""
+    """What draws of one model leave of unseen trajectories: measured less simulated, in the unit of the noise."""
 
-    draws: Float[np.ndarray, "draw trajectory time channel"]
+    errors: Float[np.ndarray, "draw trajectory time column"]
 
     @property
-    def mean(self) -> Float[np.ndarray, "trajectory time channel"]:
+    def mean(self) -> Float[np.ndarray, "trajectory time column"]:
         """Mean over the draws."""
-        return self.draws.mean(axis=0)
+        return self.errors.mean(axis=0)
 
 
 class Unseen(NamedTuple):
-    """Measured trajectories that no fit has seen; ``valid`` where a value may be used."""
+    """Measured trajectories that no fit has seen.
 
-    position: Float[np.ndarray, "trajectory time channel"]
-    valid: np.ndarray
+    Attributes:
+        position: coordinates of the markers [m], which are the first columns.
+        valid: where a value may be used, in all columns.
+    """
+
+    position: Float[np.ndarray, "trajectory time coordinate"]
+    valid: Bool[np.ndarray, "trajectory time column"]
+
+    @property
+    def markers(self) -> int:
+        """Number of columns that are coordinates of markers."""
+        return self.position.shape[-1]
+
+    def predicted(self, prediction: Prediction) -> Float[np.ndarray, "trajectory time coordinate"]:
+        """Where a model has the markers, in the mean over its draws [m]."""
+        return self.position - prediction.mean[..., : self.markers]
 
 
 @dataclass(frozen=True)
@@ -81,8 +96,8 @@ def measure_gain(
     unseen: Unseen,
     base: Prediction,
     extended: Prediction,
-    noise: Autoregression,
-    pattern: Float[np.ndarray, "group time channel"],
+    noise: Stacked,
+    pattern: Float[np.ndarray, "group time column"],
     rng: np.random.Generator,
 ) -> Gain:
     """Compare two models.
@@ -92,77 +107,81 @@ def measure_gain(
         base, extended: predictions.
         noise: of the measurements.
         pattern: what the base model leaves where it was fitted, whitened: it says where to look for the discrepancy,
-            in frequency and over the channels.
+            in frequency and over the columns.
     """
-    first, second = (np.where(unseen.valid, unseen.position - p.mean, 0.0) for p in (base, extended))
-    markers = max(unseen.valid.sum() / 3.0, 1.0)
+    first, second = (np.where(unseen.valid, p.mean, 0.0) for p in (base, extended))
+    markers = max(unseen.valid[..., : unseen.markers].sum() / 3.0, 1.0)
     own = [_elpd(unseen, p, noise) for p in (base, extended)]
     difference = own[1] - own[0]
     count = len(difference)
     explained, interval = explained_fraction(unseen, first, second, noise, pattern, rng)
+    rmse = [float(np.sqrt(np.sum(left[..., : unseen.markers] ** 2) / markers)) for left in (first, second)]
     return Gain(
-        rmse_base=float(np.sqrt(np.sum(first**2) / markers)),
-        rmse_extended=float(np.sqrt(np.sum(second**2) / markers)),
+        rmse_base=rmse[0],
+        rmse_extended=rmse[1],
         elpd_difference=float(difference.sum()),
         elpd_difference_se=float(np.sqrt(count) * difference.std(ddof=1)) if count >= DIFFERENCE_FROM else None,
         coverage=_coverage(unseen, extended, noise),
         explained=explained,
         interval=interval,
-        floor=noise_distance(noise),
+        floor=noise_distance(noise.first),
         trajectories=count,
     )
 
 
 def noise_distance(noise: Autoregression) -> float:
-    """Root mean square distance of a marker that the noise alone makes [m]."""
+    """Root mean square distance of a marker that the noise of the positions alone makes [m]."""
     return float(np.sqrt(3.0 * np.mean(noise.scale**2)))
 
 
-def _elpd(unseen: Unseen, prediction: Prediction, noise: Autoregression) -> Float[np.ndarray, " trajectory"]:
+def _elpd(unseen: Unseen, prediction: Prediction, noise: Stacked) -> Float[np.ndarray, " trajectory"]:
     """Log predictive density of each trajectory, up to the noise's normaliser."""
-    residual = np.where(unseen.valid, unseen.position - prediction.draws, 0.0)
+    residual = np.where(unseen.valid, prediction.errors, 0.0)
     white = noise.whiten(residual, unseen.valid)
     return logsumexp(-0.5 * np.sum(white**2, axis=(-2, -1)), axis=0) - np.log(len(residual))
 
 
-def _coverage(unseen: Unseen, prediction: Prediction, noise: Autoregression) -> dict[float, float]:
-    spread = np.sqrt(prediction.draws.var(axis=0) + noise.scale**2)
-    z = (
-        np.abs(unseen.position - prediction.mean)[unseen.valid]
-        / np.broadcast_to(spread, unseen.valid.shape)[unseen.valid]
-    )
+def _coverage(unseen: Unseen, prediction: Prediction, noise: Stacked) -> dict[float, float]:
+    spread = np.sqrt(prediction.errors.var(axis=0) + noise.scale**2)
+    z = (np.abs(prediction.mean) / spread)[unseen.valid]
     return {level: float(np.mean(z < norm.ppf(0.5 + level / 2))) for level in LEVELS}
 
 
 def explained_fraction(
     unseen: Unseen,
-    base: Float[np.ndarray, "trajectory time channel"],
-    extended: Float[np.ndarray, "trajectory time channel"],
-    noise: Autoregression,
-    pattern: Float[np.ndarray, "group time channel"],
+    base: Float[np.ndarray, "trajectory time column"],
+    extended: Float[np.ndarray, "trajectory time column"],
+    noise: Stacked,
+    pattern: Float[np.ndarray, "group time column"],
     rng: np.random.Generator,
 ) -> tuple[float, tuple[float, float]]:
-    """``1 - (ext^2 - noise^2) / (base^2 - noise^2)`` with its 90 % interval.
+    """``1 - (ext^2 - noise^2) / (base^2 - noise^2)`` with its 90 % interval, of all channels together.
 
     The mean squares are taken frequency by frequency and pattern by pattern (cosine transform in time, principal
-    components over the channels), each weighted by the squared share of discrepancy in what the base model leaves on
-    the FITTED data there (a Wiener filter of both factors): where there is nothing but noise, noise is not counted, and
-    where there is little else, little of it. The interval is that of the fraction on these trajectories: it holds the
-    noise in both mean squares, which is the same noise, and the uncertainty of its power at these frequencies.
+    components over the columns of a channel), each weighted by the squared share of discrepancy in what the base model
+    leaves on the FITTED data there (a Wiener filter of both factors): where there is nothing but noise, noise is not
+    counted, and where there is little else, little of it. The interval is that of the fraction on these trajectories:
+    it holds the noise in both mean squares, which is the same noise, and the uncertainty of its power at these
+    frequencies.
     """
-    axes = _components(pattern, unseen.valid.shape[-1])
-    spectrum = _noise_power(noise, base.shape[1])
-    weight = _wiener(pattern @ axes, base.shape[1]) ** 2 * spectrum[:, None]
-    usable = float(np.maximum(unseen.valid.mean(axis=(1, 2)), 1e-9).sum())
-    first, second = (
-        dct(noise.whiten(residual, unseen.valid) @ axes, axis=1, norm="ortho") for residual in (base, extended)
-    )
-    sums = np.array([np.sum(weight * first**2), np.sum(weight * second**2)])
-    floor = usable * float(np.sum(weight))
-    point = _fraction(sums[0], sums[1], floor, 1.0)
-    drawn = sums + rng.standard_normal((RESAMPLES, 2)) @ _noise_in_sums(weight, first, second, usable).T
-    sizes = 1.0 + rng.standard_normal(RESAMPLES) * _floor_error(noise, weight.sum(axis=1) / spectrum)
-    found = _fraction(drawn[:, 0], drawn[:, 1], floor, sizes)
+    sums, floor, drawn, expected = np.zeros(2), 0.0, np.zeros((RESAMPLES, 2)), np.zeros(RESAMPLES)
+    for part, own in zip(noise.parts, noise.columns, strict=True):
+        valid = unseen.valid[..., own]
+        axes = _components(pattern[..., own], valid.shape[-1])
+        spectrum = _noise_power(part, base.shape[1])
+        weight = _wiener(pattern[..., own] @ axes, base.shape[1]) ** 2 * spectrum[:, None]
+        usable = float(np.maximum(valid.mean(axis=(1, 2)), 1e-9).sum())
+        first, second = (
+            dct(part.whiten(left[..., own], valid) @ axes, axis=1, norm="ortho") for left in (base, extended)
+        )
+        sums += np.array([np.sum(weight * first**2), np.sum(weight * second**2)])
+        drawn += rng.standard_normal((RESAMPLES, 2)) @ _noise_in_sums(weight, first, second, usable).T
+        least = usable * float(np.sum(weight))
+        error = _floor_error(part, weight.sum(axis=1) / spectrum)
+        expected += least * (1.0 + rng.standard_normal(RESAMPLES) * error)
+        floor += least
+    point = _fraction(sums[0], sums[1], floor, floor)
+    found = _fraction(sums[0] + drawn[:, 0], sums[1] + drawn[:, 1], expected, floor)
     return float(point), (float(np.quantile(found, 0.05)), float(np.quantile(found, 0.95)))
 
 
@@ -181,10 +200,10 @@ def _noise_in_sums(
     return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def _fraction(base: np.ndarray, extended: np.ndarray, floor: float, size: np.ndarray | float) -> np.ndarray:
-    left = np.maximum(extended - size * floor, 0.0)
+def _fraction(base: np.ndarray, extended: np.ndarray, expected: np.ndarray | float, floor: float) -> np.ndarray:
+    left = np.maximum(extended - expected, 0.0)
     # Less than the noise's own uncertainty is no discrepancy to be explained.
-    return 1.0 - left / np.maximum(base - size * floor, 1e-3 * floor)
+    return 1.0 - left / np.maximum(base - expected, 1e-3 * floor)
 
 
 def _floor_error(noise: Autoregression, weight: Float[np.ndarray, " row"]) -> float:

@@ -3,152 +3,170 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from rfdropo_bayes.bayes.noise.autoregression import REPEATS, RESIDUALS, Autoregression, estimate_noise
+from rfdropo_bayes.bayes.channels import Channel, Series, WeighedParts
+from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS, RESIDUALS, estimate_noise
 from rfdropo_bayes.bayes.noise.repeat_shifts import repeat_shift
+from rfdropo_bayes.bayes.noise.stacked import Stacked, side_by_side
 from rfdropo_bayes.bayes.recordings import RecordingSet
+from rfdropo_bayes.bayes.repeats import Groups, deviations, group_recordings, mean_error, mean_of, repeats_apart, spread
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.repeats import group_repeats
-
-CLOCKS_AGREE = 0.1  # of a sample time: what the clocks of repeats may differ by
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Recordings as groups of repeats; a channel is one coordinate of one marker.
+    """Recordings as groups of repeats; columns are those of all channels side by side, the markers' first.
 
     Attributes:
         names: of the first recording of each group.
         members: indices of the recordings in each group.
         time: of each row [s].
-        position: mean over the repeats [m]; zero where nothing is valid.
+        channels: with the means over the repeats.
+        single: the same with every recording on its own.
+        weighed: parts that were weighed; None without.
         count: valid repeats behind each value.
-        single: every recording on its own; single_valid: what may be used of it.
+        spread: every recording less the mean of its group, in the unit of the noise.
         apart: recordings that repeat the commands of another one and are not joined with it, as their rows or clocks
             differ.
     """
 
     names: tuple[str, ...]
-    members: tuple[tuple[int, ...], ...]
+    members: Groups
     time: Float[np.ndarray, "group time"]
-    position: Float[np.ndarray, "group time channel"]
-    count: Float[np.ndarray, "group time channel"]
-    single: Float[np.ndarray, "recording time channel"]
-    single_valid: np.ndarray
+    channels: tuple[Series, ...]
+    single: tuple[Series, ...]
+    weighed: WeighedParts | None
+    count: Float[np.ndarray, "group time column"]
+    spread: Float[np.ndarray, "recording time column"]
     apart: tuple[str, ...] = ()
 
     @property
-    def valid(self) -> np.ndarray:
+    def valid(self) -> Bool[np.ndarray, "group time column"]:
         """Where there is a value."""
         return self.count > 0
+
+    @property
+    def single_valid(self) -> Bool[np.ndarray, "recording time column"]:
+        """What may be used of each recording."""
+        return np.concatenate([channel.valid for channel in self.single], axis=-1)
+
+    @property
+    def markers(self) -> int:
+        """Number of columns that are coordinates of markers."""
+        return self.channels[0].valid.shape[-1]
+
+    @property
+    def size(self) -> int:
+        """Number of residuals."""
+        return self.count.size + (0 if self.weighed is None else len(self.weighed.entries))
 
     @property
     def has_repeats(self) -> bool:
         """Whether any command sequence was carried out twice."""
         return any(len(group) > 1 for group in self.members)
 
-    def whiten(self, residual: np.ndarray, noise: Autoregression) -> Float[np.ndarray, "*batch n"]:
-        """Residuals (..., group, time, channel) of the means as independent unit normals, flattened."""
-        white = noise.separate(noise.innovations(residual, self.valid) * np.sqrt(self.count), self.valid)
-        return white.reshape(*residual.shape[:-3], int(np.prod(residual.shape[-3:])))
+    @property
+    def names_of_channels(self) -> tuple[str, ...]:
+        """What was data."""
+        further: tuple[Channel, ...] = () if self.weighed is None else (self.weighed,)
+        return tuple(channel.name for channel in (*self.channels, *further))
 
-    def mean_of(self, single: Float[np.ndarray, "recording time channel"]) -> Float[np.ndarray, "group time channel"]:
-        """Mean over the repeats of series like the recordings."""
-        return np.stack([self._mean(single, group) for group in self.members])
+    def series(self, white: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch group time column"]:
+        """Residuals of the channels that have rows."""
+        return white[..., : self.count.size].reshape(*white.shape[:-1], *self.count.shape)
 
-    def _mean(self, single: np.ndarray, group: tuple[int, ...]) -> np.ndarray:
-        chosen, valid = single[list(group)], self.single_valid[list(group)]
-        return np.where(valid, chosen, 0.0).sum(axis=0) / np.maximum(valid.sum(axis=0), 1)
+    def whiten(
+        self, errors: Float[np.ndarray, "*batch group time column"], noise: Stacked
+    ) -> Float[np.ndarray, "*batch n"]:
+        """Errors of the means as independent unit normals, flattened."""
+        return noise.whiten_means(errors, self.count).reshape(*errors.shape[:-3], self.count.size)
 
-    def deviations(self, single: Float[np.ndarray, "recording time channel"]) -> tuple[np.ndarray, np.ndarray, float]:
-        """Repeats about their means, which of them count, and their degrees of freedom per value."""
-        parts, valid, freedom, values = [], [], 0.0, 0
-        for group in self.members:
-            if len(group) > 1:
-                own = self.single_valid[list(group)]
-                own = own & (own.sum(axis=0) > 1)
-                parts.append(np.where(own, single[list(group)] - self._mean(single, group), 0.0))
-                valid.append(own)
-                freedom += own.sum() * (1.0 - 1.0 / len(group))
-                values += int(own.sum())
-        return np.concatenate(parts), np.concatenate(valid), freedom / max(values, 1)
+    def mean_of(
+        self, single: Float[np.ndarray, "*batch recording time column"]
+    ) -> Float[np.ndarray, "*batch group time column"]:
+        """Mean over the repeats of errors like those of the recordings."""
+        return mean_error(single, self.single_valid, self.members)
+
+    def deviations(self, errors: Float[np.ndarray, "recording time column"]) -> tuple[np.ndarray, np.ndarray, float]:
+        """See `repeats.deviations`."""
+        return deviations(errors, self.single_valid, self.members)
 
     @property
     def shift(self) -> float | None:
-        """See `repeat_shift`; None without repeats."""
-        return repeat_shift(*self.deviations(self.single)) if self.has_repeats else None
+        """See `repeat_shift`, of the markers; None without repeats."""
+        if not self.has_repeats:
+            return None
+        deviations, valid, share = self.deviations(self.spread)
+        return repeat_shift(deviations[..., : self.markers], valid[..., : self.markers], share)
 
     def noise(
-        self, residual: Float[np.ndarray, "recording time channel"], parameters: int, like: Autoregression | None = None
-    ) -> Autoregression:
-        """Noise from repeats where there are any, else from what a model leaves, of whose correlation between channels
+        self, errors: Float[np.ndarray, "recording time column"], parameters: int, like: Stacked | None = None
+    ) -> Stacked:
+        """Noise from repeats where there are any, else from what a model leaves, of whose correlation between columns
         nothing says how much is noise: a discrepancy moves them together, too.
 
         Args:
-            residual: recordings less what a model predicts for each.
+            errors: recordings less what a model predicts for each.
             parameters: fitted by that model.
             like: an earlier estimate, whose order, pooling and sharing are kept.
         """
-        order = None if like is None else like.order
-        shared = None if like is None else like.correlation is not None
-        pooled = None if like is None else bool(np.ptp(like.scale) == 0.0)
+        left, valid = errors, self.single_valid
+        share, source = max(1.0 - parameters / max(valid.sum(), 1), 0.1), RESIDUALS
         if self.has_repeats:
-            return estimate_noise(*self.deviations(residual), source=REPEATS, order=order, pooled=pooled, shared=shared)
-        share = max(1.0 - parameters / max(self.single_valid.sum(), 1), 0.1)
-        return estimate_noise(residual, self.single_valid, share, source=RESIDUALS, order=order, pooled=pooled)
+            (left, valid, share), source = self.deviations(errors), REPEATS
+        found = []
+        for index, own in enumerate(self.columns):
+            model = None if like is None else like.parts[index]
+            found.append(_estimated(left[..., own], valid[..., own], share, source, model))
+        return Stacked(tuple(found))
+
+    @property
+    def columns(self) -> list[slice]:
+        """Columns of each channel."""
+        return side_by_side([channel.valid.shape[-1] for channel in self.channels])
 
 
-def gather_measurements(recordings: RecordingSet, trajectories: Sequence[Trajectory], join: bool) -> Measurements:
+def _estimated(
+    deviations: np.ndarray, valid: np.ndarray, share: float, source: str, like: Autoregression | None
+) -> Autoregression:
+    shared = False if source == RESIDUALS else (None if like is None else like.correlation is not None)
+    order, pooled = (None, None) if like is None else (like.order, bool(np.ptp(like.scale) == 0.0))
+    return estimate_noise(deviations, valid, share, source=source, order=order, pooled=pooled, shared=shared)
+
+
+def gather_measurements(
+    recordings: RecordingSet, channels: Sequence[Channel], repeats: Sequence[Trajectory] = ()
+) -> Measurements:
     """Group recordings with identical commands.
 
     Args:
-        recordings: the trajectories on the simulator's clock.
-        trajectories: the same, as recorded.
-        join: whether repeats may be joined; False where parameters differ from recording to recording.
+        recordings: on the simulator's clock.
+        channels: measured in them.
+        repeats: the same recordings as they were recorded; empty where none may be joined, as parameters differ from
+            one to the next.
     """
-    count = len(trajectories)
-    groups = _groups(recordings, trajectories) if join else [(index,) for index in range(count)]
-    position = recordings.position.reshape(*recordings.position.shape[:2], -1)
-    valid = np.repeat(np.asarray(recordings.line.valid), 3, axis=-1)
-    measurements = Measurements(
-        tuple(recordings.names[group[0]] for group in groups),
-        tuple(groups),
-        np.stack([recordings.time[group[0]] for group in groups]),
-        np.zeros((0,)),
-        np.stack([valid[list(group)].sum(axis=0).astype(float) for group in groups]),
-        position,
-        valid,
-        _apart(recordings, trajectories, groups) if join else (),
+    groups: Groups = tuple((index,) for index in range(len(recordings.names)))
+    if repeats:
+        groups = group_recordings(recordings, repeats)
+    single = tuple(channel for channel in channels if isinstance(channel, Series))
+    firsts, joined = [group[0] for group in groups], []
+    for channel in single:
+        counted = np.stack([channel.valid[list(group)].any(axis=0) for group in groups])
+        joined.append(replace(channel.of_recordings(firsts), readings=mean_of(channel, groups), valid=counted))
+    count = [np.stack([c.valid[list(group)].sum(axis=0).astype(float) for group in groups]) for c in single]
+    return Measurements(
+        tuple(recordings.names[index] for index in firsts),
+        groups,
+        recordings.time[firsts],
+        tuple(joined),
+        single,
+        next((channel for channel in channels if isinstance(channel, WeighedParts)), None),
+        np.concatenate(count, axis=-1),
+        np.concatenate([spread(channel, groups) for channel in single], axis=-1),
+        repeats_apart(recordings, repeats, groups) if repeats else (),
     )
-    object.__setattr__(measurements, "position", measurements.mean_of(position))
-    return measurements
-
-
-def _apart(
-    recordings: RecordingSet, trajectories: Sequence[Trajectory], groups: Sequence[tuple[int, ...]]
-) -> tuple[str, ...]:
-    firsts = {group[0] for group in groups}
-    repeats = [index for found in group_repeats(trajectories) for index in found[1:]]
-    return tuple(recordings.names[index] for index in repeats if index in firsts)
-
-
-def _groups(recordings: RecordingSet, trajectories: Sequence[Trajectory]) -> list[tuple[int, ...]]:
-    groups: list[tuple[int, ...]] = []
-    for found in group_repeats(trajectories):
-        kept: list[list[int]] = []
-        for index in found:
-            for group in kept:
-                first = group[0]
-                step = trajectories[first].dataset.attrs["sample_time"]
-                same = recordings.rows[first] == recordings.rows[index]
-                if same and np.abs(recordings.time[first] - recordings.time[index]).max() < CLOCKS_AGREE * step:
-                    group.append(index)
-                    break
-            else:
-                kept.append([index])
-        groups += [tuple(group) for group in kept]
-    return groups

@@ -26,15 +26,19 @@ from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Look, look
 from rfdropo_bayes.audit.search import better_nearby, search, with_usable_differences
 from rfdropo_bayes.audit.verdict import NO_VERDICT, PARTLY, UNEXPLAINED, decide
-from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED, Autoregression
-from rfdropo_bayes.bayes.recordings import RecordingSet
+from rfdropo_bayes.bayes.channels import ObjectPose, Series
+from rfdropo_bayes.bayes.model import TrajectoryModel
+from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED
+from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
 
 DRAWS = 60
 AGAIN = 3  # times that a base fit is climbed on from a better point beside it, before it counts as not converged
-FIRST_GUESS = 1e-3  # [m] of white noise, until something better is known
+# White noise of each channel in its own unit, until something better is known: millimetres, and the medians of priors.
+GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3}
 HELD_OUT_ROWS = 0.6  # of a single recording, which is all that is fitted of it when the rest is to be predicted
 
 
@@ -46,7 +50,7 @@ class Question:
         lanes: simulator with the base model's mechanisms, and every candidate at its null value.
         finer: the same on a finer mesh and time step, with the commands on its own clock; None without.
         coordinates: of all parameters.
-        recordings: all of them, fitted ones first.
+        model: base model and candidates, of all recordings, fitted ones first.
         trajectories: the fitted ones.
         candidates: that may be named.
         stated_noise: from the experiment file, used where nothing was repeated; None without.
@@ -58,10 +62,10 @@ class Question:
     lanes: Lanes
     finer: tuple[Lanes, Commands] | None
     coordinates: Coordinates
-    recordings: RecordingSet
+    model: TrajectoryModel
     trajectories: Sequence[Trajectory]
     candidates: Sequence[Candidate]
-    stated_noise: Autoregression | None
+    stated_noise: Stacked | None
     start: dict[str, float] | None
     rules: Rules
     seed: int
@@ -96,7 +100,7 @@ class Answer:
     unseen: Unseen | None
     sizes: Fit
     draws: Float[np.ndarray, "draw d"]
-    suspected: Autoregression | None
+    suspected: Stacked | None
     shift: float | None
     stopped: bool
     rollouts: int
@@ -134,8 +138,8 @@ def audit(
     deadline = deadline or Deadline(question.rules.minutes)
     target, base = base_model(question, question.seed, journal, report, deadline)
     question = _with_differences_of(question, target)
-    shared = "" if target.noise.correlation is None else ", shared between channels"
-    report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.order}){shared}")
+    shared = "" if target.noise.first.correlation is None else ", shared between coordinates"
+    report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.first.order}){shared}")
     finer = None if question.finer is None else _forward(question, True, target.measurements, deadline)
     unexamined = unaffordable(question.candidates, target, base, question.rules.slowest * question.rules.minutes)
     inquiry = _inquiry(question, target, finer, unexamined, report)
@@ -173,7 +177,7 @@ def audit(
         gain,
         [stage.explained for stage in stages],
         held_out.which if held_out else "",
-        describe_remainder(target.measurements, extended.residual, target.noise),
+        describe_remainder(target.measurements, extended.residual, target.noise.first),
         (held_out.predictions[0], held_out.predictions[len(steps)]) if held_out else None,
         held_out.unseen if held_out else None,
         sizes,
@@ -188,7 +192,7 @@ def audit(
 
 def _judged(
     inquiry: Inquiry, base: Fit, steps: Sequence[Step], looks: Sequence[Look], gain: Gain | None, deadline: Deadline
-) -> tuple[str, Autoregression | None]:
+) -> tuple[str, Stacked | None]:
     """The verdict, and the noise under which the base model would pass where something is left unexplained."""
     rules, last = inquiry.rules, looks[-1].omnibus.p
     members, noise = [len(step.members) for step in steps], inquiry.target.noise
@@ -244,17 +248,24 @@ def _with_differences_of(question: Question, target: Target) -> Question:
 
 
 def _forward(question: Question, finer: bool, measurements: Measurements, deadline: Deadline | None) -> Forward:
-    chosen = {name: group[0] for name, group in zip(measurements.names, measurements.members, strict=True)}
-    return simulated(question, finer, chosen, deadline)
+    return simulated(question, finer, measurements, [group[0] for group in measurements.members], deadline)
 
 
-def simulated(question: Question, finer: bool, chosen: dict[str, int], deadline: Deadline | None = None) -> Forward:
-    """Some of the recordings, on the simulator itself or on the finer one."""
-    lanes, commands = question.lanes, question.recordings.commands
+def simulated(
+    question: Question,
+    finer: bool,
+    measurements: Measurements,
+    chosen: Sequence[int],
+    deadline: Deadline | None = None,
+) -> Forward:
+    """Some of the recordings, on the simulator itself or on the finer one; an object starts where they measured it."""
+    lanes, commands = question.lanes, question.model.recordings.commands
     if finer and question.finer is not None:
         lanes, commands = question.finer
-    rows = int(question.recordings.rows[list(chosen.values())].max())
-    return Forward(lanes, question.coordinates, commands, chosen, rows, deadline)
+    names = {question.model.recordings.names[i]: i for i in chosen}
+    rows = int(question.model.recordings.rows[list(chosen)].max())
+    start = next((c.readings[:, 0] for c in measurements.channels if isinstance(c, ObjectPose)), None)
+    return Forward(lanes, question.coordinates, commands, names, rows, deadline, start)
 
 
 def base_model(
@@ -270,27 +281,39 @@ def base_model(
         InputError: the time was up before the base model was fitted.
     """
     journal = journal or Journal()
-    per_recording = any(p.recording for p in question.coordinates.space.parameters)
-    count = len(question.trajectories)
-    fitted = _subset(question.recordings, range(count))
-    measurements = gather_measurements(fitted, question.trajectories, join=not per_recording)
-    forward = _forward(question, False, measurements, deadline)
-    noise = question.stated_noise
-    if measurements.has_repeats:
-        noise = measurements.noise(measurements.single, 0)
-    known = noise or Autoregression(
-        np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf
-    )
-    target = Target(forward, measurements, known, journal)
+    target = first_target(question, journal, deadline)
+    known = target.noise.source != RESIDUALS
     try:
         target, fit = _base_fit(target, question.start, seed, report)
-        return (target, fit) if noise is not None else _under_residual_noise(target, fit)
+        return (target, fit) if known else _under_residual_noise(target, fit)
     except OutOfTime:
         raise InputError(
             "the time was up before the base model was fitted",
             where=(deadline or Deadline()).where,
             remedy="raise it, fit fewer or shorter recordings, or start from a calibration (--base)",
         ) from None
+
+
+def first_target(question: Question, journal: Journal, deadline: Deadline | None = None) -> Target:
+    """The fitted recordings under the noise of repeats or of the experiment file, or a first guess."""
+    per_recording = any(p.recording for p in question.coordinates.space.parameters)
+    repeats = [] if per_recording else question.trajectories
+    measurements = measurements_of(question, range(len(question.trajectories)), repeats)
+    noise = question.stated_noise
+    if measurements.has_repeats:
+        noise = measurements.noise(measurements.spread, 0)
+    if noise is None:
+        scales = [np.full(c.valid.shape[-1], GUESSES[c.name]) for c in measurements.channels]
+        noise = Stacked(tuple(Autoregression(scale, np.ones(1), RESIDUALS, np.inf) for scale in scales))
+    return Target(_forward(question, False, measurements, deadline), measurements, noise, journal)
+
+
+def measurements_of(question: Question, chosen: Sequence[int], repeats: Sequence[Trajectory] = ()) -> Measurements:
+    """Some of the recordings, no more rows than the longest of them has; repeats are joined where they are given."""
+    index = list(chosen)
+    rows = int(question.model.recordings.rows[index].max())
+    channels = [c.of_recordings(index, rows) if isinstance(c, Series) else c for c in question.model.channels]
+    return gather_measurements(question.model.recordings.of(index, rows), channels, repeats)
 
 
 def _base_fit(
@@ -323,36 +346,21 @@ def _under_residual_noise(target: Target, fit: Fit) -> tuple[Target, Fit]:
     return target, fit if converged else replace(fit, promise=np.inf)
 
 
-def residual_noise(target: Target, fit: Fit) -> Autoregression:
-    """An autoregression fitted to what a model leaves of every recording."""
-    predicted = target.forward.position(fit.x)
-    single = np.array(target.measurements.single)
-    for group, position in zip(target.measurements.members, predicted, strict=True):
-        single[list(group)] -= position
-    return target.measurements.noise(np.where(target.measurements.single_valid, single, 0.0), len(fit.free))
+def residual_noise(target: Target, fit: Fit) -> Stacked:
+    """Autoregressions fitted to what a model leaves of every recording."""
+    measured = target.measurements
+    left = np.array(measured.spread)
+    for group, error in zip(measured.members, target.errors(fit.x), strict=True):
+        left[list(group)] += error
+    return measured.noise(np.where(measured.single_valid, left, 0.0), len(fit.free))
 
 
 def _asked_again(inquiry: Inquiry, base: Fit, extended: Fit) -> tuple[Inquiry, Fit]:
     """The inquiry with the noise of what a first extension leaves: that of the base model holds the discrepancy itself,
     and whitens away what would tell its causes apart."""
     target = replace(inquiry.target, noise=residual_noise(inquiry.target, extended))
-    inquiry.report(f"once more with the noise that the extended model leaves, AR({target.noise.order})")
+    inquiry.report(f"once more with the noise that the extended model leaves, AR({target.noise.first.order})")
     return replace(inquiry, target=target), climb(target, base.x, base.free)
-
-
-def _subset(recordings: RecordingSet, chosen: Sequence[int]) -> RecordingSet:
-    """Some recordings only, no more rows than the longest of them has."""
-    index = list(chosen)
-    rows = int(recordings.rows[index].max())
-    return replace(
-        recordings,
-        names=tuple(recordings.names[i] for i in index),
-        time=recordings.time[index, :rows],
-        rows=recordings.rows[index],
-        position=recordings.position[index, :rows],
-        line=type(recordings.line)(*(part[index, :rows] for part in recordings.line)),
-        commands=Commands(*(part[index] for part in recordings.commands)),
-    )
 
 
 def _final_look(inquiry: Inquiry, extended: Fit, steps: Sequence[Step]) -> Look:
@@ -365,7 +373,7 @@ def _final_look(inquiry: Inquiry, extended: Fit, steps: Sequence[Step]) -> Look:
     return found
 
 
-def _suspected(inquiry: Inquiry, base: Fit) -> Autoregression | None:
+def _suspected(inquiry: Inquiry, base: Fit) -> Stacked | None:
     """Noise fitted to what the base model leaves, where it passes under that, though not under the noise stated."""
     if inquiry.target.noise.source != STATED:
         return None
@@ -375,11 +383,12 @@ def _suspected(inquiry: Inquiry, base: Fit) -> Autoregression | None:
     return target.noise if passes else None
 
 
-def _predict(forward: Forward, fit: Fit, seed: Sequence[int]) -> Prediction:
+def _predict(target: Target, fit: Fit, seed: Sequence[int]) -> Prediction:
     """Predictions under the normal approximation, linear around the mode: along a ridge that the data leave free, such
     as the common scale of stiffness and mass, a draw would lie far from where the approximation holds."""
-    centre = forward.position(fit.x)
-    slopes = forward.derivatives(fit.x, np.eye(len(fit.x))[fit.free])
+    centre = target.errors(fit.x)
+    points = np.repeat(fit.x[None], len(fit.free), axis=0)
+    slopes, _ = target.error_slopes(points, np.eye(len(fit.x))[fit.free])
     z = np.random.default_rng(seed).multivariate_normal(np.zeros(len(fit.free)), fit.covariance, DRAWS, method="eigh")
     z -= z.mean(axis=0)
     return Prediction(centre + np.tensordot(z, slopes, axes=1))
@@ -402,7 +411,7 @@ class HeldOut:
     unseen: Unseen
     predictions: list[Prediction]
     patterns: list[np.ndarray]
-    noise: Autoregression
+    noise: Stacked
     seed: int
 
     def gain(self, before: int, after: int) -> Gain:
@@ -423,27 +432,26 @@ def _held_out(question: Question, target: Target, inquiry: Inquiry, base: Fit, s
     """The test recordings, or fitted ones that are left out in turn; None where the model was not extended."""
     if not steps:
         return None
-    count, every = len(question.trajectories), len(question.recordings.names)
+    count, every = len(question.trajectories), len(question.model.recordings.names)
     fits = [base, *(step.fit for step in steps)]
     names = ["", *(step.name for step in steps)]
     if every > count:
         which = "test recordings"
-        unseen = _unseen(question.recordings, range(count, every))
-        tested = {question.recordings.names[i]: i for i in range(count, every)}
-        predictions = [
-            _predict(simulated(question, DISCRETISATION in names[: i + 1], tested), fit, [question.seed, 3])
-            for i, fit in enumerate(fits)
-        ]
+        tested = measurements_of(question, range(count, every))
+        unseen = _unseen(tested, tested.valid)
+        predictions = []
+        for i, fit in enumerate(fits):
+            forward = simulated(question, DISCRETISATION in names[: i + 1], tested, range(count, every))
+            predictions.append(_predict(replace(target, forward=forward, measurements=tested), fit, [question.seed, 3]))
     else:
         which, unseen, predictions = _left_out(question, target, inquiry, fits, names)
-    patterns = [fit.residual.reshape(target.measurements.position.shape) for fit in fits]
+    patterns = [target.measurements.series(fit.residual) for fit in fits]
     return HeldOut(which, unseen, predictions, patterns, target.noise, question.seed)
 
 
-def _unseen(recordings: RecordingSet, chosen: Sequence[int]) -> Unseen:
-    own = _subset(recordings, chosen)
-    valid = np.repeat(np.asarray(own.line.valid), 3, axis=-1)
-    return Unseen(own.position.reshape(*own.position.shape[:2], -1), valid)
+def _unseen(tested: Measurements, valid: np.ndarray) -> Unseen:
+    position = np.asarray(tested.channels[0].measured)
+    return Unseen(position.reshape(*position.shape[:2], -1), valid)
 
 
 def _left_out(
@@ -457,24 +465,25 @@ def _left_out(
         masks = [np.arange(groups)[:, None, None] == g for g in range(groups)]
     else:
         held_out = "the later rows of the only recording"
-        rows = measured.position.shape[1]
+        rows = measured.count.shape[1]
         masks = [np.arange(rows)[None, :, None] >= HELD_OUT_ROWS * measured.valid[0].any(axis=1).sum()]
     parts: list[list[np.ndarray]] = [[] for _ in fits]
     for mask in masks:
-        mask = np.broadcast_to(mask, measured.position.shape)
+        mask = np.broadcast_to(mask, measured.count.shape)
         kept = replace(measured, count=np.where(mask, 0.0, measured.count))
         for i, fit in enumerate(fits):
             forward = target.forward
             if DISCRETISATION in names[: i + 1] and inquiry.finer is not None:
                 forward = inquiry.finer
             refitted = climb(replace(target, forward=forward, measurements=kept), fit.x, fit.free, evaluations=15)
-            parts[i].append(_predict(forward, refitted, [question.seed, 3]).draws)
+            own = replace(target, forward=forward)
+            parts[i].append(_predict(own, refitted, [question.seed, 3]).errors)
     draws = min(len(part) for row in parts for part in row)
     predictions = []
     for row in parts:
-        joined = np.zeros((draws, *measured.position.shape))
+        joined = np.zeros((draws, *measured.count.shape))
         for mask, part in zip(masks, row, strict=True):
             joined = np.where(mask, part[:draws], joined)
         predictions.append(Prediction(joined))
     valid = measured.valid & np.any(np.broadcast_arrays(*masks, measured.valid)[:-1], axis=0)
-    return held_out, Unseen(measured.position, valid), predictions
+    return held_out, _unseen(measured, valid), predictions

@@ -26,23 +26,27 @@ class Prequential:
         score: log predictive density of each block, whitened data.
         p: probability that a block of a model that is right is as surprising.
         surprise: mean square of a block's prediction errors in their own deviations, 1 where the model is right.
-        misfit: mean square of what each channel leaves at the mode, 1 where the model is right.
+        misfit: mean square of what each marker coordinate leaves at the mode, 1 where the model is right.
     """
 
     edges: Float[np.ndarray, " edge"]
     score: Float[np.ndarray, " block"]
     p: Float[np.ndarray, " block"]
     surprise: Float[np.ndarray, " block"]
-    misfit: Float[np.ndarray, " channel"]
+    misfit: Float[np.ndarray, " column"]
 
 
 def prequential(target: Target, fit: Fit) -> Prequential:
     """Score the blocks of a fitted model."""
-    shape, valid = target.measurements.position.shape, target.measurements.valid
-    residual, slopes = fit.residual.reshape(shape), fit.jacobian.reshape(*shape, -1)
+    measured = target.measurements
+    shape, valid = measured.count.shape, measured.valid
+    residual, slopes = measured.series(fit.residual), np.moveaxis(measured.series(fit.jacobian.T), 0, -1)
     coordinates = target.forward.coordinates
     mean = coordinates.prior_mean[fit.free] - fit.x[fit.free]
     precision = np.diag(coordinates.prior_sd[fit.free] ** -2.0)
+    known, design = fit.residual[measured.count.size :], fit.jacobian[measured.count.size :]  # weighed before all rows
+    before, precision = precision @ mean, precision + design.T @ design
+    mean = np.linalg.solve(precision, before + design.T @ known)
     starts = BLOCK * np.arange(max(shape[1] // BLOCK, 1))  # the last block has what is left over, too
     scores, p, surprise = [], [], []
     for start, end in zip(starts, [*starts[1:], shape[1]], strict=True):
@@ -58,9 +62,10 @@ def prequential(target: Target, fit: Fit) -> Prequential:
         p.append(max(float(chi2.sf(square, len(r))), float(np.finfo(float).tiny)) if len(r) else 1.0)
         surprise.append(square / max(len(r), 1))
         mean, precision = mean + gain, after
-    clock = target.measurements.time[int(np.argmax(valid.any(axis=2).sum(axis=1)))]
+    clock = measured.time[int(np.argmax(valid.any(axis=2).sum(axis=1)))]
     edges = np.append(clock[starts], clock[-1])
     misfit = np.sum(residual**2, axis=(0, 1)) / np.maximum(valid.sum(axis=(0, 1)), 1)
+    misfit = misfit[: measured.markers]
     return Prequential(edges, np.array(scores), np.array(p), np.array(surprise), misfit)
 
 

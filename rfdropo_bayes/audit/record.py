@@ -25,7 +25,7 @@ STIFFNESS = "young_modulus"
 def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_experiment: Any) -> dict[str, Any]:
     """Everything an audit found, in the names that /audit.json/ promises; lengths in mm where a name says so."""
     findings = [_finding(answer, step, stage) for step, stage in zip(answer.steps, _shares(answer), strict=True)]
-    gain, noise = answer.gain, answer.target.noise
+    gain, noise = answer.gain, answer.target.noise.first
     base_rms = _rms(answer, answer.base.residual)
     return {
         "verdict": answer.verdict,
@@ -62,9 +62,11 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
             "correlation_between_channels": None
             if noise.correlation is None
             else np.round(noise.correlation, 3).tolist(),
+            "other_channels": _other_noise(answer),
             "shift_between_repeats_mm": None if answer.shift is None else MILLIMETRES * answer.shift,
-            "suspected_mm": None if answer.suspected is None else (MILLIMETRES * answer.suspected.scale).tolist(),
+            "suspected_mm": None if answer.suspected is None else (MILLIMETRES * answer.suspected.first.scale).tolist(),
         },
+        "channels": list(answer.target.measurements.names_of_channels),
         "residual_in_noise_deviations": base_rms,
         "remainder": {
             "amplitude_mm": MILLIMETRES * answer.remainder.amplitude,
@@ -115,8 +117,19 @@ def next_experiment(answer: Answer) -> dict[str, Any] | None:
     return {"sentence": f"Check {name.replace('_', ' ')} on the robot: {remedy}.", "separates": [name]}
 
 
+def _other_noise(answer: Answer) -> dict[str, Any]:
+    """Noise of the channels beside the markers, in their own units; of tensions as a share of the reading."""
+    parts = zip(answer.target.measurements.channels, answer.target.noise.parts, strict=True)
+    return {
+        channel.name: {"standard_deviation": part.scale.tolist(), "autocorrelation": part.autocorrelation.tolist()}
+        for channel, part in parts
+        if channel is not answer.target.measurements.channels[0]
+    }
+
+
 def _rms(answer: Answer, white: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(white[answer.target.measurements.valid.reshape(-1)] ** 2)))
+    measured = answer.target.measurements
+    return float(np.sqrt(np.mean(measured.series(white)[measured.valid] ** 2)))
 
 
 def _shares(answer: Answer) -> list[float | None]:
@@ -219,7 +232,7 @@ def _omnibus(look: Look) -> dict[str, Any]:
 def _where(answer: Answer) -> dict[str, Any]:
     """When and where the base model fails."""
     found, question = prequential(answer.target, answer.base), answer.question
-    markers = question.recordings.markers
+    markers = question.model.recordings.markers
     misfit = np.sqrt(found.misfit.reshape(-1, 3).mean(axis=1))
     return {
         "sentence": in_words(found, markers, question.rules.base_passes),

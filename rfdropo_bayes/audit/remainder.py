@@ -1,4 +1,5 @@
-"""What no candidate explains, as a Gaussian process in time on every channel: how large, how slow, where."""
+"""What no candidate explains of the positions, as a Gaussian process in time on every coordinate: how large, how slow,
+where."""
 
 from __future__ import annotations
 
@@ -38,13 +39,14 @@ def describe_remainder(measurements: Measurements, white: Float[np.ndarray, " n"
     """Fit the process to the whitened residuals of a model.
 
     The whitening is a linear map, so that the process is fitted to the residual itself under correlated noise: its
-    covariance is whitened, too. Each channel is taken for itself.
+    covariance is whitened, too. Each coordinate is taken for itself.
     """
-    shape = measurements.position.shape
+    own = slice(0, measurements.markers)
+    shape = measurements.count.shape
     rows = np.arange(shape[1])[: min(shape[1], MOST_ROWS)]
-    channels = noise.gather(white.reshape(shape), measurements.valid)
-    data = channels[:, rows] * noise.scale / np.mean(noise.scale)
-    weight = np.sqrt(np.maximum(measurements.count[:, rows].max(axis=(1, 2)), 1.0))
+    columns = noise.gather(measurements.series(white)[..., own], measurements.valid[..., own])
+    data = columns[:, rows] * noise.scale / np.mean(noise.scale)
+    weight = np.sqrt(np.maximum(measurements.count[:, rows, own].max(axis=(1, 2)), 1.0))
     every = np.ones((len(rows), 1), dtype=bool)
     unit = Autoregression(np.ones(1), noise.autocorrelation, noise.source, noise.freedom)
     whitener = unit.whiten(np.eye(len(rows))[:, :, None], np.broadcast_to(every, (len(rows), len(rows), 1)))[..., 0].T

@@ -98,7 +98,7 @@ def look(
     simulated[DIRECTED] = most
     tests = []
     for index, residual in enumerate(residuals):
-        white = residual.reshape(target.measurements.position.shape)
+        white = target.measurements.series(residual)
         blocks = np.nanmean(block_means(white) ** 2, axis=(0, 2))
         tests.append(joint_test({name: float(v[index]) for name, v in observed.items()}, simulated, blocks))
     rows = [_row(name, seen, surprises[0], most, fit) for name in names]
@@ -124,8 +124,7 @@ def _p_value(surprise: float) -> float:
 def _statistics(
     target: Target, residuals: Float[np.ndarray, "count n"], probes: Sequence[Probe]
 ) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "count probe"]]:
-    shape = target.measurements.position.shape
-    found = statistics(residuals.reshape(len(residuals), *shape))
+    found = statistics(target.measurements.series(residuals))
     surprises = [statistic(probe.mark, residuals)[1] for probe in probes]
     return found, np.stack(surprises, axis=1) if probes else np.zeros((len(residuals), 0))
 

@@ -16,7 +16,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from rfdropo_bayes.audit.fit import CLOSE, Fit, Target
+from rfdropo_bayes.audit.fit import CLOSE, Fit, Target, heights
+from rfdropo_bayes.bayes.space import ParameterSpace
 from rfdropo_bayes.inference import LaplaceConfig, find_modes
 from rfdropo_bayes.simulators.differences import usable_difference
 
@@ -53,22 +54,17 @@ class BaseProblem:
     @property
     def n_rows(self) -> int:
         """Rows of the longest recording."""
-        return int(self.target.measurements.position.shape[1])
+        return int(self.target.measurements.count.shape[1])
 
     @property
     def _parameters(self) -> Any:
         own = self.target.forward.coordinates
         return own.space.parameters[: own.base]
 
-    @cached_property
-    def _prior(self) -> tuple[np.ndarray, np.ndarray]:
-        own = self.target.forward.coordinates
-        return own.prior_mean[: own.base], own.prior_sd[: own.base]
-
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
-        """Draws from the normal approximation of the prior, in the coordinates that climbs move in."""
-        mean, sd = self._prior
-        return self.from_unconstrained(mean + sd * np.asarray(jax.random.normal(key, (n, len(mean)))))
+        """Independent prior draws."""
+        drawn = ParameterSpace(self._parameters).sample(key, n)
+        return {name: np.asarray(column, dtype=float) for name, column in drawn.items()}
 
     def to_unconstrained(self, values: Mapping[str, Any]) -> Float[Any, "n d"]:
         """Coordinates of values."""
@@ -81,27 +77,34 @@ class BaseProblem:
         return {name: values[:, i] for i, name in enumerate(self.names)}
 
     def log_prior(self, u: Float[Any, "n d"]) -> Float[Any, " n"]:
-        """The prior's normal approximation."""
-        mean, sd = self._prior
-        return -0.5 * np.sum(((np.asarray(u) - mean) / sd) ** 2 + np.log(2.0 * np.pi * sd**2), axis=-1)
+        """Log prior density."""
+        own = self.target.forward.coordinates
+        return own.log_prior(self._points(u))[:, : own.base].sum(axis=1)
 
     @cached_property
     def prior_derivatives(self) -> tuple[Any, Any]:
         """Gradient and Hessian of the log prior."""
-        mean, sd = self._prior
-        return (lambda u: -(np.asarray(u) - mean) / sd**2), (lambda u: np.diag(-(sd**-2.0)))
+        own = self.target.forward.coordinates
+
+        def at(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            slope, curvature = own.prior_slopes(self._points(np.asarray(u)[None])[0])
+            return slope[: own.base], np.diag(curvature[: own.base])
+
+        return (lambda u: at(u)[0]), (lambda u: at(u)[1])
 
     def row_log_likelihood(
         self, values: Mapping[str, Any], horizon: int
     ) -> tuple[Float[Any, "n horizon"], Int[Any, " n"]]:
         """Of each row given those before it, up to the noise's normaliser; status 1 for a rollout that was lost."""
-        white, fine = self._rows(values, horizon)
-        return np.where(fine[:, None], -0.5 * np.sum(white**2, axis=(1, 3)), -np.inf), np.where(fine, 0, 1)
+        white, weighed, fine = self._rows(values, horizon)
+        rows = -0.5 * np.sum(white**2, axis=(1, 3))
+        rows[:, 0] -= 0.5 * np.sum(weighed**2, axis=1)
+        return np.where(fine[:, None], rows, -np.inf), np.where(fine, 0, 1)
 
     def residual_batch(self, values: Mapping[str, Any], horizon: int) -> Float[Any, "n m"]:
         """Whitened residuals of a prefix."""
-        white, fine = self._rows(values, horizon)
-        return np.where(fine[:, None], white.reshape(len(white), -1), np.inf)
+        white, weighed, fine = self._rows(values, horizon)
+        return np.where(fine[:, None], np.concatenate([white.reshape(len(white), -1), weighed], axis=1), np.inf)
 
     def residuals(self, values: Mapping[str, Any], horizon: int) -> Float[Any, " m"]:
         """The same of one set of values."""
@@ -113,11 +116,15 @@ class BaseProblem:
         points[:, : own.base] = np.asarray(u)
         return np.clip(points, *own.bounds)
 
-    def _rows(self, values: Mapping[str, Any], horizon: int) -> tuple[np.ndarray, np.ndarray]:
-        position, fine = self.target.forward.positions(self._points(self.to_unconstrained(values)))
-        white = self.target.measurements.whiten(self.target.measurements.position - position, self.target.noise)
-        shape = self.target.measurements.position.shape
-        return np.where(fine[:, None], white, 0.0).reshape(len(white), *shape)[:, :, :horizon], fine
+    def _rows(self, values: Mapping[str, Any], horizon: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whitened residuals of a prefix, those of weighed parts, and where rollouts ended well.
+
+        What the sizes of relative errors add to the likelihood is left to the climb that goes on from here.
+        """
+        white, _, fine = self.target.evaluate(self._points(self.to_unconstrained(values)))
+        white = np.where(fine[:, None], white, 0.0)
+        series = self.target.measurements.series(white)
+        return series[:, :, :horizon], white[:, self.target.measurements.count.size :], fine
 
 
 def search(target: Target, key: PRNGKeyArray) -> Float[np.ndarray, " d"]:
@@ -170,8 +177,6 @@ def better_nearby(target: Target, fit: Fit) -> Float[np.ndarray, " d"] | None:
                 point[index] += sign * step * coordinates.prior_sd[index]
                 points.append(point)
     tried = np.clip(np.stack([fit.x, *points]), *coordinates.bounds)
-    residual = target.recall("poll", [tried], lambda: {"residual": target.residual(tried)})["residual"]
-    z = ((tried - coordinates.prior_mean) / coordinates.prior_sd)[:, fit.free]
-    height = -0.5 * (np.sum(residual**2, axis=1) + np.sum(z**2, axis=1))
+    height = heights(target, tried, "poll")
     best = int(np.argmax(height))
     return tried[best] if height[best] > height[0] + 1.0 + CLOSE * float(fit.residual @ fit.residual) else None

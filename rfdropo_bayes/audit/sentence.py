@@ -46,8 +46,8 @@ def _suspicion(answer: Answer) -> str:
     noise = answer.suspected
     if noise is None:
         return ""
-    stated, other = (1e3 * noise_distance(n) for n in (answer.target.noise, noise))
-    memory = f", {noise.autocorrelation[1]:.2f} of it kept from row to row," if noise.order else ""
+    stated, other = (1e3 * noise_distance(n.first) for n in (answer.target.noise, noise))
+    memory = f", {noise.first.autocorrelation[1]:.2f} of it kept from row to row," if noise.first.order else ""
     return (
         f" But noise of {other:.2g} mm{memory} instead of the {stated:.2g} mm stated would leave no discrepancy: "
         "check [noise], or repeat one command sequence three times."
@@ -74,10 +74,10 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if answer.verdict == NO_DISCREPANCY:
         return (
             f"No discrepancy: what the base model leaves is noise as far as these data can tell "
-            f"(joint test p {_p(answer)}{_resolution(answer)}{_assumption(answer)})."
+            f"(joint test p {_p(answer)}{_resolution(answer)}{_assumption(answer)}).{_invisible(answer)}"
         )
     if not findings and answer.looks[0].omnibus.p > answer.question.rules.base_passes:
-        distance = 1e3 * noise_distance(answer.target.noise)
+        distance = 1e3 * noise_distance(answer.target.noise.first)
         return (
             f"What the base model leaves, {distance:.2g} mm, changes too slowly to be the noise of a measurement, but "
             f"without repeats it cannot be told from noise, and no candidate stands out of it "
@@ -112,6 +112,16 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     else:
         head = f"The best of the library, {named}, explains {share}, but not all: something else is at work"
     return f"{head}{_excluded(answer)}; {_remains(answer)}{_assumption(answer)}.{_adoption(answer)}"
+
+
+def _invisible(answer: Answer) -> str:
+    """Candidates that could be there all the same, as nothing that was measured shows them."""
+    names = [row.name.replace("_", " ") for row in answer.looks[0].rows if row.probe is None]
+    if not names:
+        return ""
+    which = ", ".join(names[:MOST_EXCLUDED]) + (" ..." if len(names) > MOST_EXCLUDED else "")
+    data = " and ".join(name.replace("_", " ") for name in answer.target.measurements.names_of_channels)
+    return f" What was measured ({data}) cannot show {which}."
 
 
 def _p(answer: Answer) -> str:
@@ -162,7 +172,7 @@ def _excluded(answer: Answer) -> str:
 
 def _remains(answer: Answer) -> str:
     assert answer.gain is not None
-    noise = noise_distance(answer.target.noise)
+    noise = noise_distance(answer.target.noise.first)
     remain = f"{1e3 * answer.gain.rmse_extended:.2g} mm remain"
     if answer.target.noise.source != REPEATS:
         return remain

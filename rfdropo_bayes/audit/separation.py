@@ -108,7 +108,7 @@ def separate(
         report(f"with {candidate.name}: {_words(target, grown)}")
     if target.noise.source == RESIDUALS:
         target = replace(target, noise=residual_noise(target, grown))
-        report(f"noise of what is left: AR({target.noise.order})")
+        report(f"noise of what is left: AR({target.noise.first.order})")
     grown = climb(target, grown.x, grown.free, evaluations=FINAL)
     report(f"with all: {_words(target, grown)}")
     by_name = {c.name: c for c in candidates}
@@ -151,9 +151,8 @@ def separate(
 
 def distance(target: Target, fit: Fit) -> float:
     """Root mean square distance of the markers from where the model has them [m]."""
-    measured = target.measurements
-    square = (measured.position - target.forward.position(fit.x)) ** 2
-    return float(np.sqrt(3.0 * np.mean(square[measured.valid])))
+    own = slice(0, target.measurements.markers)
+    return float(np.sqrt(3.0 * np.mean(target.errors(fit.x)[..., own][target.measurements.valid[..., own]] ** 2)))
 
 
 def effects(

@@ -45,7 +45,7 @@ def decide(
         base_p, extended_p: p-values of the joint tests; None without an extension.
         class_sizes: members of each named class.
         gain: on unseen trajectories; None where it could not be measured.
-        doubtful: see `Autoregression.doubtful`.
+        doubtful: see `Stacked.doubtful`.
     """
     if base_p > rules.base_passes and not doubtful:
         return NO_DISCREPANCY

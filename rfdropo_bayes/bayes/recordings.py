@@ -49,7 +49,7 @@ class RecordingSet:
             np.minimum(self.rows[chosen], self.time.shape[1] if rows is None else rows),
             self.position[chosen, :rows],
             Timeline(*(np.asarray(part)[chosen, :rows] for part in self.line)),
-            Commands(*(np.asarray(part)[chosen] for part in self.commands)),
+            self.commands.of(chosen),
         )
 
 

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.methods import METHODS as METHODS
     from rfdropo_bayes.inference.methods import make_config as make_config
     from rfdropo_bayes.inference.methods import method_named as method_named
+    from rfdropo_bayes.inference.modes.climb import LevenbergState as LevenbergState
+    from rfdropo_bayes.inference.modes.climb import maximise as maximise
+    from rfdropo_bayes.inference.modes.climb import normal_at as normal_at
     from rfdropo_bayes.inference.modes.search import LaplaceConfig as LaplaceConfig
     from rfdropo_bayes.inference.modes.search import find_modes as find_modes
     from rfdropo_bayes.inference.nested import NestedConfig as NestedConfig
@@ -44,6 +47,9 @@ PUBLIC = {
     "METHODS": "methods",
     "make_config": "methods",
     "method_named": "methods",
+    "LevenbergState": "modes.climb",
+    "maximise": "modes.climb",
+    "normal_at": "modes.climb",
     "LaplaceConfig": "modes.search",
     "find_modes": "modes.search",
     "NestedConfig": "nested",

@@ -77,9 +77,11 @@ def residuals_of(answer: Answer) -> figures.Residuals:
     """The base model's residuals beside commands, rates, tensions and positions."""
     target = answer.target
     measured, forward = target.measurements, target.forward
-    position = forward.position(answer.base.x)
-    left = np.where(measured.valid, measured.position - position, 0.0)
-    rows = measured.valid.any(axis=2)
+    shown = forward.observe_one(answer.base.x)
+    position = shown["position"].reshape(*shown["position"].shape[:2], -1)
+    valid = measured.valid[..., : measured.markers]
+    left = np.where(valid, target.errors(answer.base.x)[..., : measured.markers], 0.0)
+    rows = valid.any(axis=2)
     flat = left[rows]
     values, vectors = np.linalg.eigh(flat.T @ flat)
     pattern = vectors[:, -1]
@@ -97,7 +99,7 @@ def residuals_of(answer: Answer) -> figures.Residuals:
         times[rows],
         np.stack(command)[rows],
         rate[rows],
-        forward.tension(answer.base.x)[rows],
+        shown["tension"][rows],
         (position - position[:, :1])[rows] @ pattern,
         tuple(forward.lanes.simulator.channel_names),
         tuple(forward.lanes.simulator.cable_names),
@@ -128,14 +130,14 @@ def _pictures(answer: Answer, outline: Mapping[str, Any] | None) -> dict[str, Pi
         cosines = np.array([[likeness(a, b) for b in marks] for a in marks])
         found["cosines"] = embed(figures.cosine_figure([r.name for r in rows], cosines), "Cosines between signatures")
     if answer.predictions is not None and answer.unseen is not None:
-        worst = int(
-            np.argmax(np.sum((answer.unseen.position - answer.predictions[0].mean) ** 2 * answer.unseen.valid, (1, 2)))
-        )
-        seen = answer.unseen.valid[worst].any(axis=1)
+        unseen, (base, extended) = answer.unseen, map(answer.unseen.predicted, answer.predictions)
+        valid = unseen.valid[..., : unseen.markers]
+        worst = int(np.argmax(np.sum((unseen.position - base) ** 2 * valid, (1, 2))))
+        seen = valid[worst].any(axis=1)
         series = {
-            "measured": np.where(answer.unseen.valid, answer.unseen.position, np.nan)[worst, seen, -3:],
-            "base model": answer.predictions[0].mean[worst, seen, -3:],
-            "extended model": answer.predictions[1].mean[worst, seen, -3:],
+            "measured": np.where(valid, unseen.position, np.nan)[worst, seen, -3:],
+            "base model": base[worst, seen, -3:],
+            "extended model": extended[worst, seen, -3:],
         }
         found["overlay"] = embed(
             figures.overlay_figure(step * np.flatnonzero(seen), series, "last marker"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -27,6 +27,11 @@ class Commands(NamedTuple):
     step: Float[Array, "*batch step channel"]
     sample_step: Int[Array, "*batch time"]
     sample_fraction: Float[Array, "*batch time"]
+
+    def of(self, index: Sequence[int] | np.ndarray) -> Commands:
+        """Some of a batch."""
+        parts: Any = [np.asarray(part)[index] for part in self]
+        return Commands(*parts)
 
 
 def commands_on_grid(

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, TypeVar, overload
-
-import numpy as np
+from typing import Any, Literal, TypeVar, overload
 
 from rfdropo_bayes.bayes.calibration import Batch, CalibrationProblem
 from rfdropo_bayes.bayes.channels import (
@@ -24,12 +22,18 @@ from rfdropo_bayes.bayes.channels.object_pose import OBJECT_CORRELATION_TIME, OB
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN, TENSION_NOISE
 from rfdropo_bayes.bayes.channels.weighed import check_weighed
 from rfdropo_bayes.bayes.model import TrajectoryModel
-from rfdropo_bayes.bayes.noise import NOISE_MODELS, Autoregression, noise_specs
+from rfdropo_bayes.bayes.noise import (
+    NOISE_CORRELATION_TIME,
+    NOISE_MODELS,
+    OBSERVATION_NOISE,
+    Autoregression,
+    noise_specs,
+)
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
 from rfdropo_bayes.bayes.pooling import Pooled, gather_groups
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.repeats import group_recordings, with_noise_of_repeats
-from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.space import ParameterSpace, build_space
 from rfdropo_bayes.data import Trajectory, find_data_file, load_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
@@ -38,6 +42,7 @@ from rfdropo_bayes.robots import Robot, load_robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
 from rfdropo_bayes.simulators.engine import Engine
+from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_body import assemble_mesh
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
@@ -188,49 +193,79 @@ def pooling(
 def build_model(experiment: Experiment, simulator: AnySimulator, trajectories: Sequence[Trajectory]) -> TrajectoryModel:
     """The probabilistic program of an experiment for the given recordings.
 
+    Raises:
+        InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
+    """
+    recordings = gather_recordings(simulator, trajectories)
+    specs = simulator.parameters + measurement_specs(experiment.model)
+    space = model_space(experiment, simulator, specs, recordings.names)
+    channels = gather_channels(experiment, simulator, trajectories, recordings)
+    if isinstance(channels[-1], WeighedParts):
+        check_weighed(channels[-1].entries, space.names)
+    return TrajectoryModel(simulator, space, fixed_values(experiment, simulator), recordings, channels)
+
+
+def model_space(
+    experiment: Experiment,
+    simulator: AnySimulator,
+    specs: Sequence[ParameterSpec],
+    fitted: Sequence[str],
+    others: Sequence[str] = (),
+    later: Sequence[Mechanism] = (),
+) -> ParameterSpace:
+    """What is inferred: parameters of the model, those of ``later`` mechanisms after all others.
+
     The noise parameters are always inferred, unless [model.fixed] holds them; the gain of tensions with a prior only.
+
+    Args:
+        experiment: says which have a prior.
+        simulator: with all mechanisms.
+        specs: parameters that may be inferred.
+        fitted: names of the recordings that are fitted; others: of those that are not, which may belong to groups.
+        later: mechanisms whose parameters come last, such as the candidates of an audit.
 
     Raises:
         InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
     """
-    table = experiment.model
-    measurement = measurement_specs(table)
-    fixed = fixed_values(experiment, simulator)
+    table, fixed = experiment.model, fixed_values(experiment, simulator)
     check_used(table.priors, experiment, simulator, where="[model.priors]")
     check_used(table.per_recording, experiment, simulator, where="[model.per_recording]")
-    added = [spec.name for mechanism in simulator.mechanisms for spec in mechanism.parameters]
-    specs = simulator.parameters + measurement
-    given = expand_groups(table.priors, specs)
+    known, last = {spec.name for spec in specs}, [spec.name for m in later for spec in m.parameters]
+    added = [spec.name for mechanism in simulator.mechanisms if mechanism not in later for spec in mechanism.parameters]
+    measured = [s.name for s in specs if s not in simulator.parameters and s != TENSION_GAIN]
+    every = simulator.parameters + measurement_specs(table)
+    given = {name: entry for name, entry in expand_groups(table.priors, every).items() if name in known}
     both = sorted(set(fixed) & set(given))
     if both:
         raise InputError(f"{both[0]!r} has a prior and a fixed value", where="[model]", remedy="remove one of them")
-    shared = expand_groups(table.per_recording, specs)
-    defaults = [*added, *shared, *(spec.name for spec in measurement if spec != TENSION_GAIN)]
-    priors = {**given, **{name: {} for name in defaults if name not in fixed and name not in given}}
-    recordings = gather_recordings(simulator, trajectories)
+    shared = expand_groups(table.per_recording, every)
+    defaults = [name for name in (*added, *shared, *measured) if name not in fixed and name not in given]
+    priors: dict[str, Any] = {name: given.get(name, {}) for name in (*given, *defaults) if name not in last}
+    priors |= {name: given.get(name, {}) for name in last if name not in fixed and name not in priors}
     scopes = {
-        name: matching(recordings.names, patterns, where=f"[model.per_recording] {name}")
-        for name, patterns in shared.items()
+        name: matching(fitted, patterns, where=f"[model.per_recording] {name}") for name, patterns in shared.items()
     }
-    pooled = pooling(experiment, simulator.parameters, recordings.names)
-    space = build_space(specs, priors, scopes, recordings.names, pooled=pooled)
-    channels = gather_channels(experiment, simulator, trajectories, recordings)
-    if isinstance(channels[-1], WeighedParts):
-        check_weighed(channels[-1].entries, space.names)
-    return TrajectoryModel(simulator, space, fixed, recordings, channels)
+    return build_space(specs, priors, scopes, fitted, pooled=pooling(experiment, simulator.parameters, fitted, others))
 
 
 def gather_channels(
-    experiment: Experiment, simulator: AnySimulator, trajectories: Sequence[Trajectory], recordings: RecordingSet
+    experiment: Experiment,
+    simulator: AnySimulator,
+    trajectories: Sequence[Trajectory],
+    recordings: RecordingSet,
+    fitted: int | None = None,
 ) -> tuple[Channel, ...]:
-    """What was measured and is to be used, markers first and weighed parts last."""
+    """What was measured and is to be used, markers first and weighed parts last.
+
+    ``fitted`` is the number of recordings, the first ones, that need what [model] asks for; all by default.
+    """
     table, length = experiment.model, recordings.time.shape[1]
     stated = stated_noise(experiment, recordings, trajectories[0]) if table.noise == STATED else None
     channels: list[Channel] = [Markers.gather(recordings, table.noise, stated)]
     if table.tension:
-        channels.append(Tension.gather(simulator, trajectories, length))
+        channels.append(Tension.gather(simulator, trajectories, length, fitted))
     if table.motor_angle:
-        channels.append(MotorAngle.gather(trajectories, length))
+        channels.append(MotorAngle.gather(trajectories, length, fitted))
     if table.object_pose:
         channels.append(ObjectPose.gather(simulator, trajectories, length))
     if table.noise == REPEATS:
@@ -251,10 +286,10 @@ def stated_noise(experiment: Experiment, recordings: RecordingSet, first: Trajec
     noise = experiment.noise
     if noise is None or noise.standard_deviation == 0.0:
         raise InputError("no noise is stated", where='[model] noise = "stated"', remedy="give [noise]")
-    step = float(first.dataset.attrs["sample_time"])
-    memory = [] if noise.correlation_time is None else [float(np.exp(-step / noise.correlation_time))]
-    scale = np.full(3 * len(recordings.markers), noise.standard_deviation)
-    return Autoregression(scale, np.array([1.0, *memory]), STATED, np.inf)
+    values = {OBSERVATION_NOISE.name: noise.standard_deviation}
+    if noise.correlation_time is not None:
+        values[NOISE_CORRELATION_TIME.name] = noise.correlation_time
+    return Markers.gather(recordings, STATED).stated(values, float(first.dataset.attrs["sample_time"]))
 
 
 def build_problem(model: TrajectoryModel, earlier: Batch | None = None) -> CalibrationProblem:

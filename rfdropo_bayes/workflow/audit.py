@@ -21,9 +21,11 @@ from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.pipeline import Answer, Question
 from rfdropo_bayes.audit.pipeline import audit as ask
 from rfdropo_bayes.audit.record import next_experiment, record
-from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
+from rfdropo_bayes.bayes.channels import Series
+from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
+from rfdropo_bayes.bayes.model import TrajectoryModel
+from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.space import ParameterSpace, build_space
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
@@ -41,16 +43,17 @@ from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.workflow.assembly import (
     AnySimulator,
     build_simulator,
-    expand_groups,
     find_workpiece,
     fixed_values,
+    gather_channels,
     load_data,
     measurement_specs,
-    pooling,
+    model_space,
+    stated_noise,
 )
 from rfdropo_bayes.workflow.audited import Audit
 from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.experiment import AuditTable, Experiment, NoiseTable, Workpiece, load_experiment, matching
+from rfdropo_bayes.workflow.experiment import AuditTable, Experiment, NoiseTable, Workpiece, load_experiment
 from rfdropo_bayes.workflow.experiment_file import code_placed, describe, self_contained
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model, source_of
@@ -200,18 +203,14 @@ def build_question(
         left_out = obstacles(experiment, names, robot, folder, trajectories[0])
         names = [name for name in names if name not in left_out]
     simulator = build_simulator(_with(experiment, names), robot, folder)
-    recordings = gather_recordings(simulator, trajectories)
-    added = simulator.mechanisms[len(experiment.model.mechanisms) :]
-    recorded, count = recordings.names, len(fitted)
-    space, base = _space(experiment, simulator, added, recorded[:count], recorded[count:])
-    physical = tuple(spec.name for spec in simulator.parameters)
-    known = fixed_values(experiment, simulator)
+    model, base = _model(experiment, simulator, trajectories, len(fitted), names)
+    added, space = simulator.mechanisms[len(experiment.model.mechanisms) :], model.space
     coordinates = Coordinates(
         space,
         base,
-        physical,
+        tuple(spec.name for spec in simulator.parameters),
         {spec.name: spec.nominal for spec in simulator.parameters},
-        {name: value for name, value in known.items() if name in physical},
+        model.fixed,
     )
     index = {p.spec.name: i for i, p in enumerate(space.parameters)}
     candidates = [
@@ -222,8 +221,9 @@ def build_question(
 
     def lanes(changed: Experiment) -> tuple[Lanes, Commands]:
         shop = {} if workshop is None else workshop
-        key = repr((changed.robot, changed.simulator, names, recordings.marker_index.tolist(), coordinates.fixed))
-        found, commands = _lanes(changed, names, robot, folder, trajectories, coordinates, shop.get(key))
+        fields, markers = _fields(model), model.recordings.marker_index.tolist()
+        key = repr((changed.robot, changed.simulator, names, markers, coordinates.fixed, fields))
+        found, commands = _lanes(changed, names, robot, folder, trajectories, coordinates, shop.get(key), fields)
         shop[key] = found
         return found, commands
 
@@ -231,10 +231,10 @@ def build_question(
         lanes(experiment)[0],
         None if isinstance(robot, BlackBox) else lanes(_finer(experiment, robot)),
         coordinates,
-        recordings,
+        model,
         list(fitted),
         candidates,
-        _stated(experiment, recordings.position.shape[2], fitted[0]),
+        _stated(experiment, model, fitted[0]),
         start,
         Rules(bootstraps=experiment.audit.bootstraps, minutes=experiment.audit.minutes),
         seed,
@@ -303,6 +303,7 @@ def _lanes(
     trajectories: Sequence[Trajectory],
     coordinates: Coordinates,
     made: Lanes | None,
+    fields: Sequence[str],
 ) -> tuple[Lanes, Commands]:
     """The simulator with all candidates; those that would slow every rollout down get a simulator of their own."""
     whole = build_simulator(_with(experiment, names), robot, folder)
@@ -313,19 +314,19 @@ def _lanes(
     added = whole.mechanisms[len(experiment.model.mechanisms) :]
     kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
     if len(kept) == len(names):
-        return _brisk(whole, recordings.marker_index), recordings.commands
-    fast = _brisk(build_simulator(_with(experiment, kept), robot, folder), recordings.marker_index)
+        return _brisk(whole, recordings.marker_index, fields), recordings.commands
+    fast = _brisk(build_simulator(_with(experiment, kept), robot, folder), recordings.marker_index, fields)
     null = dict(coordinates.nominal) | dict(coordinates.fixed) | coordinates.named(coordinates.null)
-    routed = RoutedLanes(fast, _brisk(whole, recordings.marker_index), null)
+    routed = RoutedLanes(fast, _brisk(whole, recordings.marker_index, fields), null)
     return routed, recordings.commands
 
 
-def _brisk(simulator: AnySimulator, marker_index: np.ndarray) -> Lanes:
+def _brisk(simulator: AnySimulator, marker_index: np.ndarray, fields: Sequence[str]) -> Lanes:
     """Lanes with one-sided differences where there are any: they are exact enough for climbs and scores."""
     if isinstance(simulator, TrunkSimulator) and simulator.engine.backend.name == "numba":
         quick = simulator.with_backend(simulator.engine.backend._replace(one_sided=True))
-        return Lanes(quick, marker_index, slope_rollouts=2)
-    return Lanes(simulator, marker_index)
+        return Lanes(quick, marker_index, slope_rollouts=2, fields=fields)
+    return Lanes(simulator, marker_index, fields=fields)
 
 
 def _costly(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
@@ -349,44 +350,45 @@ def _finer(experiment: Experiment, robot: Robot) -> Experiment:
     return experiment.model_copy(update={"simulator": changed})
 
 
-def _space(
+def _model(
     experiment: Experiment,
     simulator: AnySimulator,
-    candidates: Sequence[Mechanism],
-    fitted: Sequence[str],
-    others: Sequence[str],
-) -> tuple[ParameterSpace, int]:
-    """Base parameters, then those of the candidates, each with a prior; and how many are base parameters."""
-    table = experiment.model
-    noise = {spec.name for spec in measurement_specs(table)}
-    fixed = fixed_values(experiment, simulator)
-    specs = simulator.parameters
-    added = {spec.name for m in candidates for spec in m.parameters}
-    own = [spec.name for m in simulator.mechanisms if m not in candidates for spec in m.parameters]
-    given = expand_groups({k: v for k, v in table.priors.items() if k not in noise}, specs)
-    shared = expand_groups(table.per_recording, specs)
-    defaults = [name for name in [*own, *shared] if name not in fixed and name not in given]
-    priors = {**given, **{name: {} for name in defaults}}
-    priors = {name: entry for name, entry in priors.items() if name not in added}
-    scopes = {
-        name: matching(fitted, patterns, where=f"[model.per_recording] {name}") for name, patterns in shared.items()
-    }
-    pooled = pooling(experiment, specs, fitted, others)
-    base = build_space(specs, priors, scopes, fitted, pooled=pooled)
-    taken = {p.spec.name for p in base.parameters} | set(fixed)
-    extra = {name: given.get(name, {}) for name in [s.name for s in specs if s.name in added - taken]}
-    whole = build_space(specs, {**priors, **extra}, scopes, fitted, pooled=pooled)
-    return whole, len(base.parameters)
+    trajectories: Sequence[Trajectory],
+    fitted: int,
+    names: Sequence[str],
+) -> tuple[TrajectoryModel, int]:
+    """The experiment's model with all candidates, and how many of its parameters are of the base model, which come
+    first. The noise of its channels is known, so that its parameters are not among them."""
+    table, recordings = experiment.model, gather_recordings(simulator, trajectories)
+    added = simulator.mechanisms[len(table.mechanisms) :]
+    gains = [spec for spec in measurement_specs(table) if spec == TENSION_GAIN]
+    specs, groups = (*simulator.parameters, *gains), (recordings.names[:fitted], recordings.names[fitted:])
+    space = model_space(experiment, simulator, specs, *groups, later=added)
+    of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
+    base = sum(p.spec.name not in of_candidates for p in space.parameters)
+    channels = gather_channels(experiment, simulator, trajectories, recordings, fitted)
+    return TrajectoryModel(simulator, space, fixed_values(experiment, simulator), recordings, channels), base
 
 
-def _stated(experiment: Experiment, markers: int, first: Trajectory) -> Autoregression | None:
-    """The noise that the experiment file states, for recordings without repeats."""
-    noise = experiment.noise
-    if noise is None or noise.standard_deviation == 0.0:
+def _fields(model: TrajectoryModel) -> list[str]:
+    """Parts of an observation that are data."""
+    series = [channel.name for channel in model.channels if isinstance(channel, Series)]
+    return ["position" if name == "markers" else name for name in series]
+
+
+def _stated(experiment: Experiment, model: TrajectoryModel, first: Trajectory) -> Stacked | None:
+    """The noise that the experiment file states, for recordings without repeats: that of the positions under [noise],
+    that of other channels under [model.fixed]; None where that of any channel is not stated."""
+    if experiment.noise is None or experiment.noise.standard_deviation == 0.0:
         return None
-    step = float(first.dataset.attrs["sample_time"])
-    memory = [] if noise.correlation_time is None else [float(np.exp(-step / noise.correlation_time))]
-    return Autoregression(np.full(3 * markers, noise.standard_deviation), np.array([1.0, *memory]), STATED, np.inf)
+    parts = [stated_noise(experiment, model.recordings, first)]
+    for channel in model.channels[1:]:
+        if isinstance(channel, Series):
+            known = [model.fixed.get(spec.name) for spec in channel.noise_specs]
+            if any(value is None for value in known):
+                return None
+            parts.append(channel.stated(model.fixed, float(first.dataset.attrs["sample_time"])))
+    return Stacked(tuple(parts))
 
 
 def start_values(base: Calibration | Path | None) -> dict[str, float] | None:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from rfdropo_bayes.audit.fit import climb
-from rfdropo_bayes.audit.pipeline import Answer, simulated
+from rfdropo_bayes.audit.pipeline import Answer, measurements_of, simulated
 from rfdropo_bayes.audit.record import STIFFNESS
 from rfdropo_bayes.audit.verdict import EQUIVALENT, EXPLAINED, NO_DISCREPANCY, PARTLY, UNEXPLAINED
 from rfdropo_bayes.errors import InputError, Interrupted
@@ -276,14 +276,15 @@ def error_over_oracle(answer: Answer, names: Sequence[str], hidden: Hidden) -> f
     own = [i for c in question.candidates if c.name in names for i in c.indices]
     start = coordinates.encode(hidden.values)
     oracle = climb(answer.target, start, np.array([*range(coordinates.base), *own]))
-    count = len(question.trajectories)
-    untouched = {name: i for i, name in enumerate(question.recordings.names) if i >= count}
-    predicted = simulated(question, False, untouched).position(oracle.x)
+    untouched = range(len(question.trajectories), len(question.model.recordings.names))
+    tested = measurements_of(question, untouched)
+    assert answer.unseen is not None
+    predicted = simulated(question, False, tested, untouched).observe_one(oracle.x)["position"]
 
     def error(position: np.ndarray) -> float:
         return float(np.sqrt(np.mean((position - hidden.clean) ** 2)))
 
-    return error(answer.predictions[1].mean) / error(predicted)
+    return error(answer.unseen.predicted(answer.predictions[1])) / error(predicted.reshape(hidden.clean.shape))
 
 
 def summarise(condition: Condition, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -204,7 +204,7 @@ def _outlooks(
     """Outlooks of the proposals, one of each kind at a time; of the first few, whatever the time."""
     simulator = question.lanes.simulator
     sequences = [simulator.commands(t, v, first.initial_command, first.time) for _, t, v in proposals]
-    shaped = _shaped(sequences, question.recordings.commands)
+    shaped = _shaped(sequences, question.model.recordings.commands)
     outlook = outlooks(target, base, hypotheses, shaped[:KINDS])
     for start in range(KINDS, len(shaped), KINDS):
         report(f"{start} of {len(shaped)} command sequences")

@@ -19,13 +19,14 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.fit import Target, climb
-from rfdropo_bayes.audit.forward import Forward
-from rfdropo_bayes.audit.measurements import gather_measurements
+from rfdropo_bayes.audit.pipeline import measurements_of, simulated
 from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
+from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot
 from rfdropo_bayes.workflow.audit import Workshop, build_question
 from rfdropo_bayes.workflow.commands import random_walk
@@ -34,6 +35,7 @@ from rfdropo_bayes.workflow.experiment_file import describe
 from rfdropo_bayes.workflow.files import output_folder
 
 NOISE, MEMORY = 5e-4, 0.6  # standard deviation [m] and correlation from row to row
+TENSION_NOISE = 0.02  # of a tension reading
 REPEATS, UNTOUCHED = 3, 6
 SIZES = np.geomspace(1e-4, 60.0, 40)  # multiples of the prior's scale among which a size is looked for
 
@@ -47,6 +49,7 @@ class Setting:
         audited, made: [simulator] tables of the audit and of the data.
         spread: relative deviation of the truth from the middle of the priors.
         priors: of the base parameters.
+        tension: whether cable tensions are recorded, and are data of the audit.
     """
 
     robot: str = "smooth_arm"
@@ -66,6 +69,7 @@ class Setting:
             "rayleigh_stiffness": {"distribution": "LogNormal", "median": 0.05, "sigma": 0.7},
         }
     )
+    tension: bool = False
 
 
 @dataclass(frozen=True)
@@ -125,10 +129,11 @@ def hide(
     truth[: coordinates.base] += (
         setting.spread * coordinates.prior_sd[: coordinates.base] * rng.standard_normal(coordinates.base)
     )
-    measurements = gather_measurements(gather_recordings(question.lanes.simulator, fitted), fitted, join=True)
-    chosen = {name: group[0] for name, group in zip(measurements.names, measurements.members, strict=True)}
-    forward = Forward(question.lanes, coordinates, question.recordings.commands, chosen)
-    white = Autoregression(np.full(measurements.position.shape[-1], NOISE), np.ones(1), STATED, np.inf)
+    measurements = measurements_of(question, range(len(fitted)), fitted)
+    forward = simulated(question, False, measurements, [group[0] for group in measurements.members])
+    widths = [channel.valid.shape[-1] for channel in measurements.channels]
+    sizes_of = zip(widths, (NOISE, TENSION_NOISE), strict=False)
+    white = Stacked(tuple(Autoregression(np.full(n, size), np.ones(1), STATED, np.inf) for n, size in sizes_of))
     target = Target(forward, replace(measurements, count=measurements.valid.astype(float)), white)
     sizes = {}
     for name in mechanisms:
@@ -139,10 +144,11 @@ def hide(
         truth = moved
         sizes[name] = rho
     values = {n: v for n, v in coordinates.named(truth).items() if _belongs(question, n, mechanisms)}
-    clean = _made(setting, mechanisms, values, blank)
-    sizes["discretisation"] = _discretisation(target, truth, clean[: REPEATS + 1], measurements.members)
-    _write(setting, experiment, blank, clean, values, seed, out)
-    return Hidden(values, sizes, out, clean[REPEATS + 1 :].reshape(UNTOUCHED, clean.shape[1], -1))
+    made = _made(setting, mechanisms, values, blank)
+    sizes["discretisation"] = _discretisation(target, truth, made, measurements.members)
+    _write(setting, experiment, blank, made, seed, out)
+    untouched_rows = np.asarray(made.position)[REPEATS + 1 :]
+    return Hidden(values, sizes, out, untouched_rows.reshape(*untouched_rows.shape[:2], -1))
 
 
 def _belongs(question: Any, name: str, mechanisms: Sequence[str]) -> bool:
@@ -157,7 +163,10 @@ def _experiment(setting: Setting, exclude: Sequence[str]) -> Experiment:
         {
             "robot": setting.robot,
             "data": {"format": "netcdf", "fit": ["fit_*.nc", "screen.nc"], "test": ["test_*.nc"]},
-            "model": {"priors": {name: dict(table) for name, table in setting.priors.items()}},
+            "model": {
+                "priors": {name: dict(table) for name, table in setting.priors.items()},
+                "tension": setting.tension,
+            },
             "simulator": dict(setting.audited),
             "audit": {"exclude": list(exclude)},
         }
@@ -188,6 +197,7 @@ def _blank_recordings(setting: Setting, rng: np.random.Generator) -> list[Trajec
             command_unit=robot.command_unit,
             marker_names=robot.marker_names,
             cable_names=robot.channel_names,
+            tension=np.ones((len(time), len(robot.channel_names))) if setting.tension else None,
             synthetic=True,
         )
         for name, k in zip(names, order, strict=True)
@@ -230,8 +240,8 @@ def _sized(
 
 def _made(
     setting: Setting, mechanisms: Sequence[str], values: Mapping[str, float], blank: Sequence[Trajectory]
-) -> Float[np.ndarray, "recording time marker 3"]:
-    """Noise-free positions from the finer simulator."""
+) -> Observation:
+    """What the finer simulator shows of every recording."""
     experiment = _experiment(setting, ())
     experiment = experiment.model_copy(
         update={
@@ -244,13 +254,15 @@ def _made(
     given = {name: jnp.asarray(v) for name, v in values.items()}
     observed = jax.vmap(lambda c: simulator.rollout(given, c, jnp.asarray(c.step.shape[0])))(recordings.commands)
     assert int(np.max(np.asarray(observed.status))) == 0, "the truth does not roll out well"
-    return np.asarray(observed.position)
+    return observed
 
 
-def _discretisation(target: Target, truth: np.ndarray, clean: np.ndarray, members: Sequence[Sequence[int]]) -> float:
+def _discretisation(target: Target, truth: np.ndarray, made: Observation, members: Sequence[Sequence[int]]) -> float:
     """RMS of what a refit with the true mechanisms in the model cannot absorb, in noise deviations."""
-    chosen = clean[[group[0] for group in members]]
-    fitted = replace(target.measurements, position=chosen.reshape(target.measurements.position.shape))
+    firsts = [group[0] for group in members]
+    shown = [np.asarray(part)[firsts] for part in (made.position, made.tension)]
+    channels = zip(target.measurements.channels, shown, strict=False)
+    fitted = replace(target.measurements, channels=tuple(replace(c, readings=part) for c, part in channels))
     refit = climb(replace(target, measurements=fitted), truth, np.arange(target.forward.coordinates.base))
     return float(np.sqrt(np.mean(refit.residual**2)))
 
@@ -259,18 +271,21 @@ def _write(
     setting: Setting,
     experiment: Experiment,
     blank: Sequence[Trajectory],
-    clean: np.ndarray,
-    values: Mapping[str, float],
+    made: Observation,
     seed: int,
     out: Path,
 ) -> None:
     step = setting.commands.sample_time
-    for index, (recording, position) in enumerate(zip(blank, clean, strict=True)):
+    for index, (recording, position) in enumerate(zip(blank, np.asarray(made.position), strict=True)):
         key = jax.random.fold_in(jax.random.key(seed), index)
         memory = jnp.asarray(-step / np.log(MEMORY))
         noise = draw_noise(key, jnp.asarray(recording.time), position.shape[1], Noise(jnp.asarray(NOISE), memory))
         dataset = recording.dataset.copy()
         dataset["position"] = dataset["position"].copy(data=position + np.asarray(noise))
+        if setting.tension:
+            pull = np.asarray(made.tension)[index]
+            error = np.asarray(jax.random.normal(jax.random.fold_in(key, 1), pull.shape))
+            dataset["tension"] = dataset["tension"].copy(data=pull * (1.0 + TENSION_NOISE * error))
         Trajectory(dataset).save(out / f"{recording.name}.nc")
     tables = experiment.model_dump(exclude_none=True, exclude_defaults=True)
     tables["seed"] = seed

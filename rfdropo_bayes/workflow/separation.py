@@ -9,12 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from rfdropo_bayes.audit.fit import Fit, Target
+from rfdropo_bayes.audit.fit import Fit
 from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.measurements import gather_measurements
-from rfdropo_bayes.audit.pipeline import FIRST_GUESS, Question, simulated
+from rfdropo_bayes.audit.pipeline import Question, first_target
 from rfdropo_bayes.audit.separation import Separation, separate
-from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, Autoregression
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_text
 from rfdropo_bayes.report import software_versions
@@ -74,7 +72,7 @@ def run_separation(
     with run_folder(out, "separate", **settings, resume=resume, overwrite=overwrite) as out:
         coordinates = question.coordinates
         found = separate(
-            _target(question, Journal(out / JOURNAL, resume=resume)),
+            first_target(question, Journal(out / JOURNAL, resume=resume)),
             question.candidates,
             table.groups,
             coordinates.null if start is None else coordinates.encode(start),
@@ -92,22 +90,9 @@ def run_separation(
     return content
 
 
-def _target(question: Question, journal: Journal) -> Target:
-    """The fitted recordings under the noise of repeats or of the experiment file, or a first guess."""
-    per_recording = any(p.recording for p in question.coordinates.space.parameters)
-    measurements = gather_measurements(question.recordings, question.trajectories, join=not per_recording)
-    chosen = {name: group[0] for name, group in zip(measurements.names, measurements.members, strict=True)}
-    noise = question.stated_noise
-    if measurements.has_repeats:
-        noise = measurements.noise(measurements.single, 0)
-    if noise is None:
-        noise = Autoregression(np.full(measurements.position.shape[-1], FIRST_GUESS), np.ones(1), RESIDUALS, np.inf)
-    return Target(simulated(question, False, chosen), measurements, noise, journal)
-
-
 def record_separation(found: Separation, question: Question) -> dict[str, Any]:
     """What was found as plain values; evidences in nats, lengths in mm where a name says so."""
-    noise, names = found.target.noise, list(found.groups)
+    noise, names = found.target.noise.first, list(found.groups)
     return {
         "noise": {
             "source": noise.source,

@@ -26,7 +26,9 @@ from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.audit.sentence import _named
 from rfdropo_bayes.audit.verdict import decide
+from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
+from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
@@ -117,7 +119,7 @@ def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(family, named):
             return found._replace(position=found.position * (1.0 + 3.0 * found.position))
 
     asked = question(TRUTH, 102)
-    finer = (asked.lanes, asked.recordings.commands)
+    finer = (asked.lanes, asked.model.recordings.commands)
     rules = replace(asked.rules, family=family)
     answer = audit(replace(asked, lanes=Lanes(Coarse(), np.arange(4)), finer=finer, rules=rules))
     assert [step.name for step in answer.steps] == named
@@ -165,7 +167,7 @@ def test_commands_that_excite_only_one_of_two_effects_separate_them():
     inquiry = Inquiry(target, asked.candidates, asked.rules, 0)
     look, _ = inquiry.look_at(base)
     hypotheses = [Hypothesis(name, inquiry.refit(base, look.row(name))) for name in ("play", "delay")]
-    like = Commands(*(np.asarray(part)[0] for part in asked.recordings.commands))
+    like = Commands(*(np.asarray(part)[0] for part in asked.model.recordings.commands))
     still = like._replace(step=np.zeros_like(like.step))
     moving, resting = outlooks(target, base, hypotheses, [like, still])
     now = at_hand(target, hypotheses)[("play", "delay")]
@@ -233,12 +235,12 @@ def test_an_audit_without_the_time_for_a_base_fit_says_so():
 
 
 class Rough(Toy):
-    """Motion that jumps by several deviations of the noise where the gain changes by a thousandth."""
+    """Motion that jumps by hundreds of deviations of the noise where the gain changes by a thousandth."""
 
     def rollout(self, parameters, commands, steps=None):
         observed = super().rollout(parameters, commands, steps)
         jump = jnp.sin(1e5 * parameters["gain"]) * jnp.sin(3e4 * parameters["bend"])
-        return observed._replace(position=observed.position + 20.0 * NOISE * jump)
+        return observed._replace(position=observed.position + 200.0 * NOISE * jump)
 
 
 def test_a_base_fit_that_has_not_converged_is_said_and_gives_no_verdict():
@@ -263,15 +265,16 @@ def test_rollouts_go_to_the_simulator_that_knows_their_candidates():
     theta[:, 0] = 1.3
     theta[2, play] = 0.7
     tangent = np.eye(theta.shape[1])[[0, play, 0, 1]]
-    commands = question(TRUTH, 1).recordings.commands
-    lane = np.array([0, 1, 2, 3])
+    commands, start = question(TRUTH, 1).model.recordings.of(range(4)).commands, np.zeros((4, 7))
     slow = routed._needs_slow(theta)
     np.testing.assert_array_equal(slow, [False, False, True, False])
-    for one, other in zip(routed.roll(theta, commands, lane), whole.roll(theta, commands, lane), strict=True):
-        np.testing.assert_array_equal(one, other)
-    np.testing.assert_array_equal(
-        routed.differentiate(theta, tangent, commands, lane), whole.differentiate(theta, tangent, commands, lane)
-    )
+    (shown, status), (other, _) = (lanes.roll(theta, start, commands) for lanes in (routed, whole))
+    assert list(status) == [0] * 4
+    slopes, others = (lanes.differentiate(theta, tangent, start, commands) for lanes in (routed, whole))
+    assert slopes.keys() == {"position"}
+    for name in shown:
+        np.testing.assert_array_equal(shown[name], other[name])
+    np.testing.assert_array_equal(slopes["position"], others["position"])
 
 
 def test_a_refit_finds_back_from_an_extrapolation_at_which_rollouts_fail(monkeypatch):
@@ -322,7 +325,7 @@ def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it(
     look, _ = inquiry.look_at(base)
     play, creep = (next(c for c in asked.candidates if c.name == name) for name in ("play", "creep"))
     with_play = np.array([*base.free, *play.indices], dtype=int)
-    early = climb(target, base.x, with_play, evaluations=1)
+    early = climb(target, base.x, with_play, evaluations=0)
     whole = climb(target, base.x, with_play)
     assert early.log_evidence < whole.log_evidence - 100.0  # what it is about
     both = climb(target, whole.x, np.array([*with_play, *creep.indices], dtype=int))
@@ -338,10 +341,12 @@ def test_repeats_whose_clocks_differ_are_not_joined_and_named():
     late = trajectories[1].dataset
     time = late["time"].values + 0.2 * STEP * (np.arange(ROWS) % 2)
     trajectories[1] = Trajectory(late.assign_coords(time=time))
-    measurements = gather_measurements(gather_recordings(Toy(), trajectories), trajectories, join=True)
+    gathered = gather_recordings(Toy(), trajectories)
+    channels = (Markers.gather(gathered, "repeats"),)
+    measurements = gather_measurements(gathered, channels, trajectories)
     assert measurements.apart == ("r1",)
     assert measurements.members[0] == (0, 2)
-    assert gather_measurements(gather_recordings(Toy(), trajectories), trajectories, join=False).apart == ()
+    assert gather_measurements(gathered, channels).apart == ()
 
 
 def unrepeated(truth: dict, seed: int):
@@ -349,7 +354,14 @@ def unrepeated(truth: dict, seed: int):
     trajectories = recordings({**TRUTH, **truth}, seed)
     single = [trajectories[index] for index in (0, 3, 4, 5, 6, 7, 8, 9)]
     asked = question(TRUTH, seed)
-    return replace(asked, recordings=gather_recordings(Toy(), single), trajectories=single[:2])
+    return asked_of(asked, single, 2)
+
+
+def asked_of(asked, trajectories, fitted: int):
+    """The same question about other recordings."""
+    gathered = gather_recordings(Toy(), trajectories)
+    model = replace(asked.model, recordings=gathered, channels=(Markers.gather(gathered, "white"),))
+    return replace(asked, model=model, trajectories=trajectories[:fitted])
 
 
 def test_without_repeats_the_noise_is_what_the_extended_model_leaves():
@@ -366,7 +378,7 @@ def test_without_repeats_the_noise_is_what_the_extended_model_leaves():
 
 @pytest.mark.parametrize(("size", "play", "suspected"), [(1 / 3, 0.0, True), (1.0, 0.0, False), (1.0, 3.0, False)])
 def test_a_stated_noise_that_is_too_small_is_suspected_and_a_right_one_is_not(size, play, suspected):
-    stated = Autoregression(np.full(12, size * NOISE), np.array([1.0, 0.6]), STATED, np.inf)
+    stated = Stacked((Autoregression(np.full(12, size * NOISE), np.array([1.0, 0.6]), STATED, np.inf),))
     answer = audit(replace(unrepeated({"play": play}, 6), stated_noise=stated))
     content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
     assert ("check [noise]" in content["sentence"]) == suspected
@@ -377,7 +389,7 @@ def test_a_stated_noise_that_is_too_small_is_suspected_and_a_right_one_is_not(si
 
 
 def test_where_nothing_is_wrong_a_stated_noise_is_not_suspected_however_low_the_passing_p():
-    stated = Autoregression(np.full(12, NOISE), np.array([1.0, 0.6]), STATED, np.inf)
+    stated = Stacked((Autoregression(np.full(12, NOISE), np.array([1.0, 0.6]), STATED, np.inf),))
     asked = replace(unrepeated({}, 6), stated_noise=stated)
     strict = replace(asked, rules=replace(asked.rules, extended_passes=1.0))
     answer = audit(strict)
@@ -389,7 +401,7 @@ def test_what_predicts_unseen_recordings_worse_is_named_and_not_adopted():
     """The test recordings have the effect with the other sign."""
     fitted = unrepeated({"delay": 1.0}, 7)
     single = [*fitted.trajectories, *recordings({**TRUTH, "delay": -1.0}, 7)[4:]]
-    answer = audit(replace(fitted, recordings=gather_recordings(Toy(), single), trajectories=single[:2]))
+    answer = audit(asked_of(fitted, single, 2))
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
     assert answer.steps
     assert answer.adopted == []
@@ -403,7 +415,7 @@ def test_what_only_the_fitted_recordings_have_is_not_adopted_beside_what_all_hav
     """Play is in every recording, a delay in the fitted ones alone."""
     fitted = unrepeated({"play": 3.0, "delay": 0.3}, 7)
     single = [*fitted.trajectories, *recordings({**TRUTH, "play": 3.0}, 7)[4:]]
-    answer = audit(replace(fitted, recordings=gather_recordings(Toy(), single), trajectories=single[:2]))
+    answer = audit(asked_of(fitted, single, 2))
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
     assert [step.name for step in answer.steps] == ["play"]
     assert [step.name for step in answer.adopted] == ["play"]

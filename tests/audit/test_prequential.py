@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,14 +12,17 @@ from scipy.stats import kstest, multivariate_normal
 from rfdropo_bayes.audit.fit import Fit
 from rfdropo_bayes.audit.prequential import in_words, prequential
 
+from .toys import measurements
+
 ROWS, CHANNELS, PARAMETERS = 35, 6, 3  # three blocks, the last one longer
 
 
 def asked(residual: np.ndarray, jacobian: np.ndarray, x: np.ndarray, valid: np.ndarray):
     """A target and a fit with unit priors around one, of which only these attributes are used."""
-    measurements = SimpleNamespace(position=np.zeros(valid.shape), valid=valid, time=0.05 * np.arange(ROWS)[None])
+    measured = replace(measurements(np.zeros(valid.shape), ((0,),)), count=valid.astype(float))
+    measured = replace(measured, time=0.05 * np.arange(ROWS)[None])
     coordinates = SimpleNamespace(prior_mean=np.ones(PARAMETERS), prior_sd=np.full(PARAMETERS, 2.0))
-    target = SimpleNamespace(measurements=measurements, forward=SimpleNamespace(coordinates=coordinates))
+    target = SimpleNamespace(measurements=measured, forward=SimpleNamespace(coordinates=coordinates))
     free = np.arange(PARAMETERS)
     return target, Fit(x, free, residual, jacobian, np.eye(PARAMETERS), 0.0, 0.0)
 

@@ -11,6 +11,7 @@ import pytest
 from rfdropo_bayes.audit.pipeline import base_model
 from rfdropo_bayes.audit.separation import effects, separate
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS
+from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.separation_table import separation_figure, separation_markdown
 from rfdropo_bayes.tables import parse_table
@@ -62,13 +63,14 @@ def test_what_looks_the_same_can_go_one_at_a_time_and_not_together(asked):
 
 def test_noise_that_was_not_measured_is_what_the_model_with_all_of_them_leaves(asked):
     target, base, candidates, _ = asked
-    guessed = replace(target, noise=replace(target.noise, scale=np.full(12, 1e-2), source=RESIDUALS))
+    wide = replace(target.noise.first, scale=np.full(12, 1e-2), source=RESIDUALS)
+    guessed = replace(target, noise=Stacked((wide,)))
     # As if nothing had been repeated: each recording for itself.
     joined = guessed.measurements
     members = tuple((index,) for index in range(len(joined.members)))
-    alone = replace(joined, members=members, single=joined.position, single_valid=joined.valid)
+    alone = replace(joined, members=members, single=joined.channels, spread=np.zeros(joined.count.shape))
     found = separate(replace(guessed, measurements=alone), candidates[:2], {}, base.x)
-    kept = found.target.noise
+    kept = found.target.noise.first
     assert kept.source == RESIDUALS
     # The first row is a mean of three; 10 % besides.
     assert 0.5 * NOISE < np.sqrt(np.mean(kept.scale**2)) < 1.1 * NOISE

@@ -10,6 +10,9 @@ from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED, Autoregression
 from rfdropo_bayes.bayes.noise.repeat_shifts import repeat_shift
 from rfdropo_bayes.bayes.noise.shared import mixed, shrunk_correlation
+from rfdropo_bayes.bayes.noise.stacked import Stacked
+
+from .toys import measurements
 
 MEMORY = np.array([1.0, 0.6])
 
@@ -21,13 +24,7 @@ def common(share: float, markers: int = 4) -> np.ndarray:
 
 def repeats(single: np.ndarray) -> Measurements:
     """Three recordings of one command sequence, and a fourth of another."""
-    valid = np.ones(single.shape, dtype=bool)
-    found = Measurements(
-        ("a", "b"), ((0, 1, 2), (3,)), np.zeros((2, single.shape[1])), np.zeros((0,)),
-        np.stack([3.0 * np.ones(single.shape[1:]), np.ones(single.shape[1:])]), single, valid,
-    )  # fmt: skip
-    object.__setattr__(found, "position", found.mean_of(single))
-    return found
+    return measurements(single, ((0, 1, 2), (3,)))
 
 
 def test_squares_of_whitened_rows_are_those_of_the_whole_covariance():
@@ -94,15 +91,17 @@ def test_data_without_discrepancy_pass_whatever_their_markers_share(share):
     within 3.3 standard errors of a half (12 assertions: 1 seed in 80)."""
     rng = np.random.default_rng(4)
     shape = (4, 60, 12)
-    truth = Autoregression(np.ones(12), MEMORY, REPEATS, np.inf, common(share))
+    truth = Stacked((Autoregression(np.ones(12), MEMORY, REPEATS, np.inf, common(share)),))
     columns = rng.normal(size=(8, 2, *shape[1:]))
     p = []
     for _ in range(60):
         measured = repeats(truth.draw(rng, shape))
-        noise = measured.noise(measured.single, 0)
-        assert noise.correlation is not None
+        noise = measured.noise(measured.spread, 0)
+        assert noise.first.correlation is not None
         base = span(measured.whiten(columns, noise).T)
-        residual = project_out(base, measured.whiten(measured.position, noise)[:, None]).reshape(1, 2, *shape[1:])
+        residual = project_out(base, measured.whiten(measured.channels[0].readings, noise)[:, None]).reshape(
+            1, 2, *shape[1:]
+        )
         reference = statistics(null_residuals(measured, noise, base, 8, rng, 59).reshape(-1, 2, *shape[1:]))
         p.append([tail(float(v[0]), reference[k]) for k, v in statistics(residual).items()])
     bound = 3.3 * np.sqrt(1 / 12 / 60)

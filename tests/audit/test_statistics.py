@@ -15,7 +15,6 @@ from rfdropo_bayes.audit.coordinates import Support
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.fit import Fit, widened
 from rfdropo_bayes.audit.gain import Gain, Unseen, _floor_error, _noise_power, explained_fraction
-from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.omnibus import joint_test, statistics
 from rfdropo_bayes.audit.score import likeness, project_out, signature, span, statistic
 from rfdropo_bayes.audit.verdict import decide
@@ -28,8 +27,11 @@ from rfdropo_bayes.bayes.noise.autoregression import (
     levinson,
     rows_before,
 )
+from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+from .toys import measurements
 
 RNG = np.random.default_rng(20261121)
 ROWS = 400
@@ -163,7 +165,7 @@ def test_the_explained_fraction_is_that_of_the_discrepancy():
         stated = Autoregression(size * np.ones(12), noise.autocorrelation, REPEATS, 2400.0)
         pattern = stated.whiten(ar1(RNG, (2, 100, 12), 0.6) + wave, np.ones((2, 100, 12), dtype=bool))
         point, (low, high) = explained_fraction(
-            Unseen(error, valid), error + wave, error + 0.5 * wave, stated, pattern, RNG
+            Unseen(error, valid), error + wave, error + 0.5 * wave, Stacked((stated,)), pattern, RNG
         )
         points.append(point)
         covered += low <= 0.75 <= high
@@ -253,12 +255,9 @@ def test_noise_guessed_from_residuals_gives_the_same_statistics_as_data_without_
     mean within 3.3 standard errors of a half (10 assertions: 1 seed in 100)."""
     rng = np.random.default_rng(4)
     shape = (2, 60, 6)
-    measured = Measurements(
-        ("a", "b"), ((0,), (1,)), np.zeros(shape[:2]), np.zeros(shape), np.ones(shape), np.zeros(shape),
-        np.ones(shape, dtype=bool),
-    )  # fmt: skip
+    measured = measurements(np.zeros(shape), ((0,), (1,)))
     columns = rng.normal(size=(np.prod(shape), 8))
-    truth = Autoregression(np.ones(6), np.array([1.0, memory][: 1 + (memory > 0)]), RESIDUALS, np.inf)
+    truth = Stacked((Autoregression(np.ones(6), np.array([1.0, memory][: 1 + (memory > 0)]), RESIDUALS, np.inf),))
     p = []
     for _ in range(60):
         noise = truth

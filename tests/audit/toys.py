@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import types
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +12,12 @@ from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.forward import Lanes
+from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.pipeline import Question
+from rfdropo_bayes.bayes.channels import Markers, MotorAngle, Tension, Weighed, WeighedParts
+from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.bayes.repeats import mean_of, spread
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.simulators.commands import commands_on_grid
@@ -86,13 +91,29 @@ class Named:
     """What the record asks of a mechanism."""
 
     def __init__(self, name: str) -> None:
-        self.name, self.cause, self.remedy, self.parameters = name, "a cause", "a remedy", CANDIDATES[name]
+        self.name, self.cause, self.remedy = name, "a cause", "a remedy"
+        self.parameters = CANDIDATES_OF_CABLES[name]
 
 
-def recordings(truth: dict, seed: int) -> list[Trajectory]:
-    """Three repeats of one command, one of another, six untouched; AR(1) noise."""
-    rng = np.random.default_rng(seed)
-    toy, time = Toy(), STEP * np.arange(ROWS)
+class Pulling(Toy):
+    """The toy with cables whose tension grows with the gain; ``drag`` is a friction that tensions alone show."""
+
+    parameters = (*Toy.parameters, spec("drag", 0.0, {"distribution": "HalfNormal", "scale": 1.0}))
+
+    def rollout(self, parameters, commands, steps=None):
+        level = jnp.concatenate([commands.initial[None], commands.step])
+        moved = jnp.sign(jnp.diff(level, axis=0, prepend=level[:1]))
+        tension = 5.0 + parameters["gain"] * level + parameters.get("drag", 0.0) * moved
+        return super().rollout(parameters, commands, steps)._replace(tension=tension)
+
+
+CANDIDATES_OF_CABLES = {**CANDIDATES, "drag": (Pulling.parameters[-1],)}
+
+
+def recordings(truth: dict, seed: int, toy: Toy | None = None) -> list[Trajectory]:
+    """Three repeats of one command, one of another, six untouched; AR(1) noise, and tensions read to 2 %."""
+    rng, pulls = np.random.default_rng(seed), np.random.default_rng([seed, 1])
+    toy, time = toy or Toy(), STEP * np.arange(ROWS)
     sequences = [rng.uniform(-1, 1, (ROWS // 5, 2)) for _ in range(8)]
     order = [0, 0, 0, *range(1, 8)]
     found = []
@@ -103,7 +124,9 @@ def recordings(truth: dict, seed: int) -> list[Trajectory]:
         for row in range(ROWS):
             fresh = rng.standard_normal((4, 3))
             noise[row] = MEMORY * noise[row - 1] + np.sqrt(1 - MEMORY**2) * fresh if row else fresh
-        position = np.asarray(toy.rollout(truth, commands).position) + NOISE * noise
+        shown = toy.rollout(truth, commands)
+        position = np.asarray(shown.position) + NOISE * noise
+        read = np.asarray(shown.tension) * (1.0 + 0.02 * pulls.standard_normal((ROWS, 2)))
         found.append(
             Trajectory.build(
                 name=f"r{index}",
@@ -116,12 +139,25 @@ def recordings(truth: dict, seed: int) -> list[Trajectory]:
                 command_unit="rad",
                 marker_names=toy.marker_names,
                 cable_names=toy.channel_names,
+                tension=read if isinstance(toy, Pulling) else None,
             )
         )
     return found
 
 
+def measurements(single: np.ndarray, members: tuple[tuple[int, ...], ...]) -> Measurements:
+    """Recordings (recording, time, column) of one channel, in groups of repeats."""
+    channel = MotorAngle(single, np.ones(single.shape, dtype=bool))
+    firsts = [group[0] for group in members]
+    count = np.stack([np.full(single.shape[1:], float(len(group))) for group in members])
+    joined = replace(channel.of_recordings(firsts), readings=mean_of(channel, members))
+    time = np.zeros((len(members), single.shape[1]))
+    names = tuple("abcdefgh"[index] for index in firsts)
+    return Measurements(names, members, time, (joined,), (channel,), None, count, spread(channel, members))
+
+
 LANES = Lanes(Toy(), np.arange(4))
+COORDINATES: dict = {}  # whose priors are compiled once
 
 
 def question(truth: dict, seed: int, without: tuple[str, ...] = ()) -> Question:
@@ -129,9 +165,13 @@ def question(truth: dict, seed: int, without: tuple[str, ...] = ()) -> Question:
     toy, trajectories = Toy(), recordings(truth, seed)
     gathered = gather_recordings(toy, trajectories)
     space = build_space(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
-    coordinates = Coordinates(
-        space, len(BASE), tuple(s.name for s in toy.parameters), {s.name: s.nominal for s in toy.parameters}, {}
+    coordinates = COORDINATES.setdefault(
+        gathered.names,
+        Coordinates(
+            space, len(BASE), tuple(s.name for s in toy.parameters), {s.name: s.nominal for s in toy.parameters}, {}
+        ),
     )
+    model = TrajectoryModel(toy, space, {}, gathered, (Markers.gather(gathered, "repeats"),))
     place = {name: i for i, name in enumerate(space.names)}
     candidates = [
         Candidate(name, tuple(place[s.name] for s in specs), Named(name), name)
@@ -139,4 +179,29 @@ def question(truth: dict, seed: int, without: tuple[str, ...] = ()) -> Question:
         if name not in without
     ]
     rules = Rules(bootstraps=199)
-    return Question(LANES, None, coordinates, gathered, trajectories[:4], candidates, None, None, rules, seed)
+    return Question(LANES, None, coordinates, model, trajectories[:4], candidates, None, None, rules, seed)
+
+
+def question_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Weighed, ...] = ()) -> Question:
+    """A data set of the toy with cables, whose tensions are data or not."""
+    toy = Pulling()
+    asked, trajectories = question(TRUTH_OF_CABLES, seed), recordings({**TRUTH_OF_CABLES, **truth}, seed, toy)
+    gathered = gather_recordings(toy, trajectories)
+    space = build_space(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
+    channels: tuple = (Markers.gather(gathered, "repeats"),)
+    channels += (Tension.gather(toy, trajectories, ROWS),) if tension else ()
+    channels += (WeighedParts(weighed),) if weighed else ()
+    nominal = {s.name: s.nominal for s in toy.parameters}
+    coordinates = Coordinates(space, len(BASE), tuple(nominal), nominal, {})
+    drag = Candidate("drag", (len(space.names) - 1,), Named("drag"), "drag")
+    return replace(
+        asked,
+        lanes=Lanes(toy, np.arange(4), fields=("position", "tension") if tension else ("position",)),
+        coordinates=coordinates,
+        model=TrajectoryModel(toy, space, {}, gathered, channels),
+        trajectories=trajectories[:4],
+        candidates=[*asked.candidates, drag],
+    )
+
+
+TRUTH_OF_CABLES = {"gain": 1.3, "bend": -0.4}

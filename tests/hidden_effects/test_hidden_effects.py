@@ -89,3 +89,21 @@ def test_the_size_of_what_is_hidden_is_as_asked(tmp_path):
     np.testing.assert_allclose(np.linalg.norm(moved, axis=-1), np.linalg.norm(rest, axis=-1), rtol=1e-6)
     assert np.sqrt(np.mean((moved - rest) ** 2)) > 0.3 * 5e-4
     assert {path.name for path in (tmp_path / "a").iterdir()} >= {"audit.toml", "fit_3.nc", "screen.nc", "test_6.nc"}
+
+
+@pytest.mark.slow
+def test_tensions_tell_the_size_of_a_payload_that_positions_give_as_a_ratio_only(tmp_path):
+    """Positions leave the common scale of masses and stiffness free: the payload's own interval is then the prior's.
+    Four deviations: one seed in 10^4."""
+    found = hide(Setting(tension=True), ["payload"], 0.5, 3, tmp_path, exclude=FRICTION, workshop=SHOP)
+    assert found is not None
+    truth, sizes = found.values["payload_mass"], {}
+    for name, given in (("tension", []), ("positions", ["model.tension=false"])):
+        content = audited(found, tmp_path / name, overrides=given)
+        assert content["channels"] == (["markers", "tension"] if name == "tension" else ["markers"])
+        assert content["verdict"] in ("explained", "equivalent")
+        assert "payload" in content["findings"][0]["equivalence_class"]
+        sizes[name] = content["findings"][0]["parameters"].get("payload_mass")
+    assert sizes["tension"] is not None
+    assert abs(sizes["tension"]["mean"] - truth) < 4.0 * sizes["tension"]["sd"]
+    assert sizes["tension"]["sd"] < 0.1 * truth

@@ -84,13 +84,13 @@ def test_candidates_that_do_not_run_on_a_mesh_are_left_out_and_listed(bar_mesh, 
     assert asked.finer is not None
     steps = [lanes.simulator.description["time_step_s"] for lanes in (asked.lanes, asked.finer[0])]
     assert steps[1] == steps[0] / 2
-    position, status = asked.lanes.roll(
+    shown, status = asked.lanes.roll(
         asked.coordinates.physical_values(asked.coordinates.null[None], asked.coordinates.slots(["bar"]))[:, 0],
-        asked.recordings.commands,
-        np.array([0]),
+        np.zeros((1, 7)),
+        asked.model.recordings.commands,
     )
     assert status == [0]
-    assert np.isfinite(position).all()
+    assert np.isfinite(shown["position"]).all()
 
 
 def test_beside_a_cube_every_candidate_runs():

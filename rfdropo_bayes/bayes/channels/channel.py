@@ -115,6 +115,10 @@ class Series(Channel):
     ) -> tuple[Float[Any, "recording time column"], Float[Any, "recording time column"]]:
         """Errors as residuals of unit variance, and the logarithms that normalise them, under inferred noise."""
 
+    @abstractmethod
+    def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
+        """Its noise as a known one, at values of its parameters, in rows that are ``step`` seconds apart."""
+
     def log_size(
         self, about: Float[Any, "recording time *reading"], measured: Float[Any, "recording time *reading"]
     ) -> Float[Any, "recording time column"] | None:
@@ -189,6 +193,9 @@ class FeatureChannel(Protocol):
     @property
     def feature_valid(self) -> Bool[np.ndarray, "recording time feature"]:
         """True where a feature was measured."""
+
+    def expected(self, seen: Seen) -> Float[Any, "recording time *reading"]:
+        """What would be read without noise."""
 
     def features(self, readings: Float[Any, "recording time *reading"]) -> Float[Any, "recording time feature"]:
         """Features of readings [m]."""

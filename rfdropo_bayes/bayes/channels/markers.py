@@ -15,6 +15,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.channels.channel import Seen, Series
 from rfdropo_bayes.bayes.noise import (
+    NOISE_CORRELATION_TIME,
+    OBSERVATION_NOISE,
     Autoregression,
     Noise,
     Timeline,
@@ -24,6 +26,7 @@ from rfdropo_bayes.bayes.noise import (
     row_log_density,
     whiten,
 )
+from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.recordings import RecordingSet
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -62,7 +65,8 @@ class Markers(Series):
 
     def of_recordings(self, index: list[int], rows: int | None = None) -> Markers:
         """See `Series.of_recordings`."""
-        return replace(super().of_recordings(index, rows), recordings=self.recordings.of(index, rows))
+        readings, valid = self.readings[index, :rows], self.valid[index, :rows]
+        return replace(self, readings=readings, valid=valid, recordings=self.recordings.of(index, rows))
 
     @property
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
@@ -87,6 +91,13 @@ class Markers(Series):
         residual = errors.reshape(*errors.shape[:2], -1, 3)
         white, scale = jax.vmap(lambda r, line: whiten(r, noise, line))(residual, self.recordings.line)
         return _flat(white), jnp.repeat(jnp.log(scale), 3, axis=-1)
+
+    def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
+        """See `Series.stated`: white noise, lasting where there is a correlation time."""
+        tau = values.get(NOISE_CORRELATION_TIME.name)
+        memory = [] if tau is None else [float(np.exp(-step / tau))]
+        scale = np.full(self.valid.shape[-1], values[OBSERVATION_NOISE.name])
+        return Autoregression(scale, np.array([1.0, *memory]), STATED, np.inf)
 
     def draw_noise(
         self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.channels.channel import Seen, Series
+from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -39,16 +40,21 @@ class MotorAngle(Series):
     linear: ClassVar[bool] = True
 
     @classmethod
-    def gather(cls, trajectories: Sequence[Trajectory], length: int) -> MotorAngle:
-        """Motor angles of recordings padded to ``length`` rows.
+    def gather(cls, trajectories: Sequence[Trajectory], length: int, needed: int | None = None) -> MotorAngle:
+        """Motor angles of recordings padded to ``length`` rows; only the first ``needed`` recordings must have them.
 
         They belong to the columns of commands, and these to the robot's channels, in the order in which they stand.
 
         Raises:
             InputError: a recording without motor angles, or commands that are no angles.
         """
-        measured, valid = [], []
-        for trajectory in trajectories:
+        measured: list[np.ndarray] = []
+        valid: list[np.ndarray] = []
+        for index, trajectory in enumerate(trajectories):
+            if trajectory.motor_angle is None and needed is not None and index >= needed:
+                measured.append(np.zeros_like(measured[0]))
+                valid.append(np.zeros_like(valid[0]))
+                continue
             if trajectory.motor_angle is None:
                 raise InputError(
                     "has no motor angles",
@@ -105,6 +111,10 @@ class MotorAngle(Series):
         """See `Series.whiten_inferred`: white noise."""
         size = values[MOTOR_ANGLE_NOISE.name]
         return jnp.where(self.valid, errors / size, 0.0), jnp.broadcast_to(jnp.log(size), errors.shape)
+
+    def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
+        """See `Series.stated`."""
+        return Autoregression(np.full(self.valid.shape[-1], values[MOTOR_ANGLE_NOISE.name]), np.ones(1), STATED, np.inf)
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time channel"]:
         """See `Channel.draw`."""

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.channels.channel import Seen, Series
 from rfdropo_bayes.bayes.noise import Autoregression, Noise, Timeline, draw_noise, timeline, whiten
+from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -130,7 +131,8 @@ class ObjectPose(Series):
     def of_recordings(self, index: list[int], rows: int | None = None) -> ObjectPose:
         """See `Series.of_recordings`."""
         line = Timeline(*(part[index, :rows] for part in self.line))
-        return replace(super().of_recordings(index, rows), line=line, time=self.time[index, :rows])
+        readings, valid = self.readings[index, :rows], self.valid[index, :rows]
+        return replace(self, readings=readings, valid=valid, line=line, time=self.time[index, :rows])
 
     @property
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
@@ -168,13 +170,19 @@ class ObjectPose(Series):
         self, readings: Float[np.ndarray, "repeat time 7"], valid: Bool[np.ndarray, "repeat time 6"]
     ) -> Float[np.ndarray, "time 7"]:
         """See `Series.mean`: of quaternions, which have two signs, the sum towards the first, of unit length."""
-        seen = valid.any(axis=-1)
+        seen = np.asarray(valid.any(axis=-1))
         seen[:, 0] = True
         used = np.where(seen[..., None], readings, 0.0)
         same = np.sum(used[..., 3:] * used[:1, :, 3:], axis=-1, keepdims=True) >= 0.0
         turn = np.where(same, used[..., 3:], -used[..., 3:]).sum(axis=0)
         turn = turn / np.maximum(np.linalg.norm(turn, axis=-1, keepdims=True), 1e-12)
         return np.concatenate([used[..., :3].sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None], turn], axis=-1)
+
+    def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
+        """See `Series.stated`."""
+        sizes = np.repeat([values[OBJECT_NOISE.name], values[OBJECT_TURN_NOISE.name]], 3)
+        memory = np.array([1.0, np.exp(-step / values[OBJECT_CORRELATION_TIME.name])])
+        return Autoregression(sizes, memory, STATED, np.inf)
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time 7"]:
         """See `Channel.draw`."""

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.bayes.channels.channel import Seen, Series
+from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -59,15 +60,23 @@ class Tension(Series):
     cables: Int[np.ndarray, " cable"]
 
     @classmethod
-    def gather(cls, simulator: Simulator, trajectories: Sequence[Trajectory], length: int) -> Tension:
-        """Tensions of recordings padded to ``length`` rows.
+    def gather(
+        cls, simulator: Simulator, trajectories: Sequence[Trajectory], length: int, needed: int | None = None
+    ) -> Tension:
+        """Tensions of recordings padded to ``length`` rows; only the first ``needed`` recordings must have them.
 
         Raises:
             InputError: a recording without tensions, or with columns that are no cables of the robot.
         """
         names = simulator.cable_names
-        measured, valid, columns = [], [], []
-        for trajectory in trajectories:
+        measured: list[np.ndarray] = []
+        valid: list[np.ndarray] = []
+        columns = []
+        for index, trajectory in enumerate(trajectories):
+            if trajectory.tension is None and needed is not None and index >= needed:
+                measured.append(np.zeros_like(measured[0]))
+                valid.append(np.zeros_like(valid[0]))
+                continue
             if trajectory.tension is None:
                 raise InputError(
                     "has no cable tensions",
@@ -124,6 +133,10 @@ class Tension(Series):
         """See `Series.whiten_inferred`: white noise."""
         size = values[TENSION_NOISE.name]
         return jnp.where(self.valid, errors / size, 0.0), jnp.broadcast_to(jnp.log(size), errors.shape)
+
+    def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
+        """See `Series.stated`."""
+        return Autoregression(np.full(self.valid.shape[-1], values[TENSION_NOISE.name]), np.ones(1), STATED, np.inf)
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time cable"]:
         """See `Channel.draw`."""

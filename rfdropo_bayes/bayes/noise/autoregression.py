@@ -20,8 +20,6 @@ from scipy.signal import lfilter
 
 from rfdropo_bayes.bayes.noise.shared import half_log_determinant, mixed, shrunk_correlation
 
-Array = np.ndarray | jax.Array
-
 MAX_ORDER = 3
 LEAST_SHARE = 0.05  # of the mean deviation that a column has at least: a marker that never moves is no certainty
 REPEATS, STATED, RESIDUALS = "repeats", "stated", "residuals"
@@ -88,10 +86,10 @@ class Autoregression:
 
     def whiten(
         self,
-        series: Float[Array, "*batch time column"],
+        series: Float[Any, "*batch time column"],
         valid: Bool[np.ndarray, "*rest time column"],
         count: Float[np.ndarray, "*rest time column"] | None = None,
-    ) -> Float[Array, "*batch time column"]:
+    ) -> Float[Any, "*batch time column"]:
         """Independent unit-variance rows, zero where not valid; linear in the series.
 
         ``count`` repeats stand behind each value, whose noise is smaller by its root; one without.
@@ -110,8 +108,8 @@ class Autoregression:
         return np.where(valid, found, 0.0)
 
     def innovations(
-        self, series: Float[Array, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
-    ) -> Float[Array, "*batch time column"]:
+        self, series: Float[Any, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
+    ) -> Float[Any, "*batch time column"]:
         """What the rows before do not predict, in unit variance; columns that share noise still do."""
         coefficients, deviation = self.predictors
         numbers: Any = jnp if isinstance(series, jax.Array) else np
@@ -124,14 +122,14 @@ class Autoregression:
         return numbers.where(valid, innovation / (deviation[memory] * self.scale), 0.0)
 
     def separate(
-        self, innovations: Float[Array, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
-    ) -> Float[Array, "*batch time column"]:
+        self, innovations: Float[Any, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
+    ) -> Float[Any, "*batch time column"]:
         """Innovations of which each column has its own; `gather` undoes it."""
         return innovations if self.correlation is None else mixed(innovations, valid, self.correlation, -0.5)
 
     def gather(
-        self, white: Float[np.ndarray, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
-    ) -> Float[np.ndarray, "*batch time column"]:
+        self, white: Float[Any, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
+    ) -> Float[Any, "*batch time column"]:
         """Innovations of the columns themselves, what they share included."""
         return white if self.correlation is None else mixed(white, valid, self.correlation, 0.5)
 
@@ -149,13 +147,13 @@ class Autoregression:
         return series
 
     def row_log_density(
-        self, series: Float[Array, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
-    ) -> Float[Array, "*batch time"]:
+        self, series: Float[Any, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
+    ) -> Float[Any, "*batch time"]:
         """Log density of each row given those before it."""
         white = self.whiten(series, valid)
         return -(0.5 * white**2 + np.where(valid, self.log_scale(valid) + 0.5 * np.log(2.0 * np.pi), 0.0)).sum(axis=-1)
 
-    def draw_rows(self, key: PRNGKeyArray, rows: int) -> Float[jax.Array, "time column"]:
+    def draw_rows(self, key: PRNGKeyArray, rows: int) -> Float[Any, "time column"]:
         """A realisation in one recording; traceable."""
         coefficients, deviation = self.predictors
         white = jax.random.normal(key, (rows, len(self.scale)))

@@ -45,11 +45,11 @@ def shrunk_correlation(
 
 
 def mixed(
-    series: Float[np.ndarray | jax.Array, "*batch row column"],
+    series: Float[Any, "*batch row column"],
     valid: Bool[np.ndarray, "*rest row column"],
     correlation: Float[np.ndarray, "column column"],
     power: float,
-) -> Float[np.ndarray | jax.Array, "*batch row column"]:
+) -> Float[Any, "*batch row column"]:
     """Each row times the symmetric root of the correlation of the columns it has: power -1/2 makes unit normals
     independent (each stays as near as can be to the column it was), 1/2 correlates them again."""
     numbers: Any = jnp if isinstance(series, jax.Array) else np

@@ -112,9 +112,14 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
     """One Levenberg-Marquardt step; damping grows until the log posterior rises.
 
     Damping acts on the curvature's diagonal (Marquardt's scaling), so that units do not matter. All dampings of a step
-    are tried in one batch of rollouts.
+    are tried in one batch of rollouts. A target may have ``bounds``: a coordinate stays on one that it is drawn to.
     """
     gradient, curvature = target.quadratic(state.position)
+    low, high = getattr(target, "bounds", (-np.inf, np.inf))
+    held = ((state.position <= low) & (gradient < 0.0)) | ((state.position >= high) & (gradient > 0.0))
+    if held.any():
+        gradient = np.where(held, 0.0, gradient)
+        curvature = np.where(held[:, None] | held, np.diag(np.diag(curvature)), curvature)
     diagonal = np.diag(np.maximum(np.diag(curvature), 1e-12))
     dampings = state.damping * 10.0 ** np.arange(-1.0, 5.0)
     moves = np.stack([np.linalg.solve(curvature + damping * diagonal, gradient) for damping in dampings])
@@ -124,10 +129,11 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
     promised = 0.5 * float(gradient @ newton)
     if promised < tolerance:
         return state._replace(converged=True), StepInfo(0.0, promised, 0)
-    densities = target.density(state.position + moves)
+    tried = np.clip(state.position + moves, low, high)
+    densities = target.density(tried)
     best = int(np.argmax(densities))
     gain = float(densities[best] - state.log_density)
-    position, density = (state.position + moves[best], float(densities[best])) if gain > 0.0 else state[:2]
+    position, density = (tried[best], float(densities[best])) if gain > 0.0 else state[:2]
     # An engine in single precision promises for ever what it does not deliver. Where six decades of damping gain
     # nothing, the differences left are those of rounding, or the model is useless here: smaller steps, if any.
     if gain < tolerance:

@@ -1,0 +1,94 @@
+"""The known noise of several channels side by side: each has its own memory, and shares no noise with another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import accumulate, pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rfdropo_bayes.bayes.noise.autoregression import Autoregression
+
+
+@dataclass(frozen=True)
+class Stacked:
+    """Noise of columns that belong to several channels.
+
+    Attributes:
+        parts: one for each channel, the markers' first.
+    """
+
+    parts: tuple[Autoregression, ...]
+
+    @property
+    def first(self) -> Autoregression:
+        """That of the markers."""
+        return self.parts[0]
+
+    @property
+    def source(self) -> str:
+        """What it was taken from; channels have one source in common."""
+        return self.first.source
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether that of any channel is."""
+        return any(part.doubtful for part in self.parts)
+
+    @property
+    def scale(self) -> Float[np.ndarray, " column"]:
+        """Marginal standard deviation of each column, in the column's unit."""
+        return np.concatenate([part.scale for part in self.parts])
+
+    @property
+    def columns(self) -> list[slice]:
+        """Columns of each channel."""
+        return side_by_side([len(part.scale) for part in self.parts])
+
+    def whiten(
+        self, series: Float[np.ndarray, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
+    ) -> Float[np.ndarray, "*batch time column"]:
+        """See `Autoregression.whiten`."""
+        return self._each(lambda part, x, ok: part.whiten(x, ok), series, valid)
+
+    def whiten_means(
+        self,
+        series: Float[np.ndarray, "*batch time column"],
+        count: Float[np.ndarray, "*rest time column"],
+    ) -> Float[np.ndarray, "*batch time column"]:
+        """The same of means over ``count`` repeats, whose noise is smaller by its root; zero where there is none."""
+
+        def whiten(part: Autoregression, x: np.ndarray, n: np.ndarray) -> np.ndarray:
+            return np.asarray(part.separate(part.innovations(x, n > 0) * np.sqrt(n), n > 0))
+
+        return self._each(whiten, series, count)
+
+    def gather(
+        self, white: Float[np.ndarray, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
+    ) -> Float[np.ndarray, "*batch time column"]:
+        """See `Autoregression.gather`."""
+        return self._each(lambda part, x, ok: part.gather(x, ok), white, valid)
+
+    def colour(
+        self, white: Float[np.ndarray, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
+    ) -> Float[np.ndarray, "*batch time column"]:
+        """See `Autoregression.colour`."""
+        return self._each(lambda part, x, ok: part.colour(x, ok), white, valid)
+
+    def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "*batch time column"]:
+        """A realisation of shape (..., time, column)."""
+        return np.concatenate([part.draw(rng, (*shape[:-1], len(part.scale))) for part in self.parts], axis=-1)
+
+    def _each(self, operate: Callable[..., np.ndarray], series: np.ndarray, beside: np.ndarray) -> np.ndarray:
+        found: Sequence[np.ndarray] = [
+            operate(part, series[..., own], beside[..., own])
+            for part, own in zip(self.parts, self.columns, strict=True)
+        ]
+        return np.concatenate(found, axis=-1)
+
+
+def side_by_side(widths: Sequence[int]) -> list[slice]:
+    """Where blocks of columns of some widths lie."""
+    return [slice(low, high) for low, high in pairwise(accumulate(widths, initial=0))]
