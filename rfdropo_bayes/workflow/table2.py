@@ -162,21 +162,23 @@ def run_table2(
                     progress.stage((count + 1) / len(jobs), task=job[0], row=job[1], seed=job[2])
         known = [(task, row, seed) for task in study.experiments for row in ROWS for seed in range(size.seeds)]
         found = [cell for job in known if (cell := _cell(study, *job)) is not None]
+        summaries = [summarise(task, row, found) for task, row in dict.fromkeys((c["task"], c["row"]) for c in found)]
         content = {
             "schema_version": 1,
             "command": command,
             "size": asdict(size),
             "cells": found,
-            "rows": [summarise(task, row, found) for task, row in dict.fromkeys((c["task"], c["row"]) for c in found)],
+            "rows": summaries,
             "failed": failed,
             "not_done": sum(_cell(study, *job) is None for job in list_jobs(study)),
             "paper": PAPER,
             "versions": software_versions(),
+            "claims": claims(summaries),
         }
-        content["claims"] = claims(content["rows"])
         write_text(out / "table2.json", json.dumps(content, indent=1) + "\n")
         write_text(out / "table2.md", as_markdown(content))
-        draw_figure(content, out / "table2.png")
+        if summaries:
+            draw_figure(content).savefig(out / "table2.png", dpi=150)
     return content
 
 

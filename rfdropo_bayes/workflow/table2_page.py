@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -54,11 +53,9 @@ def _row(row: Mapping[str, Any]) -> str:
 
 
 @styled
-def draw_figure(content: Mapping[str, Any], path: Path) -> None:
-    """Success of every row at every distance, with its interval."""
+def draw_figure(content: Mapping[str, Any]) -> Figure:
+    """Success of every row at every distance, with its interval; there is a row at least."""
     tasks = list(dict.fromkeys(row["task"] for row in content["rows"]))
-    if not tasks:
-        return
     heights = [1.0 + 0.4 * sum(row["task"] == task for row in content["rows"]) for task in tasks]
     figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
     FigureCanvasAgg(figure)
@@ -78,4 +75,4 @@ def draw_figure(content: Mapping[str, Any], path: Path) -> None:
         axes.set_yticks(range(len(rows)), [row["row"] for row in rows])
         axes.invert_yaxis()
         axes.legend(loc="best")
-    figure.savefig(path, dpi=150)
+    return figure
