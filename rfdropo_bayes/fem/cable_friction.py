@@ -27,6 +27,9 @@ PRESLIDING = 1e-4
 """Slip [m] that mobilises all of the friction."""
 FADING = 0.1
 """Coulomb's friction fades where the tension [N] falls below this: a slack cable presses on nothing."""
+SLACK = 1e-9
+"""[N] Added to every tension that presses on a guide: a slack cable slides as one with little friction does, whatever
+rounding leaves of its tension."""
 STRAIGHT = 1e-6
 """Smallest wrap angle [rad]; keeps its derivative finite where the cable runs straight."""
 
@@ -94,7 +97,7 @@ def slip_problem(
     guide [N]."""
     members = run_members(layout)
     direction = directions(layout, guides, position)
-    middle = 0.5 * (segment + jnp.concatenate([segment[:, 1:], segment[:, -1:]], axis=1))
+    middle = 0.5 * (segment + jnp.concatenate([segment[:, 1:], segment[:, -1:]], axis=1)) + SLACK
     weights = []
     if effects.coulomb_friction is not None:
         weights.append(middle / (middle + FADING))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.cable_friction import FADING, PRESLIDING, STRAIGHT
+from rfdropo_bayes.fem.cable_friction import FADING, PRESLIDING, SLACK, STRAIGHT
 from rfdropo_bayes.fem.native.fields import clear, point
 from rfdropo_bayes.fem.native.layered_effects import CAPSTAN, COULOMB, FRICTION
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_root, store, where_greater
@@ -51,7 +51,7 @@ def _weigh_guides(runs, friction, kinds, kind, token):
     """Friction of every guide per coefficient."""
     for r in range(runs.count):
         for g in range(runs.first[r], runs.last[r]):
-            middle = 0.5 * (load(friction.segment, g, token) + load(friction.segment, g + 1, token))
+            middle = 0.5 * (load(friction.segment, g, token) + load(friction.segment, g + 1, token)) + SLACK
             for k in range(kinds):
                 value = middle / (middle + FADING) if kind + k == 0 else middle * _wrap_angle(friction, g, token)
                 store(friction.weight, k * runs.guides + g, value)
