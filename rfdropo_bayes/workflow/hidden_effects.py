@@ -21,6 +21,7 @@ from jaxtyping import Float
 from rfdropo_bayes.audit.fit import Target, climb
 from rfdropo_bayes.audit.pipeline import measurements_of, simulated
 from rfdropo_bayes.audit.score import project_out, span
+from rfdropo_bayes.bayes.channels.tension import reading_size
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
@@ -134,7 +135,11 @@ def hide(
     widths = [channel.valid.shape[-1] for channel in measurements.channels]
     sizes_of = zip(widths, (NOISE, TENSION_NOISE), strict=False)
     white = Stacked(tuple(Autoregression(np.full(n, size), np.ones(1), STATED, np.inf) for n, size in sizes_of))
-    target = Target(forward, replace(measurements, count=measurements.valid.astype(float)), white)
+    shown = forward.observe_one(truth)  # what small tensions are small beside
+    read = [shown["position"], shown["tension"]]
+    channels = tuple(replace(c, readings=part) for c, part in zip(measurements.channels, read, strict=False))
+    plain = replace(measurements, channels=channels, count=measurements.valid.astype(float))
+    target = Target(forward, plain, white)
     sizes = {}
     for name in mechanisms:
         index = next(c.indices for c in question.candidates if c.name == name)
@@ -285,7 +290,8 @@ def _write(
         if setting.tension:
             pull = np.asarray(made.tension)[index]
             error = np.asarray(jax.random.normal(jax.random.fold_in(key, 1), pull.shape))
-            dataset["tension"] = dataset["tension"].copy(data=pull * (1.0 + TENSION_NOISE * error))
+            size = np.asarray(reading_size(pull[None], np.ones((1, *pull.shape), dtype=bool), pull[None]))[0]
+            dataset["tension"] = dataset["tension"].copy(data=pull + TENSION_NOISE * size * error)
         Trajectory(dataset).save(out / f"{recording.name}.nc")
     tables = experiment.model_dump(exclude_none=True, exclude_defaults=True)
     tables["seed"] = seed

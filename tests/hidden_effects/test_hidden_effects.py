@@ -95,15 +95,15 @@ def test_the_size_of_what_is_hidden_is_as_asked(tmp_path):
 def test_tensions_tell_the_size_of_a_payload_that_positions_give_as_a_ratio_only(tmp_path):
     """Positions leave the common scale of masses and stiffness free: the payload's own interval is then the prior's.
     Four deviations: one seed in 10^4."""
-    found = hide(Setting(tension=True), ["payload"], 0.5, 3, tmp_path, exclude=FRICTION, workshop=SHOP)
+    # Tensions differ by more than their noise between meshes: the data are made on the audit's own.
+    setting = replace(Setting(tension=True), made=Setting().audited)
+    found = hide(setting, ["payload"], 15.0, 3, tmp_path, exclude=FRICTION, workshop=SHOP)
     assert found is not None
     truth, sizes = found.values["payload_mass"], {}
     for name, given in (("tension", []), ("positions", ["model.tension=false"])):
         content = audited(found, tmp_path / name, overrides=given)
         assert content["channels"] == (["markers", "tension"] if name == "tension" else ["markers"])
-        assert content["verdict"] in ("explained", "equivalent")
-        assert "payload" in content["findings"][0]["equivalence_class"]
-        sizes[name] = content["findings"][0]["parameters"].get("payload_mass")
-    assert sizes["tension"] is not None
-    assert abs(sizes["tension"]["mean"] - truth) < 4.0 * sizes["tension"]["sd"]
-    assert sizes["tension"]["sd"] < 0.1 * truth
+        assert [finding["mechanism"] for finding in content["findings"]] == ["payload"]
+        sizes[name] = content["findings"][0]["parameters"]["payload_mass"]
+        assert abs(sizes[name]["mean"] - truth) < 4.0 * sizes[name]["sd"]
+    assert sizes["tension"]["sd"] < 0.05 * truth < 0.2 * truth < sizes["positions"]["sd"]
