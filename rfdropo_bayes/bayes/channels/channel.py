@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
 
@@ -169,6 +170,38 @@ class Series(Channel):
         size = self.log_size(about, measured)
         normaliser = scale + 0.5 * jnp.log(2.0 * jnp.pi) + (0.0 if size is None else size)
         return jnp.sum(-0.5 * white**2 - jnp.where(self.valid, normaliser, 0.0), axis=(0, 2))
+
+
+class WhiteSeries(Series):
+    """A channel whose noise, where it is inferred, is white and of one size.
+
+    Attributes:
+        size: standard deviation of an error.
+    """
+
+    size: ClassVar[ParameterSpec]
+
+    @property
+    def noise_specs(self) -> tuple[ParameterSpec, ...]:
+        """See `Series.noise_specs`."""
+        return (self.size,)
+
+    def whiten_inferred(
+        self, errors: Float[Any, "recording time column"], values: Mapping[str, Any]
+    ) -> tuple[Float[Any, "recording time column"], Float[Any, "recording time column"]]:
+        """See `Series.whiten_inferred`."""
+        size = values[self.size.name]
+        return jnp.where(self.valid, errors / size, 0.0), jnp.broadcast_to(jnp.log(size), errors.shape)
+
+    def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
+        """See `Series.stated`."""
+        return Autoregression(np.full(self.valid.shape[-1], values[self.size.name]), np.ones(1), STATED, np.inf)
+
+    def draw_errors(self, key: PRNGKeyArray, values: Mapping[str, Any]) -> Float[Any, "recording time column"]:
+        """Errors of a replica, in the unit of the noise."""
+        if self.known is not None:
+            return self.known.draw_recordings(key, *self.readings.shape[:2])
+        return values[self.size.name] * jax.random.normal(key, self.readings.shape)
 
 
 ABOVE_ZERO = 50.0  # larger than any logarithm of a ratio of sizes: keeps a root in `size_residuals` real

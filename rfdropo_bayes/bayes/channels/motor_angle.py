@@ -6,17 +6,15 @@ encoder on the motor sees the first of each pair only (`Observation.motor_angle`
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from rfdropo_bayes.bayes.channels.channel import Seen, Series
-from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
+from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -33,11 +31,12 @@ MOTOR_ANGLE_NOISE = ParameterSpec(
 
 
 @dataclass(frozen=True)
-class MotorAngle(Series):
+class MotorAngle(WhiteSeries):
     """Motor angles [rad]; columns are the channels of the commands. Readings that repeat an older one do not count."""
 
     name: ClassVar[str] = "motor_angle"
     linear: ClassVar[bool] = True
+    size: ClassVar[ParameterSpec] = MOTOR_ANGLE_NOISE
 
     @classmethod
     def gather(cls, trajectories: Sequence[Trajectory], length: int, needed: int | None = None) -> MotorAngle:
@@ -80,11 +79,6 @@ class MotorAngle(Series):
         known = np.stack(valid)
         return cls(np.where(known, np.stack(measured), 0.0), known)
 
-    @property
-    def noise_specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Series.noise_specs`."""
-        return (MOTOR_ANGLE_NOISE,)
-
     def expected(self, seen: Seen) -> Float[Any, "recording time channel"]:
         """See `Series.expected`.
 
@@ -105,21 +99,6 @@ class MotorAngle(Series):
         """See `Series.deviation`: a difference [rad]."""
         return measured - about
 
-    def whiten_inferred(
-        self, errors: Float[Any, "recording time channel"], values: Mapping[str, Any]
-    ) -> tuple[Float[Any, "recording time channel"], Float[Any, "recording time channel"]]:
-        """See `Series.whiten_inferred`: white noise."""
-        size = values[MOTOR_ANGLE_NOISE.name]
-        return jnp.where(self.valid, errors / size, 0.0), jnp.broadcast_to(jnp.log(size), errors.shape)
-
-    def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
-        """See `Series.stated`."""
-        return Autoregression(np.full(self.valid.shape[-1], values[MOTOR_ANGLE_NOISE.name]), np.ones(1), STATED, np.inf)
-
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time channel"]:
         """See `Channel.draw`."""
-        if self.known is not None:
-            error = self.known.draw_recordings(key, *self.readings.shape[:2])
-        else:
-            error = seen.values[MOTOR_ANGLE_NOISE.name] * jax.random.normal(key, self.readings.shape)
-        return jnp.where(self.valid, self.expected(seen) + error, 0.0)
+        return jnp.where(self.valid, self.expected(seen) + self.draw_errors(key, seen.values), 0.0)

@@ -6,17 +6,15 @@ reading fixes the factor as far as its gain is known.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
-from rfdropo_bayes.bayes.channels.channel import Seen, Series
-from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
+from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -45,7 +43,7 @@ SMALLEST_READING = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tension(Series):
+class Tension(WhiteSeries):
     """Cable tensions [N]; an error is relative to the size of the tension.
 
     That is the size of the tension, not of what was read for it: readings that happen to be low would count more than
@@ -57,6 +55,7 @@ class Tension(Series):
 
     name: ClassVar[str] = "tension"
     linear: ClassVar[bool] = False
+    size: ClassVar[ParameterSpec] = TENSION_NOISE
     cables: Int[np.ndarray, " cable"]
 
     @classmethod
@@ -101,11 +100,6 @@ class Tension(Series):
         return cls(np.stack(measured), np.stack(valid), cables=np.array(columns[0]))
 
     @property
-    def noise_specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Series.noise_specs`."""
-        return (TENSION_NOISE,)
-
-    @property
     def gain_specs(self) -> tuple[ParameterSpec, ...]:
         """See `Series.gain_specs`."""
         return (TENSION_GAIN,)
@@ -127,24 +121,10 @@ class Tension(Series):
         """See `Series.log_size`."""
         return jnp.log(reading_size(about, self.valid, measured))
 
-    def whiten_inferred(
-        self, errors: Float[Any, "recording time cable"], values: Mapping[str, Any]
-    ) -> tuple[Float[Any, "recording time cable"], Float[Any, "recording time cable"]]:
-        """See `Series.whiten_inferred`: white noise."""
-        size = values[TENSION_NOISE.name]
-        return jnp.where(self.valid, errors / size, 0.0), jnp.broadcast_to(jnp.log(size), errors.shape)
-
-    def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
-        """See `Series.stated`."""
-        return Autoregression(np.full(self.valid.shape[-1], values[TENSION_NOISE.name]), np.ones(1), STATED, np.inf)
-
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time cable"]:
         """See `Channel.draw`."""
         clean = self.expected(seen)
-        if self.known is not None:
-            error = self.known.draw_recordings(key, *self.readings.shape[:2])
-        else:
-            error = seen.values[TENSION_NOISE.name] * jax.random.normal(key, self.readings.shape)
+        error = self.draw_errors(key, seen.values)
         return jnp.where(self.valid, clean + error * reading_size(clean, self.valid, clean), 0.0)
 
 
