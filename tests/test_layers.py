@@ -34,6 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "bayes": {"data", "posteriors", "robots", "simulators", "mechanisms"},
     "inference": {"posteriors", "bayes"},
     "audit": {"data", "posteriors", "simulators", "mechanisms", "bayes", "inference"},
+    "prediction": {"data", "posteriors", "simulators", "bayes", "inference"},
     "report": {"data", "posteriors", "bayes", "inference", "audit"},
     "envs": {"posteriors", "robots", "simulators", "mechanisms", "report"},
     "training": {"posteriors", "robots", "inference", "report", "envs"},

@@ -20,18 +20,7 @@ from rfdropo_bayes.inference.methods import make_config, method_named, method_of
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
-from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, build_summary, software_versions
-from rfdropo_bayes.report.object_scores import score_objects
-from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
-from rfdropo_bayes.report.run_folder import POSTERIOR
-from rfdropo_bayes.robots import Robot, robot_shape
-from rfdropo_bayes.workflow.assembly import load_data
-from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.experiment import Experiment, InferenceTable, load_experiment
-from rfdropo_bayes.workflow.experiment_file import describe
-from rfdropo_bayes.workflow.files import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
-from rfdropo_bayes.workflow.model import Model
-from rfdropo_bayes.workflow.prediction import (
+from rfdropo_bayes.prediction.predictive import (
     BEGUN,
     FITTED,
     HELD,
@@ -44,6 +33,17 @@ from rfdropo_bayes.workflow.prediction import (
     predict_new,
     thin,
 )
+from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, build_summary, software_versions
+from rfdropo_bayes.report.object_scores import score_objects
+from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
+from rfdropo_bayes.report.run_folder import POSTERIOR
+from rfdropo_bayes.robots import Robot, robot_shape
+from rfdropo_bayes.workflow.assembly import load_data
+from rfdropo_bayes.workflow.calibrated import Calibration
+from rfdropo_bayes.workflow.experiment import Experiment, InferenceTable, load_experiment
+from rfdropo_bayes.workflow.experiment_file import describe
+from rfdropo_bayes.workflow.files import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
+from rfdropo_bayes.workflow.model import Model
 
 PREDICTIVE_DRAWS = 200
 PRIOR_DRAWS = 2000

@@ -15,6 +15,7 @@ from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.priors import table_of
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.prediction.predictive import Batch
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -30,7 +31,6 @@ from rfdropo_bayes.workflow.assembly import (
 )
 from rfdropo_bayes.workflow.experiment import Experiment, Workpiece
 from rfdropo_bayes.workflow.experiment_file import ROBOT_COPY, describe
-from rfdropo_bayes.workflow.prediction import Batch
 
 
 class Model:

@@ -25,6 +25,16 @@ from rfdropo_bayes.data import Trajectory, first_row_only, load_unseen, start_is
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.prediction.predictive import (
+    BEGUN,
+    FITTED,
+    HELD,
+    KNOWN_NOISE,
+    MARKER_ERRORS,
+    NOISE,
+    predict_new,
+    thin,
+)
 from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.report.trajectory_figures import draw_band
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -33,7 +43,6 @@ from rfdropo_bayes.workflow.calibrated import Calibration, axes_or_new
 from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
-from rfdropo_bayes.workflow.prediction import BEGUN, FITTED, HELD, KNOWN_NOISE, MARKER_ERRORS, NOISE, predict_new, thin
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

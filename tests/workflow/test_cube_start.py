@@ -15,9 +15,9 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.prediction.cube_start import with_measured_starts
 from rfdropo_bayes.simulators.pushing import push_table
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot
-from rfdropo_bayes.workflow.cube_start import with_measured_starts
 from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.unseen import run_prediction
 

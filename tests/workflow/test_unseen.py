@@ -20,12 +20,12 @@ from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.prediction.first_row import match_first_row, weighed_by_first_row
+from rfdropo_bayes.prediction.predictive import MARKER_ERRORS, NOISE, _for_new_recordings
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.workflow.assembly import pooling
 from rfdropo_bayes.workflow.experiment import Experiment
-from rfdropo_bayes.workflow.first_row import match_first_row, weighed_by_first_row
-from rfdropo_bayes.workflow.prediction import MARKER_ERRORS, NOISE, _for_new_recordings
 from rfdropo_bayes.workflow.simulation import simulate_all
 from rfdropo_bayes.workflow.unseen import run_prediction
 

@@ -17,8 +17,8 @@ from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import RecordingPrediction
-from rfdropo_bayes.workflow.cube_start import measured_objects, with_measured_starts
-from rfdropo_bayes.workflow.first_row import match_first_row, weighed_by_first_row
+from rfdropo_bayes.prediction.cube_start import measured_objects, with_measured_starts
+from rfdropo_bayes.prediction.first_row import match_first_row, weighed_by_first_row
 
 # Among the attributes of a posterior.
 FITTED, MARKER_ERRORS, HELD = "fitted_recordings", "marker_errors_m", "held_parameters"
