@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
-from rfdropo_bayes.workflow.comparison import misleads
-from rfdropo_bayes.workflow.table1 import OWN
-from rfdropo_bayes.workflow.tasks import TASKS, task_problem
+from rfdropo_bayes.studies.comparison import misleads
+from rfdropo_bayes.studies.table1 import OWN
+from rfdropo_bayes.studies.tasks import TASKS, task_problem
 
 FITS = Path(__file__).parents[1] / "reports" / "table1" / "push" / "fits.jsonl"
 TASK, ALONG = "TrunkPush", ("young_modulus", "poisson_ratio", "friction")

@@ -14,14 +14,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 PACKAGE = REPOSITORY / "rfdropo_bayes"
 
 # Modules at the bottom, open to every room.
-FOUNDATION = {
-    "cautions",
-    "errors",
-    "files",
-    "interrupts",
-    "runtime",
-    "tables",
-}  # modules at the bottom, open to every room
+FOUNDATION = {"cautions", "errors", "files", "interrupts", "runtime", "tables"}
 
 # From the ground up; docs/architecture.md says why. A room may import these, the foundation and the standard library.
 MAY_IMPORT: dict[str, set[str]] = {
@@ -41,6 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "deployment": {"data", "robots"},
 }
 MAY_IMPORT["workflow"] = set(MAY_IMPORT)
+MAY_IMPORT["studies"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}
 

@@ -131,7 +131,7 @@ def benchmark_audit(
     out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/audit_power"),
 ) -> None:
     """Hide effects in recordings, audit them, and count hits, misses and confusions; goes on where it was stopped."""
-    from rfdropo_bayes.workflow.audit_study import TABLE, run_study
+    from rfdropo_bayes.studies.audit_study import TABLE, run_study
 
     chosen = {"conditions": condition or [], "mechanisms": hide or [], "exclude": exclude or []}
     run_study(out, datasets, seed, cluster=cluster, **chosen)

@@ -36,7 +36,7 @@ def export(
 
 def check(path: Path, out: Path, name: str, datasets: int, overrides: list[str], resume: bool, overwrite: bool) -> None:
     """Run a check of an experiment's method and say what it found."""
-    from rfdropo_bayes.workflow.method_check import run_check
+    from rfdropo_bayes.studies.method_check import run_check
 
     found = run_check(path, out, name, datasets=datasets, overrides=overrides, resume=resume, overwrite=overwrite)
     typer.echo(found["sentence"])
@@ -60,7 +60,7 @@ def table1(
 ) -> None:
     """The paper's Table I, with baselines, rivals and off-centre truths: table1.json, table1.md, table1.png."""
     check_folder(out, "benchmark table1", resume=resume or only_done, overwrite=overwrite)
-    from rfdropo_bayes.workflow.table1 import ROWS, TASKS, Size, run_table1
+    from rfdropo_bayes.studies.table1 import ROWS, TASKS, Size, run_table1
 
     size = Size(truths, rival_truths, budget, actions, seed, repeats)
     words = shlex.join(["rfdropo", *sys.argv[1:]])

@@ -92,7 +92,7 @@ def table2(
 ) -> None:
     """The paper's Table II: policies of every method on a robot they never touched: table2.json, .md and .png."""
     check_folder(out, "benchmark table2", resume=resume or only_done, overwrite=overwrite)
-    from rfdropo_bayes.workflow.table2 import Size, run_table2
+    from rfdropo_bayes.studies.table2 import Size, run_table2
 
     content = run_table2(
         experiments or [VIRTUAL / "push.toml", VIRTUAL / "reach.toml"],

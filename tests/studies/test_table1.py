@@ -12,10 +12,10 @@ import pytest
 
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.workflow import table1
-from rfdropo_bayes.workflow.comparison import fit, misleads, scores
-from rfdropo_bayes.workflow.fits import run_fits
-from rfdropo_bayes.workflow.table1 import (
+from rfdropo_bayes.studies import table1
+from rfdropo_bayes.studies.comparison import fit, misleads, scores
+from rfdropo_bayes.studies.fits import run_fits
+from rfdropo_bayes.studies.table1 import (
     Size,
     ahead_of_ours,
     as_markdown,
@@ -26,7 +26,7 @@ from rfdropo_bayes.workflow.table1 import (
     run_table1,
     summarise,
 )
-from rfdropo_bayes.workflow.tasks import TASKS, draw_truth, excited, task_problem
+from rfdropo_bayes.studies.tasks import TASKS, draw_truth, excited, task_problem
 
 STUCK = Caution(Code.PARTICLES_STUCK, "the last moves left the particles where they were", grave=True).as_dict()
 AT_BOUND = Caution(Code.AT_BOUND, "friction sits on its lower bound").as_dict()

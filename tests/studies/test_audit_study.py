@@ -1,4 +1,4 @@
-"""Counting what audits of hidden effects have said; the audits themselves are tested in tests/hidden_effects."""
+"""Counting what audits of hidden effects have said; the audits themselves are tested in test_hidden_effects.py."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.workflow.audit_study import CONDITIONS, LEDGER, TABLE, WHOLE, _turn, judge, run_study, summarise
-from rfdropo_bayes.workflow.hidden_effects import Hidden
+from rfdropo_bayes.studies.audit_study import CONDITIONS, LEDGER, TABLE, WHOLE, _turn, judge, run_study, summarise
+from rfdropo_bayes.studies.hidden_effects import Hidden
 
 CONTENT = {
     "verdict": "equivalent",

@@ -23,10 +23,10 @@ from rfdropo_bayes.files import write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.interrupts import running
 from rfdropo_bayes.mechanisms import REGISTRY
+from rfdropo_bayes.studies.fits import Job, run_fits
+from rfdropo_bayes.studies.hidden_effects import Hidden, Setting, hide
 from rfdropo_bayes.workflow.audit import JOURNAL, Workshop, run_audit
 from rfdropo_bayes.workflow.files import output_folder
-from rfdropo_bayes.workflow.fits import Job, run_fits
-from rfdropo_bayes.workflow.hidden_effects import Hidden, Setting, hide
 
 RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
 NEAR = 1.3  # times the error of the model that knows what is hidden

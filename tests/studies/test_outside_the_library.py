@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.studies.hidden_effects import Setting, hide
 from rfdropo_bayes.workflow.audit import run_audit
-from rfdropo_bayes.workflow.hidden_effects import Setting, hide
 
 SHOP: dict = {}
 COARSE = {"refine": 1, "time_step": 0.01}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.workflow.method_check import run_check
+from rfdropo_bayes.studies.method_check import run_check
 
 EXPERIMENT = Path(__file__).resolve().parents[2] / "benchmarks" / "sbc.toml"
 
@@ -36,9 +36,9 @@ def test_the_layered_arm_is_calibrated(tmp_path):
 @pytest.mark.slow
 def test_simulated_data_fit_their_own_truth():
     """Whitened residuals of a data set at its truth are standard normal: mean square 1 to five standard errors."""
+    from rfdropo_bayes.studies.method_check import simulate_data_set
     from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
     from rfdropo_bayes.workflow.experiment import load_experiment
-    from rfdropo_bayes.workflow.method_check import simulate_data_set
 
     experiment, _ = load_experiment(EXPERIMENT)
     simulator = build_simulator(experiment, find_robot(experiment, EXPERIMENT.parent), EXPERIMENT.parent)

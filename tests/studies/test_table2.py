@@ -11,8 +11,8 @@ import pytest
 from scipy.stats import binomtest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.workflow import table2
-from rfdropo_bayes.workflow.table2 import ROWS, WITHOUT_CUBE, Size, Study, claims, list_jobs, run_table2, summarise
+from rfdropo_bayes.studies import table2
+from rfdropo_bayes.studies.table2 import ROWS, WITHOUT_CUBE, Size, Study, claims, list_jobs, run_table2, summarise
 
 VIRTUAL = Path(__file__).resolve().parents[2] / "experiments" / "virtual"
 PUSH, REACH, TRUTH, AUDIT = (VIRTUAL / f"{name}.toml" for name in ("push", "reach", "truth", "audit"))

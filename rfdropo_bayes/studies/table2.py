@@ -23,12 +23,12 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.report import software_versions
+from rfdropo_bayes.studies.table2_page import as_markdown, draw_figure
 from rfdropo_bayes.workflow.audit import run_audit
 from rfdropo_bayes.workflow.audited import EXTENDED
 from rfdropo_bayes.workflow.calibration import run_calibration
 from rfdropo_bayes.workflow.experiment_file import describe, read_tables, self_contained
 from rfdropo_bayes.workflow.files import LOG, output_folder, run_ended, run_folder
-from rfdropo_bayes.workflow.table2_page import as_markdown, draw_figure
 from rfdropo_bayes.workflow.training import CSV, POLICY, run_evaluation, run_training
 
 THRESHOLDS = (0.01525, 0.02157, 0.030)  # m, those of the paper's Table II

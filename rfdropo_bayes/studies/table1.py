@@ -18,11 +18,11 @@ from rfdropo_bayes.files import write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.rivals import import_sbi
 from rfdropo_bayes.report.facts import software_versions
-from rfdropo_bayes.workflow.comparison import RIVALS, ROWS, fit, misleads
+from rfdropo_bayes.studies.comparison import RIVALS, ROWS, fit, misleads
+from rfdropo_bayes.studies.fits import finished, run_fits
+from rfdropo_bayes.studies.table1_figure import draw_figure
+from rfdropo_bayes.studies.tasks import TASKS
 from rfdropo_bayes.workflow.files import LOG, run_folder
-from rfdropo_bayes.workflow.fits import finished, run_fits
-from rfdropo_bayes.workflow.table1_figure import draw_figure
-from rfdropo_bayes.workflow.tasks import TASKS
 
 PAPER = {  # mean squared error and its deviation, Table I
     "TrunkReach": {"BayesSim": (16.60, 0.30), "NPDR": (8.38, 3.22), "RF-DROPO": (1.70, 1.93)},
