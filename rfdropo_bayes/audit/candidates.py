@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.audit.fit import Fit, Target
 from rfdropo_bayes.audit.score import Signature, project_out, signature, span
+from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)  # quantiles of the prior at which a shape is tried
@@ -18,6 +19,12 @@ LEVELS_OF_TWO = (0.2, 0.5, 0.8)  # if there are two of them
 WAY = np.geomspace(0.05, 1.5, 12)  # from null to where a shape was tried: where on it the data are met best
 SIZES = np.geomspace(0.03, 3.0, 12)  # of an amplitude, in deviations of its prior: far from null its slope says little
 UNSEEN = 1e-6  # of the whitened data per prior deviation: the parameter does nothing at null
+
+
+def spoken(name: str) -> str:
+    """A candidate's name in words: ``payload@april`` is "payload in april"."""
+    title, _, group = name.partition(SEPARATOR)
+    return title.replace("_", " ") + (f" in {group.replace('_', ' ')}" if group else "")
 
 
 @dataclass(frozen=True)
@@ -63,12 +70,19 @@ class Candidate:
         indices: coordinates of its parameters.
         mechanism: itself.
         source: what an experiment file calls it.
+        group: of recordings that it is in; empty for all. Its name then ends in ``@group``.
     """
 
     name: str
     indices: tuple[int, ...]
     mechanism: Mechanism
     source: str
+    group: str = ""
+
+    @property
+    def title(self) -> str:
+        """Its name without the group's."""
+        return self.name.partition(SEPARATOR)[0]
 
 
 def probe_all(target: Target, fit: Fit, candidates: Sequence[Candidate]) -> list[Probe]:

@@ -8,7 +8,7 @@ coordinate would be infinite; a parameter that means nothing at null (a time con
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -79,6 +79,7 @@ class Coordinates:
         physical: names of the simulator's parameters, the order in which rollouts want them; nominal: their values
             where nothing else is said.
         fixed: values that stay, by name.
+        limits: hard bounds of the simulator's parameters, at which sums of a shared value and a group's own end.
     """
 
     space: ParameterSpace
@@ -86,6 +87,7 @@ class Coordinates:
     physical: tuple[str, ...]
     nominal: Mapping[str, float]
     fixed: Mapping[str, float]
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -246,7 +248,8 @@ class Coordinates:
     ) -> Float[np.ndarray, "n recording physical"]:
         """What the simulator is given for each recording."""
         start = np.array([self.fixed.get(name, self.nominal[name]) for name in self.physical], dtype=float)
-        return self._scattered(np.tile(start, (len(x), len(slots), 1)), self.values(x), slots)
+        found = self._scattered(np.tile(start, (len(x), len(slots), 1)), self.values(x), slots)
+        return np.clip(found, *np.transpose([self.limits.get(name, (-np.inf, np.inf)) for name in self.physical]))
 
     def physical_tangents(
         self,

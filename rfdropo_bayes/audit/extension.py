@@ -102,7 +102,13 @@ class Inquiry:
         An error of the mesh or time step that is too small to be named is no discrepancy either: where the residuals
         of the finer simulator pass more easily, it is they that count.
         """
-        free = [c for c in self.candidates if c.name not in without]
+        # Of a family of parameters, some may be in the model by themselves.
+        left = [replace(c, indices=tuple(i for i in c.indices if i not in fit.free)) for c in self.candidates]
+        free = [
+            c
+            for c, whole in zip(left, self.candidates, strict=True)
+            if c.name not in without and (c.indices or not whole.indices)
+        ]
         names = [c.name for c in free]
         finer = None
         probes = probe_all(self.target, fit, free)
@@ -242,7 +248,7 @@ class Inquiry:
             return climb(replace(self.target, forward=self.finer), start, fit.free)
         assert row.probe is not None
         candidate = next(c for c in self.candidates if c.name == row.name)
-        free = np.array([*fit.free, *candidate.indices], dtype=int)
+        free = np.array([*fit.free, *np.setdiff1d(candidate.indices, fit.free)], dtype=int)
         found = climb(self.target, best_between(self.target, fit.x, start, list(row.probe.point), SHARES), free)
         # The model without the candidate is among those with it: a climb that ends at a worse one went astray.
         if found.residual @ found.residual > fit.residual @ fit.residual:

@@ -271,8 +271,11 @@ class Forward:
         """
         points = np.atleast_2d(points)
         theta = self.coordinates.physical_values(points, self.slots)
-        found, status = self.lanes.roll(*self._per_lane(theta), self.deadline.check)
+        flat, start, commands = self._per_lane(theta)
+        once, again = self._different(flat)
+        found, status = self.lanes.roll(flat[once], start[once], commands.of(once), self.deadline.check)
         self.rollouts += len(status)
+        status, found = status[again], {name: part[again] for name, part in found.items()}
         fine = status == Result.OK
         for name in self.lanes.fields:
             fine &= np.isfinite(found[name]).reshape(len(fine), -1).all(axis=1)
@@ -298,12 +301,26 @@ class Forward:
         tangent = self.coordinates.physical_tangents(points, directions, self.slots)
         flat, start, commands = self._per_lane(theta)
         along = tangent.reshape(flat.shape)
-        found = self.lanes.differentiate(flat, along, start, commands, self.deadline.check)
-        self.rollouts += self.lanes.slope_rollouts * len(flat)
-        shown = {
-            name: np.nan_to_num(part).reshape(len(points), self.count, *part.shape[1:]) for name, part in found.items()
-        }
+        # Recordings that a direction does not touch, such as those of another group, stay as they are.
+        moved = np.flatnonzero(along.any(axis=1))
+        moved = moved if len(moved) else np.arange(1)
+        found = self.lanes.differentiate(
+            flat[moved], along[moved], start[moved], commands.of(moved), self.deadline.check
+        )
+        self.rollouts += self.lanes.slope_rollouts * len(moved)
+        shown = {}
+        for name, part in found.items():
+            every = np.zeros((len(flat), *part.shape[1:]))
+            every[moved] = np.nan_to_num(part)
+            shown[name] = every.reshape(len(points), self.count, *part.shape[1:])
         return shown | {"offset": self._offset(tangent), **self.coordinates.gain_tangents(points, directions)}
+
+    def _different(self, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lanes of which none repeats another, in their order, and which of them each lane is."""
+        lane = np.tile(np.arange(self.count), len(flat) // self.count)
+        _, first, inverse = np.unique(np.column_stack([lane, flat]), axis=0, return_index=True, return_inverse=True)
+        once = np.sort(first)
+        return once, np.searchsorted(once, first[inverse.ravel()])
 
     def _offset(self, theta: np.ndarray) -> np.ndarray:
         found = np.zeros((*theta.shape[:2], 3))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -140,19 +140,22 @@ def _estimated(
 
 
 def gather_measurements(
-    recordings: RecordingSet, channels: Sequence[Channel], repeats: Sequence[Trajectory] = ()
+    recordings: RecordingSet,
+    channels: Sequence[Channel],
+    repeats: Sequence[Trajectory] = (),
+    kinds: Sequence[Hashable] | None = None,
 ) -> Measurements:
     """Group recordings with identical commands.
 
     Args:
         recordings: on the simulator's clock.
         channels: measured in them.
-        repeats: the same recordings as they were recorded; empty where none may be joined, as parameters differ from
-            one to the next.
+        repeats: the same recordings as they were recorded; empty where none is to be joined.
+        kinds: of the recordings, by their parameters: those that have others are no repeats; all alike by default.
     """
     groups: Groups = tuple((index,) for index in range(len(recordings.names)))
     if repeats:
-        groups = group_recordings(recordings, repeats)
+        groups = _of_one_kind(group_recordings(recordings, repeats), kinds or [None] * len(recordings.names))
     single = tuple(channel for channel in channels if isinstance(channel, Series))
     firsts, joined = [group[0] for group in groups], []
     for channel in single:
@@ -170,3 +173,13 @@ def gather_measurements(
         np.concatenate([spread(channel, groups) for channel in single], axis=-1),
         repeats_apart(recordings, repeats, groups) if repeats else (),
     )
+
+
+def _of_one_kind(groups: Groups, kinds: Sequence[Hashable]) -> Groups:
+    """Groups of repeats, divided where their recordings have parameters of their own."""
+    found: dict[tuple[int, Hashable], tuple[int, ...]] = {}
+    for number, group in enumerate(groups):
+        for index in group:
+            key = (number, kinds[index])
+            found[key] = (*found.get(key, ()), index)
+    return tuple(found.values())

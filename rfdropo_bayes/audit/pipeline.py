@@ -16,6 +16,7 @@ from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.deadline import Deadline, OutOfTime
+from rfdropo_bayes.audit.differences import Groups
 from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step
 from rfdropo_bayes.audit.fit import Fit, Target, climb, widened
 from rfdropo_bayes.audit.forward import Forward, Lanes
@@ -57,6 +58,7 @@ class Question:
         start: values of base parameters to start from, of an earlier calibration; None for a search.
         rules, seed: see `Rules`.
         left_out: mechanisms that do not run on this body or engine, with the reason.
+        groups: of recordings that are compared; None for an audit of all.
     """
 
     lanes: Lanes
@@ -70,6 +72,11 @@ class Question:
     rules: Rules
     seed: int
     left_out: Mapping[str, str] = field(default_factory=dict)
+    groups: Groups | None = None
+
+    def candidate(self, name: str) -> Candidate | None:
+        """A candidate by its name; None for the mesh and time step, which are none of the library's."""
+        return next((candidate for candidate in self.candidates if candidate.name == name), None)
 
 
 @dataclass(frozen=True)
@@ -296,9 +303,7 @@ def base_model(
 
 def first_target(question: Question, journal: Journal, deadline: Deadline | None = None) -> Target:
     """The fitted recordings under the noise of repeats or of the experiment file, or a first guess."""
-    per_recording = any(p.recording for p in question.coordinates.space.parameters)
-    repeats = [] if per_recording else question.trajectories
-    measurements = measurements_of(question, range(len(question.trajectories)), repeats)
+    measurements = measurements_of(question, range(len(question.trajectories)), question.trajectories)
     noise = question.stated_noise
     if measurements.has_repeats:
         noise = measurements.noise(measurements.spread, 0)
@@ -311,9 +316,10 @@ def first_target(question: Question, journal: Journal, deadline: Deadline | None
 def measurements_of(question: Question, chosen: Sequence[int], repeats: Sequence[Trajectory] = ()) -> Measurements:
     """Some of the recordings, no more rows than the longest of them has; repeats are joined where they are given."""
     index = list(chosen)
+    kinds = [tuple(slots) for slots in question.coordinates.slots([question.model.recordings.names[i] for i in index])]
     rows = int(question.model.recordings.rows[index].max())
     channels = [c.of_recordings(index, rows) if isinstance(c, Series) else c for c in question.model.channels]
-    return gather_measurements(question.model.recordings.of(index, rows), channels, repeats)
+    return gather_measurements(question.model.recordings.of(index, rows), channels, repeats, kinds)
 
 
 def _base_fit(
@@ -457,16 +463,19 @@ def _unseen(tested: Measurements, valid: np.ndarray) -> Unseen:
 def _left_out(
     question: Question, target: Target, inquiry: Inquiry, fits: Sequence[Fit], names: Sequence[str]
 ) -> tuple[str, Unseen, list[Prediction]]:
-    """Predict each group of repeats from the others; of a single one, its later rows from its earlier ones."""
+    """Predict each group of repeats from the others; where one has parameters that no other tells (a single one has),
+    the later rows of all from the earlier ones."""
     measured = target.measurements
     groups = len(measured.members)
-    if groups > 1:
+    kinds = [tuple(slots) for slots in target.forward.slots]
+    if min(kinds.count(kind) for kind in kinds) > 1:
         held_out = "fitted recordings, each left out in turn"
         masks = [np.arange(groups)[:, None, None] == g for g in range(groups)]
     else:
-        held_out = "the later rows of the only recording"
-        rows = measured.count.shape[1]
-        masks = [np.arange(rows)[None, :, None] >= HELD_OUT_ROWS * measured.valid[0].any(axis=1).sum()]
+        held_out = "the later rows of the only recording" if groups == 1 else "the later rows of the fitted recordings"
+        rows = np.arange(measured.count.shape[1])
+        last = HELD_OUT_ROWS * measured.valid.any(axis=2).sum(axis=1)
+        masks = [rows[None, :, None] >= last[:, None, None]]
     parts: list[list[np.ndarray]] = [[] for _ in fits]
     for mask in masks:
         mask = np.broadcast_to(mask, measured.count.shape)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from rfdropo_bayes.audit.extension import DISCRETISATION, Step
+from rfdropo_bayes.audit.candidates import spoken
+from rfdropo_bayes.audit.extension import Step
 from rfdropo_bayes.audit.gain import LEVELS, noise_distance
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.prequential import in_words, prequential
@@ -15,6 +17,7 @@ from rfdropo_bayes.audit.screen import Look, Row
 from rfdropo_bayes.audit.sentence import sentence
 from rfdropo_bayes.audit.verdict import NO_DISCREPANCY, UNEXPLAINED
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS
+from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.bayes.units import force_power
 
 SCHEMA_VERSION = 1
@@ -32,6 +35,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         "sentence": sentence(answer, findings),
         "findings": findings,
         "candidates": _candidates(answer),
+        "between": _between(answer, findings),
         "base_fit_converged": answer.base.converged,
         "out_of_time": answer.stopped,
         "not_examined": {name: round(minutes, 1) for name, minutes in answer.unexamined.items()},
@@ -104,8 +108,8 @@ def next_experiment(answer: Answer) -> dict[str, Any] | None:
         return {"sentence": f"{sentence_}; docs/mechanisms.md says how to add one.", "separates": []}
     for step in answer.steps:
         if len(step.members) > 1:
-            checks = [f"{m.replace('_', ' ')}: {by_name[m].remedy}" for m in step.members if m in by_name]
-            words = " from ".join(m.replace("_", " ") for m in step.members[:2])
+            checks = [f"{spoken(m)}: {by_name[m].remedy}" for m in step.members if m in by_name]
+            words = " from ".join(spoken(m) for m in step.members[:2])
             sentence_ = f"To tell {words}: {'; '.join(checks)}. Or let `rfdropo design` propose commands that differ."
             return {"sentence": sentence_, "separates": list(step.members)}
     if not answer.steps:
@@ -114,7 +118,7 @@ def next_experiment(answer: Answer) -> dict[str, Any] | None:
         return {"sentence": sentence_, "separates": leading}
     name = answer.steps[0].name
     remedy = getattr(by_name.get(name), "remedy", "raise [simulator] refine and shorten its time_step")
-    return {"sentence": f"Check {name.replace('_', ' ')} on the robot: {remedy}.", "separates": [name]}
+    return {"sentence": f"Check {spoken(name)} on the robot: {remedy}.", "separates": [name]}
 
 
 def _other_noise(answer: Answer) -> dict[str, Any]:
@@ -142,16 +146,17 @@ def _shares(answer: Answer) -> list[float | None]:
 def _finding(answer: Answer, step: Step, share: float | None) -> dict[str, Any]:
     only = len(answer.steps) == 1 and answer.gain is not None
     row = step.before.row(step.name)
-    mechanism = next((c.mechanism for c in answer.question.candidates if c.name == step.name), None)
+    candidate = answer.question.candidate(step.name)
+    mechanism = candidate.mechanism if candidate else None
     parameters: dict[str, Any] = {}
     relative: dict[str, Any] = {}
-    if step.name != DISCRETISATION:
-        indices = next(c.indices for c in answer.question.candidates if c.name == step.name)
-        parameters = _drawn_parameters(answer, indices)
-        relative = _relative_sizes(answer, indices)
+    if candidate is not None:
+        parameters = _drawn_parameters(answer, candidate.indices)
+        relative = _relative_sizes(answer, candidate.indices)
     return {
-        "mechanism": step.name,
-        "equivalence_class": list(step.members),
+        "mechanism": candidate.title if candidate else step.name,
+        "group": candidate.group if candidate else "",
+        "equivalence_class": list(dict.fromkeys(name.partition(SEPARATOR)[0] for name in step.members)),
         "parameters": parameters,
         "relative": relative,
         "cause": getattr(mechanism, "cause", "the mesh or the time step of the simulator is too coarse"),
@@ -161,6 +166,25 @@ def _finding(answer: Answer, step: Step, share: float | None) -> dict[str, Any]:
         "adjusted_p": row.adjusted_p,
         "log_bayes_factor": step.log_bayes_factor,
         "refits": step.refits,
+    }
+
+
+def _between(answer: Answer, findings: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """What differs between two groups of recordings, and what both lack; None where none are compared."""
+    groups = answer.question.groups
+    if groups is None:
+        return None
+    keys = ("mechanism", "group", "parameters", "relative", "log_bayes_factor")
+    alike = [list(step.members[1:]) for step in answer.steps]
+    found = [
+        {**{key: finding[key] for key in keys}, "not_told_from": others}
+        for finding, others in zip(findings, alike, strict=True)
+    ]
+    return {
+        "groups": {name: list(members) for name, members in groups.members.items()},
+        "left_out": list(groups.left_out),
+        "differences": [row for row in found if row["group"]],
+        "in_both": [row for row in found if not row["group"]],
     }
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rfdropo_bayes.audit.bootstrap import p_in_words
+from rfdropo_bayes.audit.candidates import spoken
 from rfdropo_bayes.audit.extension import DISCRETISATION, TOLD_APART
 from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.pipeline import Answer
@@ -20,12 +21,33 @@ MOST_SIZES = 4
 
 def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     """What was found, how much of the discrepancy it explains, what is excluded, what remains."""
-    words = _words(answer, findings) + _suspicion(answer) + _shifted(answer) + _unexamined(answer) + _stopped(answer)
+    words = (
+        _words(answer, findings)
+        + _compared(answer, findings)
+        + _suspicion(answer)
+        + _shifted(answer)
+        + _unexamined(answer)
+        + _stopped(answer)
+    )
     return words[0].upper() + words[1:]
 
 
+def _compared(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
+    """What two groups of recordings have in common, where they are compared."""
+    groups = answer.question.groups
+    if groups is None or answer.verdict == NO_VERDICT:
+        return ""
+    names = " and ".join(groups.names)
+    left_out = f" {len(groups.left_out)} recordings of neither are left out." if groups.left_out else ""
+    both = [finding["mechanism"].replace("_", " ") for finding in findings if not finding["group"]]
+    lacking = f" {' and '.join(both)} {'is' if len(both) == 1 else 'are'} the same in both." if both else ""
+    if len(both) == len(findings):
+        return f"{lacking} No parameter and no mechanism is found to differ between {names}.{left_out}"
+    return f"{lacking} All else is shared by {names}.{left_out}"
+
+
 def _unexamined(answer: Answer) -> str:
-    names = " and ".join(name.replace("_", " ") for name in answer.unexamined)
+    names = " and ".join(spoken(name) for name in answer.unexamined)
     slow = f" Not examined, as it would have taken too long: {names}." if names else ""
     count = len(answer.question.left_out)
     does = "candidate does" if count == 1 else "candidates do"
@@ -116,7 +138,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
 
 def _invisible(answer: Answer) -> str:
     """Candidates that could be there all the same, as nothing that was measured shows them."""
-    names = [row.name.replace("_", " ") for row in answer.looks[0].rows if row.probe is None]
+    names = [row.name.replace("_", " ") for row in answer.looks[0].rows if row.probe is None and "@" not in row.name]
     if not names:
         return ""
     which = ", ".join(names[:MOST_EXCLUDED]) + (" ..." if len(names) > MOST_EXCLUDED else "")
@@ -133,20 +155,22 @@ def _adoption(answer: Answer) -> str:
     if not answer.adopted:
         return " Unseen recordings do not clearly support this: extended.toml keeps the base model."
     if answer.unsupported:
-        names = " and ".join(name.replace("_", " ") for name in answer.unsupported)
+        names = " and ".join(map(spoken, answer.unsupported))
         return f" The fitted recordings asked for {names}, too, which unseen ones do not support: not adopted."
     return ""
 
 
 def _named(finding: dict[str, Any]) -> str:
-    name = finding["mechanism"].replace("_", " ")
+    name = finding["mechanism"].replace("_", " ") + (f" in {finding['group']}" if finding["group"] else "")
     if finding["mechanism"] == DISCRETISATION:
         return "the coarse mesh or time step"
     # Where cables leave the common scale of forces and stiffness free, only the ratio means something.
     ratios = {row["parameter"]: (title, row) for title, row in finding["relative"].items()}
     given = [ratios.get(name, (name, row)) for name, row in finding["parameters"].items()]
     surest = sorted(given, key=lambda entry: -abs(entry[1]["mean"]) / max(entry[1]["sd"], 1e-300))[:MOST_SIZES]
-    sizes = ", ".join(_size(title, row) for title, row in given if (title, row) in surest)
+    sizes = ", ".join(
+        _size(title.replace(f"@{finding['group']}", ""), row) for title, row in given if (title, row) in surest
+    )
     others = [other.replace("_", " ") for other in finding["equivalence_class"][1:]]
     alike = f" (not to be told from {', '.join(others)} by these data)" if others else ""
     return f"{name} ({sizes}){alike}"
@@ -154,14 +178,14 @@ def _named(finding: dict[str, Any]) -> str:
 
 def _size(name: str, row: dict[str, Any]) -> str:
     unit = "" if row["unit"] == "-" else f" {row['unit']}"
-    return f"{name.replace('_', ' ')} {row['mean']:.3g} \u00b1 {row['sd']:.2g}{unit}"
+    return f"{spoken(name)} {row['mean']:.3g} \u00b1 {row['sd']:.2g}{unit}"
 
 
 def _excluded(answer: Answer) -> str:
     """Candidates that were refitted in the first step and are much less likely."""
     step = answer.steps[0]
     worse = [
-        name.replace("_", " ")
+        spoken(name)
         for name, value in step.refits.items()
         if name not in step.members
         and value < step.log_bayes_factor - TOLD_APART

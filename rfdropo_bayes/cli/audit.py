@@ -32,6 +32,12 @@ def audit(
     experiment: ExperimentFile,
     out: OutFolder = None,
     base: Base = None,
+    between: Annotated[
+        tuple[str, str] | None,
+        typer.Option(
+            "--between", metavar="GROUP GROUP", help="two of [model.groups]: say what differs, all else being shared"
+        ),
+    ] = None,
     seed: Seed = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -49,6 +55,7 @@ def audit(
         folder,
         overrides=overrides or [],
         base=base,
+        between=between,
         seed=seed,
         resume=resume,
         overwrite=overwrite,

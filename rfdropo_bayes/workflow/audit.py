@@ -14,6 +14,7 @@ import numpy as np
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.deadline import Deadline
+from rfdropo_bayes.audit.differences import Change, Groups, with_differences
 from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
 from rfdropo_bayes.audit.fit import widening
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
@@ -43,6 +44,7 @@ from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.workflow.assembly import (
     AnySimulator,
     build_simulator,
+    expand_groups,
     find_workpiece,
     fixed_values,
     gather_channels,
@@ -52,6 +54,7 @@ from rfdropo_bayes.workflow.assembly import (
     stated_noise,
 )
 from rfdropo_bayes.workflow.audited import Audit
+from rfdropo_bayes.workflow.between import Between, extend_groups, find_groups
 from rfdropo_bayes.workflow.calibrated import Calibration
 from rfdropo_bayes.workflow.experiment import AuditTable, Experiment, NoiseTable, Workpiece, load_experiment
 from rfdropo_bayes.workflow.experiment_file import code_placed, describe, self_contained
@@ -80,6 +83,7 @@ def audit(
     report: Callable[[str], None] = lambda line: None,
     inspect: Callable[[Answer], None] = lambda answer: None,
     tables: Mapping[str, Any] | None = None,
+    between: Between | None = None,
     **options: Any,
 ) -> Audit:
     """Say what a model lacks, by name, and measure what it gains with that.
@@ -100,6 +104,9 @@ def audit(
         report: called with a line of words now and then.
         inspect: called with the answer.
         tables: of the experiment file that the model was read from, for the record.
+        between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared.
+            Two names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
+            What both lack is named, too.
         options: keys of an experiment file's [audit]: ``candidates`` (names, or classes of one's own), ``exclude``,
             ``bootstraps``, ``minutes``.
 
@@ -109,7 +116,11 @@ def audit(
     model = _asked(model, noise, options)
     experiment, folder, title = model.experiment, model.folder, title or model.name
     deadline = Deadline(experiment.audit.minutes)
-    question = build_question(experiment, folder, runs, test, seed, start=start_values(base), workshop=workshop)
+    groups = None
+    if between is not None:
+        groups, runs, test = find_groups(between, experiment.model.groups, runs, test)
+    start = start_values(base)
+    question = build_question(experiment, folder, runs, test, seed, start=start, workshop=workshop, groups=groups)
     tables = {**model.tables(), "title": title, "seed": seed} if tables is None else tables
 
     def found(out: Path | None) -> Audit:
@@ -131,8 +142,9 @@ def audit(
     if out is None:
         return found(None)
     settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes([*runs, *test])}
-    start = base.folder if isinstance(base, Calibration) else base
-    settings |= {"options": {"base": start, "seed": seed}, "texts": model.texts()}
+    given = {"base": base.folder if isinstance(base, Calibration) else base, "seed": seed}
+    given |= {} if groups is None else {"between": {name: list(own) for name, own in groups.members.items()}}
+    settings |= {"options": given, "texts": model.texts()}
     with run_folder(Path(out), "audit", **settings, resume=resume, overwrite=overwrite) as place:
         answered = found(place)
         answered.save(place)
@@ -189,12 +201,16 @@ def build_question(
     start: dict[str, float] | None = None,
     workshop: Workshop | None = None,
     names: Sequence[str] | None = None,
+    groups: Groups | None = None,
 ) -> Question:
     """The experiment's base model with every candidate of the library in it, at its null value.
 
     ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names`` are the candidates,
-    where it is not all.
+    where it is not all; ``groups`` of recordings are compared.
     """
+    spreads = experiment.model.per_group
+    if groups is not None:  # what the groups do not share is to be found
+        experiment = experiment.model_copy(update={"model": experiment.model.model_copy(update={"per_group": {}})})
     robot = find_workpiece(experiment, folder)
     trajectories = [*fitted, *tested]
     left_out: dict[str, str] = {}
@@ -204,20 +220,29 @@ def build_question(
         names = [name for name in names if name not in left_out]
     simulator = build_simulator(_with(experiment, names), robot, folder)
     model, base = _model(experiment, simulator, trajectories, len(fitted), names)
-    added, space = simulator.mechanisms[len(experiment.model.mechanisms) :], model.space
-    coordinates = Coordinates(
-        space,
-        base,
-        tuple(spec.name for spec in simulator.parameters),
-        {spec.name: spec.nominal for spec in simulator.parameters},
-        model.fixed,
-    )
-    index = {p.spec.name: i for i, p in enumerate(space.parameters)}
+    added = simulator.mechanisms[len(experiment.model.mechanisms) :]
+    index = {p.spec.name: i for i, p in enumerate(model.space.parameters)}
     candidates = [
         Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
         for name, m in zip(names, added, strict=True)
         if name not in experiment.audit.exclude
     ]
+    if groups is not None:
+        later = {spec.name for mechanism in added for spec in mechanism.parameters}
+        plain = [spec for spec in simulator.parameters if spec.name not in later]
+        stated = expand_groups(spreads, simulator.parameters)
+        space, candidates = with_differences(
+            model.space, base, plain, candidates, groups, spreads=stated, held=tuple(model.fixed)
+        )
+        model = replace(model, space=space)
+    coordinates = Coordinates(
+        model.space,
+        base,
+        tuple(spec.name for spec in simulator.parameters),
+        {spec.name: spec.nominal for spec in simulator.parameters},
+        model.fixed,
+        {spec.name: (spec.low, spec.high) for spec in simulator.parameters},
+    )
 
     def lanes(changed: Experiment) -> tuple[Lanes, Commands]:
         shop = {} if workshop is None else workshop
@@ -239,6 +264,7 @@ def build_question(
         Rules(bootstraps=experiment.audit.bootstraps, minutes=experiment.audit.minutes),
         seed,
         {name: why for name, why in left_out.items() if name not in experiment.audit.exclude},
+        groups,
     )
 
 
@@ -424,10 +450,17 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path, out: P
             elif "drive_rate" in simulator["tetrahedra"]:
                 simulator["tetrahedra"]["drive_rate"] /= FINER
             simulator["time_step"] = answer.question.finer[0].simulator.description["time_step_s"]
-        else:
-            candidate = next(c for c in answer.question.candidates if c.name == step.name)
-            model["mechanisms"] = [*model.get("mechanisms", []), code_placed(candidate.source, folder, out)]
-            model.setdefault("priors", {}).update(sized_priors(answer, candidate))
+            continue
+        candidate = answer.question.candidate(step.name)
+        assert candidate is not None
+        if candidate.group:
+            extend_groups(model, answer, candidate)
+        if isinstance(candidate.mechanism, Change):
+            continue
+        source = code_placed(candidate.source, folder, out)
+        if source not in model.get("mechanisms", []):
+            model["mechanisms"] = [*model.get("mechanisms", []), source]
+        model.setdefault("priors", {}).update(sized_priors(answer, candidate))
     audit = extended.get("audit", {})
     if "candidates" in audit:
         adopted = {step.name for step in answer.adopted}
@@ -444,6 +477,8 @@ def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, An
     for index in candidate.indices:
         parameter = coordinates.space.parameters[index]
         table = dict(parameter.table or parameter.spec.prior)
+        if "loc" in table:  # a size in one group is measured from null
+            table["loc"] += coordinates.nominal[parameter.physical] - parameter.spec.nominal
         if factor[index] > 1.0:
             table["scale"] = float(f"{table['scale'] * factor[index]:.3g}")
         found[parameter.spec.name] = table

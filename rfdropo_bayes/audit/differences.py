@@ -1,0 +1,170 @@
+"""What may differ between two groups of recordings, such as two days: the candidates of an audit that compares them.
+
+A difference is added to a value that both groups share: a base parameter is higher in one group than in the other, a
+mechanism is there, or is larger, in one group only. A mechanism that both groups lack is a candidate as well, under its
+plain name: without it, an error of the base model would pass for a difference wherever it pays more in one group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+
+from rfdropo_bayes.audit.candidates import Candidate
+from rfdropo_bayes.audit.coordinates import MEASURED_FROM_NULL, PRIOR_DRAWS
+from rfdropo_bayes.bayes.pooling import deviation_spec
+from rfdropo_bayes.bayes.priors import prior_from_table
+from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+WHERE = "--between"
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Two groups of recordings.
+
+    Attributes:
+        members: fitted and unseen recordings of each, by the group's name.
+        left_out: recordings that belong to neither, and are not looked at.
+    """
+
+    members: Mapping[str, tuple[str, ...]]
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Of the two."""
+        first, second = self.members
+        return first, second
+
+
+@dataclass(frozen=True)
+class Change:
+    """A parameter of the base model that is not the same in both groups, with what a record asks of a mechanism."""
+
+    name: str
+    parameters: tuple[ParameterSpec, ...]
+    cause: str
+    remedy: str
+    stage: str = ""
+
+
+@dataclass
+class _Space:
+    """Parameters that are found one after the other, and where each of them is."""
+
+    parameters: list[Parameter]
+
+    def add(self, parameter: Parameter) -> int:
+        self.parameters.append(parameter)
+        return len(self.parameters) - 1
+
+
+def with_differences(
+    space: ParameterSpace,
+    base: int,
+    simulated: Sequence[ParameterSpec],
+    library: Sequence[Candidate],
+    groups: Groups,
+    *,
+    spreads: Mapping[str, float],
+    held: Sequence[str] = (),
+) -> tuple[ParameterSpace, list[Candidate]]:
+    """Parameters and candidates of a comparison.
+
+    Args:
+        space: base parameters, then those of the library.
+        base: how many belong to the base model.
+        simulated: every parameter of the base simulator.
+        library: candidates that both groups may lack.
+        groups: the two.
+        spreads: standard deviations between groups that the model states, by parameter [its unit].
+        held: parameters whose values are known, and which therefore do not differ.
+    """
+    found = _Space(list(space.parameters))
+    candidates = list(library)
+    shared = {p.spec.name: p for p in space.parameters[:base] if not p.recording}
+    free = {p.spec.name for p in space.parameters[:base] if p.recording}  # differ from one recording to the next
+    places: dict[str, dict[str, int]] = {}  # by group, by parameter
+    specs = [spec for spec in simulated if spec.name not in held and spec.name not in free]
+    for spec in specs:
+        spread = np.sqrt(2.0) * spreads[spec.name] if spec.name in spreads else _deviation_of(spec, shared)
+        # A value that both share moves with it: the difference is the same, seen from either group.
+        for group in groups.names[1:] if spec.name in shared else groups.names:
+            places.setdefault(group, {})[spec.name] = found.add(_difference(spec, spread, group, groups))
+    for group in groups.names:
+        own = places.get(group, {})
+        candidates += [_changed([spec], [own[spec.name]], group, groups) for spec in specs if spec.name in own]
+        for family in families([spec for spec in specs if spec.name in own]):
+            candidates.append(_changed(family, [own[spec.name] for spec in family], group, groups))
+        candidates += [_in_one_group(candidate, group, groups, found) for candidate in library]
+    return ParameterSpace(tuple(found.parameters)), candidates
+
+
+def families(specs: Sequence[ParameterSpec]) -> list[list[ParameterSpec]]:
+    """Parameters that are one quantity at several places (the zeros of all cables), by the start of their names."""
+    alike: dict[str, list[ParameterSpec]] = {}
+    for spec in specs:
+        alike.setdefault(repr((spec.unit, spec.low, spec.high, sorted(spec.prior.items()))), []).append(spec)
+    return [found for found in alike.values() if len(found) > 1 and _stem(found)]
+
+
+def _stem(specs: Sequence[ParameterSpec]) -> str:
+    """What the names of several parameters begin with, in whole words."""
+    words = zip(*(spec.name.split("_") for spec in specs), strict=False)
+    return "_".join(first for first, *others in words if all(other == first for other in others))
+
+
+def _deviation_of(spec: ParameterSpec, shared: Mapping[str, Parameter]) -> float:
+    """Standard deviation of a parameter's prior: what the model allows the parameter, it allows the difference."""
+    known = shared.get(spec.name)
+    prior = known.prior if known else prior_from_table(spec, dict(spec.prior), where=f"{WHERE} {spec.name}")
+    return float(np.std(np.asarray(prior.sample(jax.random.key(0), (PRIOR_DRAWS,)))))
+
+
+def _difference(spec: ParameterSpec, spread: float, group: str, groups: Groups) -> Parameter:
+    """What one group's value is off that of the other, Normal(0, ``spread``)."""
+    width = spec.high - spec.low
+    own = deviation_spec(spec, spread)._replace(low=-width, high=width)
+    prior = prior_from_table(own, dict(own.prior), where=f"{WHERE} {spec.name}")
+    return Parameter(own, prior, group, dict(own.prior), tuple(groups.members[group]), spec.name)
+
+
+def _changed(specs: Sequence[ParameterSpec], places: Sequence[int], group: str, groups: Groups) -> Candidate:
+    name = specs[0].name if len(specs) == 1 else _stem(specs)
+    described = specs[0].description if len(specs) == 1 else f"{name.replace('_', ' ')} ({len(specs)} of them)"
+    cause = f"{described}: not the same in {' and '.join(groups.names)}"
+    change = Change(name, tuple(specs), cause, f"measure it in {' and in '.join(groups.names)}, and undo what changed")
+    return Candidate(f"{name}{SEPARATOR}{group}", tuple(places), change, name, group)
+
+
+def _in_one_group(candidate: Candidate, group: str, groups: Groups, found: _Space) -> Candidate:
+    """A mechanism of the library in one group only. Shapes, which mean nothing where it is absent, are shared."""
+    parameters = [found.parameters[i] for i in candidate.indices]
+    sized = [(p.table or p.spec.prior).get("distribution") in MEASURED_FROM_NULL for p in parameters]
+    indices = []
+    for index, parameter, has_size in zip(candidate.indices, parameters, sized, strict=True):
+        if has_size:
+            indices.append(found.add(_of_one_group(parameter, group, groups)))
+        elif any(sized):
+            indices.append(index)
+        else:
+            spread = float(np.std(np.asarray(parameter.prior.sample(jax.random.key(0), (PRIOR_DRAWS,)))))
+            indices.append(found.add(_difference(parameter.spec, spread, group, groups)))
+    return replace(candidate, name=f"{candidate.name}{SEPARATOR}{group}", indices=tuple(indices), group=group)
+
+
+def _of_one_group(parameter: Parameter, group: str, groups: Groups) -> Parameter:
+    """The size of a mechanism in one group, measured from its null value and added to what both share."""
+    spec, table = parameter.spec, dict(parameter.table or parameter.spec.prior)
+    for key in ("loc", "low", "high"):
+        if key in table:
+            table[key] -= spec.nominal
+    low, high, grid = spec.low - spec.nominal, spec.high - spec.nominal, tuple(g - spec.nominal for g in spec.grid)
+    own = spec._replace(low=low, high=high, nominal=0.0, prior=table, grid=grid)
+    prior = prior_from_table(own, table, where=f"{WHERE} {spec.name}")
+    return Parameter(own, prior, group, table, tuple(groups.members[group]), spec.name)

@@ -1,0 +1,119 @@
+"""Two groups of recordings that an audit compares: which recordings they are, and how a model says what differs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.audit.candidates import Candidate
+from rfdropo_bayes.audit.differences import WHERE, Change, Groups
+from rfdropo_bayes.audit.fit import widening
+from rfdropo_bayes.audit.pipeline import Answer
+from rfdropo_bayes.bayes.pooling import Patterns, gather_groups, whole
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.tables import nearest
+
+Between = Sequence[str] | Mapping[str, Sequence[str | Trajectory] | str | Trajectory]
+"""Two names of [model.groups], or the recordings of each group by its name."""
+
+
+def find_groups(
+    between: Between, patterns: Patterns, fitted: Sequence[Trajectory], tested: Sequence[Trajectory]
+) -> tuple[Groups, list[Trajectory], list[Trajectory]]:
+    """The two groups, and the fitted and unseen recordings that belong to one of them.
+
+    Args:
+        between: the two.
+        patterns: [model.groups].
+        fitted: recordings that are fitted; tested: unseen ones.
+
+    Raises:
+        InputError: not two groups, an unknown one, one without a fitted recording, or a recording in both.
+    """
+    if len(set(between)) != 2 or len(between) != 2 or isinstance(between, str):
+        raise InputError(f"{len(set(between))} groups are named", where=WHERE, remedy="name two that differ")
+    names = [trajectory.name for trajectory in [*fitted, *tested]]
+    if isinstance(between, Mapping):
+        members = {group: _matching(group, given, names) for group, given in between.items()}
+    else:
+        members = _named(list(between), patterns, names)
+    first, second = (set(own) for own in members.values())
+    if both := sorted(first & second):
+        raise InputError(
+            f"{both[0]} is in both groups, {' and '.join(members)}", where=WHERE, remedy="keep it in one of them"
+        )
+    for group, own in members.items():
+        if not set(own) & {trajectory.name for trajectory in fitted}:
+            raise InputError(
+                f"no fitted recording is in the group {group!r}",
+                where=WHERE,
+                remedy=f"fitted recordings: {', '.join(t.name for t in fitted)}",
+            )
+    groups = Groups(members, tuple(name for name in names if name not in first | second))
+    chosen = ([t for t in each if t.name in first | second] for each in (fitted, tested))
+    return groups, *chosen
+
+
+def _named(between: Sequence[str], patterns: Patterns, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Recordings of groups that the experiment names; a recording that it puts into none is a group of its own."""
+    groups = gather_groups(names, patterns)
+    for group in between:
+        if group not in groups and group not in patterns:
+            known = list(dict.fromkeys([*patterns, *groups]))
+            raise InputError(
+                f"unknown group {group!r}",
+                where=WHERE,
+                remedy=f"{nearest(group, known)}; [model.groups] names recordings of one day or one robot",
+            )
+    return {group: groups.get(group, ()) for group in between}
+
+
+def _matching(
+    group: str, given: Sequence[str | Trajectory] | str | Trajectory, names: Sequence[str]
+) -> tuple[str, ...]:
+    """Recordings that names, wildcards or recordings themselves stand for."""
+    chosen: list[str] = []
+    for entry in [given] if isinstance(given, str | Trajectory) else given:
+        pattern = entry.name if isinstance(entry, Trajectory) else entry
+        found = [name for name in names if name == pattern or fnmatchcase(whole(name), pattern)]
+        if not found:
+            raise InputError(
+                f"no recording of the group {group!r} is called {pattern!r}",
+                where=WHERE,
+                remedy=f"recordings: {', '.join(names)}",
+            )
+        chosen += [name for name in found if name not in chosen]
+    return tuple(chosen)
+
+
+def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -> None:
+    """Say in the table [model] of an experiment file what differs between the groups.
+
+    A mechanism that one group only has is free in its recordings, and absent in all others. What both have is pooled.
+    """
+    coordinates, groups = answer.question.coordinates, answer.question.groups
+    assert groups is not None
+    factor = widening(answer.extended, coordinates)
+    fitted = {trajectory.name for trajectory in answer.question.trajectories}
+    scopes = {step.name for step in answer.adopted if step.name.partition("@")[0] == candidate.title}
+    alone = len(scopes) == 1 and not isinstance(candidate.mechanism, Change)
+    for index in candidate.indices:
+        parameter = coordinates.space.parameters[index]
+        if not parameter.added_to:
+            continue
+        name = parameter.added_to
+        if alone:
+            own = [member for member in groups.members[candidate.group] if member in fitted]
+            model.setdefault("per_recording", {})[name] = own
+            continue
+        model.setdefault("groups", {}).update({group: list(own) for group, own in groups.members.items()})
+        model.get("per_recording", {}).pop(name, None)
+        table = parameter.table or {}
+        spread = float(table["scale"]) * float(factor[index]) / np.sqrt(2.0)
+        model.setdefault("per_group", {})[name] = float(f"{spread:.3g}")
+        if name not in coordinates.names:
+            model.setdefault("priors", {}).setdefault(name, {})
