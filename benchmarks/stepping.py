@@ -24,7 +24,6 @@ import numpy as np
 from rfdropo_bayes.fem.native.layered import available_threads
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators import Commands
-from rfdropo_bayes.simulators.pushing import PushSimulator
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 from rfdropo_bayes.workflow.assembly import build_simulator
 from rfdropo_bayes.workflow.experiment import Experiment
@@ -45,15 +44,13 @@ class Row(NamedTuple):
     kib_per_lane: float | None
 
 
-def simulator(
-    precision: str, threads: int | None, state: str = "rest", *, push: bool = False
-) -> TrunkSimulator | PushSimulator:
+def simulator(precision: str, threads: int | None, state: str = "rest", *, push: bool = False) -> TrunkSimulator:
     """The trunk of the paper on the compiled engine, alone or with its cube."""
     options = {"engine": "numba", "precision": precision, "threads": threads, "push": push}
     table = {"robot": ROBOT, "simulator": options}
     robot = load_robot(ROBOT).model_copy(update={"initial_state": state})
     built = build_simulator(Experiment.model_validate(table), robot)
-    assert isinstance(built, TrunkSimulator | PushSimulator)
+    assert isinstance(built, TrunkSimulator)
     return built
 
 
@@ -82,9 +79,9 @@ def rate(run: Callable[[], Any], solves: int, seconds: float) -> tuple[float, fl
     return wall, cpu
 
 
-def sessions(model: TrunkSimulator | PushSimulator, lanes: int, seconds: float) -> tuple[float, float, float]:
+def sessions(model: TrunkSimulator, lanes: int, seconds: float) -> tuple[float, float, float]:
     """Rates and memory [KiB per lane] of a session."""
-    values, commands = drawn(lanes, isinstance(model, PushSimulator))
+    values, commands = drawn(lanes, model.pushes)
     session = model.session(lanes, PERIOD)
 
     def episodes() -> None:
@@ -95,9 +92,9 @@ def sessions(model: TrunkSimulator | PushSimulator, lanes: int, seconds: float) 
     return *rate(episodes, lanes * ACTIONS * SOLVES, seconds), session.nbytes / lanes / 1024
 
 
-def whole(model: TrunkSimulator | PushSimulator, lanes: int, seconds: float) -> tuple[float, float]:
+def whole(model: TrunkSimulator, lanes: int, seconds: float) -> tuple[float, float]:
     """Rates of whole rollouts of the same commands."""
-    values, commands = drawn(lanes, isinstance(model, PushSimulator))
+    values, commands = drawn(lanes, model.pushes)
     clock = PERIOD * np.arange(ACTIONS + 1)
     grid = [model.commands(clock[:-1], rows, np.zeros(8), clock) for rows in commands]
     stacked = Commands(*(np.stack(parts) for parts in zip(*grid, strict=True)))

@@ -220,7 +220,8 @@ def run_hub(channel: str) -> None:
     hub, parent = Hub(channel), os.getppid()
     print(hub.channel, flush=True)
     schedule_fifo()
-    hub.serve(stop=lambda: os.getppid() != parent)
+    with steady_interpreter():
+        hub.serve(stop=lambda: os.getppid() != parent)
 
 
 @contextlib.contextmanager

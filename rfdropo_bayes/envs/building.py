@@ -13,7 +13,6 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.robots import Robot, load_robot
 from rfdropo_bayes.simulators.engine import Backend, Engine
-from rfdropo_bayes.simulators.pushing import pushing
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
@@ -43,7 +42,7 @@ def trunk_simulator(
     engine = Engine(assembly, discretisation.time_step, backend, robot.initial_state == "equilibrium")
     found = mechanisms_named(list(mechanisms), robot, folder=folder)
     trunk = TrunkSimulator(robot, engine, assembly, discretisation, found)
-    return pushing(trunk) if push else trunk
+    return trunk.pushing() if push else trunk
 
 
 def make_episodes(

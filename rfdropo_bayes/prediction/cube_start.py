@@ -22,7 +22,7 @@ from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.simulators.pushing import PushSimulator
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
 SIZES = (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME)
 
@@ -40,7 +40,7 @@ def with_measured_starts(
     between draws, is taken off. A recording without a measured cube keeps what the values say.
     """
     simulator = model.simulator
-    if not isinstance(simulator, PushSimulator):
+    if not isinstance(simulator, RobotSimulator) or not simulator.pushes:
         return model, values
     specs = {spec.name: spec for spec in simulator.parameters}
     kept = [p for p in model.space.parameters if p.spec.name not in PLACE]
@@ -57,7 +57,7 @@ def with_measured_starts(
     return replace(model, space=ParameterSpace(tuple(parameters))), placed
 
 
-def _place(simulator: PushSimulator, model: TrajectoryModel, trajectory: Trajectory, values: Batch) -> Batch:
+def _place(simulator: RobotSimulator, model: TrajectoryModel, trajectory: Trajectory, values: Batch) -> Batch:
     """Centre [m] and yaw [rad] of the measured cube in the robot's frame, for every draw; empty if there is none."""
     pose = trajectory.object_pose
     if pose is None or not np.isfinite(pose[0]).all():

@@ -21,7 +21,7 @@ from rfdropo_bayes.simulators.differences import LENGTH, with_differences
 from rfdropo_bayes.simulators.engine import distinct, flattened, padded
 from rfdropo_bayes.simulators.extended import ExtendedSimulator, Values
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, Mechanism, check_mechanisms, code_of, obstacle
-from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.process import ProcessSimulation
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.tables import parse_table
@@ -103,10 +103,7 @@ class BlackBox:
     @property
     def specs(self) -> tuple[ParameterSpec, ...]:
         """Its parameters."""
-        return tuple(
-            ParameterSpec(name, p.unit, p.low, p.high, p.nominal, p.prior, p.description)
-            for name, p in self.parameters.items()
-        )
+        return specs_of(self.parameters)
 
     @cached_property
     def simulate(self) -> Callable[[Batch, np.ndarray], list[Any]]:

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem import LayeredBody, Material
+from rfdropo_bayes.fem import LayeredBody
 from rfdropo_bayes.fem.balance import Balance, tetrahedral_balance
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.commands import Commands, animated_on_grid, commands_on_grid
-from rfdropo_bayes.simulators.engine import Backend, Engine
-from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms
+from rfdropo_bayes.simulators.commands import Commands, animated_on_grid
+from rfdropo_bayes.simulators.engine import Engine
+from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_body import MeshAssembly, TetrahedraTable
-from rfdropo_bayes.simulators.protocol import Observation, Result
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values, every_node, sampled
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
 from rfdropo_bayes.simulators.trunk import refined_body
 
 
@@ -28,16 +26,11 @@ from rfdropo_bayes.simulators.trunk import refined_body
 class MeshTrunkSimulator(RobotSimulator):
     """A trunk of tetrahedra with mechanisms, behind the `Simulator` protocol, started undeformed.
 
-    Order of a rollout: as `TrunkSimulator`. Mechanisms of the body see the robot's layers and stations; what they do to
+    Mechanisms of the body see the robot's layers and stations; what they do to
     a layer holds for the elements in it, and a mass at a station rests on the section at its height.
 
     Attributes:
-        robot: what is simulated.
-        engine: what computes the motion of the body.
-        assembly: the robot bound to the mesh the engine was made for.
-        options: how the mesh is simulated.
-        time_step: of the simulation [s].
-        mechanisms: extensions, applied in the order given within each stage.
+        options: how the mesh is simulated; for the others see `RobotSimulator`.
     """
 
     robot: Robot
@@ -46,18 +39,6 @@ class MeshTrunkSimulator(RobotSimulator):
     options: TetrahedraTable
     time_step: float
     mechanisms: Sequence[Mechanism] = field(default_factory=tuple)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "mechanisms", check_mechanisms(self.mechanisms))
-
-    def with_backend(self, backend: Backend) -> MeshTrunkSimulator:
-        """The same, computed by another backend."""
-        return replace(self, engine=replace(self.engine, backend=backend))
-
-    @property
-    def lanes(self) -> int:
-        """Those of the engine."""
-        return self.engine.lanes
 
     @property
     def description(self) -> dict[str, object]:
@@ -73,7 +54,13 @@ class MeshTrunkSimulator(RobotSimulator):
             **{name: value for name, value in self.options.model_dump().items() if name != "unit"},
             "mechanisms": [mechanism.name for mechanism in self.mechanisms],
             "content_sha256": self.content_sha256,
+            **({"object": "cube"} if self.pushes else {}),
         }
+
+    @property
+    def nodes(self) -> int:
+        """See `RobotSimulator`."""
+        return len(self.assembly.system.body.rest)
 
     def commands(
         self,
@@ -85,50 +72,16 @@ class MeshTrunkSimulator(RobotSimulator):
         """Recorded commands on this simulator's clock, handed over as its drives do."""
         if self.options.drives == "sofa":
             return animated_on_grid(time, value, initial, observation_time, time_step=self.time_step)
-        return commands_on_grid(
-            time,
-            value,
-            initial,
-            observation_time,
-            time_step=self.time_step,
-            ramp=self.robot.command.ramp_s,
-            dead_time=self.robot.command.dead_time_s,
-        )
-
-    def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
-        """Simulate from rest to the last observation, or at least ``steps`` time steps; see `TrunkSimulator.rollout`.
-
-        Raises:
-            InputError: a name that is not a parameter of this simulator.
-        """
-        values = self.complete(parameters)
-        steps = self.steps_seen(values, commands, self.time_step, steps)
-        motion = self.engine.motion(*self.inputs(values, commands), steps)
-        return self.observation(values, commands, motion, Result.CABLE_LIMIT)
+        return super().commands(time, value, initial, observation_time)
 
     def inputs(self, values: Values, commands: Commands) -> tuple[TetrahedralMaterial, Array, Array]:
-        """As `TrunkSimulator.inputs`."""
+        """See `RobotSimulator`."""
         displacement = self.displacements(values, commands)
         return self.material(values), jnp.zeros_like(displacement[0]), displacement
 
-    def balance(self, parameters: Values, commands: Commands) -> Balance:
-        """See `RobotSimulator.balance`."""
-        values = self.complete(parameters)
-        material, start, displacement = self.inputs(values, commands)
-        nodes = every_node(len(self.assembly.system.body.rest))
-        motion = self.engine.recording(nodes).motion(material, start, displacement)
-        return self.balance_of(material, motion.position, motion.tension, commands)
-
-    def balance_of(
-        self,
-        material: TetrahedralMaterial,
-        position: Float[Array, "row node 3"],
-        tension: Float[Array, "row cable"],
-        commands: Commands,
-    ) -> Balance:
-        """As `TrunkSimulator.balance_of`."""
-        found = tetrahedral_balance(self.assembly.system, material, position, tension, self.time_step)
-        return sampled(found, commands)
+    def balance_of(self, material: TetrahedralMaterial, motion: Motion) -> Balance:
+        """See `RobotSimulator`; the energies are those of the body."""
+        return tetrahedral_balance(self.assembly.system, material, motion.position, motion.tension, self.time_step)
 
     def displacements(self, values: Values, commands: Commands) -> Float[Array, "step cable"]:
         """Commanded cable displacements [m] at the end of every step; SOFA's limits are those of the engine."""
@@ -142,26 +95,10 @@ class MeshTrunkSimulator(RobotSimulator):
         return refined_body(self.robot.layered_arrays(), 1, 2)
 
     def material(self, values: Values) -> TetrahedralMaterial:
-        """Material of the mesh for these values, body mechanisms included."""
+        """See `RobotSimulator`."""
         layers = self._layers
-        material = Material(
-            young_modulus=values["young_modulus"],
-            poisson_ratio=values["poisson_ratio"],
-            density=jnp.asarray(self.robot.density(values["trunk_mass"])),
-            rayleigh_mass=values["rayleigh_mass"],
-            rayleigh_stiffness=values["rayleigh_stiffness"],
-            gravity=jnp.asarray(self.robot.gravity),
-            stiffness_scale=jnp.ones(len(layers.station) - 1),
-            point_mass=jnp.asarray(self.robot.point_masses(values)),
-        )
-        for mechanism in self.mechanisms:
-            if isinstance(mechanism, BodyMechanism):
-                material = mechanism.embody(values, material, layers)
-                if material.effects.present:
-                    raise InputError(
-                        f"the mechanism {mechanism.name!r} acts on layered bodies only", where="[model] mechanisms",
-                        remedy='remove it, or set body = "layered" under [simulator]',
-                    )  # fmt: skip
+        masses = jnp.asarray(self.robot.point_masses(values))
+        material = self.embodied(values, layers, jnp.ones(len(layers.station) - 1), masses)
         assembly = self.assembly
         trunk_mass = material.density * self.robot.body.volume_m3
         return TetrahedralMaterial(

@@ -33,6 +33,13 @@ class ParameterSpec(NamedTuple):
     grid: tuple[float, ...] = ()
 
 
+def specs_of(table: Mapping[str, Any]) -> tuple[ParameterSpec, ...]:
+    """What robots, and black boxes, say of their parameters (`robots.parameter.Parameter`, by name)."""
+    return tuple(
+        ParameterSpec(name, p.unit, p.low, p.high, p.nominal, p.prior, p.description) for name, p in table.items()
+    )
+
+
 def check_names(names: Iterable[str], specs: Iterable[ParameterSpec], *, where: str) -> None:
     """Raise InputError for a name that no specification carries."""
     known = {spec.name for spec in specs}

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem import LayeredBody, Material
 from rfdropo_bayes.fem.balance import Balance
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
-from rfdropo_bayes.simulators.engine import Motion
+from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
+from rfdropo_bayes.simulators.cube import cube_at_measured, cube_inputs, push_table, scene_of
+from rfdropo_bayes.simulators.engine import Backend, CubeInputs, Engine, Motion
 from rfdropo_bayes.simulators.extended import ExtendedSimulator
-from rfdropo_bayes.simulators.mechanisms import (
-    Mechanism,
-    code_of,
-)
-from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms, code_of
+from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Values = Mapping[str, Float[Array, ""]]
@@ -36,11 +37,6 @@ def every_node(count: int) -> PointMap:
     return PointMap(np.arange(count)[:, None], np.ones((count, 1)))
 
 
-def sampled(balance: Balance, commands: Commands) -> Balance:
-    """The rows of the observation times."""
-    return Balance(*(sample(series, commands) for series in balance))
-
-
 class Wound(NamedTuple):
     """Drives between two steps."""
 
@@ -49,27 +45,77 @@ class Wound(NamedTuple):
 
 
 class RobotSimulator(ExtendedSimulator):
-    """Base of simulators that move a robot's body by cables; mechanisms act before, in and after the body.
+    """Base of simulators that move a robot's body by cables, alone or with a cube on a plate before it.
+
+    Order of a rollout: command -> actuation mechanisms -> cable displacements within their limits -> body with its
+    mechanisms, and cube -> markers -> sensing mechanisms -> observation. A cube starts at rest where it is put.
 
     Attributes:
         robot: what is simulated.
+        engine: what computes the motion of the body, and of a cube where it has a scene.
+        assembly: the discretised robot that the engine was made for.
         mechanisms: extensions, applied in the order given within each stage.
         time_step: of the simulation [s].
     """
 
     robot: Robot
+    engine: Engine
+    assembly: Any
     mechanisms: Sequence[Mechanism]
     time_step: float
 
-    @property
-    def lanes(self) -> int:
-        """How many rollouts the simulator likes to be given at once."""
-        raise NotImplementedError
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mechanisms", check_mechanisms(self.mechanisms))
 
     @property
     def description(self) -> dict[str, object]:
         """Engine, precision and discretisation, for the record."""
         raise NotImplementedError
+
+    def inputs(self, values: Values, commands: Commands) -> tuple[Any, Array, Array]:
+        """What the engine moves the body by: material, and cable displacements before the first and at each step."""
+        raise NotImplementedError
+
+    def material(self, values: Values) -> Any:
+        """Material of the body for these values, body mechanisms included."""
+        raise NotImplementedError
+
+    def balance_of(self, material: Any, motion: Motion) -> Balance:
+        """Forces and energies of a motion of all nodes, recorded after every step."""
+        raise NotImplementedError
+
+    @property
+    def nodes(self) -> int:
+        """Of the body."""
+        raise NotImplementedError
+
+    @property
+    def pushes(self) -> bool:
+        """Whether a cube stands before the robot."""
+        return self.engine.scene is not None
+
+    @property
+    def unsolved(self) -> Result:
+        """How a rollout ends whose constraints were not all solved."""
+        return Result.CONTACT_NOT_CONVERGED if self.pushes else Result.CABLE_LIMIT
+
+    @property
+    def lanes(self) -> int:
+        """How many rollouts the simulator likes to be given at once: as many as its engine."""
+        return self.engine.lanes
+
+    def with_backend(self, backend: Backend) -> Self:
+        """The same, computed by another backend."""
+        return replace(self, engine=replace(self.engine, backend=backend))  # type: ignore[type-var]
+
+    def pushing(self) -> Self:
+        """The same with the cube and the plate of its robot before it.
+
+        Raises:
+            InputError: a robot without a cube.
+        """
+        scene = scene_of(self.robot, self.assembly.system.body)
+        return replace(self, engine=replace(self.engine, scene=scene))  # type: ignore[type-var]
 
     def commands(
         self,
@@ -78,15 +124,33 @@ class RobotSimulator(ExtendedSimulator):
         initial: Float[np.ndarray, " channel"],
         observation_time: Float[np.ndarray, " time"],
     ) -> Commands:
-        """Recorded commands on the simulator's clock."""
-        raise NotImplementedError
+        """Recorded commands on the simulator's clock, with the robot's ramp and lag."""
+        timing, given = self.robot.command, (time, value, initial, observation_time)
+        return commands_on_grid(*given, time_step=self.time_step, ramp=timing.ramp_s, dead_time=timing.dead_time_s)
+
+    def body_inputs(self, values: Values) -> tuple[Any, CubeInputs | None]:
+        """Material of the body, and the cube before it, for these values."""
+        return self.material(values), cube_inputs(self.robot, values) if self.pushes else None
 
     def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
-        """Simulate from the initial state to the last observation, or ``steps`` time steps."""
-        raise NotImplementedError
+        """Simulate from the initial state to the last observation.
+
+        Args:
+            parameters: values by name; those left out are nominal.
+            commands: from `commands`.
+            steps: simulate only so many time steps, and those that mechanisms of sensing look ahead; rows beyond hold
+                no meaning. None simulates all and is differentiable in reverse mode.
+
+        Raises:
+            InputError: a name that is not a parameter of this simulator.
+        """
+        values = self.complete(parameters)
+        steps = self.steps_seen(values, commands, self.time_step, steps)
+        motion = self.engine.motion(*self.inputs(values, commands), steps, self.body_inputs(values)[1])
+        return self.observation(values, commands, motion, self.unsolved)
 
     def balance(self, parameters: Values, commands: Commands) -> Balance:
-        """Forces on the body, energies, work and losses of a rollout at the observation times; see `fem.balance`.
+        """Forces on the body, its energies, work and losses of a rollout at the observation times; see `fem.balance`.
 
         Always in double precision. Mechanisms of sensing have no part in it; a rollout that diverged says so only in
         `rollout`.
@@ -94,7 +158,52 @@ class RobotSimulator(ExtendedSimulator):
         Raises:
             InputError: a name that is not a parameter of this simulator, or cables with friction.
         """
-        raise NotImplementedError
+        values = self.complete(parameters)
+        inputs = self.inputs(values, commands)
+        engine = self.engine.recording(every_node(self.nodes))
+        motion = engine.motion(*inputs, cube=self.body_inputs(values)[1])
+        return Balance(*(sample(series, commands) for series in self.balance_of(inputs[0], motion)))
+
+    def embodied(
+        self,
+        values: Values,
+        body: LayeredBody,
+        stiffness_scale: Float[Array, " layers"],
+        point_mass: Float[Array, " stations"],
+    ) -> Material:
+        """Material of a layered body, body mechanisms included.
+
+        Raises:
+            InputError: a mechanism that acts on layered bodies only, where the engine's is not one.
+        """
+        material = Material(
+            young_modulus=values["young_modulus"],
+            poisson_ratio=values["poisson_ratio"],
+            density=jnp.asarray(self.robot.density(values["trunk_mass"])),
+            rayleigh_mass=values["rayleigh_mass"],
+            rayleigh_stiffness=values["rayleigh_stiffness"],
+            gravity=jnp.asarray(self.robot.gravity),
+            stiffness_scale=stiffness_scale,
+            point_mass=point_mass,
+        )
+        for mechanism in self.mechanisms:
+            if isinstance(mechanism, BodyMechanism):
+                material = mechanism.embody(values, material, body)
+                if material.effects.present and not self.engine.layered:
+                    raise InputError(
+                        f"the mechanism {mechanism.name!r} acts on layered bodies only", where="[model] mechanisms",
+                        remedy='remove it, or set body = "layered" under [simulator]',
+                    )  # fmt: skip
+        return material
+
+    def with_object_at(self, values: Mapping[str, Any], pose: Float[Any, "7"]) -> dict[str, Any]:
+        """Values with the cube where it was measured, less the offset of the measuring frame, standing on the plate.
+
+        Args:
+            values: of one rollout, or of many (arrays of one shape); what is left out is nominal.
+            pose: measured centre [m] and unit quaternion (x, y, z, w).
+        """
+        return {**values, **cube_at_measured(self.robot, {s.name: s.nominal for s in self.parameters} | values, pose)}
 
     def observation(self, values: Values, commands: Commands, motion: Motion, unsolved: Result) -> Observation:
         """What a motion shows; ``unsolved`` says how a rollout ended whose constraints were not all solved."""
@@ -114,12 +223,10 @@ class RobotSimulator(ExtendedSimulator):
 
     @cached_property
     def parameters(self) -> tuple[ParameterSpec, ...]:
-        """Parameters of the robot, then those of the mechanisms."""
-        base = tuple(
-            ParameterSpec(name, p.unit, p.low, p.high, p.nominal, p.prior, p.description)
-            for name, p in self.robot.parameter_table().items()
-        )
-        return base + tuple(spec for mechanism in self.mechanisms for spec in mechanism.parameters)
+        """Parameters of the robot, those of the mechanisms, then those of the cube."""
+        base = specs_of(self.robot.parameter_table())
+        extended = base + tuple(spec for mechanism in self.mechanisms for spec in mechanism.parameters)
+        return extended + (specs_of(push_table(self.robot).parameters) if self.pushes else ())
 
     @cached_property
     def content_sha256(self) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import Material
 from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneMotion, body_lanes, flat_lanes, lanes_like
 from rfdropo_bayes.simulators.commands import carried_out
-from rfdropo_bayes.simulators.engine import CubeInputs, Engine
+from rfdropo_bayes.simulators.engine import CubeInputs
 from rfdropo_bayes.simulators.mechanisms import (
     ActuationMechanism,
     Mechanism,
@@ -36,27 +36,6 @@ from rfdropo_bayes.simulators.robot_simulator import EQUILIBRIUM_TOLERANCE, Valu
 
 WHOLE = 1e-6
 """How far a control period may be from a whole number of time steps, in time steps."""
-
-
-class SteppedSimulator(Protocol):
-    """A simulator that sessions can be made of: a `RobotSimulator` of a layered body.
-
-    Attributes:
-        unsolved: how a rollout ends whose constraints were not all solved.
-    """
-
-    unsolved: Result
-
-    @property
-    def time_step(self) -> float:
-        """Of the simulation [s]."""
-
-    @property
-    def engine(self) -> Engine:
-        """What moves the body."""
-
-    def body_inputs(self, values: Values) -> tuple[Material, CubeInputs | None]:
-        """Material of the body, and the cube before it, for these values."""
 
 
 class _Drives(NamedTuple):

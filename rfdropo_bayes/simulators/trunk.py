@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array
 
 from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, cable_layout, prepare, profile_body
 from rfdropo_bayes.fem.balance import Balance, layered_balance
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.commands import Commands, commands_on_grid
-from rfdropo_bayes.simulators.engine import Backend, Engine
-from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms
-from rfdropo_bayes.simulators.protocol import Observation, Result
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values, every_node, sampled
+from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.engine import Engine
+from rfdropo_bayes.simulators.mechanisms import Mechanism
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
 from rfdropo_bayes.simulators.session import Session
 
 
@@ -70,15 +69,8 @@ def refined_body(arrays: Mapping[str, np.ndarray | int | bool], refine: int, nod
 class TrunkSimulator(RobotSimulator):
     """A layered trunk with mechanisms, behind the `Simulator` protocol.
 
-    Order of a rollout: command -> actuation mechanisms -> cable displacements within their limits -> body with its
-    mechanisms -> markers -> sensing mechanisms -> observation.
-
     Attributes:
-        robot: what is simulated.
-        engine: what computes the motion of the body.
-        assembly: the discretised robot the engine was made for.
-        discretisation: how fine it is.
-        mechanisms: extensions, applied in the order given within each stage.
+        discretisation: how finely the body and time are cut; for the others see `RobotSimulator`.
     """
 
     robot: Robot
@@ -86,19 +78,6 @@ class TrunkSimulator(RobotSimulator):
     assembly: Assembly
     discretisation: Discretisation
     mechanisms: Sequence[Mechanism] = field(default_factory=tuple)
-    unsolved: ClassVar[Result] = Result.CABLE_LIMIT
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "mechanisms", check_mechanisms(self.mechanisms))
-
-    def with_backend(self, backend: Backend) -> TrunkSimulator:
-        """The same, computed by another backend."""
-        return replace(self, engine=replace(self.engine, backend=backend))
-
-    @property
-    def lanes(self) -> int:
-        """Those of the engine."""
-        return self.engine.lanes
 
     @property
     def time_step(self) -> float:  # type: ignore[override]
@@ -116,92 +95,30 @@ class TrunkSimulator(RobotSimulator):
             "layers": len(self.assembly.system.body.station) - 1,
             "mechanisms": [mechanism.name for mechanism in self.mechanisms],
             "content_sha256": self.content_sha256,
+            **({"object": "cube"} if self.pushes else {}),
         }
 
-    def commands(
-        self,
-        time: Float[np.ndarray, " command"],
-        value: Float[np.ndarray, "command channel"],
-        initial: Float[np.ndarray, " channel"],
-        observation_time: Float[np.ndarray, " time"],
-    ) -> Commands:
-        """Recorded commands on this simulator's clock, with the robot's ramp and lag."""
-        return commands_on_grid(
-            time,
-            value,
-            initial,
-            observation_time,
-            time_step=self.discretisation.time_step,
-            ramp=self.robot.command.ramp_s,
-            dead_time=self.robot.command.dead_time_s,
-        )
+    @property
+    def nodes(self) -> int:
+        """See `RobotSimulator`."""
+        return self.assembly.system.body.nodes
 
     def session(self, lanes: int, period: float) -> Session:
         """So many trunks that are commanded one control period [s] at a time; see `Session`."""
         return Session(self, lanes, period)
 
-    def body_inputs(self, values: Values) -> tuple[Material, None]:
-        """See `SteppedSimulator`."""
-        return self.material(values), None
-
-    def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
-        """Simulate from the initial state to the last observation.
-
-        Args:
-            parameters: values by name; those left out are nominal.
-            commands: from `commands`.
-            steps: simulate only so many time steps, and those that mechanisms of sensing look ahead; rows beyond hold
-                no meaning. None simulates all and is differentiable in reverse mode.
-
-        Raises:
-            InputError: a name that is not a parameter of this simulator.
-        """
-        values = self.complete(parameters)
-        steps = self.steps_seen(values, commands, self.time_step, steps)
-        motion = self.engine.motion(*self.inputs(values, commands), steps)
-        return self.observation(values, commands, motion, self.unsolved)
-
     def inputs(self, values: Values, commands: Commands) -> tuple[Material, Array, Array]:
-        """What the engine moves the body by: material, and cable displacements before the first and at each step."""
+        """See `RobotSimulator`."""
         return self.material(values), *self.wound(values, commands, self.time_step)
 
-    def balance(self, parameters: Values, commands: Commands) -> Balance:
-        """See `RobotSimulator.balance`."""
-        values = self.complete(parameters)
-        material, start, displacement = self.inputs(values, commands)
-        nodes = every_node(self.assembly.system.body.nodes)
-        motion = self.engine.recording(nodes).motion(material, start, displacement)
-        return self.balance_of(material, motion.position, motion.tension, commands)
-
-    def balance_of(
-        self,
-        material: Material,
-        position: Float[Array, "row node 3"],
-        tension: Float[Array, "row cable"],
-        commands: Commands,
-    ) -> Balance:
-        """Forces and energies of a motion of all nodes [m], recorded after every step."""
+    def balance_of(self, material: Material, motion: Motion) -> Balance:
+        """See `RobotSimulator`; the energies are those of the body."""
         system = self.assembly.system
-        found = layered_balance(system, prepare(system, material), position, tension, self.discretisation.time_step)
-        return sampled(found, commands)
+        return layered_balance(system, prepare(system, material), motion.position, motion.tension, self.time_step)
 
     def material(self, values: Values) -> Material:
-        """Material of the body for these values, body mechanisms included."""
+        """See `RobotSimulator`."""
         body = self.assembly.system.body
-        stations = len(body.station)
-        masses = jnp.asarray(self.robot.point_masses(values))
-        scale = self.robot.stiffness_scale(values["poisson_ratio"])
-        material = Material(
-            young_modulus=values["young_modulus"],
-            poisson_ratio=values["poisson_ratio"],
-            density=jnp.asarray(self.robot.density(values["trunk_mass"])),
-            rayleigh_mass=values["rayleigh_mass"],
-            rayleigh_stiffness=values["rayleigh_stiffness"],
-            gravity=jnp.asarray(self.robot.gravity),
-            stiffness_scale=jnp.repeat(jnp.asarray(scale), self.discretisation.refine),
-            point_mass=jnp.zeros(stations).at[self.assembly.station_of].set(masses),
-        )
-        for mechanism in self.mechanisms:
-            if isinstance(mechanism, BodyMechanism):
-                material = mechanism.embody(values, material, body)
-        return material
+        masses = jnp.zeros(len(body.station)).at[self.assembly.station_of].set(self.robot.point_masses(values))
+        scale = jnp.repeat(jnp.asarray(self.robot.stiffness_scale(values["poisson_ratio"])), self.discretisation.refine)
+        return self.embodied(values, body, scale, masses)

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.robots import load_robot
-from rfdropo_bayes.simulators.pushing import PushSimulator
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator
 from rfdropo_bayes.workflow.commands import random_walk
@@ -173,7 +172,7 @@ def _blank(
     time = SAMPLE_TIME * np.arange(actions + 1)
     command_time, command = commands
     pose = None
-    if isinstance(simulator, PushSimulator):
+    if simulator.pushes:
         start = [next(s.nominal for s in simulator.parameters if s.name == f"cube_{axis}") for axis in "xyz"]
         pose = np.tile([*start, 0.0, 0.0, 0.0, 1.0], (len(time), 1))
     return Trajectory.build(

@@ -46,7 +46,6 @@ from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_body import assemble_mesh
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
-from rfdropo_bayes.simulators.pushing import pushing
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 from rfdropo_bayes.workflow.engines import backend
@@ -120,7 +119,7 @@ def build_simulator(
         assembly = assemble(robot, discretisation)
         engine = Engine(assembly, time_step, backend(table, True), robot.initial_state == "equilibrium")
         trunk = TrunkSimulator(robot, engine, assembly, discretisation, mechanisms)
-    return pushing(trunk) if table.push else trunk
+    return trunk.pushing() if table.push else trunk
 
 
 def measurement_specs(table: ModelTable) -> tuple[ParameterSpec, ...]:

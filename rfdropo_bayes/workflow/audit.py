@@ -349,7 +349,7 @@ def _lanes(
 
 def _brisk(simulator: AnySimulator, marker_index: np.ndarray, fields: Sequence[str]) -> Lanes:
     """Lanes with one-sided differences where there are any: they are exact enough for climbs and scores."""
-    if isinstance(simulator, TrunkSimulator) and simulator.engine.backend.name == "numba":
+    if isinstance(simulator, TrunkSimulator) and not simulator.pushes and simulator.engine.backend.name == "numba":
         quick = simulator.with_backend(simulator.engine.backend._replace(one_sided=True))
         return Lanes(quick, marker_index, slope_rollouts=2, fields=fields)
     return Lanes(simulator, marker_index, fields=fields)
@@ -357,7 +357,7 @@ def _brisk(simulator: AnySimulator, marker_index: np.ndarray, fields: Sequence[s
 
 def _costly(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
     """Whether a mechanism acts on the body in a way that slows the compiled engine down."""
-    if not isinstance(mechanism, BodyMechanism) or simulator.engine.backend.name != "numba":
+    if simulator.pushes or not isinstance(mechanism, BodyMechanism) or simulator.engine.backend.name != "numba":
         return False
     values = simulator.complete({})
     plain = replace(simulator, mechanisms=()).material(values)

@@ -193,6 +193,7 @@ def test_angles_tell_a_slow_drive_from_a_damped_body():
 
 @dataclass(frozen=True)
 class Drives(RobotSimulator):
+    pushes = False
     robot: Robot
     mechanisms: tuple[Mechanism, ...] = field(default_factory=tuple)
 

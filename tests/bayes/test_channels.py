@@ -36,6 +36,7 @@ class Puller:
     """A tip, a cable, an encoder and a body, all in proportion to the command."""
 
     parameters = (ParameterSpec("reach", "m", 0.01, 1.0, 0.1, {"distribution": "LogNormal", "median": 0.1, "sigma": 0.5}, ""),)  # fmt: skip # noqa: E501
+    pushes = True
     marker_names, cable_names, channel_names, lanes = ("tip",), ("a",), ("a",), 16
     description: dict[str, object] = {"engine": "closed form", "robot": "puller"}  # noqa: RUF012
 

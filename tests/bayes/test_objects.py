@@ -49,6 +49,7 @@ class Finger:
 
     parameters = (spec("reach", 0.0, 0.2, 0.1), spec("slip", 0.0, 2.0, 1.0), spec("offset_x", -0.02, 0.02, 0.0),
                   spec("start_x", -1.0, 1.0, 0.0))  # fmt: skip
+    pushes = True
     marker_names, cable_names, channel_names, lanes = ("tip",), ("a",), ("a",), 16
     description: dict[str, object] = {"engine": "closed form", "robot": "finger"}  # noqa: RUF012
 

@@ -14,7 +14,6 @@ from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
-from rfdropo_bayes.simulators.pushing import pushing
 from rfdropo_bayes.simulators.robot_simulator import every_node
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
@@ -67,7 +66,7 @@ def test_the_base_of_a_mesh_holds_what_moves_it(trunk):
 @pytest.mark.slow
 def test_what_the_cube_is_pushed_by_pushes_the_trunk_back(trunk):
     """Without friction only the trunk moves a cube along the plate."""
-    beside = pushing(replace(trunk, engine=replace(trunk.engine, backend=Backend())))
+    beside = trunk.with_backend(Backend()).pushing()
     commands = every_step(beside, 50)
     height = PLATE + 0.0175 + 0.005
     values = SOFT | {"friction": jnp.asarray(0.0), "cube_x": jnp.asarray(-0.02), "cube_y": jnp.asarray(height)}

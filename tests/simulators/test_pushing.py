@@ -16,10 +16,11 @@ from rfdropo_bayes.fem.pushing import find_contacts, trunk_rows
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators import Result, Simulator
+from rfdropo_bayes.simulators.cube import push_table
 from rfdropo_bayes.simulators.engine import Backend, Engine, Motion
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
-from rfdropo_bayes.simulators.pushing import PushSimulator, push_table, pushing
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 from rfdropo_bayes.workflow.engines import backend
 from rfdropo_bayes.workflow.experiment import SimulatorTable
@@ -45,13 +46,13 @@ def trunk(bar_mesh) -> MeshTrunkSimulator:
     return MeshTrunkSimulator(ROBOT, Engine(assembly, TIME_STEP), assembly, options, TIME_STEP)
 
 
-def on(trunk, chosen: Backend) -> PushSimulator:
+def on(trunk, chosen: Backend) -> RobotSimulator:
     """The trunk with its cube, on a backend."""
-    return pushing(replace(trunk, engine=replace(trunk.engine, backend=chosen)))
+    return trunk.with_backend(chosen).pushing()
 
 
 @pytest.fixture(scope="module")
-def beside(trunk) -> PushSimulator:
+def beside(trunk) -> RobotSimulator:
     return on(trunk, Backend("jax"))
 
 
@@ -153,9 +154,9 @@ def test_touching_surfaces_keep_their_distance(rollout):
 def test_contacts_act_equally_on_both_sides(beside, trunk):
     """Every row pushes trunk and cube with opposite forces: momentum is kept; normal rows keep angular momentum, and
     friction acts on the two surfaces, which are apart by the gap and the contact distance."""
-    scene, rest = beside.trunk.engine.scene, jnp.asarray(trunk.assembly.system.body.rest)
+    scene, rest = beside.engine.scene, jnp.asarray(trunk.assembly.system.body.rest)
     values = beside.complete({"cube_y": jnp.asarray(-0.035), "cube_yaw": jnp.asarray(0.3)})
-    cube, start = beside.cube(values)
+    cube, start = beside.body_inputs(values)[1]
     touch = find_contacts(scene, cube, start, rest)
     spheres = len(touch.trunk_node) // 2
     between = slice(8, 8 + spheres)
@@ -232,6 +233,8 @@ class Standing(NamedTuple):
     markers: int
     ending: dict
     lanes: int = 1
+    layered: bool = False
+    scene: str = "a cube on a plate"
 
     def describe(self) -> dict:
         return {"engine": "none"}
@@ -256,7 +259,7 @@ class Standing(NamedTuple):
     ],
 )
 def test_a_rollout_says_how_it_ended(trunk, commands, ending, result):
-    simulator = PushSimulator(replace(trunk, engine=Standing(len(trunk.marker_names), ending)))
+    simulator = replace(trunk, engine=Standing(len(trunk.marker_names), ending))
     observation = simulator.rollout({"cube_yaw": jnp.asarray(0.4)}, commands)
     assert int(observation.status) == result
     np.testing.assert_allclose(observation.object_pose[-1, 3:], [0.0, np.sin(0.2), 0.0, np.cos(0.2)], atol=1e-12)

@@ -13,7 +13,6 @@ from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.protocol import Result
-from rfdropo_bayes.simulators.pushing import pushing
 from rfdropo_bayes.simulators.session import Session
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
@@ -116,7 +115,7 @@ PUSHED = {"cube_x": 0.012, "cube_z": 0.15, "cube_mass": 0.05, "friction": 0.3}
 )
 def test_a_cube_is_pushed_as_in_a_rollout(engine, precision, tolerance):
     """Pose, velocity and warm starts of every lane's contacts are its own."""
-    model, compiled = pushing(simulator(engine, precision)), pushing(simulator("numba", precision))
+    model, compiled = simulator(engine, precision).pushing(), simulator("numba", precision).pushing()
     parameters, commands = drawn({name: PUSHED[name] for name in ("cube_mass", "friction")})
     down = np.zeros(8)
     down[[2, 6]] = 0.02  # the cables below
@@ -138,7 +137,7 @@ def test_a_cube_is_pushed_as_in_a_rollout(engine, precision, tolerance):
 @pytest.mark.slow
 def test_a_trunk_that_lies_still_stays_still_for_a_minute():
     """Pulled down onto plate or cube, and aside: held there by friction, it moves by less than 0.01 mm in 60 s."""
-    model = pushing(simulator("numba"))
+    model = simulator("numba").pushing()
     lanes = np.arange(8)
     pull = np.array([20.0, 30.0, 15.0, 20.0, 30.0, 15.0, 20.0, 30.0]) * 1e-3
     aside = np.array([0.0, 5.0, 0.0, 8.0, 0.0, 4.0, 0.0, 5.0]) * 1e-3

@@ -60,7 +60,13 @@ OBJECT_CORRELATION_TIME = ParameterSpec(
 
 @runtime_checkable
 class Placing(Protocol):
-    """A simulator whose object can be put where it was measured."""
+    """A simulator whose object can be put where it was measured.
+
+    Attributes:
+        pushes: whether it has one.
+    """
+
+    pushes: bool
 
     def with_object_at(self, values: Mapping[str, Any], pose: Any) -> dict[str, Any]:
         """Values with the start of the object taken from a measured pose: centre [m], quaternion (x, y, z, w)."""
@@ -89,7 +95,7 @@ class ObjectPose(Series):
         Raises:
             InputError: a simulator without a body to push, or a recording whose first pose is missing.
         """
-        if not isinstance(simulator, Placing):
+        if not isinstance(simulator, Placing) or not simulator.pushes:
             raise InputError(
                 "the simulator has no body whose pose could be measured",
                 where="[model] object_pose",

@@ -20,7 +20,18 @@ import scipy.sparse as sparse
 from jaxtyping import Int
 from scipy.sparse.linalg import splu
 
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, mesh_kernel, mesh_pasted, square_root, store
+from rfdropo_bayes.fem.native.simd import (
+    fill,
+    fma,
+    fnma,
+    kernel,
+    load,
+    load3,
+    mesh_kernel,
+    mesh_pasted,
+    square_root,
+    store,
+)
 
 
 class BlockPattern(NamedTuple):
@@ -125,20 +136,15 @@ def _invert_pivot(pivot, j, token):
     i10 = -(l10 * i00 * i11)
     i21 = -(l21 * i11 * i22)
     i20 = -(fma(l20, i00, l21 * i10) * i22)
-    store(pivot, j, i00)
-    store(pivot, j + 1, i10)
-    store(pivot, j + 2, i11)
-    store(pivot, j + 3, i20)
-    store(pivot, j + 4, i21)
-    store(pivot, j + 5, i22)
+    store(pivot, j, i00, i10, i11, i20, i21, i22)
     return i00, i10, i11, i20, i21, i22
 
 
 @mesh_pasted
 def _update_pivot(pivot, j, lower, pattern, column, token):
     """Subtract from a pivot the products of the blocks to its left."""
-    p00, p10, p11 = load(pivot, j, token), load(pivot, j + 1, token), load(pivot, j + 2, token)
-    p20, p21, p22 = load(pivot, j + 3, token), load(pivot, j + 4, token), load(pivot, j + 5, token)
+    p00, p10, p11 = load3(pivot, j, token)
+    p20, p21, p22 = load3(pivot, j + 3, token)
     for k in range(pattern.own_first[column], pattern.own_first[column + 1]):
         block = 9 * pattern.own[k]
         for m in range(3):
@@ -153,12 +159,7 @@ def _update_pivot(pivot, j, lower, pattern, column, token):
             p20 = fnma(c, a, p20)
             p21 = fnma(c, b, p21)
             p22 = fnma(c, c, p22)
-    store(pivot, j, p00)
-    store(pivot, j + 1, p10)
-    store(pivot, j + 2, p11)
-    store(pivot, j + 3, p20)
-    store(pivot, j + 4, p21)
-    store(pivot, j + 5, p22)
+    store(pivot, j, p00, p10, p11, p20, p21, p22)
 
 
 @mesh_kernel
@@ -170,9 +171,9 @@ def factor(pattern, pivot, lower, token):
         i00, i10, i11, i20, i21, i22 = _invert_pivot(pivot, 6 * column, token)
         for block in range(pattern.first[column], pattern.first[column + 1]):
             t = 9 * block
-            a00, a01, a02 = load(lower, t, token), load(lower, t + 1, token), load(lower, t + 2, token)
-            a10, a11, a12 = load(lower, t + 3, token), load(lower, t + 4, token), load(lower, t + 5, token)
-            a20, a21, a22 = load(lower, t + 6, token), load(lower, t + 7, token), load(lower, t + 8, token)
+            a00, a01, a02 = load3(lower, t, token)
+            a10, a11, a12 = load3(lower, t + 3, token)
+            a20, a21, a22 = load3(lower, t + 6, token)
             for k in range(pattern.product[block], pattern.product[block + 1]):
                 left, right = 9 * pattern.source[k, 0], 9 * pattern.source[k, 1]
                 for m in range(3):
@@ -193,15 +194,9 @@ def factor(pattern, pivot, lower, token):
                     a20 = fnma(w, x, a20)
                     a21 = fnma(w, y, a21)
                     a22 = fnma(w, z, a22)
-            store(lower, t, a00 * i00)
-            store(lower, t + 1, fma(a00, i10, a01 * i11))
-            store(lower, t + 2, fma(a00, i20, fma(a01, i21, a02 * i22)))
-            store(lower, t + 3, a10 * i00)
-            store(lower, t + 4, fma(a10, i10, a11 * i11))
-            store(lower, t + 5, fma(a10, i20, fma(a11, i21, a12 * i22)))
-            store(lower, t + 6, a20 * i00)
-            store(lower, t + 7, fma(a20, i10, a21 * i11))
-            store(lower, t + 8, fma(a20, i20, fma(a21, i21, a22 * i22)))
+            store(lower, t, a00 * i00, fma(a00, i10, a01 * i11), fma(a00, i20, fma(a01, i21, a02 * i22)), a10 * i00)
+            store(lower, t + 4, fma(a10, i10, a11 * i11), fma(a10, i20, fma(a11, i21, a12 * i22)), a20 * i00)
+            store(lower, t + 7, fma(a20, i10, a21 * i11), fma(a20, i20, fma(a21, i21, a22 * i22)))
 
 
 @mesh_kernel
@@ -210,7 +205,7 @@ def forward_substitute(pattern, pivot, lower, token):
     for column in range(len(pattern.first) - 1):
         block = pattern.first[column + 1] - pattern.border
         t, j = 9 * block, 6 * column
-        x, y, z = load(lower, t, token), load(lower, t + 1, token), load(lower, t + 2, token)
+        x, y, z = load3(lower, t, token)
         for k in range(pattern.product[block], pattern.product[block + 1]):
             left, right = 9 * pattern.source[k, 0], 9 * pattern.source[k, 1]
             for m in range(3):
@@ -218,9 +213,8 @@ def forward_substitute(pattern, pivot, lower, token):
                 x = fnma(value, load(lower, right + m, token), x)
                 y = fnma(value, load(lower, right + 3 + m, token), y)
                 z = fnma(value, load(lower, right + 6 + m, token), z)
-        store(lower, t, x * load(pivot, j, token))
-        store(lower, t + 1, fma(x, load(pivot, j + 1, token), y * load(pivot, j + 2, token)))
-        i20, i21, i22 = load(pivot, j + 3, token), load(pivot, j + 4, token), load(pivot, j + 5, token)
+        store(lower, t, x * load(pivot, j, token), fma(x, load(pivot, j + 1, token), y * load(pivot, j + 2, token)))
+        i20, i21, i22 = load3(pivot, j + 3, token)
         store(lower, t + 2, fma(x, i20, fma(y, i21, z * i22)))
 
 
@@ -267,10 +261,9 @@ def back_substitute(pattern, pivot, lower, weight, solution, token):
                 y = fnma(load(lower, t + 3 * m + 1, token), value, y)
                 z = fnma(load(lower, t + 3 * m + 2, token), value, z)
         j = 6 * column
-        i20, i21, i22 = load(pivot, j + 3, token), load(pivot, j + 4, token), load(pivot, j + 5, token)
+        i20, i21, i22 = load3(pivot, j + 3, token)
         store(solution, 3 * column, fma(load(pivot, j, token), x, fma(load(pivot, j + 1, token), y, i20 * z)))
-        store(solution, 3 * column + 1, fma(load(pivot, j + 2, token), y, i21 * z))
-        store(solution, 3 * column + 2, i22 * z)
+        store(solution, 3 * column + 1, fma(load(pivot, j + 2, token), y, i21 * z), i22 * z)
 
 
 @kernel
@@ -283,20 +276,18 @@ def extend_border(pattern, pivot, lower, rows, panels, reached, count, token):
         if reached[column] == 0:
             continue
         j = 6 * column
-        i00, i10, i11 = load(pivot, j, token), load(pivot, j + 1, token), load(pivot, j + 2, token)
-        i20, i21, i22 = load(pivot, j + 3, token), load(pivot, j + 4, token), load(pivot, j + 5, token)
+        i00, i10, i11 = load3(pivot, j, token)
+        i20, i21, i22 = load3(pivot, j + 3, token)
         for r in range(3 * panels):
             t = 9 * panels * column + 3 * r
-            x, y, z = load(rows, t, token), load(rows, t + 1, token), load(rows, t + 2, token)
-            store(rows, t, x * i00)
-            store(rows, t + 1, fma(x, i10, y * i11))
-            store(rows, t + 2, fma(x, i20, fma(y, i21, z * i22)))
+            x, y, z = load3(rows, t, token)
+            store(rows, t, x * i00, fma(x, i10, y * i11), fma(x, i20, fma(y, i21, z * i22)))
         for block in range(pattern.first[column], pattern.first[column + 1] - pattern.border):
             below = pattern.row[block]
             reached[below] = 1
             for r in range(3 * panels):
                 t, s = 9 * panels * column + 3 * r, 9 * panels * below + 3 * r
-                x, y, z = load(rows, t, token), load(rows, t + 1, token), load(rows, t + 2, token)
+                x, y, z = load3(rows, t, token)
                 for a in range(3):
                     k = 9 * block + 3 * a
                     value = fnma(x, load(lower, k, token), load(rows, s + a, token))
@@ -331,12 +322,4 @@ def condense_rows(pattern, target, rows, panels, others, other_panels, own, reac
                 w = load(others, s + 6 + m, token)
                 c6, c7, c8 = fma(x, w, c6), fma(y, w, c7), fma(z, w, c8)
         t = 9 * tile
-        store(target, t, c0)
-        store(target, t + 1, c1)
-        store(target, t + 2, c2)
-        store(target, t + 3, c3)
-        store(target, t + 4, c4)
-        store(target, t + 5, c5)
-        store(target, t + 6, c6)
-        store(target, t + 7, c7)
-        store(target, t + 8, c8)
+        store(target, t, c0, c1, c2, c3, c4, c5, c6, c7, c8)

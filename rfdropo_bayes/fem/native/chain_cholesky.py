@@ -9,17 +9,17 @@ all of the work. The factorisation turns a border row b' into (L^-1 b)', and pro
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, inlined, kernel, load, square_root, store
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, inlined, kernel, load, load3, square_root, store
 
 
 @inlined
 def _tile_minus_product(target, t, left, a, right, b, length, token):
     """The tile at ``t`` less the product of ``length`` columns of two panels; nine values, column by column."""
-    c0, c1, c2 = load(target, t, token), load(target, t + 1, token), load(target, t + 2, token)
-    c3, c4, c5 = load(target, t + 3, token), load(target, t + 4, token), load(target, t + 5, token)
-    c6, c7, c8 = load(target, t + 6, token), load(target, t + 7, token), load(target, t + 8, token)
+    c0, c1, c2 = load3(target, t, token)
+    c3, c4, c5 = load3(target, t + 3, token)
+    c6, c7, c8 = load3(target, t + 6, token)
     for k in range(length):
-        x, y, z = load(left, a + 3 * k, token), load(left, a + 3 * k + 1, token), load(left, a + 3 * k + 2, token)
+        x, y, z = load3(left, a + 3 * k, token)
         w = load(right, b + 3 * k, token)
         c0, c1, c2 = fnma(x, w, c0), fnma(y, w, c1), fnma(z, w, c2)
         w = load(right, b + 3 * k + 1, token)
@@ -33,15 +33,7 @@ def _tile_minus_product(target, t, left, a, right, b, length, token):
 def subtract_product(target, t, left, a, right, b, length, token):
     """Subtract the product of two panels from a tile."""
     c0, c1, c2, c3, c4, c5, c6, c7, c8 = _tile_minus_product(target, t, left, a, right, b, length, token)
-    store(target, t, c0)
-    store(target, t + 1, c1)
-    store(target, t + 2, c2)
-    store(target, t + 3, c3)
-    store(target, t + 4, c4)
-    store(target, t + 5, c5)
-    store(target, t + 6, c6)
-    store(target, t + 7, c7)
-    store(target, t + 8, c8)
+    store(target, t, c0, c1, c2, c3, c4, c5, c6, c7, c8)
 
 
 @kernel
@@ -52,13 +44,10 @@ def _pivot_tile(block, row, length, token):
     one = fill(1.0, block, token)
     inverse = one / square_root(c0)
     c1, c2 = c1 * inverse, c2 * inverse
-    store(block, t, inverse)
-    store(block, t + 1, c1)
-    store(block, t + 2, c2)
+    store(block, t, inverse, c1, c2)
     inverse = one / square_root(fnma(c1, c1, c4))
     c5 = fnma(c2, c1, c5) * inverse
-    store(block, t + 4, inverse)
-    store(block, t + 5, c5)
+    store(block, t + 4, inverse, c5)
     store(block, t + 8, one / square_root(fnma(c5, c5, fnma(c2, c2, c8))))
 
 
@@ -72,15 +61,8 @@ def _factor_tile(target, row, block, pivot_row, length, token):
     lower, inverse = load(block, d + 1, token), load(block, d + 4, token)
     c3, c4, c5 = fnma(c0, lower, c3) * inverse, fnma(c1, lower, c4) * inverse, fnma(c2, lower, c5) * inverse
     lower, last, inverse = load(block, d + 2, token), load(block, d + 5, token), load(block, d + 8, token)
-    store(target, t, c0)
-    store(target, t + 1, c1)
-    store(target, t + 2, c2)
-    store(target, t + 3, c3)
-    store(target, t + 4, c4)
-    store(target, t + 5, c5)
-    store(target, t + 6, fnma(c3, last, fnma(c0, lower, c6)) * inverse)
-    store(target, t + 7, fnma(c4, last, fnma(c1, lower, c7)) * inverse)
-    store(target, t + 8, fnma(c5, last, fnma(c2, lower, c8)) * inverse)
+    store(target, t, c0, c1, c2, c3, c4, c5, fnma(c3, last, fnma(c0, lower, c6)) * inverse)
+    store(target, t + 7, fnma(c4, last, fnma(c1, lower, c7)) * inverse, fnma(c5, last, fnma(c2, lower, c8)) * inverse)
 
 
 @kernel
@@ -165,7 +147,7 @@ def combine_border(border, weight, values, first, stations, size, panels, token)
 @kernel
 def _subtract_rows(block, t, values, source, target, tiles, size, token):
     """Subtract three columns of a block, from tile row ``t`` on, times three values from the values below."""
-    x, y, z = load(values, source, token), load(values, source + 1, token), load(values, source + 2, token)
+    x, y, z = load3(values, source, token)
     for i in range(tiles):
         for r in range(3):
             k, row = t + 3 * i * size + r, target + 3 * i + r
@@ -186,9 +168,7 @@ def substitute_forward(pivot, coupling, values, first, stations, tiles, token):
             y = fnma(load(pivot, t + 1, token), x, load(values, row + 1, token)) * load(pivot, t + 4, token)
             z = fnma(load(pivot, t + 2, token), x, load(values, row + 2, token))
             z = fnma(load(pivot, t + 5, token), y, z) * load(pivot, t + 8, token)
-            store(values, row, x)
-            store(values, row + 1, y)
-            store(values, row + 2, z)
+            store(values, row, x, y, z)
             _subtract_rows(pivot, t + 3 * size, values, row, row + 3, tiles - k - 1, size, token)
             if station > first:
                 _subtract_rows(coupling, p + 9 * k, values, row, s - size, tiles, size, token)
@@ -198,7 +178,7 @@ def substitute_forward(pivot, coupling, values, first, stations, tiles, token):
 def _subtract_columns(block, t, values, source, target, tiles, size, token):
     """Subtract the transpose of three columns of a block, from tile row ``t`` on, times the values below from three
     values."""
-    x, y, z = load(values, target, token), load(values, target + 1, token), load(values, target + 2, token)
+    x, y, z = load3(values, target, token)
     for i in range(tiles):
         for r in range(3):
             k, value = t + 3 * i * size + r, load(values, source + 3 * i + r, token)
@@ -218,13 +198,9 @@ def substitute_back(pivot, coupling, values, first, stations, tiles, token):
             row, t = s + 3 * k, p + 3 * (k * size + 3 * k)
             if station > first:
                 x, y, z = _subtract_columns(coupling, p + 9 * k, values, s - size, row, tiles, size, token)
-                store(values, row, x)
-                store(values, row + 1, y)
-                store(values, row + 2, z)
+                store(values, row, x, y, z)
             x, y, z = _subtract_columns(pivot, t + 3 * size, values, row + 3, row, tiles - k - 1, size, token)
             z = z * load(pivot, t + 8, token)
             y = fnma(load(pivot, t + 5, token), z, y) * load(pivot, t + 4, token)
             x = fnma(load(pivot, t + 2, token), z, fnma(load(pivot, t + 1, token), y, x)) * load(pivot, t, token)
-            store(values, row, x)
-            store(values, row + 1, y)
-            store(values, row + 2, z)
+            store(values, row, x, y, z)

@@ -32,6 +32,7 @@ from rfdropo_bayes.fem.native.simd import (
     fnma,
     kernel,
     load,
+    load3,
     square_root,
     store,
     where_greater,
@@ -173,7 +174,7 @@ def _contact(p, c, u, v, w, token):
 def _linearise_contact(p, c, lines, token):
     """Columns L of a contact at its velocity, and what its impulses are to change by."""
     zero, one, i = fill(0.0, p.free, token), fill(1.0, p.free, token), lines + 3 * c
-    u, v, w = load(p.velocity, i, token), load(p.velocity, i + 1, token), load(p.velocity, i + 2, token)
+    u, v, w = load3(p.velocity, i, token)
     y, a, b, size, push, friction = _contact_state(p, c, u, v, w, token)
     sticks = where_greater(friction * y, size, one, zero)
     inverse = one / where_greater(size, zero, size, one)
@@ -194,12 +195,7 @@ def _linearise_contact(p, c, lines, token):
         where_greater(sticks, zero, zero, across * f),
     )
     root = lines + 6 * c
-    store(p.root, root, l00)
-    store(p.root, root + 1, l10)
-    store(p.root, root + 2, l20)
-    store(p.root, root + 3, l11)
-    store(p.root, root + 4, l21)
-    store(p.root, root + 5, l22)
+    store(p.root, root, l00, l10, l20, l11, l21, l22)
     slide = friction * push
     x = where_greater(sticks, zero, y, push) - load(p.impulse, i, token)
     y = where_greater(sticks, zero, a, slide * f) - load(p.impulse, i + 1, token)
@@ -211,12 +207,9 @@ def _linearise_contact(p, c, lines, token):
     r1 = fma(l11, y, l21 * z) / where_greater(square, zero, square, one)
     r2 = z / where_greater(l22, zero, l22, one)
     r2 = where_greater(l22, zero, r2, zero)
-    store(p.aim, i, r0)
-    store(p.aim, i + 1, r1)
-    store(p.aim, i + 2, r2)
+    store(p.aim, i, r0, r1, r2)
     free = where_greater(sticks, zero, zero, one)
-    store(p.left, i, free * fnma(l00, r0, x))
-    store(p.left, i + 1, free * fnma(l11, r1, fnma(l10, r0, y)))
+    store(p.left, i, free * fnma(l00, r0, x), free * fnma(l11, r1, fnma(l10, r0, y)))
     store(p.left, i + 2, free * fnma(l21, r1, fnma(l20, r0, z)))
 
 
@@ -376,7 +369,7 @@ def _slope(p, cables, lines, contacts, share, token):
         total = fma(load(p.moving, i, token), left, total)
     for c in range(contacts):
         i = lines + 3 * c
-        x, y, z = load(p.moving, i, token), load(p.moving, i + 1, token), load(p.moving, i + 2, token)
+        x, y, z = load3(p.moving, i, token)
         u = fma(share, x, load(p.velocity, i, token))
         v = fma(share, y, load(p.velocity, i + 1, token))
         w = fma(share, z, load(p.velocity, i + 2, token))

@@ -42,15 +42,9 @@ def turn_cube(touch, token):
     """Matrix of the cube's orientation."""
     x, y, z = _column(touch.cube, 3, 1, token)
     w, one = load(touch.cube, 6, token), fill(1.0, touch.cube, token)
-    store(touch.turn, 0, one - 2.0 * fma(y, y, z * z))
-    store(touch.turn, 1, 2.0 * fma(x, y, -z * w))
-    store(touch.turn, 2, 2.0 * fma(x, z, y * w))
-    store(touch.turn, 3, 2.0 * fma(x, y, z * w))
-    store(touch.turn, 4, one - 2.0 * fma(x, x, z * z))
-    store(touch.turn, 5, 2.0 * fma(y, z, -x * w))
-    store(touch.turn, 6, 2.0 * fma(x, z, -y * w))
-    store(touch.turn, 7, 2.0 * fma(y, z, x * w))
-    store(touch.turn, 8, one - 2.0 * fma(x, x, y * y))
+    store(touch.turn, 0, one - 2.0 * fma(y, y, z * z), 2.0 * fma(x, y, -z * w), 2.0 * fma(x, z, y * w))
+    store(touch.turn, 3, 2.0 * fma(x, y, z * w), one - 2.0 * fma(x, x, z * z), 2.0 * fma(y, z, -x * w))
+    store(touch.turn, 6, 2.0 * fma(x, z, -y * w), 2.0 * fma(y, z, x * w), one - 2.0 * fma(x, x, y * y))
 
 
 @kernel
@@ -82,15 +76,7 @@ def _place_frame(touch, slot, x, y, z, token):
     scale = one / square_root(_dot(tx, ty, tz, tx, ty, tz))
     tx, ty, tz = tx * scale, ty * scale, tz * scale
     f = 9 * slot
-    store(touch.frame, f, x)
-    store(touch.frame, f + 1, y)
-    store(touch.frame, f + 2, z)
-    store(touch.frame, f + 3, tx)
-    store(touch.frame, f + 4, ty)
-    store(touch.frame, f + 5, tz)
-    store(touch.frame, f + 6, fnma(z, ty, y * tz))
-    store(touch.frame, f + 7, fnma(x, tz, z * tx))
-    store(touch.frame, f + 8, fnma(y, tx, x * ty))
+    store(touch.frame, f, x, y, z, tx, ty, tz, fnma(z, ty, y * tz), fnma(x, tz, z * tx), fnma(y, tx, x * ty))
 
 
 @kernel
@@ -98,9 +84,7 @@ def _list(touch, slot, pair, gap, x, y, z, token):
     """Write a candidate: its gap, and its place from the cube's centre."""
     touch.pair[slot] = pair
     store(touch.gap, slot, gap)
-    store(touch.arm, 3 * slot, x)
-    store(touch.arm, 3 * slot + 1, y)
-    store(touch.arm, 3 * slot + 2, z)
+    store(touch.arm, 3 * slot, x, y, z)
 
 
 @kernel
@@ -120,9 +104,7 @@ def _place_spheres(scene, touch, position, velocity, time_step, token):
     for sphere in range(scene.spheres):
         first, last = scene.first[sphere], scene.within[sphere]
         x, y, z = weighted(scene.place, scene.centre, first, last, position, token)
-        store(touch.middle, 3 * sphere, x)
-        store(touch.middle, 3 * sphere + 1, y)
-        store(touch.middle, 3 * sphere + 2, z)
+        store(touch.middle, 3 * sphere, x, y, z)
         u, v, w = weighted(scene.place, scene.centre, first, last, velocity, token)
         store(touch.reach, sphere, 2.0 * time_step * _length(u, v, w) + ALARM)
 
@@ -330,9 +312,7 @@ def find_candidates(scene, position, velocity, gravity, drag, touch, time_step, 
     for slot in range(last):
         kind = kind_of(touch, slot)
         u, v, w = trunk_velocity(scene, touch, slot, kind, velocity, token)
-        store(touch.rate, 3 * slot, u)
-        store(touch.rate, 3 * slot + 1, v)
-        store(touch.rate, 3 * slot + 2, w)
+        store(touch.rate, 3 * slot, u, v, w)
         u = u + cube_velocity(touch, slot, kind, 0, touch.cube, 7, token)
         v = v + cube_velocity(touch, slot, kind, 1, touch.cube, 7, token)
         w = w + cube_velocity(touch, slot, kind, 2, touch.cube, 7, token)

@@ -19,7 +19,7 @@ from rfdropo_bayes.fem.native.layered_effects import (
     subtract_law_product,
     subtract_surroundings_product,
 )
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, store
 from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral, resist_twist
 
 POLAR_ITERATIONS = 6
@@ -45,9 +45,9 @@ def _deformation(parity, slope, modes, layer, position, axes, token):
 def _rotation(axes, t, token):
     """Rotation of the polar decomposition in place, by Newton's iteration."""
     one, half = fill(1.0, axes, token), fill(0.5, axes, token)
-    a0, a1, a2 = load(axes, t, token), load(axes, t + 1, token), load(axes, t + 2, token)
-    b0, b1, b2 = load(axes, t + 3, token), load(axes, t + 4, token), load(axes, t + 5, token)
-    c0, c1, c2 = load(axes, t + 6, token), load(axes, t + 7, token), load(axes, t + 8, token)
+    a0, a1, a2 = load3(axes, t, token)
+    b0, b1, b2 = load3(axes, t + 3, token)
+    c0, c1, c2 = load3(axes, t + 6, token)
     for _ in range(POLAR_ITERATIONS):
         u0, u1, u2 = fnma(b2, c1, b1 * c2), fnma(b0, c2, b2 * c0), fnma(b1, c0, b0 * c1)
         v0, v1, v2 = fnma(c2, a1, c1 * a2), fnma(c0, a2, c2 * a0), fnma(c1, a0, c0 * a1)
@@ -56,21 +56,13 @@ def _rotation(axes, t, token):
         a0, a1, a2 = fma(half, a0, u0 * scale), fma(half, a1, u1 * scale), fma(half, a2, u2 * scale)
         b0, b1, b2 = fma(half, b0, v0 * scale), fma(half, b1, v1 * scale), fma(half, b2, v2 * scale)
         c0, c1, c2 = fma(half, c0, w0 * scale), fma(half, c1, w1 * scale), fma(half, c2, w2 * scale)
-    store(axes, t, a0)
-    store(axes, t + 1, a1)
-    store(axes, t + 2, a2)
-    store(axes, t + 3, b0)
-    store(axes, t + 4, b1)
-    store(axes, t + 5, b2)
-    store(axes, t + 6, c0)
-    store(axes, t + 7, c1)
-    store(axes, t + 8, c2)
+    store(axes, t, a0, a1, a2, b0, b1, b2, c0, c1, c2)
 
 
 @kernel
 def _relative(field, row, base, constant, token):
     """One mode of a field; constant modes relative to that of the lower section."""
-    x, y, z = load(field, row, token), load(field, row + 1, token), load(field, row + 2, token)
+    x, y, z = load3(field, row, token)
     if constant:
         x, y, z = x - load(field, base, token), y - load(field, base + 1, token), z - load(field, base + 2, token)
     return x, y, z
@@ -137,7 +129,7 @@ def _subtract_reaction(tables, samples, layer, work, field, token):
         token,
     )
     for k in range(2 * modes):
-        x, y, z = load(reaction, 3 * k, token), load(reaction, 3 * k + 1, token), load(reaction, 3 * k + 2, token)
+        x, y, z = load3(reaction, 3 * k, token)
         for i in range(3):
             t, row = 9 * layer + 3 * i, 3 * (layer * modes + k) + i
             value = fnma(load(axes, t, token), x, load(field, row, token))
@@ -157,7 +149,7 @@ def _dyad(axes, frame, dyads, slot, i, j, scale, token):
 @kernel
 def _same_parity_tile(target, t, stiffness, e, dyads, add, token):
     """Write (or add) the turned block of two modes of equal parity: three entries on its diagonal."""
-    first, second, third = load(stiffness, e, token), load(stiffness, e + 1, token), load(stiffness, e + 2, token)
+    first, second, third = load3(stiffness, e, token)
     for k in range(9):
         value = load(target, t + k, token) if add else fill(0.0, target, token)
         value = fma(first, load(dyads, k, token), value)

@@ -6,7 +6,7 @@ skipped by flags that are the same for all lanes; cables and softening are a few
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, square_root, store, where_greater
 from rfdropo_bayes.fem.native.tension_stiffening import add_dyad
 from rfdropo_bayes.fem.surroundings import STILL, WALL_SOFTNESS
 
@@ -88,11 +88,9 @@ def add_bending_law(tables, samples, factors, layer, work, token):
     energy = cubic * fma(mx, x, my * y)
     two = 2.0 * cubic
     store(work.slope, s, load(samples.law, law, token) + fma(energy, kx, two * mx * mx))
-    store(work.slope, s + 1, fma(two * mx, my, load(samples.law, law + 1, token)))
-    store(work.slope, s + 2, load(samples.law, law + 2, token))
+    store(work.slope, s + 1, fma(two * mx, my, load(samples.law, law + 1, token)), load(samples.law, law + 2, token))
     store(work.slope, s + 3, load(samples.law, law + 3, token) + fma(energy, ky, two * my * my))
-    store(work.slope, s + 4, load(samples.law, law + 4, token))
-    store(work.slope, s + 5, load(samples.law, law + 5, token))
+    store(work.slope, s + 4, load(samples.law, law + 4, token), load(samples.law, law + 5, token))
     force, rate = load(factors.strain, 0, token), load(factors.strain_rate, 0, token)
     ax, ay, az = _linear(samples.law, law, x, y, z, token)
     ax, ay = fma(energy, mx, ax), fma(energy, my, ay)
@@ -186,7 +184,7 @@ def add_surroundings(tables, samples, factors, station, work, token):
     """Add the wall and the fluid of a station to ``field`` and to its pivot; keeps their part of the matrix."""
     zero, row = fill(0.0, work.field, token), 3 * station * tables.modes
     x, y = load(work.position, row, token), load(work.position, row + 1, token)
-    u, v, w = load(work.velocity, row, token), load(work.velocity, row + 1, token), load(work.velocity, row + 2, token)
+    u, v, w = load3(work.velocity, row, token)
     nx, ny = load(samples.effects, NORMAL_X, token), load(samples.effects, NORMAL_Y, token)
     soft, step = fill(WALL_SOFTNESS, zero, token), load(factors.force, 0, token)
     depth = fma(nx, x, ny * y) - load(samples.effects, DISTANCE, token)
@@ -199,8 +197,7 @@ def add_surroundings(tables, samples, factors, station, work, token):
     push = step * stiffness * fma(0.5 * slope, into, beyond) + wall * fma(nx, u, ny * v)
     speed = square_root(fma(u, u, fma(v, v, w * w)) + STILL * STILL)
     drag = load(factors.fluid, 0, token) * load(samples.effects, DRAG, token) * tables.section_area[station] * speed
-    store(work.around, 2 * station, wall)
-    store(work.around, 2 * station + 1, drag)
+    store(work.around, 2 * station, wall, drag)
     store(work.field, row, fnma(push, nx, fnma(drag, u, load(work.field, row, token))))
     store(work.field, row + 1, fnma(push, ny, fnma(drag, v, load(work.field, row + 1, token))))
     store(work.field, row + 2, fnma(drag, w, load(work.field, row + 2, token)))

@@ -228,9 +228,7 @@ def record_body(tables, work, output, row, first, count, token):
     points, cables, lanes = tables.points, tables.cables, len(token)
     for p in range(points):
         x, y, z = point(tables.point_first, tables.point_place, tables.point_weight, p, work.position, token)
-        store(work.points, 3 * p, x)
-        store(work.points, 3 * p + 1, y)
-        store(work.points, 3 * p + 2, z)
+        store(work.points, 3 * p, x, y, z)
     for lane in range(min(lanes, count - first)):
         at = (first + lane) * output.records + row
         for k in range(3 * points):

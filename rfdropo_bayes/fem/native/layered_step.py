@@ -13,7 +13,7 @@ from rfdropo_bayes.fem.native.layered_assembly import (
     subtract_tangent_product,
 )
 from rfdropo_bayes.fem.native.layered_effects import SURROUNDED, add_surroundings
-from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, load3, square_root, store, where_greater
 from rfdropo_bayes.fem.native.tension_stiffening import (
     resist_lateral,
     resist_twist,
@@ -31,9 +31,7 @@ def _pull(tables, g, offset, work, x, y, z, token):
     """Add a pull on guide g to the border row at ``offset`` of every station; returns it times the guide's velocity."""
     border, velocity = work.border, work.velocity
     growth = fill(0.0, border, token)
-    store(work.pull, 3 * g, x)
-    store(work.pull, 3 * g + 1, y)
-    store(work.pull, 3 * g + 2, z)
+    store(work.pull, 3 * g, x, y, z)
     for k in range(tables.guide_first[g], tables.guide_first[g + 1]):
         row, w = tables.guide_place[k], fill(tables.guide_weight[k], border, token)
         t = tables.guide_slot[k] + offset
@@ -187,15 +185,10 @@ def _subtract_cables(tables, work, field, token):
     for c in range(tables.cables):
         impulse = load(work.weight, c + 1, token)
         for g in range(tables.cable_first[c], tables.cable_first[c + 1]):
-            x, y, z = (
-                load(work.pull, 3 * g, token),
-                load(work.pull, 3 * g + 1, token),
-                load(work.pull, 3 * g + 2, token),
-            )
+            x, y, z = load3(work.pull, 3 * g, token)
             for k in range(tables.guide_first[g], tables.guide_first[g + 1]):
                 row, w = tables.guide_place[k], impulse * tables.guide_weight[k]
-                store(field, row, fma(x, w, load(field, row, token)))
-                store(field, row + 1, fma(y, w, load(field, row + 1, token)))
+                store(field, row, fma(x, w, load(field, row, token)), fma(y, w, load(field, row + 1, token)))
                 store(field, row + 2, fma(z, w, load(field, row + 2, token)))
 
 

@@ -139,18 +139,35 @@ def load(typing_context, array, row, token):
 
 
 @intrinsic
-def store(typing_context, array, row, value):
-    """Write a `Simd` value to row ``row`` of an array ``(n, lanes)``."""
-    if not isinstance(value, SimdType):
+def load3(typing_context, array, row, token):
+    """Three rows of an array ``(n, lanes)`` from ``row`` on."""
+    simd = SimdType(array.dtype, len(token))
+
+    def generate(context, builder, sig, arguments):
+        first = context.cast(builder, arguments[1], sig.args[1], types.intp)
+        rows = [builder.add(first, ir.Constant(first.type, k)) for k in range(3)]
+        pointers = [_pointer(context, builder, sig.args[0], arguments[0], row, simd) for row in rows]
+        values = [builder.load(pointer, align=simd.dtype.bitwidth // 8) for pointer in pointers]
+        return context.make_tuple(builder, sig.return_type, values)
+
+    return types.UniTuple(simd, 3)(array, row, token), generate
+
+
+@intrinsic
+def store(typing_context, array, row, *values):
+    """Write `Simd` values to the rows of an array ``(n, lanes)`` from ``row`` on."""
+    if not all(isinstance(value, SimdType) for value in values):
         return None
 
     def generate(context, builder, sig, arguments):
-        index = context.cast(builder, arguments[1], sig.args[1], types.intp)
-        pointer = _pointer(context, builder, sig.args[0], arguments[0], index, sig.args[2])
-        builder.store(arguments[2], pointer, align=value.dtype.bitwidth // 8)
+        first = context.cast(builder, arguments[1], sig.args[1], types.intp)
+        for k, value in enumerate(cgutils.unpack_tuple(builder, arguments[2])):
+            place = builder.add(first, ir.Constant(first.type, k))
+            pointer = _pointer(context, builder, sig.args[0], arguments[0], place, values[k])
+            builder.store(value, pointer, align=values[k].dtype.bitwidth // 8)
         return context.get_dummy_value()
 
-    return types.void(array, row, value), generate
+    return types.void(array, row, types.BaseTuple.from_types(values)), generate
 
 
 @intrinsic

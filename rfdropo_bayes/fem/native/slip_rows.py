@@ -26,9 +26,7 @@ def _find_directions(tables, work, friction, token):
             px, py, pz = point(tables.guide_first, tables.guide_place, tables.guide_weight, g, work.position, token)
             dx, dy, dz = px - x, py - y, pz - z
             scale = one / square_root(fma(dx, dx, fma(dy, dy, dz * dz)))
-            store(friction.direction, 3 * g, dx * scale)
-            store(friction.direction, 3 * g + 1, dy * scale)
-            store(friction.direction, 3 * g + 2, dz * scale)
+            store(friction.direction, 3 * g, dx * scale, dy * scale, dz * scale)
             x, y, z = px, py, pz
 
 

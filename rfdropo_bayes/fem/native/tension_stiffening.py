@@ -18,9 +18,7 @@ def sum_cable_forces(tables, work, token):
             x = fnma(tension, load(work.border, t, token), x)
             y = fnma(tension, load(work.border, t + 3, token), y)
             z = fnma(tension, load(work.border, t + 6, token), z)
-        store(work.beyond, 3 * layer, x)
-        store(work.beyond, 3 * layer + 1, y)
-        store(work.beyond, 3 * layer + 2, z)
+        store(work.beyond, 3 * layer, x, y, z)
 
 
 @kernel

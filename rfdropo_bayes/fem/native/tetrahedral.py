@@ -17,6 +17,7 @@ from rfdropo_bayes.fem.native.simd import (
     fma,
     fnma,
     load,
+    load3,
     mesh_inlined,
     mesh_part,
     mesh_pasted,
@@ -85,7 +86,7 @@ def _edge_frame(mesh, e, x, axes, token):
     """Rows of ``axes``: along edge 0-1, across it in the face 0-1-2, normal to the face."""
     one = fill(1.0, x, token)
     a, b, c = 3 * mesh.frame_node[e, 0], 3 * mesh.frame_node[e, 1], 3 * mesh.frame_node[e, 2]
-    ox, oy, oz = load(x, a, token), load(x, a + 1, token), load(x, a + 2, token)
+    ox, oy, oz = load3(x, a, token)
     ex, ey, ez = load(x, b, token) - ox, load(x, b + 1, token) - oy, load(x, b + 2, token) - oz
     fx, fy, fz = load(x, c, token) - ox, load(x, c + 1, token) - oy, load(x, c + 2, token) - oz
     scale = one / square_root(fma(ex, ex, fma(ey, ey, ez * ez)))
@@ -94,15 +95,7 @@ def _edge_frame(mesh, e, x, axes, token):
     scale = one / square_root(fma(nx, nx, fma(ny, ny, nz * nz)))
     nx, ny, nz = nx * scale, ny * scale, nz * scale
     tx, ty, tz = _cross(nx, ny, nz, ex, ey, ez)
-    store(axes, 0, ex)
-    store(axes, 1, ey)
-    store(axes, 2, ez)
-    store(axes, 3, tx)
-    store(axes, 4, ty)
-    store(axes, 5, tz)
-    store(axes, 6, nx)
-    store(axes, 7, ny)
-    store(axes, 8, nz)
+    store(axes, 0, ex, ey, ez, tx, ty, tz, nx, ny, nz)
 
 
 @mesh_inlined
@@ -116,22 +109,16 @@ def _polar_frame(mesh, e, x, axes, token):
                 total = fma(load(x, 3 * mesh.node[e, a] + i, token) - origin, mesh.gradient[e, a, j], total)
             store(axes, 3 * j + i, total)
     for _ in range(POLAR_ITERATIONS):
-        a0, a1, a2 = load(axes, 0, token), load(axes, 1, token), load(axes, 2, token)
-        b0, b1, b2 = load(axes, 3, token), load(axes, 4, token), load(axes, 5, token)
-        c0, c1, c2 = load(axes, 6, token), load(axes, 7, token), load(axes, 8, token)
+        a0, a1, a2 = load3(axes, 0, token)
+        b0, b1, b2 = load3(axes, 3, token)
+        c0, c1, c2 = load3(axes, 6, token)
         u0, u1, u2 = _cross(b0, b1, b2, c0, c1, c2)
         v0, v1, v2 = _cross(c0, c1, c2, a0, a1, a2)
         w0, w1, w2 = _cross(a0, a1, a2, b0, b1, b2)
         scale = fill(1.0, x, token) / (fma(a0, u0, fma(a1, u1, a2 * u2)))
-        store(axes, 0, 0.5 * (a0 + u0 * scale))
-        store(axes, 1, 0.5 * (a1 + u1 * scale))
-        store(axes, 2, 0.5 * (a2 + u2 * scale))
-        store(axes, 3, 0.5 * (b0 + v0 * scale))
-        store(axes, 4, 0.5 * (b1 + v1 * scale))
-        store(axes, 5, 0.5 * (b2 + v2 * scale))
-        store(axes, 6, 0.5 * (c0 + w0 * scale))
-        store(axes, 7, 0.5 * (c1 + w1 * scale))
-        store(axes, 8, 0.5 * (c2 + w2 * scale))
+        store(axes, 0, 0.5 * (a0 + u0 * scale), 0.5 * (a1 + u1 * scale), 0.5 * (a2 + u2 * scale))
+        store(axes, 3, 0.5 * (b0 + v0 * scale), 0.5 * (b1 + v1 * scale), 0.5 * (b2 + v2 * scale))
+        store(axes, 6, 0.5 * (c0 + w0 * scale), 0.5 * (c1 + w1 * scale), 0.5 * (c2 + w2 * scale))
 
 
 @mesh_pasted
@@ -195,15 +182,12 @@ def _element_force(mesh, e, work, lame, shear, lookahead, token):
             sx, sy, sz = sx + fx, sy + fy, sz + fz
         else:
             fx, fy, fz = -sx, -sy, -sz
-        store(work.force, n, load(work.force, n, token) - fx)
-        store(work.force, n + 1, load(work.force, n + 1, token) - fy)
+        store(work.force, n, load(work.force, n, token) - fx, load(work.force, n + 1, token) - fy)
         store(work.force, n + 2, load(work.force, n + 2, token) - fz)
         tx = fma(load(axes, 0, token), gx, fma(load(axes, 3, token), gy, load(axes, 6, token) * gz))
         ty = fma(load(axes, 1, token), gx, fma(load(axes, 4, token), gy, load(axes, 7, token) * gz))
         tz = fma(load(axes, 2, token), gx, fma(load(axes, 5, token), gy, load(axes, 8, token) * gz))
-        store(work.turned, 3 * a, tx)
-        store(work.turned, 3 * a + 1, ty)
-        store(work.turned, 3 * a + 2, tz)
+        store(work.turned, 3 * a, tx, ty, tz)
 
 
 @mesh_inlined
@@ -212,23 +196,20 @@ def _element_tangent(mesh, e, work, lame, shear, token):
     turned, pivot, lower = work.turned, work.pivot, work.lower
     both = lame + shear
     for a in range(4):
-        gx, gy, gz = load(turned, 3 * a, token), load(turned, 3 * a + 1, token), load(turned, 3 * a + 2, token)
+        gx, gy, gz = load3(turned, 3 * a, token)
         p = 6 * mesh.node[e, a]
         bx, by, bz = both * gx, both * gy, both * gz
         size = shear * fma(gx, gx, fma(gy, gy, gz * gz))
-        store(pivot, p, fma(bx, gx, load(pivot, p, token) + size))
-        store(pivot, p + 1, fma(by, gx, load(pivot, p + 1, token)))
-        store(pivot, p + 2, fma(by, gy, load(pivot, p + 2, token) + size))
-        store(pivot, p + 3, fma(bz, gx, load(pivot, p + 3, token)))
-        store(pivot, p + 4, fma(bz, gy, load(pivot, p + 4, token)))
-        store(pivot, p + 5, fma(bz, gz, load(pivot, p + 5, token) + size))
+        store(pivot, p, fma(bx, gx, load(pivot, p, token) + size), fma(by, gx, load(pivot, p + 1, token)))
+        store(pivot, p + 2, fma(by, gy, load(pivot, p + 2, token) + size), fma(bz, gx, load(pivot, p + 3, token)))
+        store(pivot, p + 4, fma(bz, gy, load(pivot, p + 4, token)), fma(bz, gz, load(pivot, p + 5, token) + size))
     pair = 0
     for b in range(3):
-        cx, cy, cz = load(turned, 3 * b, token), load(turned, 3 * b + 1, token), load(turned, 3 * b + 2, token)
+        cx, cy, cz = load3(turned, 3 * b, token)
         lx, ly, lz = lame * cx, lame * cy, lame * cz
         sx, sy, sz = shear * cx, shear * cy, shear * cz
         for a in range(b + 1, 4):
-            gx, gy, gz = load(turned, 3 * a, token), load(turned, 3 * a + 1, token), load(turned, 3 * a + 2, token)
+            gx, gy, gz = load3(turned, 3 * a, token)
             t = 9 * mesh.slot[e, pair]
             dot = fma(gx, sx, fma(gy, sy, gz * sz))
             store(lower, t, fma(gx, lx, fma(sx, gx, load(lower, t, token) + dot)))

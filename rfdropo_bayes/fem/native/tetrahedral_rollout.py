@@ -96,8 +96,7 @@ def _pull(pattern, mesh, cables, p, row, work, x, y, z, token):
         node, w = cables.node[p, k], cables.weight[p, k]
         if node < mesh.free and w != 0.0:
             t = 9 * (pattern.first[node + 1] - pattern.border + row // 3) + 3 * (row % 3)
-            store(work.lower, t, load(work.lower, t, token) + x * w)
-            store(work.lower, t + 1, load(work.lower, t + 1, token) + y * w)
+            store(work.lower, t, load(work.lower, t, token) + x * w, load(work.lower, t + 1, token) + y * w)
             store(work.lower, t + 2, load(work.lower, t + 2, token) + z * w)
 
 
