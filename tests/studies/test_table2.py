@@ -73,7 +73,7 @@ def test_the_target_keeps_its_truth_and_takes_the_task(tmp_path) -> None:
     study = Study({"reach": REACH}, TRUTH, AUDIT, tmp_path, SMALL)
     tables = table2._on_target(study, table2._tables(study, "reach"))
     assert tables["training"]["task"] == "TrunkReach-v0"
-    assert tables["model"]["fixed"]["young_modulus"] == 3.2e6
+    assert tables["model"]["fixed"]["young_modulus"] == 5.6e6
     assert "data" not in tables
 
 
