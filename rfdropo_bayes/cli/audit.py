@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +20,7 @@ from rfdropo_bayes.cli.options import (
     say_progress,
     see_calibration,
 )
-from rfdropo_bayes.cli.results import show_audit
+from rfdropo_bayes.cli.results import say, show_audit
 
 Base = Annotated[
     Path | None, typer.Option("--base", help="folder of an earlier calibration, to start the base model from")
@@ -88,10 +87,7 @@ def separate(
         overwrite=overwrite,
         report=say_progress(quiet),
     )
-    if as_json:
-        typer.echo(json.dumps(found, indent=2))
-    elif not quiet:
-        typer.echo((folder / TABLE).read_text(encoding="utf-8"))
+    say(found, (folder / TABLE).read_text(encoding="utf-8"), quiet=quiet, as_json=as_json)
 
 
 def design(
@@ -118,10 +114,7 @@ def design(
         overwrite=overwrite,
         report=say_progress(quiet),
     )
-    if as_json:
-        typer.echo(json.dumps(found, indent=2))
-    elif not quiet:
-        typer.echo(f"{found['sentence']}\ncommands: {folder / COMMANDS}")
+    say(found, found["sentence"], f"commands: {folder / COMMANDS}", quiet=quiet, as_json=as_json)
 
 
 def benchmark_audit(

@@ -32,15 +32,22 @@ AUDITED = ("verdict", "sentence", "findings", "gain", "next_experiment")
 MOST_ROWS = 20
 
 
+def say(found: Mapping[str, Any], *lines: str, quiet: bool, as_json: bool) -> None:
+    """Print a result as JSON, or lines of words about it, or nothing."""
+    if as_json:
+        typer.echo(json.dumps(found, indent=2))
+    elif not quiet:
+        for line in lines:
+            typer.echo(line)
+
+
 def show_calibration(found: Calibration, *, quiet: bool, as_json: bool) -> None:
     """Print the result of a finished calibration: headline, table of parameters, cautions, and where the report is."""
     summary, folder = found.content, found.folder or Path()
     report = folder / "report.html"
-    if as_json:
+    if as_json or quiet:
         chosen = {key: summary[key] for key in CALIBRATED if key in summary}
-        typer.echo(json.dumps({**chosen, "folder": str(folder), "report": str(report)}, indent=2))
-        return
-    if quiet:
+        say({**chosen, "folder": str(folder), "report": str(report)}, quiet=quiet, as_json=as_json)
         return
     console = Console(highlight=False)
     for sentence in summary["headline"]:
@@ -58,10 +65,8 @@ def show_calibration(found: Calibration, *, quiet: bool, as_json: bool) -> None:
 def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: bool) -> None:
     """Print the result of an audit; ``found`` is the content of audit.json."""
     files = {"folder": str(folder), "report": str(folder / "report.html"), "extended": str(folder / "extended.toml")}
-    if as_json:
-        typer.echo(json.dumps({**{key: found[key] for key in AUDITED if key in found}, **files}, indent=2))
-        return
-    if quiet:
+    if as_json or quiet:
+        say({**{key: found[key] for key in AUDITED if key in found}, **files}, quiet=quiet, as_json=as_json)
         return
     console = Console(highlight=False)
     verdict = Text(found["verdict"], style=f"bold {COLOURS.get(found['verdict'], '')}")
@@ -78,13 +83,15 @@ def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: 
 
 def show_simulation(found: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
     """Print how far a simulation is from its recordings; ``found`` is the content of simulation.json."""
-    if as_json:
-        typer.echo(json.dumps(found, indent=2))
-    elif not quiet:
-        for name, facts in found["recordings"].items():
-            typer.echo(f"{name}: {facts['status']}{_off(facts['error_mm'])}; {facts['files'][0]}")
-        if found["error_mm"] is not None and len(found["recordings"]) > 1:
-            typer.echo(f"all of them{_off(found['error_mm'])}")
+    lines = [
+        f"{name}: {one['status']}{_off(one['error_mm'])}; {one['files'][0]}"
+        for name, one in found["recordings"].items()
+    ]
+    runs = found["recordings"].items()
+    lines = [f"{name}: {run['status']}{_off(run['error_mm'])}; {run['files'][0]}" for name, run in runs]
+    if found["error_mm"] is not None and len(lines) > 1:
+        lines.append(f"all of them{_off(found['error_mm'])}")
+    say(found, *lines, quiet=quiet, as_json=as_json)
 
 
 def _off(error: Mapping[str, float] | None) -> str:
@@ -99,14 +106,10 @@ def _off(error: Mapping[str, float] | None) -> str:
 
 def show_prediction(facts: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
     """Print what a prediction is of; ``facts`` is the content of prediction.json."""
-    if as_json:
-        typer.echo(json.dumps(facts, indent=2))
-    elif not quiet:
-        start = "from the measured first row" if facts["start_pose_known"] else "without a measured first row"
-        typer.echo(f"{facts['rows']} rows {start}, under {facts['draws']} draws of {facts['posterior']}")
-        typer.echo("mean, 50 and 90 % bands in m:")
-        for file in facts["files"]:
-            typer.echo(f"  {file}")
+    start = "from the measured first row" if facts["start_pose_known"] else "without a measured first row"
+    lines = [f"{facts['rows']} rows {start}, under {facts['draws']} draws of {facts['posterior']}"]
+    lines += ["mean, 50 and 90 % bands in m:", *(f"  {file}" for file in facts["files"])]
+    say(facts, *lines, quiet=quiet, as_json=as_json)
 
 
 def _parameters(rows: Iterable[tuple[str, Mapping[str, Any], str]]) -> Table:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Annotated
 import typer
 
 from rfdropo_bayes.cli.options import AsJson, ExperimentFile, OutFolder, Overrides, Overwrite, Quiet, Resume, folder_for
+from rfdropo_bayes.cli.results import say
 from rfdropo_bayes.workflow.files import check_folder
 
 
@@ -28,15 +28,12 @@ def train(
     from rfdropo_bayes.workflow.training import CARD, POLICY, run_training
 
     found = run_training(experiment, folder, overrides=overrides or [], resume=resume, overwrite=overwrite)
-    if as_json:
-        typer.echo(json.dumps(found, indent=2))
-    elif not quiet:
-        last = found["evaluation"]
-        typer.echo(
-            f"half of the episodes end within {1e3 * last['distance_median']:.2f} mm of the goal, 95 % within "
-            f"{1e3 * last['distance_q95']:.2f} mm, after {found['steps']} steps in {found['seconds']:.0f} s"
-        )
-        typer.echo(f"policy: {folder / POLICY}\ncard: {folder / CARD}")
+    last = found["evaluation"]
+    learnt = (
+        f"half of the episodes end within {1e3 * last['distance_median']:.2f} mm of the goal, 95 % within "
+        f"{1e3 * last['distance_q95']:.2f} mm, after {found['steps']} steps in {found['seconds']:.0f} s"
+    )
+    say(found, learnt, f"policy: {folder / POLICY}", f"card: {folder / CARD}", quiet=quiet, as_json=as_json)
 
 
 def evaluate(
@@ -59,11 +56,7 @@ def evaluate(
     found = run_evaluation(
         experiment, policy, folder, episodes=episodes, seed=seed, overrides=overrides or [], overwrite=overwrite
     )
-    if as_json:
-        typer.echo(json.dumps(found, indent=2))
-    elif not quiet:
-        typer.echo(evaluation_table(found))
-        typer.echo(f"table: {folder / TABLE}")
+    say(found, evaluation_table(found), f"table: {folder / TABLE}", quiet=quiet, as_json=as_json)
 
 
 VIRTUAL = Path("experiments/virtual")

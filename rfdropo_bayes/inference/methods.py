@@ -18,8 +18,7 @@ from rfdropo_bayes.inference.modes import search as laplace
 from rfdropo_bayes.inference.progress import Logbook, Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.rfdropo import search as rfdropo
-from rfdropo_bayes.inference.smc import bridge
-from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc import bridge, sampler
 from rfdropo_bayes.inference.smc import start as starts
 from rfdropo_bayes.tables import nearest
 
@@ -39,7 +38,7 @@ class Method(NamedTuple):
 
 
 METHODS: dict[str, Method] = {
-    "smc": Method(horizon_smc.SmcConfig, starts.run),
+    "smc": Method(sampler.SmcConfig, starts.run),
     "rfdropo": Method(rfdropo.RfdropoConfig, rfdropo.run, posterior=False),
     "laplace": Method(laplace.LaplaceConfig, laplace.run),
     "bridge": Method(bridge.BridgeConfig, bridge.run),

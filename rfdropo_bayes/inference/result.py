@@ -104,7 +104,7 @@ def stage_cautions(trace: list[dict[str, Any]], rollouts: float | None, correlat
     """What the stages of all replicates say against the draws: a budget that ran out, particles that did not move.
 
     Args:
-        trace: a dictionary per stage, as in the result of `horizon_smc`.
+        trace: a dictionary per stage, as in the result of `smc.sampler`.
         rollouts: their budget.
         correlation: that moves were to leave at most.
     """

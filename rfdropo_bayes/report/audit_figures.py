@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.ticker import LogFormatter
 
 from rfdropo_bayes.report import style
@@ -15,8 +17,7 @@ from rfdropo_bayes.report.units import display_name
 
 MILLIMETRES = 1e3
 BINS = 12
-
-SIGNS = 3  # place of the panel whose abscissa is a sign
+SIGN = "direction"  # the cause that is a sign
 
 
 @dataclass(frozen=True)
@@ -50,36 +51,73 @@ def _strongest(series: np.ndarray, main: np.ndarray) -> int:
     return int(np.argmax(np.abs(centred.T @ (main - main.mean())) / size))
 
 
+@dataclass(frozen=True)
+class Shown:
+    """What the figures of an audit show.
+
+    Attributes:
+        residuals: of the base model.
+        blocks: misfit of each block of rows, for each model; 1 where a model is right.
+        seconds: length of a block [s].
+        models: names of the base model and of its extensions, in the order of ``blocks``.
+        names: of the candidates that were probed.
+        cosines: between their signatures.
+        unseen: time [s] and position [m] of the last marker in the unseen recording that the base model predicts worst:
+            measured, base model, extended model; None without one.
+        remainder: time [s], mean and deviation [m] of what the final model leaves of the last marker; None if nothing.
+    """
+
+    residuals: Residuals
+    blocks: Sequence[Sequence[float]]
+    seconds: float
+    models: Sequence[str]
+    names: Sequence[str]
+    cosines: Float[np.ndarray, "k k"]
+    unseen: tuple[Float[np.ndarray, " row"], Mapping[str, Float[np.ndarray, "row 3"]]] | None
+    remainder: tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row 3"], Float[np.ndarray, "row 3"]] | None
+
+
+def causes(residuals: Residuals) -> dict[str, tuple[str, np.ndarray]]:
+    """What residuals are drawn against, by name: a label and a value for each row."""
+    held = _strongest(residuals.command, residuals.main)
+    turned = _strongest(residuals.rate, residuals.main)
+    channel, unit = residuals.channels[turned], residuals.unit
+    found = {
+        "time": ("time [s]", residuals.time),
+        "command": (f"command {residuals.channels[held]} [{unit}]", residuals.command[:, held]),
+        "rate": (f"rate of {channel} [{unit}/s]", residuals.rate[:, turned]),
+        SIGN: (f"sign of the rate of {channel} [-]", np.sign(residuals.rate[:, turned])),
+        "position": ("position along the pattern [mm]", MILLIMETRES * residuals.position),
+    }
+    if residuals.cables:  # a black box may have none
+        cable = _strongest(residuals.tension, residuals.main)
+        found["tension"] = (f"tension of {residuals.cables[cable]} [N]", residuals.tension[:, cable])
+    return found
+
+
+def draw_residual(axes: Axes, residuals: Residuals, against: str) -> None:
+    """Draw the residual's dominant pattern against one of `causes`, with its mean in bins and two standard errors."""
+    label, values = causes(residuals)[against]
+    main, signs = MILLIMETRES * residuals.main, against == SIGN
+    spread = 0.12 * np.random.default_rng(0).standard_normal(len(values)) if signs else 0.0
+    axes.scatter(values + spread, main, s=4, color=style.PRIOR, alpha=0.4, linewidths=0)
+    centre, mean, error = _binned(values, main, 3 if signs else BINS)
+    axes.errorbar(centre, mean, 2 * error, color=style.POSTERIOR, marker="o", markersize=3, capsize=2)
+    axes.axhline(0.0, color=style.MEASURED, linewidth=0.8)
+    axes.set_xlabel(label)
+    axes.set_ylabel(f"residual, {100 * residuals.share:.0f} % of it [mm]")
+
+
 @style.styled
 def panels_figure(residuals: Residuals) -> Figure:
-    """The residual against time, command, rate, sign of rate, position and tension, with the mean in bins."""
-    main = MILLIMETRES * residuals.main
-    channel = _strongest(residuals.rate, main)
-    held = _strongest(residuals.command, main)
+    """The residual against time, command, rate, sign of rate, position and tension."""
     figure = Figure(figsize=(style.WIDTH, 5.2))
-    panels = [
-        ("time [s]", residuals.time),
-        (f"command {residuals.channels[held]} [{residuals.unit}]", residuals.command[:, held]),
-        (f"rate of {residuals.channels[channel]} [{residuals.unit}/s]", residuals.rate[:, channel]),
-        (f"sign of the rate of {residuals.channels[channel]} [-]", np.sign(residuals.rate[:, channel])),
-        ("position along the pattern [mm]", MILLIMETRES * residuals.position),
-    ]
-    if residuals.cables:  # a black box may have none
-        cable = _strongest(residuals.tension, main)
-        panels.append((f"tension of {residuals.cables[cable]} [N]", residuals.tension[:, cable]))
-    grid = figure.subplots(2, 3, sharey=True).ravel()
-    for axes in grid[len(panels) :]:
-        style.empty(axes)
-    for place, (axes, (label, values)) in enumerate(zip(grid, panels, strict=False)):
-        signs = place == SIGNS
-        spread = 0.12 * np.random.default_rng(0).standard_normal(len(values)) if signs else 0.0
-        axes.scatter(values + spread, main, s=4, color=style.PRIOR, alpha=0.4, linewidths=0)
-        centre, mean, error = _binned(values, main, 3 if signs else BINS)
-        axes.errorbar(centre, mean, 2 * error, color=style.POSTERIOR, marker="o", markersize=3, capsize=2)
-        axes.axhline(0.0, color=style.MEASURED, linewidth=0.8)
-        axes.set_xlabel(label)
-        axes.set_ylabel(f"residual, {100 * residuals.share:.0f} % of it [mm]")
+    grid, names = figure.subplots(2, 3, sharey=True).ravel(), list(causes(residuals))
+    for axes, name in zip(grid, names, strict=False):
+        draw_residual(axes, residuals, name)
         axes.tick_params(labelleft=True)  # each can be seen by itself
+    for axes in grid[len(names) :]:
+        style.empty(axes)
     return figure
 
 
@@ -94,82 +132,90 @@ def _binned(x: np.ndarray, y: np.ndarray, bins: int) -> tuple[np.ndarray, np.nda
     )  # type: ignore[return-value]
 
 
-@style.styled
-def blocks_figure(blocks: Sequence[Sequence[float]], seconds: float, titles: Sequence[str]) -> Figure:
-    """When the models fail: mean square of the block means, 1 where a model is right."""
-    figure = Figure(figsize=(style.WIDTH, 2.6))
-    axes = figure.subplots()
-    for row, title in zip(blocks, titles, strict=True):
-        axes.stairs(row, seconds * np.arange(len(row) + 1), baseline=None, label=title, linewidth=1.4)
+def draw_blocks(axes: Axes, shown: Shown) -> None:
+    """Draw when each model fails: mean square of the block means, 1 where a model is right."""
+    for row, model in zip(shown.blocks, shown.models, strict=True):
+        axes.stairs(row, shown.seconds * np.arange(len(row) + 1), baseline=None, label=model, linewidth=1.4)
     axes.axhline(1.0, color=style.MEASURED, linewidth=0.8)
     axes.set_yscale("log")
     for ticks in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
         ticks(LogFormatter(minor_thresholds=(1.5, 0.6)))
     axes.set_xlabel("time [s]")
     axes.set_ylabel("mean square / that of noise [-]")
+
+
+@style.styled
+def blocks_figure(shown: Shown) -> Figure:
+    """When the models fail."""
+    figure = Figure(figsize=(style.WIDTH, 2.6))
+    draw_blocks(figure.subplots(), shown)
     figure.legend(loc="outside upper center", ncols=4)
     return figure
 
 
+def draw_cosines(axes: Axes, shown: Shown) -> AxesImage:
+    """Draw how alike the candidates' signatures are, once the base parameters have done what they can."""
+    image = axes.imshow(np.abs(shown.cosines), vmin=0.0, vmax=1.0, cmap="Blues")
+    labels = [display_name(name) for name in shown.names]
+    axes.set_xticks(range(len(labels)), labels, rotation=60, ha="right", rotation_mode="anchor")
+    axes.set_yticks(range(len(labels)), labels)
+    axes.grid(False)
+    for (i, j), value in np.ndenumerate(np.abs(shown.cosines)):
+        if value > 0.3 and i != j:
+            colour = "white" if value > 0.6 else "black"
+            axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=6.5, color=colour)
+    return image
+
+
 @style.styled
-def cosine_figure(names: Sequence[str], cosines: Float[np.ndarray, "k k"]) -> Figure:
-    """How alike the candidates' signatures are, once the base parameters have done what they can."""
-    size = 1.6 + 0.34 * len(names)
+def cosine_figure(shown: Shown) -> Figure:
+    """How alike the candidates' signatures are."""
+    size = 1.6 + 0.34 * len(shown.names)
     figure = Figure(figsize=(min(style.WIDTH, size + 2.0), size))
     axes = figure.subplots()
-    image = axes.imshow(np.abs(cosines), vmin=0.0, vmax=1.0, cmap="Blues")
-    labels = [display_name(name) for name in names]
-    axes.set_xticks(range(len(names)), labels, rotation=60, ha="right", rotation_mode="anchor")
-    axes.set_yticks(range(len(names)), labels)
-    axes.grid(False)
-    for i, row in enumerate(cosines):
-        for j, value in enumerate(row):
-            if abs(value) > 0.3 and i != j:
-                axes.text(
-                    j,
-                    i,
-                    f"{abs(value):.2f}",
-                    ha="center",
-                    va="center",
-                    fontsize=6.5,
-                    color="white" if abs(value) > 0.6 else "black",
-                )
-    figure.colorbar(image, ax=axes, shrink=0.8, label="cosine [-]")
+    figure.colorbar(draw_cosines(axes, shown), ax=axes, shrink=0.8, label="cosine [-]")
     return figure
 
 
+def draw_unseen(axes: Axes, shown: Shown, axis: int) -> None:
+    """Draw one coordinate of the last marker of an unseen recording: measured, base model, extended model."""
+    assert shown.unseen is not None
+    time, series = shown.unseen
+    for (label, values), colour in zip(series.items(), (style.MEASURED, style.TEST, style.POSTERIOR), strict=True):
+        axes.plot(time, MILLIMETRES * values[:, axis], color=colour, label=label, linewidth=1.1)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel(f"last marker, {'xyz'[axis]} [mm]")
+
+
 @style.styled
-def overlay_figure(
-    time: Float[np.ndarray, " row"], series: Mapping[str, Float[np.ndarray, "row 3"]], title: str
-) -> Figure:
-    """The last marker of one unseen recording: measured, base model, extended model."""
+def unseen_figure(shown: Shown) -> Figure:
+    """The last marker of one unseen recording, all coordinates."""
     figure = Figure(figsize=(style.WIDTH, 2.8))
-    colours = {"measured": style.MEASURED, "base model": style.TEST, "extended model": style.POSTERIOR}
     for axis, axes in enumerate(figure.subplots(1, 3)):
-        for label, values in series.items():
-            axes.plot(time, MILLIMETRES * values[:, axis], color=colours[label], label=label, linewidth=1.1)
-        axes.set_xlabel("time [s]")
-        axes.set_ylabel(f"{title}, {'xyz'[axis]} [mm]")
+        draw_unseen(axes, shown, axis)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3)
     return figure
 
 
-@style.styled
-def remainder_figure(
-    time: Float[np.ndarray, " row"], mean: Float[np.ndarray, "row 3"], sd: Float[np.ndarray, "row 3"], title: str
-) -> Figure:
-    """What the final model leaves of the last marker, as a Gaussian process with two standard deviations."""
-    figure = Figure(figsize=(style.WIDTH, 2.4))
-    axes = figure.subplots()
-    for axis in range(3):
+def draw_remainder(axes: Axes, shown: Shown) -> None:
+    """Draw what the final model leaves of the last marker, as a Gaussian process with two standard deviations."""
+    assert shown.remainder is not None
+    time, mean, sd = shown.remainder
+    for axis, colour in enumerate(style.AXIS_COLOURS):
         centre, width = MILLIMETRES * mean[:, axis], MILLIMETRES * sd[:, axis]
-        axes.plot(time, centre, color=style.AXIS_COLOURS[axis], label="xyz"[axis])
-        axes.fill_between(
-            time, centre - 2 * width, centre + 2 * width, color=style.AXIS_COLOURS[axis], alpha=0.18, linewidth=0
-        )
+        axes.plot(time, centre, color=colour, label="xyz"[axis])
+        axes.fill_between(time, centre - 2 * width, centre + 2 * width, color=colour, alpha=0.18, linewidth=0)
     axes.axhline(0.0, color=style.MEASURED, linewidth=0.8)
     axes.set_xlabel("time [s]")
-    axes.set_ylabel(f"{title} [mm]")
+    axes.set_ylabel("left of the last marker [mm]")
+
+
+@style.styled
+def remainder_figure(shown: Shown) -> Figure:
+    """What the final model leaves of the last marker."""
+    figure = Figure(figsize=(style.WIDTH, 2.4))
+    axes = figure.subplots()
+    draw_remainder(axes, shown)
     axes.legend(loc="upper right", ncols=3)
     return figure

@@ -32,12 +32,12 @@ LEAST_P = 1e-16
 
 
 def render_audit(
-    answer: Answer, content: Mapping[str, Any], title: str, config: str, outline: Mapping[str, Any] | None = None
+    seen: figures.Shown, content: Mapping[str, Any], title: str, config: str, outline: Mapping[str, Any] | None = None
 ) -> str:
     """HTML of an audit.
 
     Args:
-        answer: the audit.
+        seen: what its figures show.
         content: of audit.json.
         title: of the experiment.
         config: the experiment file as it was run.
@@ -58,7 +58,7 @@ def render_audit(
         title=title,
         sections=SECTIONS,
         stylesheet=Markup(stylesheet),
-        pictures=_pictures(answer, outline),
+        pictures=_pictures(seen, outline),
         config=config,
     )
 
@@ -107,46 +107,44 @@ def residuals_of(answer: Answer) -> figures.Residuals:
     )
 
 
-def _pictures(answer: Answer, outline: Mapping[str, Any] | None) -> dict[str, Picture | None]:
-    measured = answer.target.measurements
-    step = float(np.median(np.diff(measured.time[0])))
-    titles = ["base model", *(f"with {display_name(s.name)}" for s in answer.steps)]
-    found: dict[str, Picture | None] = {
-        "robot": embed(robot_figure(outline), "The robot from the side and from its base") if outline else None,
-        "panels": embed(
-            figures.panels_figure(residuals_of(answer)), "Residual against time, command, rate, position and tension"
-        ),
-        "blocks": embed(
-            figures.blocks_figure([look.omnibus.blocks.tolist() for look in answer.looks], BLOCK * step, titles),
-            "Misfit of each block of rows",
-        ),
-        "cosines": None,
-        "overlay": None,
-        "remainder": None,
-    }
-    rows = [row for row in answer.looks[0].rows if row.probe is not None][:MOST_COSINES]
-    if len(rows) > 1:
-        marks = [row.probe.mark for row in rows if row.probe is not None]
-        cosines = np.array([[likeness(a, b) for b in marks] for a in marks])
-        found["cosines"] = embed(figures.cosine_figure([r.name for r in rows], cosines), "Cosines between signatures")
+def shown(answer: Answer) -> figures.Shown:
+    """What the figures of an audit show."""
+    step = float(np.median(np.diff(answer.target.measurements.time[0])))
+    probed = [row for row in answer.looks[0].rows if row.probe is not None][:MOST_COSINES]
+    marks = [row.probe.mark for row in probed if row.probe is not None]
+    unseen = None
     if answer.predictions is not None and answer.unseen is not None:
-        unseen, (base, extended) = answer.unseen, map(answer.unseen.predicted, answer.predictions)
-        valid = unseen.valid[..., : unseen.markers]
-        worst = int(np.argmax(np.sum((unseen.position - base) ** 2 * valid, (1, 2))))
+        recordings, (base, extended) = answer.unseen, map(answer.unseen.predicted, answer.predictions)
+        valid = recordings.valid[..., : recordings.markers]
+        worst = int(np.argmax(np.sum((recordings.position - base) ** 2 * valid, (1, 2))))
         seen = valid[worst].any(axis=1)
-        series = {
-            "measured": np.where(valid, unseen.position, np.nan)[worst, seen, -3:],
-            "base model": base[worst, seen, -3:],
-            "extended model": extended[worst, seen, -3:],
-        }
-        found["overlay"] = embed(
-            figures.overlay_figure(step * np.flatnonzero(seen), series, "last marker"),
-            "Measured, base model and extended model",
-        )
+        measured = np.where(valid, recordings.position, np.nan)
+        series = {"measured": measured, "base model": base, "extended model": extended}
+        unseen = (step * np.flatnonzero(seen), {name: path[worst, seen, -3:] for name, path in series.items()})
     rest = answer.remainder
-    if rest.amplitude > 0.0:
-        found["remainder"] = embed(
-            figures.remainder_figure(rest.time, rest.mean[0, :, -3:], rest.sd[0, :, -3:], "left of the last marker"),
-            "Gaussian process of what remains",
-        )
-    return found
+    return figures.Shown(
+        residuals_of(answer),
+        [look.omnibus.blocks.tolist() for look in answer.looks],
+        BLOCK * step,
+        ["base model", *(f"with {display_name(step.name)}" for step in answer.steps)],
+        [row.name for row in probed],
+        np.array([[likeness(a, b) for b in marks] for a in marks]),
+        unseen,
+        (rest.time, rest.mean[0, :, -3:], rest.sd[0, :, -3:]) if rest.amplitude > 0.0 else None,
+    )
+
+
+def _pictures(seen: figures.Shown, outline: Mapping[str, Any] | None) -> dict[str, Picture | None]:
+    """The figures of the page by name, None where there is nothing to show."""
+    drawn = {
+        "robot": (robot_figure(outline), "The robot from the side and from its base") if outline else None,
+        "panels": (
+            figures.panels_figure(seen.residuals),
+            "Residual against time, command, rate, position and tension",
+        ),
+        "blocks": (figures.blocks_figure(seen), "Misfit of each block of rows"),
+        "cosines": (figures.cosine_figure(seen), "Cosines between signatures") if len(seen.names) > 1 else None,
+        "overlay": (figures.unseen_figure(seen), "Measured, base model and extended model") if seen.unseen else None,
+        "remainder": (figures.remainder_figure(seen), "Gaussian process of what remains") if seen.remainder else None,
+    }
+    return {name: None if picture is None else embed(*picture) for name, picture in drawn.items()}

@@ -31,7 +31,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.report import software_versions
-from rfdropo_bayes.report.audit_page import render_audit
+from rfdropo_bayes.report.audit_page import render_audit, shown
 from rfdropo_bayes.report.summary import combined_hash
 from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.simulators.black_box import BlackBox
@@ -134,10 +134,11 @@ def audit(
             next_experiment=next_experiment(answer),
         )
         shape = robot_shape(model.robot) if isinstance(model.robot, Robot) else None
-        page = render_audit(answer, content, title, describe(tables), shape)
+        seen = shown(answer)
+        page = render_audit(seen, content, title, describe(tables), shape)
         extended = extended_tables(dict(tables), answer, folder, out)
         made = None if isinstance(experiment.robot, str) else experiment.robot
-        return Audit(content, extended, page, made, out or folder, out)
+        return Audit(content, extended, page, made, out or folder, out, seen)
 
     if out is None:
         return found(None)

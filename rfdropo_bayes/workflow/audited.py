@@ -8,15 +8,23 @@ from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_text
-from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.report import audit_figures as figures
+from rfdropo_bayes.report.audit_figures import Shown
+from rfdropo_bayes.report.trajectory_figures import AXES
+from rfdropo_bayes.tables import nearest, parse_table
+from rfdropo_bayes.workflow.calibrated import axes_or_new
 from rfdropo_bayes.workflow.experiment import Experiment
 from rfdropo_bayes.workflow.experiment_file import describe
 from rfdropo_bayes.workflow.model import Model
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 AUDIT, EXTENDED, REPORT = "audit.json", "extended.toml", "report.html"
 
@@ -32,6 +40,7 @@ class Audit:
         robot: that was audited: a name or path, or the object itself.
         base: folder that paths in the tables are relative to.
         folder: that it was written to, if any.
+        shown: what its figures show; None where it was read from files.
     """
 
     content: Mapping[str, Any]
@@ -40,6 +49,7 @@ class Audit:
     robot: Any
     base: Path
     folder: Path | None = None
+    shown: Shown | None = None
 
     @property
     def verdict(self) -> str:
@@ -80,6 +90,72 @@ class Audit:
         if self.robot is not None:
             experiment = experiment.model_copy(update={"robot": self.robot})
         return Model.of_experiment(experiment, self.base)
+
+    def plot_residual(self, against: str = "time", ax: Axes | None = None) -> Axes:
+        """Draw what the base model leaves of the fitted recordings, beside what might have caused it.
+
+        Args:
+            against: time, command, rate, direction (sign of the rate), position, or tension.
+            ax: that it is drawn on; axes of a new figure by default.
+
+        Raises:
+            InputError: no such cause. As for all figures: the audit was read from files, which do not hold them.
+        """
+        residuals = self._shown().residuals
+        known = figures.causes(residuals)
+        if against not in known:
+            raise InputError(f"no cause {against!r}", where="audit", remedy=nearest(against, known))
+        axes = axes_or_new(ax)
+        figures.draw_residual(axes, residuals, against)
+        return axes
+
+    def plot_blocks(self, ax: Axes | None = None) -> Axes:
+        """Draw when each model fails: mean square of the means of blocks of rows, 1 where a model is right."""
+        axes = axes_or_new(ax)
+        figures.draw_blocks(axes, self._shown())
+        axes.legend()
+        return axes
+
+    def plot_likeness(self, ax: Axes | None = None) -> Axes:
+        """Draw how alike the candidates' signatures are: cosines, once the base parameters have done what they can."""
+        axes = axes_or_new(ax)
+        figures.draw_cosines(axes, self._shown())
+        return axes
+
+    def plot_unseen(self, axis: str = "x", ax: Axes | None = None) -> Axes:
+        """Draw the last marker of an unseen recording: measured, base model, extended model.
+
+        Raises:
+            InputError: no recording was left unseen, or nothing was named.
+        """
+        if self._shown().unseen is None:
+            raise InputError("no unseen recording was predicted", where="audit", remedy="give recordings as test=")
+        axes = axes_or_new(ax)
+        figures.draw_unseen(axes, self._shown(), AXES.index(axis))
+        axes.legend()
+        return axes
+
+    def plot_remainder(self, ax: Axes | None = None) -> Axes:
+        """Draw what the last model leaves of the last marker, with two standard deviations.
+
+        Raises:
+            InputError: it leaves nothing but noise.
+        """
+        if self._shown().remainder is None:
+            raise InputError("the last model leaves nothing but noise", where="audit", remedy="draw another figure")
+        axes = axes_or_new(ax)
+        figures.draw_remainder(axes, self._shown())
+        axes.legend()
+        return axes
+
+    def _shown(self) -> Shown:
+        if self.shown is None:
+            raise InputError(
+                "an audit that was read from files cannot draw",
+                where="audit",
+                remedy="see its report.html, or audit again",
+            )
+        return self.shown
 
     def report(self, path: Path | str) -> Path:
         """Write the report, one HTML page that needs nothing else; return its path."""

@@ -105,7 +105,7 @@ def test_few_data_sets_are_refused():
 
 
 @pytest.mark.slow
-def test_horizon_smc_is_calibrated_on_the_linear_model():
+def test_smc_is_calibrated_on_the_linear_model():
     found = sbc.calibrate(LinearGaussian(), simulate, "smc", {"particles": 150, "start": "prior"}, KEY, 60)
     assert found.passed, found.sentence
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpyro.distributions as dist
 import pytest
+from matplotlib.figure import Figure
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.priors import table_of
+from rfdropo_bayes.errors import InputError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.02
@@ -179,3 +182,12 @@ def test_an_audit_of_a_black_box_names_a_hidden_delay(runs):
     members = found.content["findings"][0]["equivalence_class"]
     assert "command_delay" in members
     assert "command_delay" in found.extended.mechanisms or len(members) > 1
+    axes = Figure().add_subplot()
+    assert found.plot_residual("rate", ax=axes) is axes
+    assert axes.get_xlabel().startswith("rate of")
+    assert len(found.plot_blocks(Figure().add_subplot()).patches) == len(found.shown.models)
+    assert next(line.get_label() for line in found.plot_unseen("x", Figure().add_subplot()).lines) == "measured"
+    with pytest.raises(InputError, match="did you mean 'rate'"):
+        found.plot_residual("rates")
+    with pytest.raises(InputError, match="cannot draw"):
+        replace(found, shown=None).plot_blocks()

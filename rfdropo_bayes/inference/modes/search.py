@@ -36,7 +36,7 @@ from rfdropo_bayes.inference.modes.targets import (
 )
 from rfdropo_bayes.inference.progress import UNRECORDED, UNSAVED, Checkpoint, Logbook, run_digest
 from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_cautions, prior_cautions
-from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc.moves import StraightProblem, squared_distance
 from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES
 
@@ -304,7 +304,7 @@ def survey(
     blocks = BlockProblem(StraightProblem(problem, straight_key), horizons)
     # The sampler takes blocks for rows of equal cost, which is more than short ones cost.
     whole = None if config.rollouts is None else SURVEY_OF_CLIMBS * config.rollouts * problem.n_rows / horizons[-1]
-    sampling = horizon_smc.SmcConfig(
+    sampling = sampler.SmcConfig(
         rollouts=whole,
         particles=config.survey,
         kernel="crank_nicolson",
@@ -326,25 +326,25 @@ def survey(
 
 
 def _populations(
-    blocks: BlockProblem, config: horizon_smc.SmcConfig, key: PRNGKeyArray, checkpoint: Checkpoint, logbook: Logbook
-) -> tuple[list[tuple[np.ndarray, np.ndarray]], horizon_smc.SmcState]:
+    blocks: BlockProblem, config: sampler.SmcConfig, key: PRNGKeyArray, checkpoint: Checkpoint, logbook: Logbook
+) -> tuple[list[tuple[np.ndarray, np.ndarray]], sampler.SmcState]:
     """Positions and rows of the particles at the end of each block, and the sampler's last state."""
     init_key, stage_key = jax.random.split(key)
-    plan = horizon_smc.make_plan(blocks, config)
+    plan = sampler.make_plan(blocks, config)
     ends: list[tuple[np.ndarray, np.ndarray]] = []
     saved = checkpoint.load()
     if saved is None:
-        state = horizon_smc.init(init_key, blocks, plan, config)
+        state = sampler.init(init_key, blocks, plan, config)
     else:
         arrays, meta = saved
-        state = horizon_smc.unpack(arrays, meta)
+        state = sampler.unpack(arrays, meta)
         ends = [(arrays[f"positions_{block}"], arrays[f"rows_{block}"]) for block in range(meta["ends"])]
     while not state.finished:
-        state, _ = horizon_smc.step(stage_key, state, blocks, plan, config)
+        state, _ = sampler.step(stage_key, state, blocks, plan, config)
         population = state.population
         if population.progress == len(ends) + 1:
             ends.append((population.position, population.rows))
-        arrays, meta = horizon_smc.pack(state)
+        arrays, meta = sampler.pack(state)
         for block, (position, rows) in enumerate(ends):
             arrays |= {f"positions_{block}": position, f"rows_{block}": rows}
         checkpoint.save(arrays, meta | {"ends": len(ends)})

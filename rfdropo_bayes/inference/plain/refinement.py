@@ -39,7 +39,7 @@ from rfdropo_bayes.inference.result import (
     prior_cautions,
     replicate_cautions,
 )
-from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc.bridge import BridgeConfig, BridgedProblem, ModeMixture
 from rfdropo_bayes.inference.smc.moves import SlopedProblem, chosen_kernel, fit_reference, host_generator
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
@@ -112,7 +112,7 @@ def run(
     config = replace(config, replicates=config.replicates or REPLICATES)
     large = chosen_kernel(config.kernel, problem, None) == "hamiltonian"
     whole = large or problem.n_rows > MOST_ROWS
-    first = horizon_smc.run(WholeProblem(problem) if whole else problem, config, first_key, logbook.part(0.0, 0.5))
+    first = sampler.run(WholeProblem(problem) if whole else problem, config, first_key, logbook.part(0.0, 0.5))
     values = {name: jnp.asarray(first.draws[name].ravel()) for name in problem.names}
     view = centred(problem, _finite(problem.to_unconstrained(values)))
     seed = int(host_generator(jax.random.fold_in(second_key, 1)).integers(2**31))
@@ -123,7 +123,7 @@ def run(
     bridged = _cover(view, _finite(view.to_unconstrained(values)), climbed.modes if climbed else [], seed)
     correlation, moves = min(config.correlation, FORGOTTEN), max(config.max_moves, MOST_MOVES)
     settings = replace(config, blocks=1, correlation=correlation, max_moves=moves)
-    second = horizon_smc.run(bridged, settings, second_key, logbook.part(0.5, 1.0, "refined"))
+    second = sampler.run(bridged, settings, second_key, logbook.part(0.5, 1.0, "refined"))
     joined = _joined(problem, view, bridged, first, second)
     if climbed is not None:
         ledger = climbed.climbs.ledger

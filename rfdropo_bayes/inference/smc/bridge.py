@@ -40,10 +40,9 @@ from rfdropo_bayes.inference.result import (
     replicate_cautions,
     stage_cautions,
 )
-from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc.moves import StraightProblem, host_generator, squared_distance
 
-FROM_OPTIMA = "smc_from_optima"
 LEAST_SHARE = 0.05  # of a mode, before normalising: Laplace evidences of ill-shaped modes are off by nats
 MOMENTS = 1000  # prior draws behind its mean and covariance
 NARROWEST = 1e-6  # least deviation of a normal approximation in any direction, as a share of its largest one
@@ -82,9 +81,9 @@ class BridgeConfig:
             raise InputError("prior_share must be at least 0 and below 1", where="[inference]")
 
     @property
-    def sampler(self) -> horizon_smc.SmcConfig:
+    def sampling(self) -> sampler.SmcConfig:
         """The same as settings of the sampler."""
-        return horizon_smc.SmcConfig(
+        return sampler.SmcConfig(
             rollouts=self.rollouts,
             particles=self.particles,
             replicates=self.replicates,
@@ -160,12 +159,12 @@ def sample_from_modes(
     """Sample from around optima that are known to the posterior; the climbs' cost is part of the result's."""
     moment_key, run_key = jax.random.split(key)
     view: Problem = problem
-    modes, ledger, sampler = found.modes, found.climbs.ledger, config.sampler
+    modes, ledger, sampling = found.modes, found.climbs.ledger, config.sampling
     if isinstance(problem, ResidualProblem):
         view = straight = StraightProblem(problem, moment_key)
         modes = [straight.mode(mode) for mode in modes]
     bridged = BridgedProblem(view, covering(view, modes, moment_key), config)
-    sampled = horizon_smc.run(bridged, sampler, run_key, logbook)
+    sampled = sampler.run(bridged, sampling, run_key, logbook)
     u = np.stack([sampled.draws[name] for name in bridged.names], axis=-1)
     values = view.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
     draws = {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in problem.names}
@@ -173,7 +172,7 @@ def sample_from_modes(
     evaluations = ledger.evaluations + sampled.evaluations
     # Several optima are what the mixture is for: no caution here, unlike in Laplace alone.
     # What the sampler says of coordinates, and of its share of rollouts, is said below of parameters and of all.
-    kept = stage_cautions(sampled.trace, sampler.rollouts, sampler.correlation)
+    kept = stage_cautions(sampled.trace, sampling.rollouts, sampling.correlation)
     kept += replicate_cautions(draws, np.asarray(sampled.details["log_evidence_replicates"]))
     kept += [caution for caution in found.cautions if caution.code is Code.CLIMB_UNFINISHED]
     return replace(
@@ -192,7 +191,7 @@ def sample_from_modes(
         optimum=mode_values(problem, found.modes[0]),
         details=sampled.details
         | {
-            "algorithm": FROM_OPTIMA,
+            "algorithm": "bridge",
             "laplace_log_evidence": [mode.log_evidence for mode in found.modes],
             "modes": len(found.modes),
         },

@@ -38,12 +38,12 @@ from rfdropo_bayes.inference.plain import refinement
 from rfdropo_bayes.inference.plain.problem import NumpyroProblem
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook, run_digest
 from rfdropo_bayes.inference.result import InferenceResult
-from rfdropo_bayes.inference.smc import bridge
-from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc import bridge, sampler
 from rfdropo_bayes.inference.smc.bridge import ModeMixture
 from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES, MOST_REPLICATES, WORTH_A_REPLICATE, SmcConfig
 from rfdropo_bayes.inference.smc.tempering import log_effective_sample_size
 
+FROM_OPTIMA = "smc_from_optima"
 CLIMBING = 0.25  # share of the budget that climbs to optima may take
 SURVEY_OF_ALL = 0.4  # and the survey before them
 PER_SURVEYOR = 32.0  # rollouts that a particle of the survey takes, typically
@@ -73,12 +73,12 @@ def run(
     """Sample a posterior, from the start that ``config.start`` names or that the budget allows.
 
     Raises:
-        InputError: as `horizon_smc.run`; or a start at the optima is asked for and the problem has no residuals.
+        InputError: as `sampler.run`; or a start at the optima is asked for and the problem has no residuals.
     """
     if _refinable(problem, config):
         return refinement.run(problem, config, key, logbook)
     if config.start == "prior" or (config.start == "auto" and not _worth_judging(problem, config)):
-        return horizon_smc.run(problem, config, key, logbook)
+        return sampler.run(problem, config, key, logbook)
     if not isinstance(problem, ResidualProblem):
         raise InputError(
             'start = "optimum" is for problems with residuals, and this one has no residuals',
@@ -100,11 +100,11 @@ def run(
             raise
         # No draw to climb from had a likelihood: whether the prior excludes the data is for more particles to say.
         left = replace(config, rollouts=_left(config, spent))
-        return _with_cost(horizon_smc.run(problem, left, key, logbook), spent)
+        return _with_cost(sampler.run(problem, left, key, logbook), spent)
     if found is not None:
         return _from_optima(problem, config, found, way, sample_key, logbook.part(CLIMBED, 1.0))
     assert way is not None
-    result = horizon_smc.run(problem, _several(way, config, _left(config, spent)), sample_key, logbook)
+    result = sampler.run(problem, _several(way, config, _left(config, spent)), sample_key, logbook)
     facts = {"expected_stages": way.stages, "information_nats": way.information}
     return replace(_with_cost(result, spent), details=result.details | facts)
 
@@ -185,7 +185,7 @@ def _from_optima(
     settings = bridge.BridgeConfig(
         rollouts=sampling,
         particles=config.particles,
-        replicates=horizon_smc.decided(1, replace(config, rollouts=sampling, blocks=1)).chains,
+        replicates=sampler.decided(1, replace(config, rollouts=sampling, blocks=1)).chains,
         target_ess=config.target_ess,
         draws=config.draws,
     )
@@ -205,6 +205,7 @@ def _from_optima(
         evaluations=result.evaluations + ledger.evaluations,
         details=result.details
         | {
+            "algorithm": FROM_OPTIMA,
             **({} if way is None else {"expected_stages": way.stages, "information_nats": way.information}),
             "prefix_ess": [prefix.ess for prefix in prefixes],
         },

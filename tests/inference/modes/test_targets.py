@@ -13,8 +13,7 @@ from rfdropo_bayes.inference.modes import search as laplace
 from rfdropo_bayes.inference.modes.climb import maximise
 from rfdropo_bayes.inference.modes.search import LaplaceConfig
 from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
-from rfdropo_bayes.inference.smc import bridge
-from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc import bridge, sampler
 from rfdropo_bayes.inference.smc.bridge import BridgeConfig
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
@@ -112,7 +111,7 @@ def test_a_nonlinear_model_agrees_with_smc():
     """Both estimate means to about 0.03 sd; Laplace's mode is off by O(1 / n), most for the noise (0.3 sd)."""
     problem = Decay()
     result = laplace.run(problem, LaplaceConfig(), KEY)
-    sampled = horizon_smc.run(problem, SmcConfig(particles=1000, replicates=2), KEY)
+    sampled = sampler.run(problem, SmcConfig(particles=1000, replicates=2), KEY)
     for name in problem.names:
         reference = sampled.draws[name]
         assert abs(result.draws[name].mean() - reference.mean()) < 0.4 * reference.std()
@@ -128,6 +127,7 @@ def test_the_bridge_has_the_evidence_at_a_fraction_of_the_rollouts():
     assert result.log_evidence[0] == pytest.approx(exact, abs=0.12)
     assert result.log_evidence[1] < 0.15
     assert result.rollouts < 4 * 500 * 8
+    assert result.details["algorithm"] == "bridge"
     mean, covariance = problem.posterior()
     draws = np.stack([result.draws[name].ravel() for name in problem.names], axis=1)
     assert np.abs((draws.mean(axis=0) - mean) / np.sqrt(np.diag(covariance))).max() < 0.12

@@ -14,7 +14,7 @@ from scipy.stats import gamma, multivariate_normal
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.plain.problem import problem_from_numpyro
-from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
 from ..toys import LinearGaussian
@@ -252,7 +252,7 @@ def test_what_cannot_be_represented_is_drawn_anew():
 
     problem = problem_from_numpyro(model, (np.ones(3),))
     config = SmcConfig(particles=300)
-    population = horizon_smc.init(KEY, problem, horizon_smc.make_plan(problem, config), config).population
+    population = sampler.init(KEY, problem, sampler.make_plan(problem, config), config).population
     share = gammainc(1e-4, 1e-4 * np.finfo(float).tiny)
     assert len(np.unique(population.position)) == 300
     assert np.exp(population.log_weights).sum() == pytest.approx(1.0 - share, abs=0.02)

@@ -12,7 +12,7 @@ import pytest
 
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
 from ..toys import Decay, LinearGaussian, TwoModes
@@ -23,7 +23,7 @@ KEY = jax.random.key(20)
 @pytest.fixture(scope="module")
 def linear():
     problem = LinearGaussian()
-    return problem, horizon_smc.run(problem, SmcConfig(particles=1000, replicates=10), KEY)
+    return problem, sampler.run(problem, SmcConfig(particles=1000, replicates=10), KEY)
 
 
 def test_evidence_of_every_prefix(linear):
@@ -67,10 +67,7 @@ def test_what_a_budget_has_left_becomes_further_draws():
     in 5000, three parameters together."""
     problem = LinearGaussian()
     few, many = (
-        [
-            horizon_smc.run(problem, SmcConfig(rollouts=4000.0, particles=100, draws=d), jax.random.key(i))
-            for i in range(5)
-        ]
+        [sampler.run(problem, SmcConfig(rollouts=4000.0, particles=100, draws=d), jax.random.key(i)) for i in range(5)]
         for d in (100, 400)
     )
     for plain, result in zip(few, many, strict=True):
@@ -88,7 +85,7 @@ def test_what_a_budget_has_left_becomes_further_draws():
 def test_random_walk_agrees_and_costs_more(linear):
     problem, reference = linear
     config = SmcConfig(particles=1000, replicates=4, kernel="random_walk")
-    result = horizon_smc.run(problem, config, KEY)
+    result = sampler.run(problem, config, KEY)
     assert result.log_evidence[0] == pytest.approx(problem.prefix_log_evidence()[-1], abs=0.25)
     assert result.rollouts / 4 > 2.0 * reference.rollouts / 10
 
@@ -96,7 +93,7 @@ def test_random_walk_agrees_and_costs_more(linear):
 def test_nothing_is_evaluated_twice():
     """Rollouts charged are those made, and only first looks at a block and proposals are made."""
     problem = LinearGaussian()
-    result = horizon_smc.run(problem, SmcConfig(particles=100), KEY)
+    result = sampler.run(problem, SmcConfig(particles=100), KEY)
     assert sum(n * h for n, h in problem.calls) / problem.n_rows == pytest.approx(result.rollouts)
     moves = sum(row["moves"] for row in result.trace if row["moves"] and not row.get("final"))
     moves += sum(row["moves"] for row in result.trace if row.get("final"))
@@ -106,7 +103,7 @@ def test_nothing_is_evaluated_twice():
 
 def test_same_key_same_draws_other_key_other_draws():
     problem, config = LinearGaussian(), SmcConfig(particles=100, replicates=2)
-    first, again, other = (horizon_smc.run(problem, config, jax.random.key(k)) for k in (1, 1, 2))
+    first, again, other = (sampler.run(problem, config, jax.random.key(k)) for k in (1, 1, 2))
     for name in problem.names:
         np.testing.assert_array_equal(first.draws[name], again.draws[name])
         assert not np.array_equal(first.draws[name], other.draws[name])
@@ -117,7 +114,7 @@ def test_same_key_same_draws_other_key_other_draws():
 def test_two_modes_keep_their_shares():
     """4000 draws of a share of 0.61 scatter by 0.008 if independent; resampling at few stages makes it about 0.02."""
     problem = TwoModes()
-    result = horizon_smc.run(problem, SmcConfig(particles=1000, replicates=4), KEY)
+    result = sampler.run(problem, SmcConfig(particles=1000, replicates=4), KEY)
     evidence, share = problem.mode_evidence()
     assert result.log_evidence[0] == pytest.approx(evidence, abs=0.15)
     assert np.mean(result.draws["x0"] > 0) == pytest.approx(share, abs=0.08)
@@ -126,7 +123,7 @@ def test_two_modes_keep_their_shares():
 
 def test_failed_rollouts_get_no_weight_and_are_counted():
     problem = Decay(fails_above=0.8)
-    result = horizon_smc.run(problem, SmcConfig(particles=400), KEY)
+    result = sampler.run(problem, SmcConfig(particles=400), KEY)
     assert result.draws["rate"].max() <= 0.8
     assert np.isfinite(result.log_likelihood).all()
     assert np.isfinite(result.log_evidence[0])
@@ -143,20 +140,20 @@ def test_a_failure_costs_evidence_by_its_prior_mass():
             rows, status = super().row_log_likelihood(values, horizon)
             return np.where(np.isnan(rows), np.nan, 0.0), status
 
-    result = horizon_smc.run(Flat(n_rows=3, fails_above=1.0), SmcConfig(particles=4000, blocks=1), KEY)
+    result = sampler.run(Flat(n_rows=3, fails_above=1.0), SmcConfig(particles=4000, blocks=1), KEY)
     assert result.log_evidence[0] == pytest.approx(np.log(0.5), abs=0.06)  # 4 binomial deviations
 
 
 def test_a_prior_that_excludes_the_data_is_named():
     with pytest.raises(InputError, match=r"the prior excludes the data.*diverged 200"):
-        horizon_smc.run(Decay(fails_above=-1.0), SmcConfig(particles=200), KEY)
+        sampler.run(Decay(fails_above=-1.0), SmcConfig(particles=200), KEY)
 
 
 def test_a_prior_far_from_the_data_collapses_the_evidence():
     near, far = LinearGaussian(), LinearGaussian()
     far.mean = far.mean + 30.0
     exact = far.prefix_log_evidence()[-1]
-    result = horizon_smc.run(far, SmcConfig(particles=300), KEY)
+    result = sampler.run(far, SmcConfig(particles=300), KEY)
     assert exact < near.prefix_log_evidence()[-1] - 100.0
     assert result.log_evidence[0] == pytest.approx(exact, rel=0.01)
     assert any(caution.sentence.startswith("the data put x0, x1, x2 into the outermost") for caution in result.cautions)
@@ -165,7 +162,7 @@ def test_a_prior_far_from_the_data_collapses_the_evidence():
 @pytest.mark.parametrize("budget", [pytest.param(1500.0, marks=pytest.mark.slow), 8000.0])
 def test_the_budget_is_kept(budget):
     problem = LinearGaussian(n_rows=40, d=8)
-    result = horizon_smc.run(problem, SmcConfig(rollouts=budget, replicates=2), KEY)
+    result = sampler.run(problem, SmcConfig(rollouts=budget, replicates=2), KEY)
     assert result.rollouts <= budget
     assert sum(n * h for n, h in problem.calls) / problem.n_rows <= budget
     assert np.isfinite(result.log_evidence[0])
@@ -173,14 +170,14 @@ def test_the_budget_is_kept(budget):
 
 def test_a_budget_that_runs_out_is_said():
     problem = LinearGaussian(n_rows=40, d=8)
-    result = horizon_smc.run(problem, SmcConfig(rollouts=1100.0, particles=300), KEY)
+    result = sampler.run(problem, SmcConfig(rollouts=1100.0, particles=300), KEY)
     assert result.rollouts <= 1100
     assert Code.BUDGET_SPENT in [caution.code for caution in result.cautions]
 
 
 def test_a_budget_that_allows_nothing_is_refused():
     with pytest.raises(InputError, match=r"too few.*allow at least"):
-        horizon_smc.run(LinearGaussian(), SmcConfig(rollouts=20.0), KEY)
+        sampler.run(LinearGaussian(), SmcConfig(rollouts=20.0), KEY)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +194,7 @@ def test_a_ridge_is_followed_by_few_particles():
     problem.design[:, 1] = problem.design[:, 0]
     problem.noise = problem.noise * 0.01
     problem.data = problem.design @ problem.mean
-    result = horizon_smc.run(problem, SmcConfig(particles=150, replicates=2), KEY)
+    result = sampler.run(problem, SmcConfig(particles=150, replicates=2), KEY)
     _, covariance = problem.posterior()
     assert covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]) < -0.999
     assert result.log_evidence[0] == pytest.approx(problem.prefix_log_evidence()[-1], abs=1.0)

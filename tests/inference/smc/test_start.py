@@ -12,7 +12,7 @@ from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.modes import search as laplace
 from rfdropo_bayes.inference.modes.climb import Laplace
-from rfdropo_bayes.inference.smc import sampler as horizon_smc
+from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc import start as starts
 from rfdropo_bayes.inference.smc.bridge import ModeMixture
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
@@ -239,8 +239,8 @@ def test_as_many_replicates_start_at_the_prior_as_can_go_all_the_way(options, ex
 
 def test_a_budget_decides_on_replicates_and_without_one_there_is_one():
     """20 rollouts a particle and 100 particles each, or what a look at every row costs, if that is more."""
-    assert horizon_smc.decided(30, SmcConfig(rollouts=1000.0)).chains == 1
-    assert horizon_smc.decided(30, SmcConfig(rollouts=5000.0)).chains == 2
-    assert horizon_smc.decided(30, SmcConfig(rollouts=1e5)).chains == 4
-    assert horizon_smc.decided(200, SmcConfig(rollouts=5000.0, spacing="every")).chains == 1
-    assert horizon_smc.decided(30, SmcConfig()).chains == 1
+    assert sampler.decided(30, SmcConfig(rollouts=1000.0)).chains == 1
+    assert sampler.decided(30, SmcConfig(rollouts=5000.0)).chains == 2
+    assert sampler.decided(30, SmcConfig(rollouts=1e5)).chains == 4
+    assert sampler.decided(200, SmcConfig(rollouts=5000.0, spacing="every")).chains == 1
+    assert sampler.decided(30, SmcConfig()).chains == 1
