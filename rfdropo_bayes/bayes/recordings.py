@@ -12,6 +12,7 @@ from rfdropo_bayes.bayes.noise import Timeline, timeline
 from rfdropo_bayes.data import Trajectory, check_channels, shared_markers
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
+from rfdropo_bayes.simulators.extended import ExtendedSimulator
 from rfdropo_bayes.simulators.protocol import Simulator
 
 
@@ -76,7 +77,7 @@ def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) 
         times.append(np.concatenate([trajectory.time, tail]) - trajectory.time[0])
         positions.append(np.pad(position, ((0, missing), (0, 0), (0, 0))))
         valid.append(np.pad(mask, ((0, missing), (0, 0))))
-        commands.append(_commands(simulator, trajectory))
+        commands.append(commands_of(simulator, trajectory))
     lines = [timeline(time, ok) for time, ok in zip(times, valid, strict=True)]
     return RecordingSet(
         names,
@@ -90,7 +91,15 @@ def gather_recordings(simulator: Simulator, trajectories: Sequence[Trajectory]) 
     )
 
 
-def _commands(simulator: Simulator, trajectory: Trajectory) -> Commands:
+def commands_of(simulator: Simulator, trajectory: Trajectory) -> Commands:
+    """Commands of a recording on the simulator's clock, as its drives take them.
+
+    Raises:
+        InputError: other channels or another unit than the simulator's, or drives that do not fit the recording.
+    """
     unit = getattr(simulator, "command_unit", trajectory.command_unit)
     check_channels(trajectory, simulator.channel_names, unit)
-    return simulator.commands(trajectory.command_time, trajectory.command, trajectory.initial_command, trajectory.time)
+    initial, command = trajectory.initial_command, trajectory.command
+    if isinstance(simulator, ExtendedSimulator):
+        command = simulator.taken(trajectory.name, initial, command)
+    return simulator.commands(trajectory.command_time, command, initial, trajectory.time)

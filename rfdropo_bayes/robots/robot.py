@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 
 from rfdropo_bayes.robots.body import Body
 from rfdropo_bayes.robots.cable import Cable, Channels
+from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in
 from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.table import Name, Positive, Table, Vector
@@ -91,6 +92,9 @@ class Robot(Table):
     motors: tuple[Motor, ...] = Field(
         default=(), description="drives of the channels, in their order; none where the robot is only recorded"
     )
+    drives: tuple[DriveTravel, ...] = Field(
+        default=(), description="what is known of the drives: limits of travel, and what happens to commands beyond"
+    )
     parameters: dict[Name, Parameter] = Field(description="physical parameters with bounds and default priors, by name")
 
     @model_validator(mode="after")
@@ -119,6 +123,8 @@ class Robot(Table):
             raise ValueError("the bounds of a mass let it be negative, or the trunk massless")
         self._check_inside()
         self._check_motors()
+        for table in self.drives:
+            table.columns(self.channel_names)
         return self
 
     def _check_motors(self) -> None:
@@ -157,6 +163,10 @@ class Robot(Table):
     def without_command_timing(self) -> Robot:
         """The same robot, carrying every command out at once: no ramp, no dead time."""
         return self.model_copy(update={"command": Command(unit=self.command.unit, ramp_s=0.0, dead_time_s=0.0)})
+
+    def travel(self, recording: str, initial: Float[np.ndarray, " channel"]) -> Travel | None:
+        """What is stated of the drives in a recording that begins at this command [m or rad]; see `travel_in`."""
+        return travel_in(self.drives, self.channel_names, recording, initial)
 
     @property
     def gravity(self) -> Float[np.ndarray, "3"]:

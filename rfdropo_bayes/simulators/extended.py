@@ -43,6 +43,12 @@ class ExtendedSimulator:
         """Any place that the markers can have [m]."""
         raise NotImplementedError
 
+    def taken(
+        self, recording: str, initial: Float[np.ndarray, " channel"], value: Float[np.ndarray, "command channel"]
+    ) -> Float[np.ndarray, "command channel"]:
+        """The commands of a recording as the drives take them, given those that were sent [m or rad]."""
+        return value
+
     def complete(self, parameters: Values) -> dict[str, Array]:
         """All values by name; those left out are nominal.
 

@@ -132,6 +132,17 @@ class RobotSimulator(ExtendedSimulator):
         """Material of the body, and the cube before it, for these values."""
         return self.material(values), cube_inputs(self.robot, values) if self.pushes else None
 
+    def taken(
+        self, recording: str, initial: Float[np.ndarray, " channel"], value: Float[np.ndarray, "command channel"]
+    ) -> Float[np.ndarray, "command channel"]:
+        """See `ExtendedSimulator.taken`; what happens to commands beyond the travel is stated by the robot.
+
+        Raises:
+            InputError: what is stated of the drives does not fit the recording; see `robots.travel_in`.
+        """
+        travel = self.robot.travel(recording, initial)
+        return value if travel is None else travel.follow(initial, value)
+
     def rollout(self, parameters: Values, commands: Commands, steps: Int[Array, ""] | None = None) -> Observation:
         """Simulate from the initial state to the last observation.
 

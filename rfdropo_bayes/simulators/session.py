@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import astuple, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import Material
+from rfdropo_bayes.robots import Travel
 from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneMotion, body_lanes, flat_lanes, lanes_like
 from rfdropo_bayes.simulators.commands import carried_out
 from rfdropo_bayes.simulators.engine import CubeInputs
@@ -61,13 +63,15 @@ class Session:
         simulator: whose rollouts the lanes are.
         lanes: how many.
         period: control period [s], a whole number of time steps.
+        recording: as whose drives those of the lanes answer commands, where what is known of them differs between
+            recordings; what holds for all recordings by default.
 
     Raises:
         InputError: a period that is none, or a mechanism that is not written by steps.
     """
 
-    def __init__(self, simulator: Any, lanes: int, period: float) -> None:
-        self.simulator, self.lanes, self.period = simulator, lanes, float(period)
+    def __init__(self, simulator: Any, lanes: int, period: float, recording: str = "") -> None:
+        self.simulator, self.lanes, self.period, self.recording = simulator, lanes, float(period), recording
         self.robot = simulator.robot
         self.steps = round(period / simulator.time_step)
         if self.steps < 1 or abs(self.steps - period / simulator.time_step) > WHOLE:
@@ -84,6 +88,10 @@ class Session:
         kept = math.ceil((command.ramp_s + command.dead_time_s) / self.period + WHOLE) + 2
         channels = len(self.robot.channel_names)
         self._past = _Past(np.full((lanes, kept), -np.inf), np.zeros((lanes, kept, channels)), np.zeros(lanes, int))
+        self._travel = self.robot.travel(recording, np.zeros(channels))
+        if self._travel is not None:
+            self._travel = Travel(*(np.tile(part, (lanes, 1)) for part in astuple(self._travel)))
+        self._forgotten = np.zeros((lanes, channels))
         self._started = np.zeros(lanes, bool)
         self._drives = self._first_drives(self._values, np.zeros((lanes, channels)))[0]
         self._cameras = self._first_look(self._values, np.zeros((lanes, len(self.robot.marker_names), 3)))[0]
@@ -121,8 +129,8 @@ class Session:
             The first observation of these rows.
 
         Raises:
-            InputError: no such lane or parameter, a value outside its hard bounds, or one that a mechanism cannot
-                carry out by steps.
+            InputError: no such lane or parameter, a value outside its hard bounds, one that a mechanism cannot
+                carry out by steps, or a command outside the travel of the drives.
         """
         rows = np.atleast_1d(np.asarray(rows, dtype=np.intp))
         if rows.size == 0 or rows.min() < 0 or rows.max() >= self.lanes or len(set(rows.tolist())) < len(rows):
@@ -131,6 +139,7 @@ class Session:
         first = np.zeros((len(rows), len(self.robot.channel_names))) if command is None else np.asarray(command, float)
         past = self._past
         past.given[rows], past.value[rows], past.periods[rows] = -np.inf, first[:, None], 0
+        self._begin_travel(rows, first)
         fresh, angle = self._first_drives(self._values, past.value[:, -1])
         chosen = np.zeros(self.lanes, bool)
         chosen[rows] = True
@@ -171,7 +180,10 @@ class Session:
 
     def save(self) -> dict[str, np.ndarray]:
         """A copy of the state: arrays by name, one row a lane."""
+        travel = {} if self._travel is None else {"low": self._travel.low.copy(), "high": self._travel.high.copy()}
         return {
+            **travel,
+            "forgotten": self._forgotten.copy(),
             "started": self._started.copy(),
             "parameters": self._table.copy(),
             "command_time": self._past.given.copy(),
@@ -200,13 +212,24 @@ class Session:
             if name != "bodies":
                 part[chosen] = state[name]
         self.bodies.restore(chosen, state["bodies"])
-        self._started = mine["started"]
+        self._started, self._forgotten = mine["started"], mine["forgotten"]
+        if self._travel is not None:
+            self._travel = replace(self._travel, low=mine["low"], high=mine["high"])
         self._table, self._values = mine["parameters"], jnp.asarray(mine["parameters"])
         self._past = _Past(mine["command_time"], mine["command"], mine["periods"])
         self._drives, self._cameras = (
             lanes_like(self._drives, mine["drives"]),
             lanes_like(self._cameras, mine["cameras"]),
         )
+
+    def _begin_travel(self, rows: np.ndarray, first: Float[np.ndarray, "row channel"]) -> None:
+        """Limits of the drives of lanes that start from these commands."""
+        self._forgotten[rows] = 0.0
+        if self._travel is None:
+            return
+        for row, command in zip(rows, first, strict=True):
+            travel = self.robot.travel(self.recording, command)
+            self._travel.low[row], self._travel.high[row] = travel.low, travel.high
 
     def _check_mechanisms(self, mechanisms: tuple[Mechanism, ...]) -> None:
         for mechanism in mechanisms:
@@ -246,6 +269,8 @@ class Session:
     def _sent(self, commands: Float[np.ndarray, "lane channel"]) -> Float[np.ndarray, "lane step channel"]:
         """What the drives carry out in every step of the period, ramps and dead time included."""
         past, timing, time_step = self._past, self.robot.command, self.simulator.time_step
+        if self._travel is not None:
+            self._forgotten, commands = self._travel.advance(self._forgotten, past.value[:, -1], commands)
         past.given[:, :-1], past.value[:, :-1] = past.given[:, 1:].copy(), past.value[:, 1:].copy()
         past.given[:, -1], past.value[:, -1] = self.time, commands
         step = self.steps * past.periods[:, None] + np.arange(1, self.steps + 1)

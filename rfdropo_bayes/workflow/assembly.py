@@ -102,7 +102,10 @@ def build_simulator(
     """Robot, body, engine and mechanisms; ``folder`` is that of the experiment file, for the mesh of a body."""
     table = experiment.simulator
     if isinstance(robot, BlackBox):
+        if experiment.model.drives:
+            raise InputError("a black box has no drives", where="[[model.drives]]", remedy="let the box have them")
         return BlackBoxSimulator(robot, mechanisms_named(experiment.model.mechanisms, robot, folder=folder))
+    robot = with_drives(robot, experiment.model)
     if table.drives == "direct":
         robot = robot.without_command_timing()
     time_step = table.time_step or robot.time_step_s
@@ -120,6 +123,22 @@ def build_simulator(
         engine = Engine(assembly, time_step, backend(table, True), robot.initial_state == "equilibrium")
         trunk = TrunkSimulator(robot, engine, assembly, discretisation, mechanisms)
     return trunk.pushing() if table.push else trunk
+
+
+def with_drives(robot: Robot, table: ModelTable) -> Robot:
+    """A robot with what the experiment states of its drives; names of groups stand for their recordings.
+
+    Raises:
+        InputError: a cable that the robot does not have.
+    """
+    stated = []
+    for drives in (*robot.drives, *table.drives):
+        drives.columns(robot.channel_names)
+        named = [drives.recordings] if isinstance(drives.recordings, str) else drives.recordings
+        patterns = (table.groups.get(name, name) for name in named)
+        flat = [each for entry in patterns for each in ([entry] if isinstance(entry, str) else entry)]
+        stated.append(drives.model_copy(update={"recordings": tuple(flat)}))
+    return robot.model_copy(update={"drives": tuple(stated)}) if stated else robot
 
 
 def measurement_specs(table: ModelTable) -> tuple[ParameterSpec, ...]:

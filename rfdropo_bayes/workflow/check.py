@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -22,8 +22,8 @@ from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.report.recording_figures import save_recording
-from rfdropo_bayes.robots import Robot, robot_shape
-from rfdropo_bayes.workflow.assembly import build_model, build_simulator, find_robot
+from rfdropo_bayes.robots import Robot, Travel, robot_shape
+from rfdropo_bayes.workflow.assembly import build_model, build_simulator, find_robot, with_drives
 from rfdropo_bayes.workflow.calibration import inference_options
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
 from rfdropo_bayes.workflow.files import output_folder
@@ -70,6 +70,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
     folder = Path(path).resolve().parent
     robot = find_robot(experiment, folder)
     found = Check()
+    robot = _try(found, partial(with_drives, robot, experiment.model)) or robot
     _say_robot(found, robot)
     recordings = {role: list(_read(found, experiment, folder, role)) for role in ("fit", "test")}
     for role, trajectories in recordings.items():
@@ -188,6 +189,10 @@ def _commands(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[st
         return
     if tuple(names) != robot.channel_names:
         yield f"the robot calls them {_names(robot.channel_names)}, in this order"
+    travel = _try(found, partial(robot.travel, trajectory.name, trajectory.initial_command))
+    if travel is not None:
+        yield from _travel(travel, robot)
+        command = travel.follow(trajectory.initial_command, command)
     asked = command @ np.asarray(robot.channel_matrix({})).T
     for cable, low, high, (least, most) in zip(
         robot.cable_names, asked.min(axis=0), asked.max(axis=0), robot.displacement_limits(), strict=True
@@ -198,6 +203,17 @@ def _commands(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[st
                 f"mm; beyond its displacement_limit_m, {MILLIMETRES * least:.3g} to {MILLIMETRES * most:.3g} mm, it is "
                 "held"
             )
+
+
+def _travel(travel: Travel, robot: Robot) -> Iterator[str]:
+    """What is stated of the drives in one recording, channels alike together."""
+    alike: dict[str, list[str]] = {}
+    for name, low, high, lost, kept in zip(robot.channel_names, *astuple(travel), strict=True):
+        word = "lost" if lost else "kept" if kept else "clipped"
+        if np.isfinite(low) or np.isfinite(high):
+            alike.setdefault(f"{low:.4g} to {high:.4g} {robot.command_unit}, beyond: {word}", []).append(name)
+    for text, names in alike.items():
+        yield f"drives of {_names(names)}: {text}"
 
 
 def _say_repeats(found: Check, trajectories: Sequence[Trajectory]) -> None:

@@ -203,7 +203,8 @@ def _outlooks(
 ) -> list[Outlook]:
     """Outlooks of the proposals, one of each kind at a time; of the first few, whatever the time."""
     simulator = question.lanes.simulator
-    sequences = [simulator.commands(t, v, first.initial_command, first.time) for _, t, v in proposals]
+    held = first.initial_command
+    sequences = [simulator.commands(t, simulator.taken(first.name, held, v), held, first.time) for _, t, v in proposals]
     shaped = _shaped(sequences, question.model.recordings.commands)
     outlook = outlooks(target, base, hypotheses, shaped[:KINDS])
     for start in range(KINDS, len(shaped), KINDS):

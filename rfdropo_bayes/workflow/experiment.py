@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rfdropo_bayes.data import DataSpec
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable
 from rfdropo_bayes.tables import parse_table
@@ -62,6 +62,10 @@ class ModelTable(Table):
         default_factory=dict,
         description="recordings that have a set-up in common (a day, a robot), by names or wildcards; one in no group"
         " is a group of its own",
+    )
+    drives: list[DriveTravel] = Field(
+        default_factory=list,
+        description="what is known of the drives, beside what the robot file says",
     )
     per_group: dict[str, float] = Field(
         default_factory=dict,

@@ -13,7 +13,8 @@ import pandas as pd
 from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
-from rfdropo_bayes.data import Trajectory, check_channels, shared_markers
+from rfdropo_bayes.bayes.recordings import commands_of
+from rfdropo_bayes.data import Trajectory, shared_markers
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.simulators.commands import Commands
@@ -98,8 +99,7 @@ def _rollouts(
     rollout = jax.jit(simulator.rollout)
     for source in sources:
         markers = shared_markers([source], simulator.marker_names)
-        check_channels(source, simulator.channel_names, simulator.command_unit)
-        commands = simulator.commands(source.command_time, source.command, source.initial_command, source.time)
+        commands = commands_of(simulator, source)
         observation = jax.device_get(rollout({k: np.asarray(v) for k, v in values.items()}, commands))
         chosen = [simulator.marker_names.index(name) for name in markers]
         result = Result(int(observation.status))

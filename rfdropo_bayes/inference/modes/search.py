@@ -22,12 +22,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
+from scipy.special import logsumexp
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, Values
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.climb import Climbable, Laplace, LevenbergState, climb_cost, laplace, maximise
+from rfdropo_bayes.inference.modes.mixture import MIXTURES, draw_mixture, mixture_weights, rivals
 from rfdropo_bayes.inference.modes.targets import (
     SmoothTarget,
     log_likelihood_derivatives,
@@ -64,7 +66,9 @@ class LaplaceConfig:
         max_steps: most steps of a climb at one horizon.
         tolerance: a climb ends when a step promises less [nat].
         jacobian: "forward", "central" or "auto".
-        draws: draws from the normal approximation.
+        draws: draws from the normal approximations.
+        mixture: weights of the optima that explain the data about as well as the best, see `mixture.rivals`: "equal",
+            "evidence" (Laplace's), or "best" for the best alone.
         rollouts: budget in full-length rollouts, of which every climb gets its share, and a survey at most
             `SURVEY_OF_CLIMBS`; None for no limit.
     """
@@ -78,6 +82,7 @@ class LaplaceConfig:
     jacobian: str = "auto"
     draws: int = 2000
     rollouts: float | None = None
+    mixture: str = "equal"
 
     def __post_init__(self) -> None:
         for name in ("starts", "screen", "blocks", "max_steps", "draws"):
@@ -87,6 +92,10 @@ class LaplaceConfig:
             raise InputError(f"survey = {self.survey} is neither 0 nor {FEWEST_PARTICLES} or more", where="[inference]")
         if self.tolerance <= 0.0 or (self.rollouts is not None and self.rollouts <= 0.0):
             raise InputError("tolerance and rollouts must be positive", where="[inference]")
+        if self.mixture not in MIXTURES:
+            raise InputError(
+                f"unknown mixture {self.mixture!r}", where="[inference]", remedy=f"one of {', '.join(MIXTURES)}"
+            )
         if self.jacobian not in JACOBIANS:
             raise InputError(
                 f"unknown jacobian {self.jacobian!r}", where="[inference]", remedy=f"one of {', '.join(JACOBIANS)}"
@@ -131,6 +140,7 @@ def find_modes(
     checkpoint: Checkpoint = UNSAVED,
     logbook: Logbook = UNRECORDED,
     ledger: Ledger | None = None,
+    chosen: Callable[[Climbs], Bool[np.ndarray, " start"]] | None = None,
 ) -> Modes:
     """Climb from the best of some prior draws to the optima of the full posterior.
 
@@ -141,6 +151,7 @@ def find_modes(
         checkpoint: of the climbs.
         logbook: for the checkpoint of a survey, and where stages are reported.
         ledger: is charged; after an error it knows what was spent in vain.
+        chosen: which of the last climbs matter; by default those within `RIVAL` nats of the best.
 
     Raises:
         InputError: a problem without residuals whose likelihood JAX cannot differentiate either.
@@ -173,7 +184,8 @@ def find_modes(
         share = (climbs.level + climbs.done / len(climbs.positions)) / len(horizons)
         logbook.part(SURVEY_OF_CLIMBS * (config.survey > 0), 1.0).stage(share, method="laplace", **climbs.trace[-1])
     assert climbs.noise is not None
-    return _collect(climbs, target_at(problem.n_rows, climbs.ledger, climbs.positions[0], climbs.noise))
+    matter = climbs.log_density > climbs.log_density.max() - RIVAL if chosen is None else chosen(climbs)
+    return _collect(climbs, target_at(problem.n_rows, climbs.ledger, climbs.positions[0], climbs.noise), matter)
 
 
 def screened(
@@ -469,7 +481,7 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
     return int(np.clip((rows / served - grid) / step, 0, config.max_steps))
 
 
-def _collect(climbs: Climbs, target: Climbable) -> Modes:
+def _collect(climbs: Climbs, target: Climbable, matter: Bool[np.ndarray, " start"]) -> Modes:
     """Laplace at every optimum that could matter, in the order of their evidence."""
     cautions = []
     modes: list[Laplace] = []
@@ -477,7 +489,7 @@ def _collect(climbs: Climbs, target: Climbable) -> Modes:
         state = LevenbergState(
             climbs.positions[index], float(climbs.log_density[index]), 0.0, bool(climbs.converged[index])
         )
-        if state.log_density > climbs.log_density.max() - RIVAL and _apart(state.position, modes):
+        if state.log_density > -np.inf and matter[index] and _apart(state.position, modes):
             mode = laplace(target, state)
             modes += [mode] if _apart(mode.mean, modes) else []
     modes.sort(key=lambda mode: -mode.log_evidence)
@@ -485,13 +497,6 @@ def _collect(climbs: Climbs, target: Climbable) -> Modes:
     if not climbs.converged[best]:
         sentence = "the best climb had not converged when its steps or its budget ran out; raise max_steps or rollouts"
         cautions.append(Caution(Code.CLIMB_UNFINISHED, sentence, grave=True))
-    rivals = [mode for mode in modes[1:] if mode.log_evidence > modes[0].log_evidence - 5.0]
-    if rivals:
-        sentence = (
-            f"{len(rivals)} further optima have an evidence within 5 nats: one normal distribution does not describe "
-            "this posterior; use the bridge or SMC"
-        )
-        cautions.append(Caution(Code.SEVERAL_OPTIMA, sentence))
     return Modes(modes, climbs, cautions)
 
 
@@ -508,26 +513,30 @@ def run(
     key: PRNGKeyArray,
     logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
-    """Posterior mode and draws of the normal approximation around it, mapped back to physical units."""
+    """Posterior modes and draws of the normal approximations around them, mapped back to physical units."""
     mode_key, draw_key = jax.random.split(key)
     digest = run_digest(problem, "laplace", config, key)
     checkpoint = logbook.checkpoint("laplace", digest)
-    found = find_modes(problem, config, mode_key, checkpoint, logbook)
-    best = found.modes[0]
-    factor = np.linalg.cholesky(best.covariance)
-    u = best.mean + np.asarray(jax.random.normal(draw_key, (config.draws, len(best.mean)))) @ factor.T
-    draws = chains(problem, [u])
-    ledger = found.climbs.ledger
+
+    def explain_as_well(climbs: Climbs) -> Bool[np.ndarray, " start"]:
+        return rivals(evaluate_rows(problem, climbs.positions, problem.n_rows, climbs.ledger))
+
+    found = find_modes(problem, config, mode_key, checkpoint, logbook, chosen=explain_as_well)
+    modes, ledger = found.modes, found.climbs.ledger
+    weights = mixture_weights(config.mixture, [mode.log_evidence for mode in modes])
+    draws = chains(problem, [draw_mixture(modes, weights, config.draws, draw_key)])
+    best = modes[0]
     return InferenceResult(
         method="laplace",
         draws=draws,
-        log_evidence=(best.log_evidence, float("nan")),
+        log_evidence=(float(logsumexp([mode.log_evidence for mode in modes])), float("nan")),
         trace=found.climbs.trace,
         rollouts=ledger.rollouts,
         evaluations=ledger.evaluations,
         excluded=dict(ledger.excluded),
         cautions=[
             *found.cautions,
+            *_several(weights, config.mixture),
             *prior_cautions(problem, draws),
             *exclusion_cautions(ledger.excluded, ledger.evaluations),
         ],
@@ -536,9 +545,25 @@ def run(
         details={
             "covariance_unconstrained": best.covariance.tolist(),
             "noise_coordinates": np.flatnonzero(np.asarray(found.climbs.noise)).tolist(),
-            "modes": [{"log_evidence": m.log_evidence, **mode_values(problem, m)} for m in found.modes],
+            "optima": [
+                {"weight": float(weight), "log_evidence": mode.log_evidence, "log_density": mode.log_density}
+                for weight, mode in zip(weights, modes, strict=True)
+            ],
+            "modes": [{"log_evidence": m.log_evidence, **mode_values(problem, m)} for m in modes],
         },
     )
+
+
+def _several(weights: Float[np.ndarray, " mode"], mixture: str) -> list[Caution]:
+    """A caution where more than one optimum explains the data about as well."""
+    if len(weights) == 1:
+        return []
+    use = "the best alone was used" if mixture == "best" else f"they are mixed ({mixture})"
+    sentence = (
+        f"{len(weights)} optima explain the data about as well, and {use}: one normal distribution does not describe "
+        "this posterior; use the bridge or SMC where the noise model is right"
+    )
+    return [Caution(Code.SEVERAL_OPTIMA, sentence)]
 
 
 def mode_values(problem: Problem, mode: Laplace) -> dict[str, float]:

@@ -1,0 +1,65 @@
+"""Several optima: which of them explain the data about as well, and how a posterior mixes them.
+
+Densities alone do not say it. A simulator is wrong in ways that last from row to row, so that neighbouring rows repeat
+one piece of evidence: under white noise optima that follow the data equally well lie hundreds of nats apart. Optima are
+therefore compared by the rows' log densities, whose differences are as certain as their autocorrelation lets them be
+(as the differences between models of Vehtari, Gelman & Gabry 2017, for series).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, PRNGKeyArray
+from numpyro.diagnostics import effective_sample_size
+from scipy.special import softmax
+
+from rfdropo_bayes.inference.modes.climb import Laplace
+
+MIXTURES = ("equal", "evidence", "best")
+CERTAIN = 2.0  # standard errors by which an optimum must be worse to be left out
+
+
+def rivals(rows: Float[np.ndarray, "mode row"]) -> Bool[np.ndarray, " mode"]:
+    """Which optima explain the data about as well as the first, given the log density of each row at each.
+
+    An optimum is left out where its rows are worse in sum by more than two standard errors of that sum. The standard
+    error takes the autocorrelation of the differences into account. The best of all is always kept.
+    """
+    best = int(np.argmax(rows.sum(axis=1)))
+    difference = rows[best] - rows
+    return np.array([i == best or _uncertain(each) for i, each in enumerate(difference)])
+
+
+def _uncertain(difference: Float[np.ndarray, " row"]) -> bool:
+    count = len(difference)
+    if count < 4 or not np.isfinite(difference).all():
+        return False
+    size = float(effective_sample_size(difference[None]))
+    # Differences that alternate must not count as more rows than there are; a constant one is certain.
+    size = np.clip(size, 1.0, count) if np.isfinite(size) else count
+    return bool(difference.sum() <= CERTAIN * count * difference.std(ddof=1) / np.sqrt(size))
+
+
+def mixture_weights(mixture: str, log_evidence: Sequence[float]) -> Float[np.ndarray, " mode"]:
+    """Weights of optima, best evidence first; `MIXTURES` names the rules."""
+    if mixture == "evidence":
+        return softmax(np.asarray(log_evidence))
+    equal = np.full(len(log_evidence), 1.0 / len(log_evidence))
+    return equal if mixture == "equal" else np.eye(len(log_evidence))[0]
+
+
+def draw_mixture(
+    modes: Sequence[Laplace], weights: Float[np.ndarray, " mode"], count: int, key: PRNGKeyArray
+) -> Float[np.ndarray, "draw d"]:
+    """Draws from a mixture of normals, in random order; each gets its share of them up to one draw."""
+    order_key, draw_key = jax.random.split(key)
+    ends = np.round(np.cumsum(weights) * count).astype(int)
+    member = np.repeat(np.arange(len(modes)), np.diff(ends, prepend=0))
+    normal = np.asarray(jax.random.normal(draw_key, (count, len(modes[0].mean))))
+    factors = np.stack([np.linalg.cholesky(mode.covariance) for mode in modes])
+    means = np.stack([mode.mean for mode in modes])
+    drawn = means[member] + np.einsum("nij,nj->ni", factors[member], normal)
+    return drawn[np.asarray(jax.random.permutation(order_key, count))]

@@ -1,0 +1,177 @@
+"""What the owner knows of the drives: limits of travel, where counters start, and what happens to commands beyond."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+from pydantic import Field, model_validator
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots.table import Table
+from rfdropo_bayes.tables import nearest
+
+ROUNDING = 1e-9
+"""How far [m or rad] a sum of commands may be beyond a limit that it reaches exactly."""
+
+Values = float | tuple[float, ...]
+
+
+class DriveTravel(Table):
+    """What is known of how some drives answer commands, in some recordings.
+
+    Numbers are those of the drive's counter, one for all of the table's cables or one for each.
+    """
+
+    cables: Literal["all"] | tuple[str, ...] = Field(
+        default="all", description='"all", or names of the command channels that it holds for'
+    )
+    recordings: str | tuple[str, ...] = Field(
+        default="*", description="recordings that it holds for: groups of [model.groups], names or wildcards"
+    )
+    low: Values | None = Field(default=None, description="least value of the counter; none by default")
+    high: Values | None = Field(default=None, description="greatest value of the counter; none by default")
+    start: Values | None = Field(
+        default=None,
+        description="the counter when a recording begins; the command in force there by default, so that the counter "
+        "is the command",
+    )
+    count_size: float = Field(
+        default=1.0,
+        description="pull per count [m or rad, as the commands]; negative where the counter falls as a cable is pulled",
+    )
+    beyond: Literal["lost", "kept", "clipped"] = Field(
+        description='what happens to a command beyond a limit: "lost", the drive ignores all of it; "clipped", it goes '
+        'to the limit and forgets the rest; "kept", it waits at the limit until the commands come back',
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> DriveTravel:
+        if self.cables != "all" and (not self.cables or len(set(self.cables)) < len(self.cables)):
+            raise ValueError("cables of a drive table are none, or one stands twice")
+        if self.count_size == 0.0:
+            raise ValueError("count_size of a drive table is zero")
+        if self.low is None and self.high is None:
+            raise ValueError("a drive table has neither low nor high: it states nothing")
+        for name in ("low", "high", "start"):
+            values = getattr(self, name)
+            if isinstance(values, tuple) and (self.cables == "all" or len(values) != len(self.cables)):
+                raise ValueError(f"{name} of a drive table needs one number, or one for each of its named cables")
+        low, high, start = (self._each(name, 1 if self.cables == "all" else len(self.cables)) for name in _NUMBERS)
+        if np.any(low >= high):
+            raise ValueError("low of a drive table is not below high")
+        if np.any(start < low) or np.any(start > high):
+            raise ValueError("start of a drive table is not between low and high")
+        return self
+
+    def _each(self, name: str, count: int) -> Float[np.ndarray, " cable"]:
+        """Values of one key for each cable; infinite where no limit is given, not a number without a start."""
+        value = getattr(self, name)
+        return np.broadcast_to(np.asarray(_NUMBERS[name] if value is None else value, float), (count,))
+
+    def holds_for(self, recording: str) -> bool:
+        """Whether the table speaks of a recording, or of a piece of it."""
+        patterns = (self.recordings,) if isinstance(self.recordings, str) else self.recordings
+        return any(fnmatchcase(recording.partition("[")[0], pattern) for pattern in patterns)
+
+    def columns(self, channels: Sequence[str]) -> list[int]:
+        """Where its cables are among the command channels.
+
+        Raises:
+            InputError: a cable that is none of them.
+        """
+        named = channels if self.cables == "all" else self.cables
+        for name in named:
+            if name not in channels:
+                raise InputError(f"unknown cable {name!r}", where="[[drives]] cables", remedy=nearest(name, channels))
+        return [list(channels).index(name) for name in named]
+
+
+_NUMBERS = {"low": -np.inf, "high": np.inf, "start": np.nan}
+
+
+@dataclass(frozen=True)
+class Travel:
+    """Limits of every channel in one recording, as commands [m or rad], and what happens beyond them."""
+
+    low: Float[np.ndarray, " channel"]
+    high: Float[np.ndarray, " channel"]
+    lost: Bool[np.ndarray, " channel"]
+    kept: Bool[np.ndarray, " channel"]
+
+    def follow(
+        self, initial: Float[np.ndarray, " channel"], command: Float[np.ndarray, "command channel"]
+    ) -> Float[np.ndarray, "command channel"]:
+        """Commands as the drives take them, given those that were sent, cumulative [m or rad]."""
+        forgotten, before = np.zeros_like(initial, float), np.asarray(initial, float)
+        taken = np.empty_like(command, dtype=float)
+        for row, sent in enumerate(np.asarray(command, float)):
+            forgotten, before = self.advance(forgotten, before, sent)
+            taken[row] = before
+        return taken
+
+    def advance(
+        self,
+        forgotten: Float[np.ndarray, "*lane channel"],
+        before: Float[np.ndarray, "*lane channel"],
+        sent: Float[np.ndarray, "*lane channel"],
+    ) -> tuple[Float[np.ndarray, "*lane channel"], Float[np.ndarray, "*lane channel"]]:
+        """All that has been forgotten after a command, and where the drives take it.
+
+        Args:
+            forgotten: of the commands before.
+            before: where the drives took the last of them.
+            sent: the command, cumulative.
+        """
+        asked = sent - forgotten
+        held = np.clip(asked, self.low, self.high)
+        over = np.abs(asked - held) > ROUNDING
+        taken = np.where(over & self.lost, before, np.where(over, held, asked))
+        return np.where(self.kept, 0.0, sent - taken), taken
+
+
+def travel_in(
+    tables: Sequence[DriveTravel], channels: Sequence[str], recording: str, initial: Float[np.ndarray, " channel"]
+) -> Travel | None:
+    """What is stated of the drives in one recording; None if nothing is.
+
+    Args:
+        tables: of a robot and its experiment.
+        channels: names of the command channels.
+        recording: name of the recording.
+        initial: command before its first row [m or rad].
+
+    Raises:
+        InputError: an unknown cable, two tables that state the travel of one cable, or a recording that begins outside.
+    """
+    holding = [table for table in tables if table.holds_for(recording)]
+    if not holding:
+        return None
+    size = len(channels)
+    low, high, beyond = np.full(size, -np.inf), np.full(size, np.inf), np.full(size, "kept", dtype="<U7")
+    stated = np.zeros(size, bool)
+    for table in holding:
+        columns = table.columns(channels)
+        if stated[columns].any():
+            twice = channels[columns[int(np.argmax(stated[columns]))]]
+            raise InputError(
+                f"two tables state the travel of {twice} in {recording}",
+                where="[[drives]] of the robot, [[model.drives]] of the experiment",
+                remedy="keep one of them, or narrow their recordings",
+            )
+        stated[columns], beyond[columns] = True, table.beyond
+        least, most, start = (table._each(name, len(columns)) for name in _NUMBERS)
+        begun = np.asarray(initial, float)[columns]
+        zero = np.where(np.isnan(start), 0.0, start * table.count_size - begun)
+        ends = np.sort(np.stack([least, most]) * table.count_size - zero, axis=0)
+        if np.any(begun < ends[0] - ROUNDING) or np.any(begun > ends[1] + ROUNDING):
+            cable = channels[columns[int(np.argmax((begun < ends[0] - ROUNDING) | (begun > ends[1] + ROUNDING)))]]
+            raise InputError(
+                f"{recording} begins outside the travel of {cable}", where="[[drives]]", remedy="state its start"
+            )
+        low[columns], high[columns] = ends
+    return Travel(low, high, beyond == "lost", beyond == "kept")
