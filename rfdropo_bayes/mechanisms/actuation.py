@@ -3,13 +3,55 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from rfdropo_bayes.mechanisms.priors import half_normal, log_normal, normal
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+SPOOL = 0.02  # [m], a usual radius: a prior for metres of cable becomes one for radians of the motor that winds it
+POWERS = {"m": 1, "m/s": 1, "1/m": -1, "s/m": -1}  # of a length in each unit
+NUMBERED = tuple(str(k + 1) for k in range(8))
+REST = 1e-9  # m or rad per step: less is the rounding of a command that is held
+GRID = (5.0, 15.0, 30.0, 60.0, 85.0, 110.0, 150.0, 250.0, 500.0, 1000.0)  # of travels to a stop, inverted
+SIZES = ("loc", "scale")  # entries of a prior's table that have the parameter's unit
+
+
+class InCommandUnit:
+    """Base of such mechanisms: a class gives its parameters for metres of cable.
+
+    Args:
+        unit: of the commands, "m" or "rad".
+    """
+
+    parameters: tuple[ParameterSpec, ...]
+    in_metres: ClassVar[tuple[ParameterSpec, ...]]
+
+    def __init__(self, unit: str = "m") -> None:
+        self.parameters = self.in_metres if unit == "m" else tuple(turned(spec) for spec in self.in_metres)
+
+    @classmethod
+    def for_robot(cls, robot: Robot) -> InCommandUnit:
+        """With parameters in the unit that a robot is commanded in."""
+        return cls(robot.command_unit)
+
+
+def turned(spec: ParameterSpec) -> ParameterSpec:
+    """A parameter given for metres of cable, for radians of a motor with a usual spool."""
+    factor = SPOOL ** -POWERS[spec.unit]
+    return spec._replace(
+        unit="rad".join(spec.unit.rsplit("m", 1)),
+        low=factor * spec.low,
+        high=factor * spec.high,
+        nominal=factor * spec.nominal,
+        prior={name: factor * value if name in SIZES else value for name, value in spec.prior.items()},
+        grid=tuple(factor * value for value in spec.grid),
+    )
 
 
 def kept_over(time_step: float, time_constant: Float[Array, ""]) -> Float[Array, ""]:
@@ -26,11 +68,7 @@ class CommandDelay:
     inside_drive = True
     cause = "communication and drive latency"
     remedy = "stamp commands where they are executed, or shift the clock by this much"
-    parameters = (
-        ParameterSpec(
-            "command_delay", "s", 0.0, 2.0, 0.0, {"distribution": "HalfNormal", "scale": 0.1}, "delay of every command"
-        ),
-    )
+    parameters = (ParameterSpec("command_delay", "s", 0.0, 2.0, 0.0, half_normal(0.1), "delay of every command"),)
 
     def actuate(
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
@@ -80,11 +118,7 @@ class ActuatorLag(SteppedActuation):
     inside_drive = True
     cause = "bandwidth of the position loop of the drives"
     remedy = "stiffen the position loop, or keep the lag in the model"
-    parameters = (
-        ParameterSpec(
-            "actuator_lag", "s", 0.0, 5.0, 0.0, {"distribution": "HalfNormal", "scale": 0.2}, "time constant of the lag"
-        ),
-    )
+    parameters = (ParameterSpec("actuator_lag", "s", 0.0, 5.0, 0.0, half_normal(0.2), "time constant of the lag"),)
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Float[Array, " channel"]:
         """Where the drives stand."""
@@ -108,16 +142,295 @@ class CommandGain(MemorylessActuation):
     remedy = "measure the cable travel of one motor turn"
     parameters = (
         ParameterSpec(
-            "command_gain_error",
-            "-",
-            -0.9,
-            2.0,
-            0.0,
-            {"distribution": "Normal", "loc": 0.0, "scale": 0.2},
-            "relative error of the commanded displacement",
+            "command_gain_error", "-", -0.9, 2.0, 0.0, normal(0.2), "relative error of the commanded displacement"
         ),
     )
 
     def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
         """Scale the whole command."""
         return (1.0 + values["command_gain_error"]) * sent
+
+
+class CableGain(MemorylessActuation):
+    """Each command scaled by its own ``1 + error``; zero at null. Equal errors of all are `command_gain`'s.
+
+    Args:
+        channels: names of the command channels; numbers by default.
+    """
+
+    name = "cable_gain"
+    stage = "actuation"
+    inside_drive = False
+    cause = "spools of different radius, or cables of different stretch"
+    remedy = "measure the travel of each cable for one turn of its drive"
+
+    def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
+        self.parameters = tuple(
+            ParameterSpec(
+                f"cable_gain_error_{channel}",
+                "-",
+                -0.9,
+                2.0,
+                0.0,
+                normal(0.1),
+                f"relative error of the displacement of {channel}",
+            )
+            for channel in channels
+        )
+
+    @classmethod
+    def for_robot(cls, robot: Robot) -> CableGain:
+        """One error for every command channel of a robot."""
+        return cls(robot.channel_names)
+
+    def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
+        """Scale each command, from zero on."""
+        count = sent.shape[-1]
+        error = jnp.stack([values[spec.name] for spec in self.parameters[:count]])
+        return (1.0 + error) * sent
+
+
+class CableSlack(InCommandUnit, MemorylessActuation):
+    """The first part of every pull only takes up slack (a dead zone around zero); none at null."""
+
+    name = "cable_slack"
+    stage = "actuation"
+    inside_drive = False
+    cause = "cables that are not taut at zero command, or a dead zone of the drives"
+    remedy = "tension the cables until each just moves the body, and set zero there"
+    in_metres = (
+        ParameterSpec(
+            "cable_slack", "m", 0.0, 0.1, 0.0, half_normal(0.001), "command that is lost before a cable is taut"
+        ),
+    )
+
+    def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
+        """Shrink the command towards zero by the slack."""
+        slack = values["cable_slack"]
+        return jnp.where(sent > slack, sent - slack, jnp.where(sent < -slack, sent + slack, 0.0))
+
+
+class Backlash(InCommandUnit, SteppedActuation):
+    """At each reversal a drive moves by twice ``backlash`` before the cable follows (play operator); none at null."""
+
+    name = "backlash"
+    stage = "actuation"
+    inside_drive = False
+    cause = "play in gears, couplings or spools"
+    remedy = "reverse each drive by hand and measure the play; preload the transmission"
+    in_metres = (
+        ParameterSpec("backlash", "m", 0.0, 0.1, 0.0, half_normal(0.0005), "half of the play between drive and cable"),
+    )
+
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
+        """How far the drive leads the cable, and what it was sent last: the middle of the play at first."""
+        return jnp.zeros_like(first), first
+
+    def advance(
+        self, values: Values, memory: tuple[Array, Array], given: Float[Array, " channel"], now: float
+    ) -> tuple[tuple[Array, Array], Float[Array, " channel"]]:
+        """Drag the cable's end along with the drive."""
+        half, (lead, last) = values["backlash"], memory
+        move = given - last
+        # Written with strict comparisons, so that without play the derivative stays that of the last move.
+        ahead = lead + jnp.where(jnp.abs(move) > REST, move, 0.0)
+        lead = jnp.where(ahead > half, half, jnp.where(ahead < -half, -half, ahead))
+        return (lead, given), given - lead
+
+
+class EndStop(InCommandUnit, MemorylessActuation):
+    """Commands beyond a limit are cut off on either side; the limit is infinite, its inverse zero, at null."""
+
+    name = "end_stop"
+    stage = "actuation"
+    inside_drive = True
+    cause = "a mechanical end stop, a software limit or the largest torque of a drive"
+    remedy = "read the drives' limits and their measured positions where the command is largest"
+    in_metres = (
+        ParameterSpec(
+            "inverse_travel_limit",
+            "1/m",
+            0.0,
+            1e5,
+            0.0,
+            half_normal(100.0),
+            "one over the largest command that is carried out",
+            grid=(5.0, 15.0, 30.0, 55.0, 60.0, 70.0, 85.0, 110.0, 150.0, 250.0),
+        ),
+    )
+
+    def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
+        """Cut the command off at the limit."""
+        inverse = values["inverse_travel_limit"]
+        limit = jnp.sign(sent) / jnp.maximum(inverse, 1e-12)
+        return jnp.where(jnp.abs(sent) * inverse > 1.0, limit, sent)
+
+
+class TravelStop(InCommandUnit, SteppedActuation):
+    """Commands beyond a stop are lost, not remembered: a drive at its stop moves with the next command away from it.
+
+    In contrast to `EndStop`, which cuts off the accumulated command and has to be commanded all the way back. Travel is
+    counted from the initial command. Both limits are infinite, their inverses zero, at null.
+    """
+
+    name = "travel_stop"
+    stage = "actuation"
+    inside_drive = True
+    cause = "commands given relative to where the drive is, at a stop or at a limit of its controller"
+    remedy = "record where the drives are, not what they were told; command absolute positions"
+    in_metres = (
+        ParameterSpec(
+            "inverse_release_travel",
+            "1/m",
+            0.0,
+            1e5,
+            0.0,
+            half_normal(200.0),
+            "one over the travel from the initial command to the stop on the side of release",
+            grid=GRID,
+        ),
+        ParameterSpec(
+            "inverse_pull_travel",
+            "1/m",
+            0.0,
+            1e5,
+            0.0,
+            half_normal(200.0),
+            "one over the travel from the initial command to the stop on the side of pull",
+            grid=GRID,
+        ),
+    )
+
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
+        """What was lost at the stops, and the command that travel is counted from."""
+        return jnp.zeros_like(first), first
+
+    def advance(
+        self, values: Values, memory: tuple[Array, Array], given: Float[Array, " channel"], now: float
+    ) -> tuple[tuple[Array, Array], Float[Array, " channel"]]:
+        """Follow the command, less all that was lost at the stops."""
+        release, pull = values["inverse_release_travel"], values["inverse_pull_travel"]
+        lost, start = memory
+        travel = given - start - lost
+        over = jnp.where(travel * pull > 1.0, travel - 1.0 / jnp.maximum(pull, 1e-12), 0.0)
+        under = jnp.where(-travel * release > 1.0, travel + 1.0 / jnp.maximum(release, 1e-12), 0.0)
+        lost = lost + over + under
+        return (lost, start), given - lost
+
+
+class RateLimit(InCommandUnit, SteppedActuation):
+    """Drives follow at a limited speed; the speed is infinite, its inverse zero, at null."""
+
+    name = "rate_limit"
+    stage = "actuation"
+    inside_drive = True
+    cause = "the speed or current limit of the drives, or a trajectory generator between command and drive"
+    remedy = "read the drives' speed limit, or record their positions during a large step"
+    in_metres = (
+        ParameterSpec(
+            "inverse_speed_limit",
+            "s/m",
+            0.0,
+            1e4,
+            0.0,
+            half_normal(30.0),
+            "one over the largest speed of a drive",
+            grid=(3.0, 12.0, 20.0, 40.0, 100.0),
+        ),
+    )
+
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Float[Array, " channel"]:
+        """Where the drives stand."""
+        return first
+
+    def advance(
+        self, values: Values, memory: Float[Array, " channel"], given: Float[Array, " channel"], now: float
+    ) -> tuple[Float[Array, " channel"], Float[Array, " channel"]]:
+        """Follow the command as fast as the limit allows."""
+        inverse = values["inverse_speed_limit"]
+        longest = now / jnp.maximum(inverse, 1e-12)
+        move = given - memory
+        reached = jnp.where(jnp.abs(move) * inverse > now, memory + jnp.sign(move) * longest, given)
+        return reached, reached
+
+
+class SpoolGrowth(InCommandUnit, MemorylessActuation):
+    """Displacement grows with the square of the command, ``u (1 + k u)``; k is zero at null."""
+
+    name = "spool_growth"
+    stage = "actuation"
+    inside_drive = False
+    cause = "cable wound in layers, a conical spool, or a lever whose arm changes with its angle"
+    remedy = "measure the travel of a cable turn by turn; use a grooved spool of one layer"
+    in_metres = (
+        ParameterSpec(
+            "spool_growth", "1/m", -1e3, 1e3, 0.0, normal(5.0), "relative change of the displacement per command"
+        ),
+    )
+
+    def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
+        """Add the square of the command, from zero command on."""
+        return sent + values["spool_growth"] * sent**2
+
+
+class DriveCreep(SteppedActuation):
+    """A share of every displacement is given back with a time constant, as by a creeping cable; no share at null."""
+
+    name = "drive_creep"
+    stage = "actuation"
+    inside_drive = False
+    cause = "creep of the cables or of their anchorage under load"
+    remedy = "hold one command for minutes and watch the pose; stretch new cables before use"
+    parameters = (
+        ParameterSpec(
+            "drive_creep", "-", -0.9, 0.9, 0.0, normal(0.1), "share of a displacement that is lost in the end"
+        ),
+        ParameterSpec(
+            "drive_creep_time",
+            "s",
+            1e-2,
+            1e3,
+            1.0,
+            log_normal(1.0, 1.2),
+            "time constant of the loss",
+            grid=(0.2, 0.5, 1.5, 5.0, 20.0),
+        ),
+    )
+
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
+        """The slowly following command, and where it started."""
+        return first, first
+
+    def advance(
+        self, values: Values, memory: tuple[Array, Array], given: Float[Array, " channel"], now: float
+    ) -> tuple[tuple[Array, Array], Float[Array, " channel"]]:
+        """Take away a share of the slowly following command."""
+        slow, start = memory
+        kept = kept_over(now, values["drive_creep_time"])
+        slow = given + kept * (slow - given)
+        return (slow, start), given - values["drive_creep"] * (slow - start)
+
+
+class DriveDrift(InCommandUnit, SteppedActuation):
+    """The zero of all drives moves at a steady rate from the start of the recording; no rate at null."""
+
+    name = "drive_drift"
+    stage = "actuation"
+    inside_drive = False
+    cause = "drives or cables that slip, or spools that wind unevenly, so that the zero wanders"
+    remedy = "return to zero at the end of a recording and compare the pose with that at the start"
+    in_metres = (
+        ParameterSpec(
+            "drive_drift", "m/s", -0.1, 0.1, 0.0, normal(0.0005), "rate at which the zero of every drive moves"
+        ),
+    )
+
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Int[Array, ""]:
+        """Number of steps."""
+        return jnp.zeros((), int)
+
+    def advance(
+        self, values: Values, memory: Int[Array, ""], given: Float[Array, " channel"], now: float
+    ) -> tuple[Int[Array, ""], Float[Array, " channel"]]:
+        """Add the drift to every channel."""
+        return memory + 1, given + values["drive_drift"] * now * (memory + 1)

@@ -7,6 +7,7 @@ the guides, or in series with the drive; see ``fem.cable_friction``.
 from __future__ import annotations
 
 from rfdropo_bayes.fem import LayeredBody, Material
+from rfdropo_bayes.mechanisms.priors import half_normal
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -21,13 +22,7 @@ class CoulombFriction:
     remedy = "pull a slack cable through the body with a spring scale; lubricate or line the guides"
     parameters = (
         ParameterSpec(
-            "coulomb_friction",
-            "N",
-            0.0,
-            50.0,
-            0.0,
-            {"distribution": "HalfNormal", "scale": 0.5},
-            "friction force of every guide along the cable",
+            "coulomb_friction", "N", 0.0, 50.0, 0.0, half_normal(0.5), "friction force of every guide along the cable"
         ),
     )
 
@@ -51,7 +46,7 @@ class CapstanFriction:
             0.0,
             2.0,
             0.0,
-            {"distribution": "HalfNormal", "scale": 0.3},
+            half_normal(0.3),
             "coefficient of friction between cables and guides",
         ),
     )
@@ -71,13 +66,7 @@ class CableCompliance:
     remedy = "hang a known weight on each cable and measure its stretch; use stiffer cable"
     parameters = (
         ParameterSpec(
-            "cable_compliance",
-            "m/N",
-            0.0,
-            0.1,
-            0.0,
-            {"distribution": "HalfNormal", "scale": 5e-4},
-            "stretch of every cable per tension",
+            "cable_compliance", "m/N", 0.0, 0.1, 0.0, half_normal(5e-4), "stretch of every cable per tension"
         ),
     )
 

@@ -1,4 +1,4 @@
-"""All mechanisms by name. To add one: write its class in a module of its own, and one line here.
+"""All mechanisms by name. To add one: write its class in the module of its stage, and one line here.
 
 A mechanism may also live in a user's code: ``"package.module:ClassName"``, or ``"file.py:ClassName"`` beside the
 experiment file, stands wherever a registry name does; see docs/mechanisms.md.
@@ -15,32 +15,41 @@ from pathlib import Path
 from typing import Any
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.mechanisms.actuation import ActuatorLag, CommandDelay, CommandGain
-from rfdropo_bayes.mechanisms.backlash import Backlash
-from rfdropo_bayes.mechanisms.body import BaseTilt, Payload, StiffnessGradient
-from rfdropo_bayes.mechanisms.cable_gain import CableGain
-from rfdropo_bayes.mechanisms.cable_slack import CableSlack
-from rfdropo_bayes.mechanisms.camera_drift import CameraDrift
-from rfdropo_bayes.mechanisms.camera_offset import CameraOffset
-from rfdropo_bayes.mechanisms.clock_offset import ClockOffset
-from rfdropo_bayes.mechanisms.drive_creep import DriveCreep
-from rfdropo_bayes.mechanisms.drive_drift import DriveDrift
-from rfdropo_bayes.mechanisms.end_stop import EndStop
-from rfdropo_bayes.mechanisms.friction import CableCompliance, CapstanFriction, CoulombFriction
-from rfdropo_bayes.mechanisms.marker_offset import MarkerOffset
-from rfdropo_bayes.mechanisms.material_laws import (
+from rfdropo_bayes.mechanisms.actuation import (
+    ActuatorLag,
+    Backlash,
+    CableGain,
+    CableSlack,
+    CommandDelay,
+    CommandGain,
+    DriveCreep,
+    DriveDrift,
+    EndStop,
+    RateLimit,
+    SpoolGrowth,
+    TravelStop,
+)
+from rfdropo_bayes.mechanisms.body import (
+    BaseTilt,
     BendingStiffening,
     BendTwistCoupling,
+    Payload,
     PlaneAnisotropy,
     Softening,
+    StiffnessGradient,
     ViscoelasticBranch,
 )
-from rfdropo_bayes.mechanisms.rate_limit import RateLimit
-from rfdropo_bayes.mechanisms.sensing import CameraRotation, CameraScale
-from rfdropo_bayes.mechanisms.sensor_lag import SensorLag
-from rfdropo_bayes.mechanisms.spool_growth import SpoolGrowth
+from rfdropo_bayes.mechanisms.friction import CableCompliance, CapstanFriction, CoulombFriction
+from rfdropo_bayes.mechanisms.sensing import (
+    CameraDrift,
+    CameraOffset,
+    CameraRotation,
+    CameraScale,
+    ClockOffset,
+    MarkerOffset,
+    SensorLag,
+)
 from rfdropo_bayes.mechanisms.surroundings import QuadraticDrag, WallContact
-from rfdropo_bayes.mechanisms.travel_stop import TravelStop
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.mechanisms import Mechanism
@@ -85,12 +94,7 @@ REGISTRY: dict[str, type] = {
 }
 
 
-ACTS = {
-    "actuation": ("actuate",),
-    "body": ("embody",),
-    "contact": ("embody",),
-    "sensing": ("sense", "sense_over_time"),
-}
+ACTS = {"actuation": ("actuate",), "body": ("embody",), "contact": ("embody",), "sensing": ("sense", "sense_over_time")}
 """By which method a mechanism of each stage acts."""
 
 

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms.priors import half_normal, normal
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
-_ANGLE = {"distribution": "Normal", "loc": 0.0, "scale": 0.05}
+NUMBERED = tuple(str(k + 1) for k in range(4))
+ROUNDING = 1e-30  # [m2] under the square root
+_ANGLE = normal(0.05)
 
 
 class CameraRotation:
@@ -44,17 +55,238 @@ class CameraScale:
     cause = "scale calibration of the motion capture"
     remedy = "measure a known length"
     parameters = (
-        ParameterSpec(
-            "camera_scale_error",
-            "-",
-            -0.5,
-            0.5,
-            0.0,
-            {"distribution": "Normal", "loc": 0.0, "scale": 0.02},
-            "relative error of measured lengths",
-        ),
+        ParameterSpec("camera_scale_error", "-", -0.5, 0.5, 0.0, normal(0.02), "relative error of measured lengths"),
     )
 
     def sense(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
         """Scale about the base's origin."""
         return (1.0 + values["camera_scale_error"]) * position
+
+
+class CameraOffset:
+    """The origin of the measuring frame lies beside that of the robot's base; nowhere else at null."""
+
+    name = "camera_offset"
+    stage = "sensing"
+    cause = "registration of the motion-capture frame, or a base that was moved"
+    remedy = "register the frame's origin on the base again"
+    parameters = tuple(
+        ParameterSpec(
+            f"camera_offset_{axis}", "m", -0.2, 0.2, 0.0, normal(0.002), f"shift of measured positions along {axis}"
+        )
+        for axis in "xyz"
+    )
+
+    def sense(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
+        """Shift all positions."""
+        return position + jnp.stack([values[spec.name] for spec in self.parameters])
+
+
+class CameraDrift:
+    """The measuring frame moves at a steady velocity from the start of the recording; none at null."""
+
+    name = "camera_drift"
+    stage = "sensing"
+    cause = "cameras or a base that move or warm up during the recording"
+    remedy = "record a marker that is fixed to the base"
+    parameters = tuple(
+        ParameterSpec(
+            f"camera_drift_{axis}",
+            "m/s",
+            -0.1,
+            0.1,
+            0.0,
+            normal(0.0005),
+            f"velocity of measured positions along {axis}",
+        )
+        for axis in "xyz"
+    )
+
+    def sense_over_time(
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
+    ) -> Float[Array, "time marker 3"]:
+        """Shift the positions in proportion to time."""
+        return position + self._shift(values, (time - time[0])[:, None, None])
+
+    def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> tuple[()]:
+        """Nothing to remember."""
+        return ()
+
+    def advance(
+        self, values: Values, memory: tuple[()], given: Float[Array, "marker 3"], now: Float[Array, ""]
+    ) -> tuple[tuple[()], Float[Array, "marker 3"]]:
+        """Shift the positions in proportion to time."""
+        return memory, given + self._shift(values, now)
+
+    def _shift(self, values: Values, elapsed: Float[Array, "..."]) -> Float[Array, "..."]:
+        return elapsed * jnp.stack([values[spec.name] for spec in self.parameters])
+
+
+class MarkerOffset:
+    """Each marker displaced from its place by an arm that turns with the body; nowhere at null.
+
+    The arm is given as it is in the first row. From there it turns as little as takes the body's direction at the
+    marker, which its neighbours in the robot's order show (their chord), to what it is later: without twist, exact for
+    bending between markers that are close. A robot with one marker shows no direction, and its arm keeps its own.
+
+    Args:
+        markers: names; numbers by default.
+    """
+
+    name = "marker_offset"
+    stage = "sensing"
+    cause = "markers glued beside the places that the robot's description gives"
+    remedy = "measure where each marker sits on the body, and correct the robot's description"
+
+    def __init__(self, markers: Sequence[str] = NUMBERED) -> None:
+        self.parameters = tuple(
+            ParameterSpec(
+                f"marker_offset_{marker}_{axis}",
+                "m",
+                -0.05,
+                0.05,
+                0.0,
+                normal(0.002),
+                f"distance of marker {marker} from its place along {axis}, at the start",
+            )
+            for marker in markers
+            for axis in "xyz"
+        )
+
+    @classmethod
+    def for_robot(cls, robot: Robot) -> MarkerOffset:
+        """One arm for every marker of a robot."""
+        return cls(robot.marker_names)
+
+    def sense(self, values: Values, position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
+        """Add the arms, turned."""
+        return self._moved(values, position[:1], position)
+
+    def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> Float[Array, "marker 3"]:
+        """The first positions, at which the arms are given."""
+        return first
+
+    def advance(
+        self, values: Values, memory: Float[Array, "marker 3"], given: Float[Array, "marker 3"], now: Float[Array, ""]
+    ) -> tuple[Float[Array, "marker 3"], Float[Array, "marker 3"]]:
+        """Add the arms, turned."""
+        return memory, self._moved(values, memory[None], given[None])[0]
+
+    def _moved(
+        self, values: Values, first: Float[Array, "1 marker 3"], position: Float[Array, "time marker 3"]
+    ) -> Float[Array, "time marker 3"]:
+        count = position.shape[1]
+        arm = jnp.stack([values[spec.name] for spec in self.parameters[: 3 * count]]).reshape(count, 3)
+        if count == 1:
+            return position + arm
+        return position + _turned(_direction(first), _direction(position), arm)
+
+
+def _direction(position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
+    """Direction of the body at every marker: the chord of its neighbours."""
+    ends = position[:, 1:2] - position[:, :1], position[:, -1:] - position[:, -2:-1]
+    chord = jnp.concatenate([ends[0], position[:, 2:] - position[:, :-2], ends[1]], axis=1)
+    return chord / jnp.sqrt(jnp.sum(chord**2, axis=-1, keepdims=True) + ROUNDING)
+
+
+def _turned(
+    first: Float[Array, "1 marker 3"], now: Float[Array, "time marker 3"], arm: Float[Array, "marker 3"]
+) -> Float[Array, "time marker 3"]:
+    """Arms after the smallest rotation that takes one unit direction to another (Rodrigues' formula)."""
+    axis = jnp.cross(first, now)  # its length is the sine
+    cosine = jnp.sum(first * now, axis=-1, keepdims=True)
+    once = jnp.cross(axis, arm)
+    return arm + once + jnp.cross(axis, once) / jnp.maximum(1.0 + cosine, 1e-3)  # a body does not turn right round
+
+
+class SensorLag:
+    """Measured positions are smoothed by a first-order filter, ``tau y' = x - y``; tau = 0 at null."""
+
+    name = "sensor_lag"
+    stage = "sensing"
+    cause = "a low-pass filter of the motion capture, or exposure that blurs over time"
+    remedy = "switch the filter off, or record the drives' own encoders for comparison"
+    parameters = (ParameterSpec("sensor_lag", "s", 0.0, 5.0, 0.0, half_normal(0.1), "time constant of the filter"),)
+
+    def sense_over_time(
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
+    ) -> Float[Array, "time marker 3"]:
+        """Exact response to positions that run straight from one observation to the next."""
+
+        def follow(memory: tuple[Array, Array, Array], row: tuple[Array, Array]) -> tuple[Any, Array]:
+            return self.advance(values, memory, *row)
+
+        return jax.lax.scan(follow, self.begin(values, position[0], 0.0), (position, time - time[0]))[1]
+
+    def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> tuple[Array, Array, Array]:
+        """The last position as it was seen and as it was, and its time: the first one at zero."""
+        return first, first, jnp.zeros(())
+
+    def advance(
+        self, values: Values, memory: tuple[Array, Array, Array], given: Float[Array, "marker 3"], now: Float[Array, ""]
+    ) -> tuple[tuple[Array, Array, Array], Float[Array, "marker 3"]]:
+        """Exact response to a position that ran straight from the last one to this."""
+        last, before, then = memory
+        tau = values["sensor_lag"]
+        on = tau > 0.0
+        safe = jnp.where(on, tau, 1.0)
+        gap = jnp.maximum(now - then, 1e-9)
+        slope = (given - before) / gap
+        kept = jnp.where(on, jnp.exp(-gap / safe), 0.0)
+        seen = given - tau * slope + kept * (last - before + tau * slope)
+        return (seen, given, jnp.asarray(now, float)), seen
+
+
+class ClockOffset:
+    """Positions carry time stamps that are late or early by a constant; zero at null."""
+
+    name = "clock_offset"
+    stage = "sensing"
+    cause = "cameras and drives on clocks that were not synchronised, or frames stamped when they arrive"
+    remedy = "synchronise the clocks by a trigger that both record"
+    parameters = (
+        ParameterSpec(
+            "clock_offset", "s", -1.0, 1.0, 0.0, normal(0.05), "what is seen at a time happened so much earlier"
+        ),
+    )
+
+    def sense_over_time(
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
+    ) -> Float[Array, "time marker 3"]:
+        """Read the positions at other times, linearly between observations; beyond the ends they stand still."""
+        return _read(position, time, time - values["clock_offset"])
+
+    def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> tuple[Array, Array]:
+        """The last observations and their times, as far back as an offset may reach; none before the first."""
+        rows = math.ceil(self.parameters[0].high / interval) + 2
+        return jnp.broadcast_to(first, (rows, *first.shape)), jnp.zeros(rows)
+
+    def check_steps(self, values: Mapping[str, Float[np.ndarray, " lane"]]) -> None:
+        """Raise InputError where a session would have to show what has not happened yet."""
+        if np.any(values["clock_offset"] < 0.0):
+            raise InputError(
+                f"clock_offset = {np.min(values['clock_offset']):g} s would show the future",
+                where="a session",
+                remedy="leave clock_offset out: it belongs to a recording, and a policy sees one clock",
+            )
+
+    def advance(
+        self, values: Values, memory: tuple[Array, Array], given: Float[Array, "marker 3"], now: Float[Array, ""]
+    ) -> tuple[tuple[Array, Array], Float[Array, "marker 3"]]:
+        """Read the positions earlier."""
+        position = jnp.concatenate([memory[0][1:], given[None]])
+        time = jnp.concatenate([memory[1][1:], jnp.asarray(now, float)[None]])
+        return (position, time), _read(position, time, now - values["clock_offset"])
+
+
+def _read(
+    position: Float[Array, "time marker 3"], time: Float[Array, " time"], at: Float[Array, "*when"]
+) -> Float[Array, "*when marker 3"]:
+    """Positions at other times, linearly between those given; beyond the ends they stand still."""
+    # Not a clip, whose derivative at the first and last row would be halved.
+    until = jnp.where(at > time[-1], time[-1], at)
+    after = jnp.clip(jnp.searchsorted(time, until), 1, len(time) - 1)
+    gap = jnp.maximum(time[after] - time[after - 1], 1e-9)
+    weight = ((time[after] - until) / gap)[..., None, None]
+    read = position[after] - weight * (position[after] - position[after - 1])
+    return jnp.where((at > time[0])[..., None, None], read, position[0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from rfdropo_bayes.fem import LayeredBody, Material, Wall
+from rfdropo_bayes.mechanisms.priors import half_normal, normal
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -24,7 +25,7 @@ class QuadraticDrag:
             0.0,
             1e5,
             0.0,
-            {"distribution": "HalfNormal", "scale": 300.0},
+            half_normal(300.0),
             "half the fluid's density times the drag coefficient",
         ),
     )
@@ -49,7 +50,7 @@ class WallContact:
             0.0,
             1e7,
             0.0,
-            {"distribution": "HalfNormal", "scale": 1e3},
+            half_normal(1e3),
             "force of the surface per depth and length of the body",
         ),
         ParameterSpec(
@@ -58,7 +59,7 @@ class WallContact:
             -1.0,
             1.0,
             0.03,
-            {"distribution": "Normal", "loc": 0.03, "scale": 0.03},
+            normal(0.03, loc=0.03),
             "distance at which the surface stops the axis, from the axis at rest",
             grid=(0.005, 0.01, 0.02, 0.04, 0.08),
         ),

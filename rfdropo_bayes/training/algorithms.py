@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import math
 from collections.abc import Mapping
 from typing import Any
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.tables import nearest
 
 ALGORITHMS = ("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN")
 CONTINUOUS_ONLY, DISCRETE_ONLY = ("SAC", "TD3", "DDPG"), ("DQN",)
@@ -32,12 +32,8 @@ def algorithm_class(name: str, kind: str) -> Any:
         InputError: no such algorithm, or one for the other kind of actions.
     """
     if name not in ALGORITHMS:
-        close = difflib.get_close_matches(name.upper(), ALGORITHMS, n=1)
-        raise InputError(
-            f"unknown algorithm {name!r}",
-            where="[training] algorithm",
-            remedy=f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(ALGORITHMS)}",
-        )
+        remedy = nearest(name.upper(), ALGORITHMS)
+        raise InputError(f"unknown algorithm {name!r}", where="[training] algorithm", remedy=remedy)
     wrong = CONTINUOUS_ONLY if kind == "discrete" else DISCRETE_ONLY
     if name in wrong:
         others = ", ".join(other for other in ALGORITHMS if other not in wrong)
@@ -67,12 +63,8 @@ def algorithm_options(
     short = ("net_arch", "log_std_init", "activation")
     for option in given:
         if option not in (*known, *short):
-            close = difflib.get_close_matches(option, [*known, *short], n=1)
-            raise InputError(
-                f"{name} has no option {option!r}",
-                where="[training.options]",
-                remedy=f"did you mean {close[0]!r}?" if close else f"it has {', '.join(known)}",
-            )
+            remedy = nearest(option, [*known, *short])
+            raise InputError(f"{name} has no option {option!r}", where="[training.options]", remedy=remedy)
     policy: dict[str, Any] = {"net_arch": [128, 128]}
     if name in ("PPO", "A2C") and kind == "continuous":
         policy["log_std_init"] = -1.0
@@ -92,7 +84,5 @@ def _activation(name: str) -> Any:
 
     known = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
     if name not in known:
-        raise InputError(
-            f"unknown activation {name!r}", where="[training.options]", remedy=f"use one of {', '.join(known)}"
-        )
+        raise InputError(f"unknown activation {name!r}", where="[training.options]", remedy=nearest(name, known))
     return known[name]

@@ -162,7 +162,7 @@ def test_a_mechanism_of_the_users_own_is_found_beside_the_experiment(tmp_path):
     (tmp_path / "mine.py").write_text(OWN)
     (mechanism,) = mechanisms_named(["mine.py:Half"], folder=tmp_path)
     assert mechanism.name == "half"
-    assert mechanisms_named(["rfdropo_bayes.mechanisms.backlash:Backlash"])[0].name == "backlash"
+    assert mechanisms_named(["rfdropo_bayes.mechanisms.actuation:Backlash"])[0].name == "backlash"
     for wrong in ("mine.py:None_", "other.py:Half", "no.such:Thing", "mine.py:Nothing"):
         with pytest.raises(InputError):
             mechanisms_named([wrong], folder=tmp_path)

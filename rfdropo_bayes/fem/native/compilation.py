@@ -1,10 +1,10 @@
-"""Compilation of a kernel with all functions that it calls as one program: optimised once, compiled once.
+"""Compilers for Numba that optimise a kernel once, together with all functions that it calls.
 
-Numba on its own optimises every function together with all that it calls, and makes machine code of it, then does the
-same again in each of its callers. Here a function that only kernels call is lowered to LLVM's language and left at
-that; arrays in it belong to the caller, and are not counted. The kernel at the top is linked with all that it calls,
-each once, and optimised in one pass, without a search for loops to vectorise: kernels work on vectors.
-Meshes are compiled Numba's way: as one program they ran at half the rate (17 for 36 rollouts a second).
+Numba by itself optimises and compiles every function with all that it calls, and repeats this in each of its callers.
+`DeferredCompiler`, for functions that only kernels call, stops at LLVM's intermediate code. `WholeCompiler`, for the
+kernel at the top, links all of them, each once, and optimises in one pass. The pass looks for no loops to vectorise,
+because kernels work on vectors. Meshes are compiled Numba's way: as one program they ran at half the rate (17 for 36
+rollouts a second).
 """
 
 from __future__ import annotations
