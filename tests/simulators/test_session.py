@@ -10,7 +10,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import DriveTravel, load_robot
 from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.session import Session
@@ -30,10 +30,12 @@ VALUES = {
 
 @functools.cache
 def simulator(engine: str, precision: str = "float64", mechanisms: tuple[str, ...] = (), state: str = "rest"):
-    """The paper's trunk; its drives ramp every command over two periods, and here answer late, too."""
+    """The paper's trunk; its drives ramp every command over two periods, and here answer late, as far as they reach."""
     robot = load_robot("trunk_sofa")
+    names, kinds = robot.channel_names, ("lost", "clipped", "kept")
+    drives = tuple(DriveTravel(cables=names[k:6:3], low=-0.004, high=0.018, beyond=kinds[k]) for k in range(3))
     timing = robot.command.model_copy(update={"dead_time_s": 0.013})
-    robot = robot.model_copy(update={"command": timing, "initial_state": state})
+    robot = robot.model_copy(update={"command": timing, "initial_state": state, "drives": drives})
     discretisation = Discretisation(robot.time_step_s)
     assembly = assemble(robot, discretisation)
     backend = Backend(engine, precision)
@@ -56,8 +58,8 @@ def drawn(values: dict[str, float], seed: int = 0):
 def rollouts(model, parameters, commands):
     """Whole rollouts of the same commands."""
     grid = [
-        model.commands(PERIOD * np.arange(PERIODS), rows, np.zeros(8), PERIOD * np.arange(PERIODS + 1))
-        for rows in commands
+        model.commands(PERIOD * np.arange(PERIODS), taken, np.zeros(8), PERIOD * np.arange(PERIODS + 1))
+        for taken in (model.taken("", np.zeros(8), sent) for sent in commands)
     ]
     stacked = type(grid[0])(*(np.stack(parts) for parts in zip(*grid, strict=True)))
     return jax.jit(jax.vmap(lambda p, *c: model.rollout(p, type(grid[0])(*c))))(parameters, *stacked)

@@ -20,13 +20,14 @@ from rfdropo_bayes.inference.modes.climb import Laplace
 
 MIXTURES = ("equal", "evidence", "best")
 CERTAIN = 2.0  # standard errors by which an optimum must be worse to be left out
+STRONG = 3.0  # nats by which it must be worse, too: less is no strong evidence under any noise (Kass & Raftery 1995)
 
 
 def rivals(rows: Float[np.ndarray, "mode row"]) -> Bool[np.ndarray, " mode"]:
     """Which optima explain the data about as well as the first, given the log density of each row at each.
 
-    An optimum is left out where its rows are worse in sum by more than two standard errors of that sum. The standard
-    error takes the autocorrelation of the differences into account. The best of all is always kept.
+    An optimum is left out where its rows are worse in sum by more than 3 nats and by more than two standard errors of
+    that sum. The standard error takes the autocorrelation of the differences into account. The best is always kept.
     """
     best = int(np.argmax(rows.sum(axis=1)))
     difference = rows[best] - rows
@@ -35,8 +36,10 @@ def rivals(rows: Float[np.ndarray, "mode row"]) -> Bool[np.ndarray, " mode"]:
 
 def _uncertain(difference: Float[np.ndarray, " row"]) -> bool:
     count = len(difference)
-    if count < 4 or not np.isfinite(difference).all():
+    if not np.isfinite(difference).all():
         return False
+    if count < 4 or difference.sum() <= STRONG:
+        return bool(difference.sum() <= STRONG)
     size = float(effective_sample_size(difference[None]))
     # Differences that alternate must not count as more rows than there are; a constant one is certain.
     size = np.clip(size, 1.0, count) if np.isfinite(size) else count

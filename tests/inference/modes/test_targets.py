@@ -10,7 +10,8 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.modes import search as laplace
-from rfdropo_bayes.inference.modes.climb import maximise
+from rfdropo_bayes.inference.modes.climb import Laplace, maximise
+from rfdropo_bayes.inference.modes.mixture import draw_mixture, mixture_weights, rivals
 from rfdropo_bayes.inference.modes.search import LaplaceConfig
 from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
 from rfdropo_bayes.inference.smc import bridge, sampler
@@ -133,13 +134,16 @@ def test_the_bridge_has_the_evidence_at_a_fraction_of_the_rollouts():
     assert np.abs((draws.mean(axis=0) - mean) / np.sqrt(np.diag(covariance))).max() < 0.12
 
 
+class Absolute(TwoModes):
+    """Its residuals, too, see the first parameter but for its sign."""
+
+    def residuals(self, values, horizon):
+        u = jax.numpy.stack([values[name] for name in self.names])
+        return (self.data[:horizon] - jax.numpy.concatenate([abs(u[:1]), u[1:]])[:horizon]) / self.noise[:horizon]
+
+
 @pytest.mark.slow
 def test_the_bridge_keeps_two_modes_that_the_climbs_found():
-    class Absolute(TwoModes):
-        def residuals(self, values, horizon):
-            u = jax.numpy.stack([values[name] for name in self.names])
-            return (self.data[:horizon] - jax.numpy.concatenate([abs(u[:1]), u[1:]])[:horizon]) / self.noise[:horizon]
-
     problem = Absolute()
     evidence, share = problem.mode_evidence()
     config = BridgeConfig(climb=LaplaceConfig(starts=8, blocks=1), replicates=2)
@@ -147,8 +151,6 @@ def test_the_bridge_keeps_two_modes_that_the_climbs_found():
     assert result.details["modes"] == 2
     assert result.log_evidence[0] == pytest.approx(evidence, abs=0.2)
     assert np.mean(result.draws["x0"] > 0) == pytest.approx(share, abs=0.1)
-    alone = laplace.run(problem, config.climb, KEY)
-    assert Code.SEVERAL_OPTIMA in [caution.code for caution in alone.cautions]
 
 
 def test_a_climb_ends_where_nothing_comes_of_what_it_promises():
@@ -195,3 +197,35 @@ def test_a_climb_ends_where_nothing_is_delivered_of_what_is_promised():
     state, steps = maximise(target, np.zeros(1), max_steps=60, tolerance=1e-4)
     assert state.converged
     assert len(steps) == 3
+
+
+def test_optima_are_rivals_as_far_as_correlated_rows_let_one_tell():
+    """Worse by 100 nats in rows of their own noise, an optimum is none; in rows that repeat ten values it may be."""
+    rng = np.random.default_rng(0)
+    best = np.zeros(1000)
+    alone = best - 0.1 + 0.5 * rng.standard_normal(1000)  # 100 +- 16
+    lasting = best - 0.1 + 0.5 * np.repeat(rng.standard_normal(10), 100)  # 100 +- 160
+    lasting += -100.0 / 1000 - lasting.mean()
+    np.testing.assert_array_equal(rivals(np.stack([best, alone, lasting])), [True, False, True])
+    np.testing.assert_array_equal(rivals(np.stack([best - 4e-3, best])), [False, True])  # a constant loss is certain
+    np.testing.assert_array_equal(rivals(np.stack([np.full(1000, -np.inf), best])), [False, True])
+
+
+@pytest.mark.parametrize(("mixture", "weights"), [("equal", [0.5, 0.5]), ("evidence", [0.8, 0.2]), ("best", [1.0, 0.0])])
+def test_draws_come_from_optima_by_their_weights(mixture, weights):
+    """4000 draws: the share of a half scatters by 0 as draws are allotted, the mean by 0.016 sd (5 of them: 0.08)."""
+    modes = [Laplace(np.array([at, 0.0]), np.diag([0.01, 4.0]), at) for at in (-3.0, 3.0)]
+    found = mixture_weights(mixture, [float(np.log(0.8)), float(np.log(0.2))])
+    np.testing.assert_allclose(found, weights, rtol=1e-12)
+    drawn = draw_mixture(modes, found, 4000, KEY)
+    assert np.mean(drawn[:, 0] < 0) == pytest.approx(weights[0], abs=1e-3)
+    np.testing.assert_allclose(np.abs(drawn[:, 0]).mean(), 3.0, atol=0.008)
+    np.testing.assert_allclose(drawn.std(axis=0)[1], 2.0, rtol=0.06)
+
+
+def test_laplace_mixes_optima_that_explain_the_data_as_well():
+    """A parameter whose sign the data do not see: the optima are alike but for the prior, and each gets a half."""
+    result = laplace.run(Absolute(), LaplaceConfig(starts=8, blocks=1, screen=32), KEY)
+    assert [optimum["weight"] for optimum in result.details["optima"]] == [0.5, 0.5]
+    assert np.mean(result.draws["x0"] > 0) == pytest.approx(0.5, abs=0.01)
+    assert Code.SEVERAL_OPTIMA in [caution.code for caution in result.cautions]
