@@ -36,7 +36,7 @@ from rfdropo_bayes.fem.layered import (  # noqa: E402
     spread_forces,
     uniform_body,
 )
-from rfdropo_bayes.fem.rollouts import Rollout, simulate, simulate_prefix  # noqa: E402
+from rfdropo_bayes.fem.rollouts import Rollout, simulate  # noqa: E402
 
 __all__ = [
     "BendingLaw",
@@ -66,7 +66,6 @@ __all__ = [
     "remembering",
     "rest_positions",
     "simulate",
-    "simulate_prefix",
     "solid_torsion_constant",
     "spread_forces",
     "state_at_rest",

@@ -27,7 +27,6 @@ from rfdropo_bayes.fem import (
     point_positions,
     prepare,
     simulate,
-    simulate_prefix,
     state_at_rest,
     tetrahedral_dynamics,
 )
@@ -207,7 +206,6 @@ class Engine:
             system: Any = self.body.system
             state: Any = tetrahedral_dynamics.state_at_rest(system)._replace(cube=place)
             run: Any = partial(tetrahedral_dynamics.simulate, system, inputs.material)
-            steps = None
         else:
             system = self.body.system
             prepared, state = prepare(system, inputs.material), state_at_rest(system)  # type: ignore[arg-type]
@@ -215,9 +213,8 @@ class Engine:
                 state, found = find_equilibrium(system, prepared, inputs.start)
                 imbalance = found.residual
             state = state._replace(cube=place)
-            run = partial(simulate if steps is None else simulate_prefix, system, prepared)
-        limit = () if steps is None else (steps,)
-        rollout = run(state, rows, self.time_step, markers, *limit, **around)
+            run = partial(simulate, system, prepared)
+        rollout = run(state, rows, self.time_step, markers, horizon=steps, **around)
         first = point_positions(markers, state.position)
         pose = None
         if cube is not None:

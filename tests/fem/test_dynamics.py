@@ -190,7 +190,7 @@ def prefix(trunk, markers):
         material = fem.material(trunk, **{**SILICONE, "density": density}, **DAMPING, gravity=(0.0, -9.81, 0.0))
         prepared = fem.prepare(trunk, material)
         start = fem.state_at_rest(trunk)
-        return fem.simulate_prefix(trunk, prepared, start, pulls, 0.01, markers, horizon)
+        return fem.simulate(trunk, prepared, start, pulls, 0.01, markers, horizon=horizon)
 
     return jax.jit(jax.vmap(run, (0, None, None)))
 
