@@ -102,10 +102,7 @@ class ExtendedSimulator:
         return jnp.where(found > 0, jnp.maximum(steps, end[last]), steps)
 
     def measured(
-        self,
-        values: Values,
-        position: Float[Array, "time marker 3"],
-        time: Float[Array, " time"],
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
         """Marker positions as they are measured [m], given the true ones and when they are seen [s]."""
         for mechanism in self.mechanisms:

@@ -287,10 +287,7 @@ class RobotSimulator(ExtendedSimulator):
         return self.robot.marker_points()
 
     def measured(
-        self,
-        values: Values,
-        position: Float[Array, "time marker 3"],
-        time: Float[Array, " time"],
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
         """See `ExtendedSimulator.measured`; the offset of the measuring frame is added last."""
         position = super().measured(values, position, time)

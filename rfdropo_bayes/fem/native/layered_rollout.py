@@ -12,17 +12,7 @@ from rfdropo_bayes.fem.native.cube_motion import record_cubes, start_cubes
 from rfdropo_bayes.fem.native.fields import clear, fill_lanes, point
 from rfdropo_bayes.fem.native.layered_assembly import layer_frame
 from rfdropo_bayes.fem.native.layered_constraints import constrained_step
-from rfdropo_bayes.fem.native.layered_effects import (
-    BRANCH,
-    DECAY,
-    EFFECTS,
-    FLAGS,
-    GAIN,
-    GIVE,
-    LAW,
-    SHARE,
-    add_branch,
-)
+from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, GAIN, GIVE, LAW, SHARE, add_branch
 from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
 from rfdropo_bayes.fem.native.layered_step import solve_increment

@@ -25,12 +25,7 @@ from numba import types
 from numba.core import cgutils
 from numba.core.registry import cpu_target
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import (
-    intrinsic,
-    lower_builtin,
-    models,
-    register_model,
-)
+from numba.extending import intrinsic, lower_builtin, models, register_model
 
 from rfdropo_bayes.fem.native.compilation import DeferredCompiler, WholeCompiler
 

@@ -19,14 +19,7 @@ from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
-from rfdropo_bayes.fem.native.contact_records import (
-    PushOutput,
-    Touch,
-    cube_rows,
-    pairs_of,
-    scene_tables,
-    touch_storage,
-)
+from rfdropo_bayes.fem.native.contact_records import PushOutput, Touch, cube_rows, pairs_of, scene_tables, touch_storage
 from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
 from rfdropo_bayes.fem.native.layered import available_threads
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
