@@ -309,6 +309,12 @@ def where_greater(typing_context, left, right, first, second):
     return first(left, right, first, second), generate
 
 
+@kernel
+def magnitude(value, zero):
+    """Absolute value of every lane."""
+    return where_greater(value, zero, value, -value)
+
+
 @intrinsic
 def any_greater(typing_context, left, right):
     """True if left > right in any lane."""
