@@ -23,7 +23,7 @@ from rfdropo_bayes.fem.dynamics import (  # noqa: E402
     without_cables,
 )
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Memory, Viscoelasticity, Wall  # noqa: E402
-from rfdropo_bayes.fem.energies import Energies, energies, linear_momentum, total_mass  # noqa: E402
+from rfdropo_bayes.fem.energies import Energies, energies  # noqa: E402
 from rfdropo_bayes.fem.equilibrium import EquilibriumInfo, static_equilibrium  # noqa: E402
 from rfdropo_bayes.fem.layered import (  # noqa: E402
     LayeredBody,
@@ -58,7 +58,6 @@ __all__ = [
     "attach",
     "cable_layout",
     "energies",
-    "linear_momentum",
     "material",
     "point_positions",
     "prepare",
@@ -71,7 +70,6 @@ __all__ = [
     "state_at_rest",
     "static_equilibrium",
     "step",
-    "total_mass",
     "uniform_body",
     "without_cables",
 ]

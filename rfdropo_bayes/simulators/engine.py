@@ -279,15 +279,10 @@ class Engine:
         if isinstance(self.body.system, System):
             start = inputs.start if self.from_equilibrium else None
             found = self.native.rollout(inputs.material, inputs.displacement, start=start, steps=steps, cube=cube)
-            return found.position, found.tension, found.diverged, found.residual, found.converged, found.pose
-        commands = inputs.displacement[:, :steps]
-        found = self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
-        markers, rest = self.body.markers, self.body.system.body.rest
-        first = np.einsum("pk,pki->pi", markers.weight, rest[markers.node])
-        count = len(found.position)
-        position = np.concatenate([np.broadcast_to(first, (count, 1, *first.shape)), found.position], axis=1)
-        tension = np.concatenate([np.zeros((count, 1, found.tension.shape[-1])), found.tension], axis=1)
-        return position, tension, found.diverged, np.zeros(count), found.converged, found.pose
+        else:
+            commands = inputs.displacement[:, :steps]
+            found = self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
+        return found.position, found.tension, found.diverged, found.residual, found.converged, found.pose
 
 
 def cube_arrays(cube: CubeInputs) -> tuple[Float[np.ndarray, "batch 13"], Float[np.ndarray, "batch 4"]]:
