@@ -23,7 +23,7 @@ from rfdropo_bayes.fem.dynamics import (  # noqa: E402
     without_cables,
 )
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Memory, Viscoelasticity, Wall  # noqa: E402
-from rfdropo_bayes.fem.energies import Energies, energies, linear_momentum, total_mass  # noqa: E402
+from rfdropo_bayes.fem.energies import Energies, energies  # noqa: E402
 from rfdropo_bayes.fem.equilibrium import EquilibriumInfo, static_equilibrium  # noqa: E402
 from rfdropo_bayes.fem.layered import (  # noqa: E402
     LayeredBody,
@@ -36,7 +36,7 @@ from rfdropo_bayes.fem.layered import (  # noqa: E402
     spread_forces,
     uniform_body,
 )
-from rfdropo_bayes.fem.rollouts import Rollout, simulate, simulate_prefix  # noqa: E402
+from rfdropo_bayes.fem.rollouts import Rollout, simulate  # noqa: E402
 
 __all__ = [
     "BendingLaw",
@@ -58,7 +58,6 @@ __all__ = [
     "attach",
     "cable_layout",
     "energies",
-    "linear_momentum",
     "material",
     "point_positions",
     "prepare",
@@ -66,13 +65,11 @@ __all__ = [
     "remembering",
     "rest_positions",
     "simulate",
-    "simulate_prefix",
     "solid_torsion_constant",
     "spread_forces",
     "state_at_rest",
     "static_equilibrium",
     "step",
-    "total_mass",
     "uniform_body",
     "without_cables",
 ]

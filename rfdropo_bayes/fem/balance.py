@@ -29,12 +29,7 @@ from rfdropo_bayes.fem.dynamics import (
 )
 from rfdropo_bayes.fem.effects import BodyEffects, Scalar
 from rfdropo_bayes.fem.energies import Energies, energies
-from rfdropo_bayes.fem.tetrahedra import (
-    elastic_energy,
-    element_rotations,
-    lame_constants,
-    nodal_force,
-)
+from rfdropo_bayes.fem.tetrahedra import elastic_energy, element_rotations, lame_constants, nodal_force
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem
 
 

@@ -13,7 +13,7 @@ static and is closed over, never traced.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -89,6 +89,10 @@ class State(NamedTuple):
     memory: Memory = Memory()  # of the effects; see ``remembering``
     cube: CubeState | None = None  # that the body pushes
     touch: Float[Array, "pairs 3"] | None = None  # impulses of the step before between the pairs that can touch [N s]
+
+
+AnyState = TypeVar("AnyState")
+"""`State`, or that of another body: position, velocity, tension, cube and touch are there."""
 
 
 class StepInfo(NamedTuple):
@@ -406,14 +410,23 @@ def accept(
     system: System, prepared: Prepared, state: State, moved: State, converged: Bool[Array, ""]
 ) -> tuple[State, StepInfo]:
     """The new state if it is finite and near the body, else the old one at rest."""
-    reach = LOST * (system.body.station[-1] - system.body.station[0])
-    away = jnp.max(jnp.abs(layered.layer_positions(system.body, moved.position) - prepared.rest))
-    fine = (away < reach) & jnp.all(jnp.isfinite(moved.velocity)) & jnp.all(jnp.isfinite(moved.tension))
+    away = layered.layer_positions(system.body, moved.position) - prepared.rest
+    return accept_within(LOST * (system.body.station[-1] - system.body.station[0]), away, state, moved, converged)
+
+
+def accept_within(
+    reach: float, away: Float[Array, "..."], state: AnyState, moved: AnyState, converged: Bool[Array, ""]
+) -> tuple[AnyState, StepInfo]:
+    """The new state of any body if it is finite and no coordinate is ``reach`` away from its place at rest, else the
+    old one at rest [m]."""
+    old: Any = state
+    new: Any = moved
+    fine = (jnp.max(jnp.abs(away)) < reach) & jnp.all(jnp.isfinite(new.velocity)) & jnp.all(jnp.isfinite(new.tension))
     cube = None
-    if state.cube is not None and moved.cube is not None:
-        fine = fine & jnp.all(jnp.isfinite(moved.cube.position))
-        cube = unchanged(state.cube, moved.cube, fine)
-    velocity, tension, touch = jax.tree.map(jnp.zeros_like, (state.velocity, state.tension, state.touch))
-    stopped = State(state.position, velocity, tension, state.memory, touch=touch)
-    kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), moved._replace(cube=None), stopped)
+    if old.cube is not None and new.cube is not None:
+        fine = fine & jnp.all(jnp.isfinite(new.cube.position))
+        cube = unchanged(old.cube, new.cube, fine)
+    velocity, tension, touch = jax.tree.map(jnp.zeros_like, (old.velocity, old.tension, old.touch))
+    stopped = old._replace(velocity=velocity, tension=tension, cube=None, touch=touch)
+    kept = jax.tree.map(lambda after, before: jnp.where(fine, after, before), new._replace(cube=None), stopped)
     return kept._replace(cube=cube), StepInfo(diverged=~fine, converged=converged | ~fine)

@@ -1,4 +1,4 @@
-"""Energies and momentum of a state, for checks and reports."""
+"""Energies of a state."""
 
 from __future__ import annotations
 
@@ -36,13 +36,3 @@ def energies(system: System, prepared: Prepared, state: State) -> Energies:
         elastic=elastic,
         gravitational=-jnp.sum(prepared.weight * state.position),
     )
-
-
-def linear_momentum(system: System, prepared: Prepared, state: State) -> Float[Array, "3"]:
-    """Sum of M v over the body [kg m/s]."""
-    return jnp.sum(mass_times(system, prepared, state.velocity), axis=0)
-
-
-def total_mass(prepared: Prepared) -> Float[Array, ""]:
-    """Mass of the body with its point masses [kg]."""
-    return jnp.sum(prepared.mass.diagonal) + 2.0 * jnp.sum(prepared.mass.lower)

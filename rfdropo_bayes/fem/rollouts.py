@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rfdropo_bayes.fem.dynamics import Prepared, State, System, remembering, step
+from rfdropo_bayes.fem.dynamics import Prepared, State, StepInfo, System, remembering, step
 from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.layered import PointMap, point_positions
 from rfdropo_bayes.fem.pushing import PushScene
@@ -21,55 +22,62 @@ class Rollout(NamedTuple):
 
     position: Float[Array, "rows points 3"]  # [m]
     tension: Float[Array, "rows cables"]  # [N]
-    state: State  # after the last step
+    state: Any  # after the last step
     diverged: Bool[Array, ""]
     converged: Bool[Array, ""]  # whether the impulses of every step's constraints were found
     pose: Float[Array, "rows 7"] | None = None  # of the cube: centre [m] and unit quaternion (x, y, z, w)
 
 
 class _Progress(NamedTuple):
-    state: State
-    diverged: Bool[Array, ""]
-    converged: Bool[Array, ""]
+    state: Any
+    info: StepInfo
 
 
-class _Scene(NamedTuple):
-    """What is around the body."""
-
-    external_force: Float[Array, "nodes 3"] | float
-    push: PushScene | None
-    cube: Cube | None
+Recorded = tuple[Float[Array, "points 3"], Float[Array, " cables"], Float[Array, "7"] | None]
+"""Points, tensions, and pose of the cube."""
 
 
-class _Row(NamedTuple):
-    """What is recorded."""
+def roll(
+    take: Callable[[Any, Float[Array, " cables"]], tuple[Any, StepInfo]],
+    start: Any,
+    displacement: Float[Array, "rows substeps cables"],
+    points: PointMap,
+    horizon: Int[Array, ""] | int | None = None,
+) -> Rollout:
+    """Rollout of any body, given how it takes a step to commanded cable displacements [m].
 
-    position: Float[Array, "points 3"]
-    tension: Float[Array, " cables"]
-    pose: Float[Array, "7"] | None
+    Args:
+        horizon: rows to compute; later ones are zero. It may be traced: one compilation serves every prefix, rows
+            beyond it cost nothing, and there is no reverse mode. None computes all, in reverse mode, too.
+    """
 
+    def one(progress: _Progress, commanded: Float[Array, " cables"]) -> tuple[_Progress, None]:
+        state, info = take(progress.state, commanded)
+        before = progress.info
+        codes = StepInfo(before.diverged | info.diverged, before.converged & info.converged)
+        return _Progress(state, codes), None
 
-def _advance(
-    system: System,
-    prepared: Prepared,
-    progress: _Progress,
-    commands: Float[Array, "substeps cables"],
-    time_step: Scalar,
-    around: _Scene,
-) -> _Progress:
-    """The steps of one recorded row."""
+    def recorded(state: Any) -> Recorded:
+        cube = state.cube
+        pose = None if cube is None else jnp.concatenate([cube.position, cube.orientation])
+        return point_positions(points, state.position), state.tension, pose
 
-    def one(progress: _Progress, displacement: Float[Array, " cables"]) -> tuple[_Progress, None]:
-        state, info = step(system, prepared, progress.state, displacement, time_step, *around)
-        return _Progress(state, progress.diverged | info.diverged, progress.converged & info.converged), None
+    def row(progress: _Progress, commands: Float[Array, "substeps cables"]) -> tuple[_Progress, Recorded]:
+        progress = lax.scan(one, progress, commands)[0]
+        return progress, recorded(progress.state)
 
-    return lax.scan(one, progress, commands)[0]
+    def next_row(index: Int[Array, ""], carry: tuple[_Progress, Recorded]) -> tuple[_Progress, Recorded]:
+        progress, here = row(carry[0], displacement[index])
+        return progress, jax.tree.map(lambda rows, new: rows.at[index].set(new), carry[1], here)
 
-
-def _record(points: PointMap, state: State) -> _Row:
-    cube = state.cube
-    pose = None if cube is None else jnp.concatenate([cube.position, cube.orientation])
-    return _Row(point_positions(points, state.position), state.tension, pose)
+    first = _Progress(start, StepInfo(jnp.array(False), jnp.array(True)))
+    if horizon is None:
+        last, rows = lax.scan(row, first, displacement)
+    else:
+        count = displacement.shape[0]
+        empty = jax.tree.map(lambda part: jnp.zeros((count, *part.shape)), recorded(start))
+        last, rows = lax.fori_loop(0, jnp.minimum(horizon, count), next_row, (first, empty))
+    return Rollout(rows[0], rows[1], last.state, *last.info, rows[2])
 
 
 def simulate(
@@ -82,48 +90,15 @@ def simulate(
     external_force: Float[Array, "nodes 3"] | float = 0.0,
     scene: PushScene | None = None,
     cube: Cube | None = None,
+    horizon: Int[Array, ""] | int | None = None,
 ) -> Rollout:
     """Rollout from ``state`` through the commanded cable displacements [m] of every step, recorded after every row.
 
     ``time_step`` [s] is that of one substep; ``external_force`` [N] is constant. With a ``scene`` and a ``cube`` the
-    body pushes it; ``state.cube`` is where it starts. Forward and reverse mode both work.
+    body pushes it; ``state.cube`` is where it starts. ``horizon`` as for `roll`.
     """
-    around = _Scene(external_force, scene, cube)
 
-    def row(progress: _Progress, commands: Float[Array, "substeps cables"]) -> tuple[_Progress, _Row]:
-        progress = _advance(system, prepared, progress, commands, time_step, around)
-        return progress, _record(points, progress.state)
+    def take(before: State, commanded: Float[Array, " cables"]) -> tuple[State, StepInfo]:
+        return step(system, prepared, before, commanded, time_step, external_force, scene, cube)
 
-    start = _Progress(remembering(system, prepared, state, scene), jnp.array(False), jnp.array(True))
-    last, rows = lax.scan(row, start, displacement)
-    return Rollout(rows.position, rows.tension, last.state, last.diverged, last.converged, rows.pose)
-
-
-def simulate_prefix(
-    system: System,
-    prepared: Prepared,
-    state: State,
-    displacement: Float[Array, "rows substeps cables"],
-    time_step: Scalar,
-    points: PointMap,
-    horizon: Int[Array, ""] | int,
-    external_force: Float[Array, "nodes 3"] | float = 0.0,
-    scene: PushScene | None = None,
-    cube: Cube | None = None,
-) -> Rollout:
-    """The first ``horizon`` rows of ``simulate``; later rows are zero.
-
-    ``horizon`` may be traced: one compilation serves every prefix, and rows beyond it cost nothing. No reverse mode.
-    """
-    rows, around = displacement.shape[0], _Scene(external_force, scene, cube)
-
-    def row(index: Int[Array, ""], carry: tuple[_Progress, _Row]) -> tuple[_Progress, _Row]:
-        progress, recorded = carry
-        progress = _advance(system, prepared, progress, displacement[index], time_step, around)
-        here = _record(points, progress.state)
-        return progress, jax.tree.map(lambda all_rows, one: all_rows.at[index].set(one), recorded, here)
-
-    start = _Progress(remembering(system, prepared, state, scene), jnp.array(False), jnp.array(True))
-    empty = jax.tree.map(lambda one: jnp.zeros((rows, *one.shape)), _record(points, state))
-    last, recorded = lax.fori_loop(0, jnp.minimum(horizon, rows), row, (start, empty))
-    return Rollout(recorded.position, recorded.tension, last.state, last.diverged, last.converged, recorded.pose)
+    return roll(take, remembering(system, prepared, state, scene), displacement, points, horizon)

@@ -162,9 +162,7 @@ def nodal_force(
 
 
 def element_tangents(
-    body: TetrahedralBody,
-    turn: Float[Array, "elements 3 3"],
-    lame: tuple[Float[Array, "..."], Float[Array, "..."]],
+    body: TetrahedralBody, turn: Float[Array, "elements 3 3"], lame: tuple[Float[Array, "..."], Float[Array, "..."]]
 ) -> Float[Array, "elements 4 4 3 3"]:
     """Tangent stiffness Q K Q' [N/m] of every element: block (a, b) couples node a's force to node b's displacement."""
     first, shear = (jnp.broadcast_to(value * 1.0, body.volume.shape) * body.volume for value in lame)

@@ -8,23 +8,23 @@ SOFA's recordings hold.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.fem import levels as level_systems
 from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian
 from rfdropo_bayes.fem.constrained_step import Pull, constrained_step, meet
 from rfdropo_bayes.fem.drives import DriveLimits
-from rfdropo_bayes.fem.dynamics import LOST, StepInfo
-from rfdropo_bayes.fem.layered import PointMap, point_positions
+from rfdropo_bayes.fem.dynamics import LOST, StepInfo, accept_within
+from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.levels import LevelMatrix, Levels, node_levels
-from rfdropo_bayes.fem.pushing import PushScene, unchanged, untouched
+from rfdropo_bayes.fem.pushing import PushScene, untouched
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
+from rfdropo_bayes.fem.rollouts import Rollout, roll
 from rfdropo_bayes.fem.tetrahedra import (
     TetrahedralBody,
     element_rotations,
@@ -66,17 +66,6 @@ class TetrahedralState(NamedTuple):
     measured: Float[Array, " cables"]  # [m]
     cube: CubeState | None = None  # that the body pushes
     touch: Float[Array, "pairs 3"] | None = None  # impulses of the step before between the pairs that can touch [N s]
-
-
-class TetrahedralRollout(NamedTuple):
-    """Recorded motion; a diverged rollout stays finite, but its rows from then on mean nothing."""
-
-    position: Float[Array, "rows points 3"]  # [m]
-    tension: Float[Array, "rows cables"]  # [N]
-    state: TetrahedralState
-    diverged: Bool[Array, ""]
-    converged: Bool[Array, ""]
-    pose: Float[Array, "rows 7"] | None = None  # of the cube: centre [m] and unit quaternion (x, y, z, w)
 
 
 def tetrahedral_system(body: TetrahedralBody, cables: CableLayout, limits: DriveLimits) -> TetrahedralSystem:
@@ -148,24 +137,8 @@ def step(
     tension = found.impulses.cable / time_step
     position = state.position + time_step * velocity
     moved = TetrahedralState(position, velocity, tension, shortening, found.cube, found.touch)
-    return accept(system, state, moved, found.converged)
-
-
-def accept(
-    system: TetrahedralSystem, state: TetrahedralState, moved: TetrahedralState, converged: Bool[Array, ""]
-) -> tuple[TetrahedralState, StepInfo]:
-    """The new state if it is finite and near the body, else the old one at rest."""
     reach = LOST * float(np.ptp(system.body.rest, axis=0).max())
-    away = jnp.max(jnp.abs(moved.position - system.body.rest))
-    fine = (away < reach) & jnp.all(jnp.isfinite(moved.velocity)) & jnp.all(jnp.isfinite(moved.tension))
-    cube = None
-    if state.cube is not None and moved.cube is not None:
-        fine = fine & jnp.all(jnp.isfinite(moved.cube.position))
-        cube = unchanged(state.cube, moved.cube, fine)
-    still = jax.tree.map(jnp.zeros_like, (state.velocity, state.tension, state.touch))
-    stopped = state._replace(velocity=still[0], tension=still[1], cube=None, touch=still[2])
-    kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), moved._replace(cube=None), stopped)
-    return kept._replace(cube=cube), StepInfo(~fine, converged | ~fine)
+    return accept_within(reach, moved.position - system.body.rest, state, moved, found.converged)
 
 
 def simulate(
@@ -177,22 +150,15 @@ def simulate(
     points: PointMap,
     scene: PushScene | None = None,
     cube: Cube | None = None,
-) -> TetrahedralRollout:
-    """Rollout through the commanded cable displacements [m] of every step, recorded at the end of every row."""
-
-    def one(carry, commanded):
-        state, info = carry
-        state, new = step(system, material, state, commanded, time_step, scene, cube)
-        return (state, StepInfo(info.diverged | new.diverged, info.converged & new.converged)), None
-
-    def row(carry, commands):
-        carry, _ = lax.scan(one, carry, commands)
-        state = carry[0]
-        pose = None if state.cube is None else jnp.concatenate([state.cube.position, state.cube.orientation])
-        return carry, (point_positions(points, state.position), state.tension, pose)
-
+    horizon: Int[Array, ""] | int | None = None,
+) -> Rollout:
+    """Rollout through the commanded cable displacements [m] of every step; as ``fem.simulate``."""
     if scene is not None and state.touch is None:
         state = state._replace(touch=untouched(scene))
-    start = state, StepInfo(jnp.array(False), jnp.array(True))
-    (state, info), (position, tension, pose) = lax.scan(row, start, displacement)
-    return TetrahedralRollout(position, tension, state, info.diverged, info.converged, pose)
+    return roll(
+        partial(step, system, material, time_step=time_step, scene=scene, cube=cube),
+        state,
+        displacement,
+        points,
+        horizon,
+    )

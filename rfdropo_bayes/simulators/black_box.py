@@ -207,21 +207,6 @@ class BlackBoxSimulator(ExtendedSimulator):
         """Unit of the commands."""
         return self.box.command_unit
 
-    @property
-    def marker_names(self) -> tuple[str, ...]:
-        """Markers of the box."""
-        return self.box.marker_names
-
-    @property
-    def channel_names(self) -> tuple[str, ...]:
-        """Command channels of the box."""
-        return self.box.channel_names
-
-    @property
-    def cable_names(self) -> tuple[str, ...]:
-        """Cables of the box."""
-        return self.box.cable_names
-
     @cached_property
     def parameters(self) -> tuple[ParameterSpec, ...]:
         """Parameters of the box, then those of the mechanisms."""

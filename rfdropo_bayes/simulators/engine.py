@@ -27,7 +27,6 @@ from rfdropo_bayes.fem import (
     point_positions,
     prepare,
     simulate,
-    simulate_prefix,
     state_at_rest,
     tetrahedral_dynamics,
 )
@@ -207,7 +206,6 @@ class Engine:
             system: Any = self.body.system
             state: Any = tetrahedral_dynamics.state_at_rest(system)._replace(cube=place)
             run: Any = partial(tetrahedral_dynamics.simulate, system, inputs.material)
-            steps = None
         else:
             system = self.body.system
             prepared, state = prepare(system, inputs.material), state_at_rest(system)  # type: ignore[arg-type]
@@ -215,9 +213,8 @@ class Engine:
                 state, found = find_equilibrium(system, prepared, inputs.start)
                 imbalance = found.residual
             state = state._replace(cube=place)
-            run = partial(simulate if steps is None else simulate_prefix, system, prepared)
-        limit = () if steps is None else (steps,)
-        rollout = run(state, rows, self.time_step, markers, *limit, **around)
+            run = partial(simulate, system, prepared)
+        rollout = run(state, rows, self.time_step, markers, horizon=steps, **around)
         first = point_positions(markers, state.position)
         pose = None
         if cube is not None:
@@ -282,15 +279,10 @@ class Engine:
         if isinstance(self.body.system, System):
             start = inputs.start if self.from_equilibrium else None
             found = self.native.rollout(inputs.material, inputs.displacement, start=start, steps=steps, cube=cube)
-            return found.position, found.tension, found.diverged, found.residual, found.converged, found.pose
-        commands = inputs.displacement[:, :steps]
-        found = self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
-        markers, rest = self.body.markers, self.body.system.body.rest
-        first = np.einsum("pk,pki->pi", markers.weight, rest[markers.node])
-        count = len(found.position)
-        position = np.concatenate([np.broadcast_to(first, (count, 1, *first.shape)), found.position], axis=1)
-        tension = np.concatenate([np.zeros((count, 1, found.tension.shape[-1])), found.tension], axis=1)
-        return position, tension, found.diverged, np.zeros(count), found.converged, found.pose
+        else:
+            commands = inputs.displacement[:, :steps]
+            found = self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
+        return found.position, found.tension, found.diverged, found.residual, found.converged, found.pose
 
 
 def cube_arrays(cube: CubeInputs) -> tuple[Float[np.ndarray, "batch 13"], Float[np.ndarray, "batch 4"]]:

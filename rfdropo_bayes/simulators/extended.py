@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,12 +28,29 @@ class ExtendedSimulator:
     """Base of simulators whose mechanisms act on the commands before the motion and on its measurement.
 
     Attributes:
+        robot: what moves; it names markers, cables and command channels.
         mechanisms: extensions, applied in the order given within each stage.
         time_step: of the simulation [s].
     """
 
+    robot: Any
     mechanisms: Sequence[Mechanism]
     time_step: float
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Markers of the robot."""
+        return self.robot.marker_names
+
+    @property
+    def cable_names(self) -> tuple[str, ...]:
+        """Cables of the robot."""
+        return self.robot.cable_names
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Command channels of the robot."""
+        return self.robot.channel_names
 
     @property
     def parameters(self) -> tuple[ParameterSpec, ...]:
@@ -108,10 +126,7 @@ class ExtendedSimulator:
         return jnp.where(found > 0, jnp.maximum(steps, end[last]), steps)
 
     def measured(
-        self,
-        values: Values,
-        position: Float[Array, "time marker 3"],
-        time: Float[Array, " time"],
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
         """Marker positions as they are measured [m], given the true ones and when they are seen [s]."""
         for mechanism in self.mechanisms:

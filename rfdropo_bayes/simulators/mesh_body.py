@@ -11,7 +11,15 @@ from pydantic import BaseModel, ConfigDict, Field
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.drives import DriveLimits
 from rfdropo_bayes.fem.layered import PointMap
-from rfdropo_bayes.fem.tetrahedra import TetrahedralBody, locate, mean_points, route_cables, tetrahedral_body
+from rfdropo_bayes.fem.tetrahedra import (
+    TetrahedralBody,
+    equal_node_masses,
+    locate,
+    lumped_masses,
+    mean_points,
+    route_cables,
+    tetrahedral_body,
+)
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralSystem, tetrahedral_system
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import TetrahedralMesh
@@ -81,12 +89,13 @@ def assemble_mesh(robot: Robot, mesh: TetrahedralMesh, table: TetrahedraTable) -
     limits = DriveLimits(np.full(len(guides), np.inf))
     if table.drives == "sofa":
         limits = DriveLimits(robot.displacement_limits()[:, 1], table.drive_rate or np.inf)
+    share = equal_node_masses(body, 1.0) if table.masses == "equal" else lumped_masses(body, 1.0 / body.volume.sum())
     station = np.asarray(robot.body.station_m)
     layer = np.searchsorted(station, body.rest[body.element, 2].mean(axis=1), side="right") - 1
     return MeshAssembly(
         tetrahedral_system(body, cables, limits),
         _markers(robot, body, dict(zip(robot.cable_names, guides, strict=True)), table.marker_cables),
-        _node_share(body, table.masses),
+        np.asarray(share),
         np.clip(layer, 0, len(station) - 2),
         _station_share(body, station),
     )
@@ -123,14 +132,6 @@ def _markers(
         for parts in zip(*rows, strict=True)
     )
     return PointMap(node, weight)
-
-
-def _node_share(body: TetrahedralBody, masses: str) -> Float[np.ndarray, " nodes"]:
-    if masses == "equal":
-        return np.full(len(body.rest), 1.0 / len(body.rest))
-    share = np.zeros(len(body.rest))
-    np.add.at(share, body.element, body.volume[:, None] / (4.0 * body.volume.sum()))
-    return share
 
 
 def _station_share(body: TetrahedralBody, station: Float[np.ndarray, " stations"]) -> np.ndarray:

@@ -249,21 +249,6 @@ class RobotSimulator(ExtendedSimulator):
         """Unit of the robot's commands: "m" of cable, or "rad" of a motor."""
         return self.robot.command.unit
 
-    @property
-    def marker_names(self) -> tuple[str, ...]:
-        """Markers of the robot."""
-        return self.robot.marker_names
-
-    @property
-    def cable_names(self) -> tuple[str, ...]:
-        """Cables of the robot."""
-        return self.robot.cable_names
-
-    @property
-    def channel_names(self) -> tuple[str, ...]:
-        """Command channels of the robot."""
-        return self.robot.channel_names
-
     def pretension(self, values: Values) -> Float[Array, " cable"]:
         """Cable displacements at zero command [m]."""
         return jnp.stack([values[name] for name in self.robot.initial_displacement_names])
@@ -298,10 +283,7 @@ class RobotSimulator(ExtendedSimulator):
         return self.robot.marker_points()
 
     def measured(
-        self,
-        values: Values,
-        position: Float[Array, "time marker 3"],
-        time: Float[Array, " time"],
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
         """See `ExtendedSimulator.measured`; the offset of the measuring frame is added last."""
         position = super().measured(values, position, time)

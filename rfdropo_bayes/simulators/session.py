@@ -94,7 +94,8 @@ class Session:
         self._forgotten = np.zeros((lanes, channels))
         self._started = np.zeros(lanes, bool)
         self._drives = self._first_drives(self._values, np.zeros((lanes, channels)))[0]
-        self._cameras = self._first_look(self._values, np.zeros((lanes, len(self.robot.marker_names), 3)))[0]
+        nowhere = np.zeros((lanes, len(self.robot.marker_names), 3))
+        self._cameras = self._look(self._values, None, nowhere, np.zeros(lanes))[0]
 
     @property
     def time(self) -> Float[np.ndarray, " lane"]:
@@ -148,7 +149,7 @@ class Session:
         found = self.bodies.reset(rows, *jax.tree.map(lambda part: np.asarray(part)[rows], inputs))
         position = np.zeros((self.lanes, *found.position.shape[1:]))
         position[rows] = found.position
-        cameras, seen = self._first_look(self._values, position)
+        cameras, seen = self._look(self._values, None, position, np.zeros(self.lanes))
         self._cameras = _chosen(chosen, cameras, self._cameras)
         self._started |= chosen
         return self._observation(found, np.asarray(seen)[rows], np.asarray(angle)[rows])
@@ -343,15 +344,18 @@ class Session:
 
     @cached_property
     def _look(self) -> Any:
-        """Cameras of all lanes after an observation, and the marker positions [m] that they see."""
+        """Cameras of all lanes after an observation, and the marker positions [m] that they see; None for the cameras
+        before makes it the first."""
         chain = self._camera_chain
 
         def look(
-            values: Values, memories: tuple[Any, ...], position: Float[Array, "marker 3"], now: Float[Array, ""]
+            values: Values, before: tuple[Any, ...] | None, position: Float[Array, "marker 3"], now: Float[Array, ""]
         ) -> tuple[tuple[Any, ...], Float[Array, "marker 3"]]:
             after = []
-            for mechanism, memory in zip(chain, memories, strict=True):
+            for k, mechanism in enumerate(chain):
+                memory: Any = ()
                 if isinstance(mechanism, SteppedMechanism):
+                    memory = mechanism.begin(values, position, self.period) if before is None else before[k]
                     memory, position = mechanism.advance(values, memory, position, now)
                 else:
                     position = mechanism.sense(values, position[None])[0]
@@ -360,26 +364,6 @@ class Session:
             return tuple(after), position + offset
 
         return self._by_lane(look)
-
-    @cached_property
-    def _first_look(self) -> Any:
-        """As `_look`, for first observations."""
-        chain = self._camera_chain
-
-        def first(
-            values: Values, position: Float[Array, "marker 3"]
-        ) -> tuple[tuple[Any, ...], Float[Array, "marker 3"]]:
-            memories, shown = [], position
-            for mechanism in chain:
-                if isinstance(mechanism, SteppedMechanism):
-                    memory = mechanism.begin(values, shown, self.period)
-                    memory, shown = mechanism.advance(values, memory, shown, jnp.zeros(()))
-                else:
-                    memory, shown = (), mechanism.sense(values, shown[None])[0]
-                memories.append(memory)
-            return tuple(memories), shown + jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])
-
-        return self._by_lane(first)
 
     def _observation(self, found: LaneMotion, position: np.ndarray, angle: np.ndarray) -> Observation:
         cases = found.diverged, found.imbalance > EQUILIBRIUM_TOLERANCE, ~found.converged

@@ -189,13 +189,13 @@ def test_both_engines_give_the_same_numbers(frames, limits):
         return simulate(system, material, state_at_rest(system), command.reshape(10, 3, 3), 0.01, points)
 
     slow = jax.jit(jax.vmap(one))(parameters, commands)
-    assert np.ptp(fast.position[:, :, 0], axis=1).max() > 5e-3  # the bar does bend
-    assert (fast.tension > 0.0).any()
-    assert (fast.tension == 0.0).any()
+    assert np.ptp(fast.position[:, 1:, 0], axis=1).max() > 5e-3  # the bar does bend
+    assert (fast.tension[:, 1:] > 0.0).any()
+    assert (fast.tension[:, 1:] == 0.0).any()
     assert not fast.diverged.any()
     assert fast.converged.all()
-    np.testing.assert_allclose(fast.position, slow.position, atol=1e-9)
-    np.testing.assert_allclose(fast.tension, slow.tension, atol=1e-5)
+    np.testing.assert_allclose(fast.position[:, 1:], slow.position, atol=1e-9)
+    np.testing.assert_allclose(fast.tension[:, 1:], slow.tension, atol=1e-5)
 
 
 def test_results_do_not_depend_on_batch_lane_or_threads():

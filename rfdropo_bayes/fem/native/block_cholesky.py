@@ -310,11 +310,7 @@ def condense_rows(pattern, target, rows, panels, others, other_panels, own, reac
             if not own:
                 s = 9 * (pattern.first[column + 1] - pattern.border + j)
             for m in range(3):
-                x, y, z = (
-                    load(rows, t + m, token),
-                    load(rows, t + 3 + m, token),
-                    load(rows, t + 6 + m, token),
-                )
+                x, y, z = (load(rows, t + m, token), load(rows, t + 3 + m, token), load(rows, t + 6 + m, token))
                 w = load(others, s + m, token)
                 c0, c1, c2 = fma(x, w, c0), fma(y, w, c1), fma(z, w, c2)
                 w = load(others, s + 3 + m, token)

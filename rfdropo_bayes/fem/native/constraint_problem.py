@@ -33,6 +33,7 @@ from rfdropo_bayes.fem.native.simd import (
     kernel,
     load,
     load3,
+    magnitude,
     square_root,
     store,
     where_greater,
@@ -91,11 +92,6 @@ def problem_storage(lines: int, contacts: int, lanes: int, dtype: type) -> Probl
     }  # fmt: skip
     arrays = {name: aligned_zeros((max(size, 1), lanes), dtype) for name, size in sizes.items()}
     return Problem(**arrays, column=np.zeros(max(rows, 1), dtype=np.int64))
-
-
-@kernel
-def _size(value, zero):
-    return where_greater(value, zero, value, -value)
 
 
 @kernel
@@ -218,7 +214,7 @@ def _linearise_line(p, i, cables, first, token):
     """As `_linearise_contact`, of a line; in the first iteration cables that pulled before still pull."""
     zero, one = fill(0.0, p.free, token), fill(1.0, p.free, token)
     velocity, impulse, firm = load(p.velocity, i, token), load(p.impulse, i, token), load(p.firmness, i, token)
-    root = square_root(_size(firm, zero))
+    root = square_root(magnitude(firm, zero))
     answer = _line(p, i, cables, velocity, token)
     if i < cables:
         active = where_greater(zero, velocity, one, zero)
@@ -227,7 +223,7 @@ def _linearise_line(p, i, cables, first, token):
         answer = -firm * velocity
     else:
         bound = load(p.limit, i, token) * load(p.sign, i, token)
-        active = where_greater(bound, _size(answer, zero), one, zero)
+        active = where_greater(bound, magnitude(answer, zero), one, zero)
     root = where_greater(active, zero, root, zero)
     acts = where_greater(root, zero, one, zero)
     store(p.root, i, root)
@@ -250,9 +246,9 @@ def _linearise(p, cables, lines, contacts, first, token):
     m = 0
     for i in range(n):
         root = _first_root(i, lines)
-        size = _size(load(p.root, root, token), zero)
+        size = magnitude(load(p.root, root, token), zero)
         if i >= lines and (i - lines) % 3 == 1:
-            size = size + _size(load(p.root, root + 1, token), zero)
+            size = size + magnitude(load(p.root, root + 1, token), zero)
         if any_greater(size, zero):
             p.column[m] = i
             m += 1
@@ -339,7 +335,7 @@ def _change(p, lines, n, m, token):
     zero = fill(0.0, p.free, token)
     largest = zero
     for i in range(n):
-        left = _size(load(p.left, i, token), zero)
+        left = magnitude(load(p.left, i, token), zero)
         largest = where_greater(left, largest, left, largest)
     beside = any_greater(largest, zero)
     for i in range(n):
@@ -405,8 +401,8 @@ def _residual(p, lines, n, token):
         for k in range(1 if i < lines else 3 - (i - lines) % 3):
             entry = load(p.root, root + k, token)
             square = fma(entry, entry, square)
-        wrong = _size(load(p.aim, i, token), zero) / square_root(where_greater(square, zero, square, one))
-        wrong = wrong + _size(load(p.left, i, token) * load(p.matrix, i * n + i, token), zero)
+        wrong = magnitude(load(p.aim, i, token), zero) / square_root(where_greater(square, zero, square, one))
+        wrong = wrong + magnitude(load(p.left, i, token) * load(p.matrix, i * n + i, token), zero)
         largest = where_greater(wrong, largest, wrong, largest)
     return largest
 
@@ -438,7 +434,10 @@ def solve_problem(p, cables, runs, contacts, settled, token):
             free = load(p.free, i, token)
             velocity = free + _multiply(p.matrix, p.impulse, i, n, token)
             store(p.velocity, i, velocity)
-            free, own = _size(free, zero), _size(load(p.matrix, i * n + i, token) * load(p.impulse, i, token), zero)
+            free, own = (
+                magnitude(free, zero),
+                magnitude(load(p.matrix, i * n + i, token) * load(p.impulse, i, token), zero),
+            )
             largest = where_greater(free, largest, free, largest)
             largest = where_greater(own, largest, own, largest)
         m = _linearise(p, cables, lines, contacts, iteration == 0, token)
@@ -448,7 +447,7 @@ def solve_problem(p, cables, runs, contacts, settled, token):
         _change(p, lines, n, m, token)
         doubt = zero
         for i in range(n):
-            doubt = fma(_size(load(p.moving, i, token), zero), _firmness(p, i, lines, token), doubt)
+            doubt = fma(magnitude(load(p.moving, i, token), zero), _firmness(p, i, lines, token), doubt)
         doubt = doubt * (largest * (ROUNDING * settled))
         share = _search_share(p, cables, lines, contacts, going, doubt, token)
         for i in range(n):

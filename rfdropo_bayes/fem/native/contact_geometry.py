@@ -11,7 +11,18 @@ import math
 from rfdropo_bayes.fem.constraints import APART
 from rfdropo_bayes.fem.native.contact_records import CORNERS
 from rfdropo_bayes.fem.native.fields import weighted
-from rfdropo_bayes.fem.native.simd import any_greater, fill, fma, fnma, kernel, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import (
+    any_greater,
+    fill,
+    fma,
+    fnma,
+    kernel,
+    load,
+    magnitude,
+    square_root,
+    store,
+    where_greater,
+)
 
 ALARM = 0.005
 """[m] Surfaces nearer than this, and as much more as they move in two steps, are looked at for contacts."""
@@ -19,11 +30,6 @@ EAGER = 0.02
 """[m/s] A candidate is a contact from the start if it would open more slowly than this; it saves solves, no more."""
 HALF_DIAGONAL = 0.5 * math.sqrt(3.0)
 """Of a cube of side one."""
-
-
-@kernel
-def _size(value, zero):
-    return where_greater(value, zero, value, -value)
 
 
 @kernel
@@ -68,7 +74,7 @@ def _height(scene, x, y, z):
 def _place_frame(touch, slot, x, y, z, token):
     """A normal, and two tangents; the first is across the axis that the normal is furthest from."""
     zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
-    ax, ay, az = _size(x, zero), _size(y, zero), _size(z, zero)
+    ax, ay, az = magnitude(x, zero), magnitude(y, zero), magnitude(z, zero)
     first = where_greater(ax, ay, zero, where_greater(ax, az, zero, one))
     second = (one - first) * where_greater(ay, az, zero, one)
     third = one - first - second

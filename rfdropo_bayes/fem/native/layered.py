@@ -36,7 +36,7 @@ from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, has_
 from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
-from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, Storage, compile_rollout, storage
+from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, compile_rollout, storage
 from rfdropo_bayes.fem.native.section_modes import border_panels, layered_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
 from rfdropo_bayes.fem.native.slip_records import KINDS, Friction, friction_storage, runs_of
@@ -189,7 +189,20 @@ class NativeLayered:
 
     def records(self, rubs: bool) -> Records:
         """What a block works on in the calling thread; ``rubs``: with friction of the cables."""
-        return Records(*self._storage(), self._friction() if rubs else None, self._touch(), *self._rows(rubs))
+        kept = self._local.__dict__.setdefault("records", {})
+        if rubs not in kept:
+            tables, made = self.tables, (self.lanes, self.dtype.type)
+            runs = KINDS * self._runs.count if rubs else 0
+            pairs = 0 if self._scene is None else pairs_of(self._scene.spheres)
+            beside, border = (runs + 2) // 3 + pairs, border_panels(tables.cables)
+            kept[rubs] = Records(
+                *storage(tables, *made),
+                friction_storage(self._runs, *made) if rubs else None,
+                None if self._scene is None else touch_storage(self._scene.spheres, *made),
+                row_storage(3 * tables.stations * tables.modes, beside, border, *made),
+                problem_storage(tables.cables + runs, pairs, *made),
+            )
+        return kept[rubs]
 
     def run_block(self, run: Run, records: Records, first: int) -> None:
         """Run one lane block, whose first rollout is ``first``, on `records`."""
@@ -284,41 +297,6 @@ class NativeLayered:
         arrays = {name: np.ascontiguousarray(array, dtype=self.dtype) for name, array in arrays.items()}
         pitches = {f"{name}_pitch": value.shape[1] if len(value) > 1 else 0 for name, value in state.items()}
         return Batch(**arrays, present=effect_flags(effects), count=count, **pitches)
-
-    def _storage(self) -> Storage:
-        """Storage of the calling thread."""
-        if not hasattr(self._local, "storage"):
-            self._local.storage = storage(self.tables, self.lanes, self.dtype.type)
-        return self._local.storage
-
-    def _friction(self) -> Friction:
-        """Friction of the calling thread."""
-        if not hasattr(self._local, "friction"):
-            self._local.friction = friction_storage(self._runs, self.lanes, self.dtype.type)
-        return self._local.friction
-
-    def _touch(self) -> Touch | None:
-        """Contacts of the calling thread."""
-        if self._scene is None:
-            return None
-        if not hasattr(self._local, "touch"):
-            self._local.touch = touch_storage(self._scene.spheres, self.lanes, self.dtype.type)
-        return self._local.touch
-
-    def _rows(self, rubs: bool) -> tuple[Rows, Problem]:
-        """Border rows and constraints of the calling thread, with friction of the cables or without."""
-        kept = self._local.__dict__.setdefault("rows", {})
-        if rubs not in kept:
-            tables, runs = self.tables, KINDS * self._runs.count if rubs else 0
-            pairs = 0 if self._scene is None else pairs_of(self._scene.spheres)
-            kept[rubs] = (
-                row_storage(
-                    3 * tables.stations * tables.modes, (runs + 2) // 3 + pairs, border_panels(tables.cables),
-                    self.lanes, self.dtype.type,
-                ),
-                problem_storage(tables.cables + runs, pairs, self.lanes, self.dtype.type),
-            )  # fmt: skip
-        return kept[rubs]
 
 
 @cache

@@ -12,13 +12,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.fem.native.chain_cholesky import condense_rows, extend_border
 from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
-from rfdropo_bayes.fem.native.contact_geometry import (
-    add_missed,
-    find_candidates,
-    list_contacts,
-    sphere_of,
-    weights,
-)
+from rfdropo_bayes.fem.native.contact_geometry import add_missed, find_candidates, list_contacts, sphere_of, weights
 from rfdropo_bayes.fem.native.cube_motion import add_cube, remember_impulses, stop_cube, take_cube_step
 from rfdropo_bayes.fem.native.fields import clear
 from rfdropo_bayes.fem.native.layered_step import (

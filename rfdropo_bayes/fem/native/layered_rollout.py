@@ -12,17 +12,7 @@ from rfdropo_bayes.fem.native.cube_motion import record_cubes, start_cubes
 from rfdropo_bayes.fem.native.fields import clear, fill_lanes, point
 from rfdropo_bayes.fem.native.layered_assembly import layer_frame
 from rfdropo_bayes.fem.native.layered_constraints import constrained_step
-from rfdropo_bayes.fem.native.layered_effects import (
-    BRANCH,
-    DECAY,
-    EFFECTS,
-    FLAGS,
-    GAIN,
-    GIVE,
-    LAW,
-    SHARE,
-    add_branch,
-)
+from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, GAIN, GIVE, LAW, SHARE, add_branch
 from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
 from rfdropo_bayes.fem.native.layered_step import solve_increment
@@ -80,66 +70,30 @@ class Schedule(NamedTuple):
     resumed: int = 0  # 1 goes on from the state in ``Work`` instead of starting anew
 
 
-class Storage(NamedTuple):
-    """Everything one lane block works on."""
-
-    samples: Samples
-    factors: Factors
-    work: Work
-
-
-def storage(tables: LayeredTables, lanes: int, dtype: type) -> Storage:
+def storage(tables: LayeredTables, lanes: int, dtype: type) -> tuple[Samples, Factors, Work]:
     """Zeroed, aligned storage of one lane block."""
     modes, stations, cables = tables.modes, tables.stations, tables.cables
     size, panels, layers = 3 * modes, border_panels(cables), stations - 1
 
-    def rows(count: int) -> np.ndarray:
-        return aligned_zeros((max(count, 1), lanes), dtype)
+    def rows(**sizes: int) -> dict[str, np.ndarray]:
+        return {name: aligned_zeros((max(count, 1), lanes), dtype) for name, count in sizes.items()}
 
-    samples = Samples(
-        moduli=rows(3),
-        density=rows(1),
-        layer_scale=rows(layers),
-        point_mass=rows(stations),
-        stiffness=rows(layers * tables.entries),
-        station_mass=rows(tables.station_mass.size),
-        layer_mass=rows(tables.layer_mass.size),
-        gravity=rows(3),
-        damping=rows(2),
-        law=rows(LAW * layers),
-        effects=rows(EFFECTS),
-        present=np.zeros(FLAGS, dtype=np.int64),
-    )
-    work = Work(
-        position=rows(stations * size),
-        velocity=rows(stations * size),
-        pivot=rows(stations * size * size),
-        coupling=rows(stations * size * size),
-        border=rows(stations * 3 * panels * size),
-        condensed=rows(9 * panels * panels),
-        solution=rows(stations * size),
-        field=rows(stations * size),
-        correction=rows(stations * size),
-        weight=rows(3 * panels),
-        axes=rows(9 * layers),
-        dyads=rows(54),
-        local=rows(2 * size),
-        reaction=rows(2 * size),
-        pull=rows(3 * (len(tables.guide_first) - 1)),
-        slack=rows(cables),
-        tension=rows(cables),
-        commanded=rows(cables),
-        points=rows(3 * tables.points),
-        before=rows(stations * size),
-        beyond=rows(3 * layers),
-        twist=rows(layers),
-        string=rows(layers),
-        branch=rows(layers * 2 * size),
-        slope=rows(6 * layers),
-        around=rows(2 * stations),
-        **{name: rows(1) for name in ("unsolved", "accepted", "lost", "failed", "relaxation", "imbalance", "softness")},
-    )
-    return Storage(samples, Factors(*(rows(1) for _ in Factors._fields)), work)
+    values, section = stations * size, 2 * size
+    samples = rows(
+        moduli=3, density=1, layer_scale=layers, point_mass=stations, stiffness=layers * tables.entries,
+        station_mass=tables.station_mass.size, layer_mass=tables.layer_mass.size, gravity=3, damping=2,
+        law=LAW * layers, effects=EFFECTS,
+    )  # fmt: skip
+    work = rows(
+        position=values, velocity=values, pivot=values * size, coupling=values * size, border=3 * panels * values,
+        condensed=9 * panels * panels, solution=values, field=values, correction=values, weight=3 * panels,
+        axes=9 * layers, dyads=54, local=section, reaction=section, pull=3 * (len(tables.guide_first) - 1),
+        slack=cables, tension=cables, commanded=cables, points=3 * tables.points, before=values, beyond=3 * layers,
+        twist=layers, string=layers, branch=layers * section, slope=6 * layers, around=2 * stations,
+        unsolved=1, accepted=1, lost=1, failed=1, relaxation=1, imbalance=1, softness=1,
+    )  # fmt: skip
+    factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))
+    return Samples(**samples, present=np.zeros(FLAGS, dtype=np.int64)), factors, Work(**work)
 
 
 @kernel

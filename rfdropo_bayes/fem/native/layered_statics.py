@@ -7,15 +7,10 @@ from rfdropo_bayes.fem.native.fields import clear
 from rfdropo_bayes.fem.native.layered_assembly import add_layer_force, layer_frame, start_loads
 from rfdropo_bayes.fem.native.layered_effects import GIVE, SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.layered_step import gather_cables, near
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, magnitude, square_root, store, where_greater
 
 UNBOUNDED = 1e30
 """Relative force out of balance of a lane whose equilibrium was lost."""
-
-
-@kernel
-def _size(value, zero):
-    return where_greater(value, zero, value, -value)
 
 
 @kernel
@@ -30,7 +25,7 @@ def _farthest(tables, field, token):
                 for m in range(modes):
                     row = 3 * (station * modes + m) + i
                     value = fma(load(field, row, token), fill(tables.shape[node * modes + m], field, token), value)
-                value = _size(value, zero)
+                value = magnitude(value, zero)
                 largest = where_greater(value, largest, value, largest)
     return largest
 
@@ -95,7 +90,7 @@ def _imbalance(tables, samples, factors, work, token):
     for station in range(tables.stations):
         for node in range(modes):
             for i in range(3):
-                loads = loads + _size(_node_force(tables, work.field, station, node, i, token), zero)
+                loads = loads + magnitude(_node_force(tables, work.field, station, node, i, token), zero)
     for c in range(tables.cables):
         loads = loads + load(work.tension, c, token)
     if samples.present[SURROUNDED]:
@@ -108,7 +103,7 @@ def _imbalance(tables, samples, factors, work, token):
     for station in range(tables.held, tables.stations):
         for node in range(modes):
             for i in range(3):
-                force = _size(_node_force(tables, work.field, station, node, i, token), zero)
+                force = magnitude(_node_force(tables, work.field, station, node, i, token), zero)
                 largest = where_greater(largest, force, largest, force)
     tiny = fill(1e-30, zero, token)
     return largest / where_greater(loads, tiny, loads, tiny)

@@ -25,12 +25,7 @@ from numba import types
 from numba.core import cgutils
 from numba.core.registry import cpu_target
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import (
-    intrinsic,
-    lower_builtin,
-    models,
-    register_model,
-)
+from numba.extending import intrinsic, lower_builtin, models, register_model
 
 from rfdropo_bayes.fem.native.compilation import DeferredCompiler, WholeCompiler
 
@@ -312,6 +307,12 @@ def where_greater(typing_context, left, right, first, second):
         return builder.select(builder.fcmp_ordered(">", arguments[0], arguments[1]), arguments[2], arguments[3])
 
     return first(left, right, first, second), generate
+
+
+@kernel
+def magnitude(value, zero):
+    """Absolute value of every lane."""
+    return where_greater(value, zero, value, -value)
 
 
 @intrinsic

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sparse
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.cables import CableLayout
@@ -19,31 +18,14 @@ from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
-from rfdropo_bayes.fem.native.contact_records import (
-    PushOutput,
-    Touch,
-    cube_rows,
-    pairs_of,
-    scene_tables,
-    touch_storage,
-)
+from rfdropo_bayes.fem.native.contact_records import PushOutput, Touch, cube_rows, pairs_of, scene_tables, touch_storage
 from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
-from rfdropo_bayes.fem.native.layered import available_threads
+from rfdropo_bayes.fem.native.layered import NativeRollout, available_threads
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
 from rfdropo_bayes.fem.native.tetrahedral import Mesh, Samples, Work
 from rfdropo_bayes.fem.pushing import PushScene
 from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
-
-
-class Rollouts(NamedTuple):
-    """Recorded motion of a batch; a diverged rollout stays finite, but its rows from then on mean nothing."""
-
-    position: Float[np.ndarray, "samples rows points 3"]  # [m]
-    tension: Float[np.ndarray, "samples rows cables"]  # [N]
-    diverged: Bool[np.ndarray, " samples"]
-    converged: Bool[np.ndarray, " samples"]  # whether the impulses of every step's constraints were found
-    pose: Float[np.ndarray, "samples rows 7"] | None = None  # of the cube: centre [m], unit quaternion (x, y, z, w)
 
 
 class TetrahedralEngine:
@@ -92,7 +74,7 @@ class TetrahedralEngine:
         time_step: float,
         stride: int = 1,
         cube: tuple[Float[np.ndarray, "*samples 13"], Float[np.ndarray, "*samples 4"]] | None = None,
-    ) -> Rollouts:
+    ) -> NativeRollout:
         """Rollouts from rest through the commanded displacements [m] of every step, recorded every ``stride`` steps.
 
         ``parameters`` holds, with a leading axis of samples: ``young_modulus`` [Pa], ``poisson_ratio``, ``node_mass``
@@ -113,13 +95,15 @@ class TetrahedralEngine:
             poses = PushOutput(np.zeros((samples, 1 + commands.shape[1] // stride, 7)))
         chunks = [np.arange(first, first + self.lanes) for first in range(0, samples, self.lanes)]
         rows, points = commands.shape[1] // stride, len(self._nodes)
-        result = Rollouts(
-            np.empty((samples, rows, points, 3)),
-            np.empty((samples, rows, commands.shape[2])),
+        result = NativeRollout(
+            np.zeros((samples, 1 + rows, points, 3)),
+            np.zeros((samples, 1 + rows, commands.shape[2])),
             np.zeros(samples, dtype=bool),
             np.ones(samples, dtype=bool),
+            np.zeros(samples),
             None if poses is None else poses.pose,
         )
+        result.position[:, 0] = np.einsum("pk,pki->pi", self.points.weight, self.body.rest[self.points.node])
 
         def run(chunk: Int[np.ndarray, " lanes"]) -> None:
             lane, kept = np.minimum(chunk, samples - 1), chunk[chunk < samples]
@@ -133,8 +117,8 @@ class TetrahedralEngine:
                 *self._constraints(), schedule, output, poses, int(chunk[0]), samples, lane_token(self.lanes),
             )  # fmt: skip
             count = len(kept)
-            result.position[kept] = np.moveaxis(output.position, 3, 0)[:count]
-            result.tension[kept] = np.moveaxis(output.tension, 2, 0)[:count]
+            result.position[kept, 1:] = np.moveaxis(output.position, 3, 0)[:count]
+            result.tension[kept, 1:] = np.moveaxis(output.tension, 2, 0)[:count]
             result.diverged[kept] = work.lost[0, :count] > 0.0
             result.converged[kept] = ~(work.unsolved[0, :count] > 0.0)
 
