@@ -58,18 +58,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         },
         "coverage": {} if gain is None else {f"{level:g}": gain.coverage[level] for level in LEVELS},
         "noise_floor_mm": MILLIMETRES * noise_distance(noise) if noise.source == REPEATS else None,
-        "noise": {
-            "source": noise.source,
-            "order": noise.order,
-            "autocorrelation": noise.autocorrelation.tolist(),
-            "standard_deviation_mm": (MILLIMETRES * noise.scale).tolist(),
-            "correlation_between_channels": None
-            if noise.correlation is None
-            else np.round(noise.correlation, 3).tolist(),
-            "other_channels": _other_noise(answer),
-            "shift_between_repeats_mm": None if answer.shift is None else MILLIMETRES * answer.shift,
-            "suspected_mm": None if answer.suspected is None else (MILLIMETRES * answer.suspected.first.scale).tolist(),
-        },
+        "noise": _noise(answer),
         "channels": list(answer.target.measurements.names_of_channels),
         "residual_in_noise_deviations": base_rms,
         "remainder": {
@@ -86,6 +75,20 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         "versions": versions,
         "data_sha256": data_sha256,
         "schema_version": SCHEMA_VERSION,
+    }
+
+
+def _noise(answer: Answer) -> dict[str, Any]:
+    noise = answer.target.noise.first
+    return {
+        "source": noise.source,
+        "order": noise.order,
+        "autocorrelation": noise.autocorrelation.tolist(),
+        "standard_deviation_mm": (MILLIMETRES * noise.scale).tolist(),
+        "correlation_between_channels": None if noise.correlation is None else np.round(noise.correlation, 3).tolist(),
+        "other_channels": _other_noise(answer),
+        "shift_between_repeats_mm": None if answer.shift is None else MILLIMETRES * answer.shift,
+        "suspected_mm": None if answer.suspected is None else (MILLIMETRES * answer.suspected.first.scale).tolist(),
     }
 
 

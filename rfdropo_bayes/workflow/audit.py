@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -127,29 +128,32 @@ def audit(
         journal = None if out is None else Journal(out / JOURNAL, resume=resume)
         answer = ask(question, report, journal, deadline)
         inspect(answer)
-        content = record(
-            answer,
-            versions=software_versions(),
-            data_sha256=combined_hash([trajectory.sha256 for trajectory in [*runs, *test]]),
-            next_experiment=next_experiment(answer),
-        )
-        shape = robot_shape(model.robot) if isinstance(model.robot, Robot) else None
-        seen = shown(answer)
-        page = render_audit(seen, content, title, describe(tables), shape)
-        extended = extended_tables(dict(tables), answer, folder, out)
-        made = None if isinstance(experiment.robot, str) else experiment.robot
-        return Audit(content, extended, page, made, out or folder, out, seen)
+        data = combined_hash([trajectory.sha256 for trajectory in [*runs, *test]])
+        return _audited(answer, model, tables, title, data, out)
 
     if out is None:
         return found(None)
     settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes([*runs, *test])}
-    given = {"base": base.folder if isinstance(base, Calibration) else base, "seed": seed}
+    given: dict[str, Any] = {"base": base.folder if isinstance(base, Calibration) else base, "seed": seed}
     given |= {} if groups is None else {"between": {name: list(own) for name, own in groups.members.items()}}
     settings |= {"options": given, "texts": model.texts()}
     with run_folder(Path(out), "audit", **settings, resume=resume, overwrite=overwrite) as place:
         answered = found(place)
         answered.save(place)
     return answered
+
+
+def _audited(
+    answer: Answer, model: Model, tables: Mapping[str, Any], title: str, data_sha256: str, out: Path | None
+) -> Audit:
+    """What an audit found as an object, with its page."""
+    versions, following = software_versions(), next_experiment(answer)
+    content = record(answer, versions=versions, data_sha256=data_sha256, next_experiment=following)
+    seen, shape = shown(answer), robot_shape(model.robot) if isinstance(model.robot, Robot) else None
+    page = render_audit(seen, content, title, describe(tables), shape)
+    extended = extended_tables(dict(tables), answer, model.folder, out)
+    made = None if isinstance(model.experiment.robot, str) else model.experiment.robot
+    return Audit(content, extended, page, made, out or model.folder, out, seen)
 
 
 def _asked(model: Model, noise: Mapping[str, float] | None, options: Mapping[str, Any]) -> Model:
@@ -229,13 +233,7 @@ def build_question(
         if name not in experiment.audit.exclude
     ]
     if groups is not None:
-        later = {spec.name for mechanism in added for spec in mechanism.parameters}
-        plain = [spec for spec in simulator.parameters if spec.name not in later]
-        stated = expand_groups(spreads, simulator.parameters)
-        space, candidates = with_differences(
-            model.space, base, plain, candidates, groups, spreads=stated, held=tuple(model.fixed)
-        )
-        model = replace(model, space=space)
+        model, candidates = _compared(model, base, simulator, added, candidates, groups, spreads)
     coordinates = Coordinates(
         model.space,
         base,
@@ -245,17 +243,12 @@ def build_question(
         {spec.name: (spec.low, spec.high) for spec in simulator.parameters},
     )
 
-    def lanes(changed: Experiment) -> tuple[Lanes, Commands]:
-        shop = {} if workshop is None else workshop
-        fields, markers = _fields(model), model.recordings.marker_index.tolist()
-        key = repr((changed.robot, changed.simulator, names, markers, coordinates.fixed, fields))
-        found, commands = _lanes(changed, names, robot, folder, trajectories, coordinates, shop.get(key), fields)
-        shop[key] = found
-        return found, commands
-
+    made = partial(
+        _lanes_in, {} if workshop is None else workshop, names, robot, folder, trajectories, model, coordinates
+    )
     return Question(
-        lanes(experiment)[0],
-        None if isinstance(robot, BlackBox) else lanes(_finer(experiment, robot)),
+        made(experiment)[0],
+        None if isinstance(robot, BlackBox) else made(_finer(experiment, robot)),
         coordinates,
         model,
         list(fitted),
@@ -267,6 +260,23 @@ def build_question(
         {name: why for name, why in left_out.items() if name not in experiment.audit.exclude},
         groups,
     )
+
+
+def _compared(
+    model: TrajectoryModel,
+    base: int,
+    simulator: AnySimulator,
+    added: Sequence[Mechanism],
+    candidates: list[Candidate],
+    groups: Groups,
+    spreads: Mapping[str, float],
+) -> tuple[TrajectoryModel, list[Candidate]]:
+    """The model in which parameters may differ between groups, and these differences among its candidates."""
+    later = {spec.name for mechanism in added for spec in mechanism.parameters}
+    plain = [spec for spec in simulator.parameters if spec.name not in later]
+    stated, held = expand_groups(spreads, simulator.parameters), tuple(model.fixed)
+    space, candidates = with_differences(model.space, base, plain, candidates, groups, spreads=stated, held=held)
+    return replace(model, space=space), candidates
 
 
 def candidate_names(experiment: Experiment) -> list[str]:
@@ -320,6 +330,24 @@ def _with(experiment: Experiment, names: Sequence[str]) -> Experiment:
     """The experiment with more mechanisms."""
     model = experiment.model.model_copy(update={"mechanisms": [*experiment.model.mechanisms, *names]})
     return experiment.model_copy(update={"model": model})
+
+
+def _lanes_in(
+    workshop: Workshop,
+    names: Sequence[str],
+    robot: Workpiece,
+    folder: Path,
+    trajectories: Sequence[Trajectory],
+    model: TrajectoryModel,
+    coordinates: Coordinates,
+    experiment: Experiment,
+) -> tuple[Lanes, Commands]:
+    """As `_lanes`; those that the workshop has are not made again."""
+    fields, markers = _fields(model), model.recordings.marker_index.tolist()
+    key = repr((experiment.robot, experiment.simulator, names, markers, coordinates.fixed, fields))
+    found, commands = _lanes(experiment, names, robot, folder, trajectories, coordinates, workshop.get(key), fields)
+    workshop[key] = found
+    return found, commands
 
 
 def _lanes(
