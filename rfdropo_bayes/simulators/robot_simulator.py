@@ -214,7 +214,8 @@ class RobotSimulator(ExtendedSimulator):
             values: of one rollout, or of many (arrays of one shape); what is left out is nominal.
             pose: measured centre [m] and unit quaternion (x, y, z, w).
         """
-        return {**values, **cube_at_measured(self.robot, {s.name: s.nominal for s in self.parameters} | values, pose)}
+        known = {spec.name: spec.nominal for spec in self.parameters} | dict(values)
+        return {**values, **cube_at_measured(self.robot, known, pose)}
 
     def observation(self, values: Values, commands: Commands, motion: Motion, unsolved: Result) -> Observation:
         """What a motion shows; ``unsolved`` says how a rollout ended whose constraints were not all solved."""
