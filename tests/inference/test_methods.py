@@ -53,7 +53,11 @@ def test_options_come_as_toml_has_them():
 )
 def test_every_method_answers_in_the_same_form(method):
     problem = Spring() if method == "rfdropo" else Decay(n_rows=20)
-    options = {"smc": {"particles": 100}, "rfdropo": {"evaluations": 40, "rollouts_per_candidate": 10}}.get(method, {})
+    options = {
+        "smc": {"particles": 100},
+        "rfdropo": {"evaluations": 40, "rollouts_per_candidate": 10},
+        "laplace": {"starts": 1, "blocks": 1},
+    }.get(method, {})
     result = methods.run(problem, method, options, jax.random.key(0))
     assert result.method == method
     shapes = {draws.shape for draws in result.draws.values()}

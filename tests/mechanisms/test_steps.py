@@ -76,7 +76,8 @@ def test_a_camera_sees_by_steps_what_it_sees_in_a_rollout(name):
     if isinstance(mechanism, SteppedMechanism):
         seen = in_periods(mechanism, values, POSITION[:, 0], POSITION, TIME, 0.05)
     else:  # a mechanism without memory needs no other form
-        seen = jax.vmap(lambda v, p: jnp.stack([mechanism.sense(v, row[None])[0] for row in p]))(values, POSITION)
+        row_by_row = jax.vmap(lambda v, row: mechanism.sense(v, row[None])[0], in_axes=(None, 0))
+        seen = jax.jit(jax.vmap(row_by_row))(values, POSITION)
     whole = (
         jax.jit(jax.vmap(mechanism.sense))(values, POSITION)
         if hasattr(mechanism, "sense")

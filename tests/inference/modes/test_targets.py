@@ -211,7 +211,9 @@ def test_optima_are_rivals_as_far_as_correlated_rows_let_one_tell():
     np.testing.assert_array_equal(rivals(np.stack([np.full(1000, -np.inf), best])), [False, True])
 
 
-@pytest.mark.parametrize(("mixture", "weights"), [("equal", [0.5, 0.5]), ("evidence", [0.8, 0.2]), ("best", [1.0, 0.0])])
+@pytest.mark.parametrize(
+    ("mixture", "weights"), [("equal", [0.5, 0.5]), ("evidence", [0.8, 0.2]), ("best", [1.0, 0.0])]
+)
 def test_draws_come_from_optima_by_their_weights(mixture, weights):
     """4000 draws: the share of a half scatters by 0 as draws are allotted, the mean by 0.016 sd (5 of them: 0.08)."""
     modes = [Laplace(np.array([at, 0.0]), np.diag([0.01, 4.0]), at) for at in (-3.0, 3.0)]

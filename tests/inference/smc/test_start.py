@@ -171,10 +171,10 @@ class Deaf(LinearGaussian):
 def test_a_look_in_vain_is_part_of_the_budget():
     """The sampler goes on from the prior with what is left of it."""
     problem = Deaf(n_rows=40, d=2, noise=1e-2)
-    result = methods.run(problem, "smc", {"rollouts": 8000.0, "blocks": 2}, KEY)
+    result = methods.run(problem, "smc", {"rollouts": 2500.0, "blocks": 2}, KEY)
     assert problem.heard
     assert sum(n * h for n, h in problem.calls) / problem.n_rows <= result.rollouts * (1.0 + 1e-9)
-    assert result.rollouts <= 8000.0
+    assert result.rollouts <= 2500.0
 
 
 def test_a_start_at_the_optima_needs_residuals():
