@@ -18,7 +18,7 @@ from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import Autoregression
-from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
+from rfdropo_bayes.bayes.pooling import DEVIATION, SPREAD, Pooled
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
 from rfdropo_bayes.data import Trajectory, first_row_only, load_unseen, start_is_known
@@ -129,7 +129,7 @@ def predict(
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
     fitted, errors = record.attrs.get(FITTED, belonging), record.attrs.get(MARKER_ERRORS)
-    predicted = predict_new(
+    found = predict_new(
         program,
         [unseen],
         values,
@@ -138,9 +138,11 @@ def predict(
         fitted=fitted,
         errors=errors,
         groups=table.groups,
-    )[0]
+    )
+    predicted = found.recordings[0]
     bands = summarise(predicted)
     bands.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": model.name, "recording": unseen.name}
+    bands.attrs["draws_that_did_not_match_the_first_row"] = found.unmatched
     return Prediction(bands, predicted)
 
 
@@ -221,6 +223,7 @@ def run_prediction(
             "first_command": unseen.first_command,
             "rows": len(found.drawn.time),
             "draws": int(found.drawn.predicted.shape[0]),
+            "draws_that_did_not_match_the_first_row": found.bands.attrs["draws_that_did_not_match_the_first_row"],
             "unit": "m",
             "frame": unseen.dataset.attrs["frame"],
             "simulator": fit.model.simulator.description if fit.model else {},
@@ -269,12 +272,17 @@ def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> Pa
     priors: dict[str, dict[str, Any]] = {}
     known = {spec.name for spec in specs}
     pooled: dict[str, Pooled] = {}
+    families = [i.name.removesuffix(SPREAD) for i in record.free if i.name.endswith(SPREAD) and i.name not in known]
+    families.sort(key=len, reverse=True)  # the longest name that fits: one cable's own spread, before that of all
     for info in record.free:
         name, _, recording = info.name.partition(SEPARATOR)
         shared = name.removesuffix(DEVIATION)
         if name not in known and shared in known:
             groups = pooled[shared].groups if shared in pooled else {}
-            pooled[shared] = Pooled(float(dict(info.prior)["scale"]), {**groups, recording: ()})
+            family = next((key for key in families if shared == key or shared.startswith(f"{key}_")), "")
+            pooled[shared] = Pooled(float(dict(info.prior)["scale"]), {**groups, recording: ()}, family)
+            continue
+        if name.removesuffix(SPREAD) in families:
             continue
         priors[name] = dict(info.prior)
         if recording:
