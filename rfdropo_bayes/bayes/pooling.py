@@ -87,20 +87,20 @@ def spread_spec(spec: ParameterSpec, pooled: Pooled) -> ParameterSpec:
     )
 
 
-def deviation_spec(spec: ParameterSpec, pooled: Pooled) -> ParameterSpec:
-    """What a group's value of a parameter is off the shared one, Normal(0, spread), in the parameter's unit.
+def deviation_spec(spec: ParameterSpec, spread: float) -> ParameterSpec:
+    """What a group's value of a parameter is off the shared one, Normal(0, ``spread``), in the parameter's unit.
 
     Raises:
         InputError: a spread that is not positive.
     """
-    _check_spread(spec, pooled.spread)
+    _check_spread(spec, spread)
     return ParameterSpec(
         f"{spec.name}{DEVIATION}",
         spec.unit,
         -float("inf"),
         float("inf"),
         0.0,
-        {"distribution": "Normal", "loc": 0.0, "scale": pooled.spread},
+        {"distribution": "Normal", "loc": 0.0, "scale": spread},
         f"of one group of recordings, from the {spec.name.replace('_', ' ')} that all share",
     )
 

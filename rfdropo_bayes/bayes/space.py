@@ -245,7 +245,7 @@ def spread_of(spec: ParameterSpec, pooled: Pooled) -> list[Parameter]:
 
 def deviations(spec: ParameterSpec, pooled: Pooled) -> list[Parameter]:
     """What each group's value of a parameter is off the shared one."""
-    own = deviation_spec(spec, pooled)
+    own = deviation_spec(spec, pooled.spread)
     prior = prior_from_table(own, dict(own.prior), where=f"[model.per_group] {spec.name}")
     scale = spread_spec(spec, pooled).name if pooled.family else ""
     return [

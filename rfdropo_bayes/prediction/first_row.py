@@ -144,7 +144,7 @@ def _with_deviations(
     recordings = problem.model.recordings
     index = recordings.names.index(recording)
     valid = recordings.line.valid[index, 0]
-    spread = np.stack([_spread(p, values) for p in own], axis=1)
+    spread = np.stack([spread_of_draws(p, values, len(values[p.name])) for p in own], axis=1)
     drawn = np.stack([values[p.name] for p in own], axis=1) / spread
     sd = _errors(recordings.markers, errors)[valid, None] / np.sqrt(3.0)
     noise = np.asarray(jax.random.normal(key, (len(drawn), int(valid.sum()), 3)))
@@ -163,11 +163,11 @@ def _with_deviations(
     return {**values, **dict(matched)}, int((~found.converged).sum())
 
 
-def _spread(deviation: Parameter, values: Batch) -> Float[np.ndarray, " n"]:
-    """Standard deviation between groups of what a deviation is added to, of each draw."""
+def spread_of_draws(deviation: Parameter, values: Mapping[str, np.ndarray], count: int) -> Float[np.ndarray, " n"]:
+    """Standard deviation between groups of what a deviation is added to, for each of ``count`` draws."""
     if deviation.scaled_by:
-        return values[deviation.scaled_by]
-    return np.full(len(values[deviation.name]), float((deviation.table or {})["scale"]))
+        return np.asarray(values[deviation.scaled_by])
+    return np.full(count, float((deviation.table or {})["scale"]))
 
 
 def _first_rows(problem: CalibrationProblem, values: Batch) -> Float[np.ndarray, "n recording marker 3"]:

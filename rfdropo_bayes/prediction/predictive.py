@@ -26,6 +26,7 @@ from rfdropo_bayes.prediction.first_row import match_first_row, weighed_by_first
 FITTED, MARKER_ERRORS, HELD = "fitted_recordings", "marker_errors_m", "held_parameters"
 NOISE, BEGUN = "noise_model", "fitted_recordings_begin"
 KNOWN_NOISE = "known_noise"  # of the positions, where its parameters are not inferred
+MODEL_ERROR = "model_error"  # see `day.ModelError`
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 

@@ -21,12 +21,14 @@ from rfdropo_bayes.inference.methods import make_config, method_named, method_of
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
+from rfdropo_bayes.prediction.day import model_error
 from rfdropo_bayes.prediction.predictive import (
     BEGUN,
     FITTED,
     HELD,
     KNOWN_NOISE,
     MARKER_ERRORS,
+    MODEL_ERROR,
     NOISE,
     Batch,
     marker_errors,
@@ -206,6 +208,7 @@ def record_posterior(
     before = {name: column[:PRIOR_PREDICTIVE_DRAWS] for name, column in prior.items()}
     predictions: list[RecordingPrediction] = predict_fitted(problem, values, fit_key, prior=before)
     errors, fitted = marker_errors(predictions), list(problem.model.recordings.names)
+    left = model_error(predictions)
     cautions: list[Caution] = []
     if tested:
         found = predict_new(
@@ -230,6 +233,7 @@ def record_posterior(
             FITTED: fitted,
             MARKER_ERRORS: errors,
             HELD: result.held,
+            MODEL_ERROR: None if left is None else left._asdict(),
             **known_noise(problem),
         },
     )

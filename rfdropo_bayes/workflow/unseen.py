@@ -101,6 +101,7 @@ def predict(
     start: Any = None,
     draws: int = DRAWS,
     seed: int = 0,
+    group: str | None = None,
 ) -> Prediction:
     """Predict what the markers will do under given commands, from at most the start pose.
 
@@ -111,18 +112,16 @@ def predict(
         start: positions of the markers in the first row [m], (marker, 3), beside such a pair; unknown by default.
         draws: of the posterior that are rolled out.
         seed: of what is random.
+        group: the day, robot or other group that they belong to; as [model.groups] has it by default.
 
     Raises:
         InputError: a calibration without its model, or commands of another robot.
     """
-    model, record = fit.model, fit.record
-    if model is None:
-        raise InputError("the calibration has no model", where="predict", remedy="give the one that calibrate returned")
+    record, model = fit.record, model_of(fit)
     simulator, table = model.simulator, model.experiment.model
     _check_noise(record, table.noise)
     unseen = first_row_only(commands) if isinstance(commands, Trajectory) else _commanded(model, *commands, start)
-    fixed = {**fixed_values(model.experiment, simulator), **record.attrs.get(HELD, {})}
-    space = _fitted_space(record, simulator.parameters + measurement_specs(table))
+    fixed, space = fitted_parts(fit)
     recordings = gather_recordings(simulator, [unseen])
     channels = (_markers(recordings, table.noise, record.attrs.get(KNOWN_NOISE)),)
     program = TrajectoryModel(simulator, space, fixed, recordings, channels)
@@ -137,13 +136,31 @@ def predict(
         chunk=simulator.lanes,
         fitted=fitted,
         errors=errors,
-        groups=table.groups,
+        groups=table.groups if group is None else {group: unseen.name},
     )
     predicted = found.recordings[0]
     bands = summarise(predicted)
     bands.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": model.name, "recording": unseen.name}
     bands.attrs["draws_that_did_not_match_the_first_row"] = found.unmatched
     return Prediction(bands, predicted)
+
+
+def model_of(fit: Calibration) -> Model:
+    """The model of a calibration.
+
+    Raises:
+        InputError: it was read from files that do not say which.
+    """
+    if fit.model is None:
+        raise InputError("the calibration has no model", where="predict", remedy="give the one that calibrate returned")
+    return fit.model
+
+
+def fitted_parts(fit: Calibration) -> tuple[dict[str, float], ParameterSpace]:
+    """Values that a calibration took for known, and the parameters that it inferred."""
+    model = model_of(fit)
+    fixed = {**fixed_values(model.experiment, model.simulator), **fit.record.attrs.get(HELD, {})}
+    return fixed, _fitted_space(fit.record, model.simulator.parameters + measurement_specs(model.experiment.model))
 
 
 def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
@@ -182,6 +199,7 @@ def run_prediction(
     rows: tuple[int, int] | None = None,
     overrides: Sequence[str] = (),
     seed: int | None = None,
+    group: str | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
     """Predict what the markers will do under the commands of a file, from at most the start pose.
@@ -198,6 +216,7 @@ def run_prediction(
         rows: predict observation rows first to last only; the pose of the first is then that of row ``first``.
         overrides: assignments that replace entries of the experiment file.
         seed: of the draws; that of the experiment by default.
+        group: see `predict`.
         overwrite: write whatever ``out`` holds.
 
     Raises:
@@ -210,8 +229,9 @@ def run_prediction(
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
     unseen = load_unseen(experiment.data, folder, commands, start, rows, record.attrs.get(BEGUN))
     fit = Calibration(record, {}, "", Model.of_experiment(experiment, folder))
-    found = predict(fit, unseen, seed=experiment.seed if seed is None else seed)
-    options = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
+    found = predict(fit, unseen, seed=experiment.seed if seed is None else seed, group=group)
+    options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
+    options["group"] = group
     settings: dict[str, Any] = {"tables": tables, "folder": folder, "options": options, "data": hashes([unseen])}
     with run_folder(out, "predict", **settings, overwrite=overwrite) as out:
         facts = {
