@@ -40,6 +40,7 @@ _HOMES = {
     "Robot": "robots",
     "Trajectory": "data",
     "Tube": "robots.sections",
+    "adapt": "workflow.adaptation",
     "audit": "workflow.audit",
     "calibrate": "workflow.calibration",
     "deploy": "deployment.session",

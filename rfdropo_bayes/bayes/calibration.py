@@ -17,7 +17,6 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
 from rfdropo_bayes.bayes.batches import is_batch, padded
 from rfdropo_bayes.bayes.channels import Channel, FeatureChannel, Series
 from rfdropo_bayes.bayes.model import Measured, TrajectoryModel
-from rfdropo_bayes.bayes.space import ParameterSpace
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
@@ -56,7 +55,10 @@ class CalibrationProblem:
         self.status_names = {int(result): result.name.lower() for result in Result}
         self.compared = [channel for channel in model.channels if isinstance(channel, FeatureChannel)]
         physical = {spec.name for spec in model.simulator.parameters}
-        self.physical_names = tuple(p.name for p in model.space.parameters if p.physical in physical)
+        self.scales, self.typical_scales = model.space.scales, model.space.typical_scales
+        self.physical_names = tuple(
+            p.name for p in model.space.parameters if p.physical in physical or p.name in self.scales
+        )
 
     @cached_property
     def fingerprint(self) -> str:
@@ -82,9 +84,13 @@ class CalibrationProblem:
         """The same problem with some parameters known, and no longer inferred; itself where none is."""
         if not values:
             return self
-        space = ParameterSpace(tuple(p for p in self.model.space.parameters if p.name not in values))
-        model = replace(self.model, space=space, fixed={**self.model.fixed, **values})
+        model = replace(self.model, space=self.model.space.holding(values), fixed={**self.model.fixed, **values})
         return CalibrationProblem(model, chunk=self.chunk)
+
+    def scale_log_prior(self, values: Float[np.ndarray, "n scale"]) -> Float[np.ndarray, " n"]:
+        """Log density of the prior of the standard deviations, in the order of ``scales``."""
+        priors = [self.model.space[name].prior for name in self.scales]
+        return np.sum([np.asarray(p.log_prob(column)) for p, column in zip(priors, values.T, strict=True)], axis=0)
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
         """Independent prior draws."""

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpyro
+import numpyro.distributions as dist
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.bayes.channels import Channel, Markers, ObjectPose, Seen
@@ -138,7 +139,10 @@ class TrajectoryModel:
 
     def __call__(self, observe: bool = True) -> None:
         """The numpyro model; ``observe=False`` leaves the positions free, for predictive draws."""
-        values = {p.name: numpyro.sample(p.name, p.prior) for p in self.space.parameters}
+        values: dict[str, Array] = {}
+        for p in self.space.parameters:  # a spread comes before what it is the spread of
+            prior = dist.Normal(0.0, values[p.scaled_by]) if p.scaled_by else p.prior
+            values[p.name] = numpyro.sample(p.name, prior)
         seen = self.seen(self.simulate(values), values)
         numpyro.deterministic("status", seen.observation.status)
         for index, name in enumerate(self.recordings.names):

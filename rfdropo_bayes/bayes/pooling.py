@@ -9,7 +9,7 @@ from fnmatch import fnmatchcase
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
-DEVIATION = "_deviation"
+DEVIATION, SPREAD = "_deviation", "_spread"
 
 Patterns = Mapping[str, str | Sequence[str]]
 
@@ -19,12 +19,15 @@ class Pooled:
     """How one parameter is pooled.
 
     Attributes:
-        spread: standard deviation between groups, in the parameter's unit.
+        spread: standard deviation between groups, in the parameter's unit: the scale of its half-normal prior, or its
+            value where it is known.
         groups: recordings of each group, by the group's name.
+        family: parameters with the same family have one spread, ``<family>_spread``; empty where the spread is known.
     """
 
     spread: float
     groups: Mapping[str, tuple[str, ...]]
+    family: str = ""
 
 
 def whole(recording: str) -> str:
@@ -64,16 +67,33 @@ def gather_groups(recordings: Sequence[str], patterns: Patterns) -> dict[str, tu
     return groups
 
 
+def spread_spec(spec: ParameterSpec, pooled: Pooled) -> ParameterSpec:
+    """The standard deviation between groups of all parameters of a family: half-normal, of the stated scale.
+
+    Half-normal, because two or three groups leave the upper end to the prior (Gelman 2006).
+
+    Raises:
+        InputError: a scale that is not positive.
+    """
+    _check_spread(spec, pooled.spread)
+    return ParameterSpec(
+        f"{pooled.family}{SPREAD}",
+        spec.unit,
+        0.0,
+        float("inf"),
+        pooled.spread,
+        {"distribution": "HalfNormal", "scale": pooled.spread},
+        f"standard deviation of the {pooled.family.replace('_', ' ')} between groups of recordings",
+    )
+
+
 def deviation_spec(spec: ParameterSpec, spread: float) -> ParameterSpec:
     """What a group's value of a parameter is off the shared one, Normal(0, ``spread``), in the parameter's unit.
 
     Raises:
         InputError: a spread that is not positive.
     """
-    if not spread > 0.0:
-        raise InputError(
-            f"the spread between groups is {spread}", where=f"[model.per_group] {spec.name}", remedy="a positive number"
-        )
+    _check_spread(spec, spread)
     return ParameterSpec(
         f"{spec.name}{DEVIATION}",
         spec.unit,
@@ -83,3 +103,10 @@ def deviation_spec(spec: ParameterSpec, spread: float) -> ParameterSpec:
         {"distribution": "Normal", "loc": 0.0, "scale": spread},
         f"of one group of recordings, from the {spec.name.replace('_', ' ')} that all share",
     )
+
+
+def _check_spread(spec: ParameterSpec, spread: float) -> None:
+    if not spread > 0.0:
+        raise InputError(
+            f"the spread between groups is {spread}", where=f"[model.per_group] {spec.name}", remedy="a positive number"
+        )

@@ -90,6 +90,28 @@ class ResidualProblem(Problem, Protocol):
 
 
 @runtime_checkable
+class Hierarchy(Problem, Protocol):
+    """A problem some of whose parameters are standard deviations of others, whose mean is zero.
+
+    Attributes:
+        scales: names of the standard deviations, with those of the parameters that each is of; may be empty.
+        typical_scales: a value of each from the middle of its prior.
+    """
+
+    scales: Mapping[str, tuple[str, ...]]
+    typical_scales: Mapping[str, float]
+
+    def holding(self, values: Mapping[str, float]) -> ResidualProblem:
+        """The same problem with some parameters known; what a known standard deviation is of has itself for its
+        unconstrained coordinate."""
+        ...
+
+    def scale_log_prior(self, values: Float[Any, "n scale"]) -> Float[Any, " n"]:
+        """Log density of the prior of the standard deviations."""
+        ...
+
+
+@runtime_checkable
 class RolloutProblem(Problem, Protocol):
     """A problem that can be simulated without a noise model, as RF-DROPO wants it.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,12 +13,13 @@ import numpy as np
 import numpyro.distributions as dist
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from rfdropo_bayes.bayes.pooling import Pooled, deviation_spec
+from rfdropo_bayes.bayes.pooling import Pooled, deviation_spec, spread_spec
 from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
 
 SEPARATOR = "@"
+HALF_NORMAL_MEDIAN = 0.6745
 INTERIOR = 15.0  # in unconstrained space: within 3e-7 of the width of a bound
 
 
@@ -33,6 +34,8 @@ class Parameter:
         table: the prior as it was written, for the record.
         members: recordings of the group.
         added_to: the parameter that it is added to; empty if it is a value of its own.
+        scaled_by: the parameter that is its standard deviation, in place of that of its prior; empty if none is. Its
+            coordinate in the unconstrained space is then the ratio of the two (a non-centred parametrisation).
     """
 
     spec: ParameterSpec
@@ -41,6 +44,7 @@ class Parameter:
     table: Mapping[str, Any] | None = None
     members: tuple[str, ...] = ()
     added_to: str = ""
+    scaled_by: str = ""
 
     @property
     def name(self) -> str:
@@ -67,6 +71,11 @@ class Parameter:
         support = self.prior.support
         low, high = getattr(support, "lower_bound", -np.inf), getattr(support, "upper_bound", np.inf)
         return max(self.spec.low, float(low)), min(self.spec.high, float(high))
+
+    def scaled(self, spread: float) -> Parameter:
+        """The same parameter where its standard deviation is known."""
+        table = {**(self.table or {}), "scale": float(spread)}
+        return replace(self, prior=dist.Normal(0.0, float(spread)), table=table, scaled_by="")
 
     def inside(self, values: Float[Array, " n"], otherwise: Float[Array, " n"]) -> Float[Array, " n"]:
         """Values, those on the edge of the support moved inside, and ``otherwise`` for those beyond it."""
@@ -99,10 +108,31 @@ class ParameterSpace:
                 chosen[p.added_to] = chosen[p.added_to] + values[p.name]
         return chosen
 
+    @cached_property
+    def scales(self) -> dict[str, tuple[str, ...]]:
+        """Names of the parameters that are standard deviations of others, with those of the others."""
+        found = dict.fromkeys(p.scaled_by for p in self.parameters if p.scaled_by)
+        return {name: tuple(p.name for p in self.parameters if p.scaled_by == name) for name in found}
+
+    @property
+    def typical_scales(self) -> dict[str, float]:
+        """The median of the half-normal prior of each of ``scales``."""
+        return {name: HALF_NORMAL_MEDIAN * float((self[name].table or {})["scale"]) for name in self.scales}
+
+    def holding(self, values: Mapping[str, float]) -> ParameterSpace:
+        """The space without some parameters, which are known."""
+        kept = [p for p in self.parameters if p.name not in values]
+        return ParameterSpace(tuple(p.scaled(values[p.scaled_by]) if p.scaled_by in values else p for p in kept))
+
     def sample(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Array, " n"]]:
         """Independent draws from the prior, one array of length n per parameter."""
         keys = jax.random.split(key, len(self.parameters))
-        return {p.name: p.prior.sample(k, (n,)) for p, k in zip(self.parameters, keys, strict=True)}
+        drawn = {p.name: p.prior.sample(k, (n,)) for p, k in zip(self.parameters, keys, strict=True)}
+        return {p.name: drawn[p.name] * self._ratio(p, drawn) for p in self.parameters}
+
+    def _ratio(self, parameter: Parameter, values: Mapping[str, Any]) -> Any:
+        """Standard deviation of a parameter over that of its prior; one where it is that of its prior."""
+        return values[parameter.scaled_by] / parameter.prior.scale if parameter.scaled_by else 1.0
 
     def sample_around(
         self, earlier: Mapping[str, Float[Array | np.ndarray, " m"]], key: PRNGKeyArray, n: int
@@ -127,15 +157,20 @@ class ParameterSpace:
 
     def log_prior(self, values: Mapping[str, Float[Array, "..."]]) -> Float[Array, "..."]:
         """Log density of the prior in physical units."""
-        return sum(p.prior.log_prob(values[p.name]) for p in self.parameters)
+        ratios = [self._ratio(p, values) for p in self.parameters]
+        each = zip(self.parameters, ratios, strict=True)
+        return sum(p.prior.log_prob(values[p.name] / ratio) - jnp.log(ratio) for p, ratio in each)
 
     def to_unconstrained(self, values: Mapping[str, Float[Any, "..."]]) -> Float[Array, "... d"]:
         """Map values to the real line, parameter by parameter in the order of ``names``."""
-        return jnp.stack([p.transform.inv(jnp.asarray(values[p.name])) for p in self.parameters], axis=-1)
+        ratios = [self._ratio(p, values) for p in self.parameters]
+        each = zip(self.parameters, ratios, strict=True)
+        return jnp.stack([p.transform.inv(jnp.asarray(values[p.name]) / ratio) for p, ratio in each], axis=-1)
 
     def from_unconstrained(self, u: Float[Array, "... d"]) -> dict[str, Float[Array, "..."]]:
         """Inverse of `to_unconstrained`."""
-        return {p.name: p.transform(u[..., i]) for i, p in enumerate(self.parameters)}
+        drawn = {p.name: p.transform(u[..., i]) for i, p in enumerate(self.parameters)}
+        return {p.name: drawn[p.name] * self._ratio(p, drawn) for p in self.parameters}
 
     def log_prior_unconstrained(self, u: Float[Array, "... d"]) -> Float[Array, "..."]:
         """Log density of the prior in unconstrained coordinates, with the Jacobian."""
@@ -192,17 +227,28 @@ def build_space(
                 )
             parameters.append(Parameter(spec, prior, recording, chosen))
         if name in pooled:
-            parameters += deviations(spec, pooled[name])
+            spread = spread_of(spec, pooled[name])
+            known = [parameter.name for parameter in parameters]
+            parameters += [p for p in spread if p.name not in known] + deviations(spec, pooled[name])
     if not parameters:
         raise InputError("no parameter has a prior", where=where, remedy="give at least one")
     return ParameterSpace(tuple(parameters))
+
+
+def spread_of(spec: ParameterSpec, pooled: Pooled) -> list[Parameter]:
+    """The standard deviation between groups, where it is inferred."""
+    if not pooled.family:
+        return []
+    own = spread_spec(spec, pooled)
+    return [Parameter(own, prior_from_table(own, dict(own.prior), where="[model.per_group]"), "", dict(own.prior))]
 
 
 def deviations(spec: ParameterSpec, pooled: Pooled) -> list[Parameter]:
     """What each group's value of a parameter is off the shared one."""
     own = deviation_spec(spec, pooled.spread)
     prior = prior_from_table(own, dict(own.prior), where=f"[model.per_group] {spec.name}")
+    scale = spread_spec(spec, pooled).name if pooled.family else ""
     return [
-        Parameter(own, prior, group, dict(own.prior), tuple(members), spec.name)
+        Parameter(own, prior, group, dict(own.prior), tuple(members), spec.name, scale)
         for group, members in pooled.groups.items()
     ]

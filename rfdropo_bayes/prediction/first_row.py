@@ -17,10 +17,9 @@ from rfdropo_bayes.bayes.recordings import RecordingSet
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import next_step
+from rfdropo_bayes.prediction.own_fit import fit_own
 
 SMALLEST_ERROR = 1e-6  # [m]
-STEP = 0.05  # of a central difference, in prior deviations
-ROUNDS = 2  # of linearisation: the pose at rest is all but linear in what is found from it
 LEAST_SHARE = 0.1  # of the draws: a row that leaves fewer says that the model is wrong, not which draw is right
 
 Batch = dict[str, Float[np.ndarray, " n"]]
@@ -33,14 +32,13 @@ def match_first_row(
     deviations: Sequence[Parameter],
     errors: Mapping[str, float],
     key: PRNGKeyArray,
-) -> Batch:
+) -> tuple[Batch, int]:
     """Condition what is a recording's own on its first row: the frame's offset, and deviations of a new group.
 
     Offsets are set: each draw is shifted so that the weighted mean over the markers agrees, and a marker weighs as
     little as the model is wrong about it. Deviations are drawn given the row, in which the model is as wrong as it was
-    in the fitted recordings: each draw from their prior is moved to the optimum under perturbed data, which for a
-    linear model is a draw from the posterior (randomised maximum likelihood, Oliver, He & Reynolds 1996). Of a group's
-    recordings the first that has a first row is used.
+    in the fitted recordings: each draw from their prior is moved to the optimum under a perturbed row (`fit_own`), the
+    offsets set anew at every step. Of a group's recordings the first that has a first row is used.
 
     Args:
         problem: of the new recordings.
@@ -51,6 +49,9 @@ def match_first_row(
             deviations stay as they were drawn.
         key: of the perturbations.
 
+    Returns:
+        the values, and how many draws did not converge: they keep the best that they have found.
+
     Raises:
         InputError: a first row that is masked throughout.
     """
@@ -59,13 +60,17 @@ def match_first_row(
     if shifted:
         values = _with_offsets(problem, values, names, errors)
     if not errors or not deviations:
-        return values
+        return values, 0
+    lost = 0
     for number, group in enumerate(dict.fromkeys(p.recording for p in deviations)):
         own = [p for p in deviations if p.recording == group]
         seen = [r for r in own[0].members if recordings.line.valid[recordings.names.index(r), 0].any()]
         if seen:
-            values = _with_deviations(problem, values, seen[0], own, errors, jax.random.fold_in(key, number))
-    return _with_offsets(problem, values, names, errors) if shifted else values
+            free = any(p.recording == seen[0] for p in shifted)
+            own_key = jax.random.fold_in(key, number)
+            values, unmatched = _with_deviations(problem, values, seen[0], own, errors, own_key, shifted=free)
+            lost += unmatched
+    return (_with_offsets(problem, values, names, errors) if shifted else values), lost
 
 
 def weighed_by_first_row(
@@ -131,34 +136,38 @@ def _with_deviations(
     own: Sequence[Parameter],
     errors: Mapping[str, float],
     key: PRNGKeyArray,
-) -> Batch:
-    """Each draw of the deviations (in units of their spread) at the optimum for a perturbed first row."""
+    *,
+    shifted: bool,
+) -> tuple[Batch, int]:
+    """Each draw of the deviations, in units of their spread, at the optimum for a perturbed first row, and how many did
+    not converge; where ``shifted``, the frame is free to shift and only the row's shape counts."""
     recordings = problem.model.recordings
     index = recordings.names.index(recording)
     valid = recordings.line.valid[index, 0]
-    spread = np.array([float((p.table or {})["scale"]) for p in own])
+    spread = np.stack([spread_of_draws(p, values, len(values[p.name])) for p in own], axis=1)
     drawn = np.stack([values[p.name] for p in own], axis=1) / spread
-    sd = np.repeat(_errors(recordings.markers, errors)[valid] / np.sqrt(3.0), 3)
-    noise = np.asarray(jax.random.normal(key, (len(drawn), len(sd))))
-    measured = recordings.position[index, 0, valid].reshape(-1) / sd + noise
+    sd = _errors(recordings.markers, errors)[valid, None] / np.sqrt(3.0)
+    noise = np.asarray(jax.random.normal(key, (len(drawn), int(valid.sum()), 3)))
+    measured = recordings.position[index, 0, valid] + sd * noise
 
-    def at(deviation: np.ndarray) -> Batch:
-        return {**values, **{p.name: column for p, column in zip(own, (deviation * spread).T, strict=True)}}
+    def residuals(deviation: np.ndarray, draw: np.ndarray) -> np.ndarray:
+        given = {name: column[draw] for name, column in values.items()}
+        given |= {p.name: column for p, column in zip(own, (deviation * spread[draw]).T, strict=True)}
+        error = _first_rows(problem, given)[:, index, valid] - measured[draw]
+        if shifted:
+            error = error - np.average(error, axis=1, weights=1.0 / sd[:, 0] ** 2, keepdims=True)
+        return (error / sd).reshape(len(draw), -1)
 
-    def row(deviation: np.ndarray) -> np.ndarray:
-        return _first_rows(problem, at(deviation))[:, index, valid].reshape(len(deviation), -1) / sd
+    found = fit_own(residuals, drawn)
+    matched = zip([p.name for p in own], (found.point * spread).T, strict=True)
+    return {**values, **dict(matched)}, int((~found.converged).sum())
 
-    unit = STEP * np.eye(len(own))
-    found = drawn
-    for _ in range(ROUNDS):
-        slope = np.stack([(row(found + e) - row(found - e)) / (2.0 * STEP) for e in unit], axis=2)
-        missing = measured - row(found) + np.einsum("nij,nj->ni", slope, found)
-        normal = np.einsum("nij,nik->njk", slope, slope) + np.eye(len(own))
-        right = np.einsum("nij,ni->nj", slope, missing) + drawn
-        fine = np.isfinite(normal).all(axis=(1, 2)) & np.isfinite(right).all(axis=1)
-        found = found.copy()
-        found[fine] = np.linalg.solve(normal[fine], right[fine][..., None])[..., 0]
-    return at(found)
+
+def spread_of_draws(deviation: Parameter, values: Mapping[str, np.ndarray], count: int) -> Float[np.ndarray, " n"]:
+    """Standard deviation between groups of what a deviation is added to, for each of ``count`` draws."""
+    if deviation.scaled_by:
+        return np.asarray(values[deviation.scaled_by])
+    return np.full(count, float((deviation.table or {})["scale"]))
 
 
 def _first_rows(problem: CalibrationProblem, values: Batch) -> Float[np.ndarray, "n recording marker 3"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -14,6 +15,7 @@ from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.pooling import Patterns, gather_groups, whole
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import RecordingPrediction
@@ -24,8 +26,27 @@ from rfdropo_bayes.prediction.first_row import match_first_row, weighed_by_first
 FITTED, MARKER_ERRORS, HELD = "fitted_recordings", "marker_errors_m", "held_parameters"
 NOISE, BEGUN = "noise_model", "fitted_recordings_begin"
 KNOWN_NOISE = "known_noise"  # of the positions, where its parameters are not inferred
+MODEL_ERROR = "model_error"  # see `day.ModelError`
 
 Batch = dict[str, Float[np.ndarray, " n"]]
+
+
+class NewPredictions(NamedTuple):
+    """Predictions of recordings that no fit has seen, and how many draws did not converge in matching a first row."""
+
+    recordings: list[RecordingPrediction]
+    unmatched: int
+
+
+def match_cautions(found: NewPredictions) -> list[Caution]:
+    """A caution where draws did not converge in matching a first row."""
+    if not found.unmatched:
+        return []
+    sentence = (
+        f"{found.unmatched} draws of a new group's parameters did not converge in matching its first row: they count "
+        "as they are, and the bands may be too wide"
+    )
+    return [Caution(Code.FIRST_ROW_UNMATCHED, sentence)]
 
 
 def thin(draws: Mapping[str, Float[np.ndarray, "chain draw"]], count: int) -> Batch:
@@ -63,7 +84,7 @@ def predict_new(
     fitted: Sequence[str],
     errors: Mapping[str, float] | None = None,
     groups: Patterns | None = None,
-) -> list[RecordingPrediction]:
+) -> NewPredictions:
     """Predictions of recordings that no fit has seen, from their commands and at most their first row.
 
     A parameter that was free per recording takes, for a new one, the values it had in the fitted recordings, one of
@@ -89,13 +110,13 @@ def predict_new(
     own = {whole(name) for name in fitted}
     drawn = [p for p in space.parameters if p.added_to and p.name not in values]
     new = [n for n in names if whole(n) not in own]
-    extended = match_first_row(problem, extended, new, drawn, errors or {}, row_key)
+    extended, unmatched = match_first_row(problem, extended, new, drawn, errors or {}, row_key)
     placed, extended = with_measured_starts(fresh, trajectories, extended)
     if placed is not fresh:
         problem = CalibrationProblem(placed, chunk=chunk)
     matched = {member for p in drawn for member in p.members}
     unseen = [n for n in new if n not in matched]
-    return _predictions(problem, extended, noise_key, "test", unseen=unseen, errors=errors)
+    return NewPredictions(_predictions(problem, extended, noise_key, "test", unseen=unseen, errors=errors), unmatched)
 
 
 def _for_new_recordings(
@@ -133,6 +154,8 @@ def _for_new_recordings(
         drawn = values.get(parameter.name)
         if drawn is None:
             drawn = np.asarray(parameter.prior.sample(jax.random.fold_in(key, len(names) + len(parameters)), (count,)))
+            if parameter.scaled_by:
+                drawn = drawn * values[parameter.scaled_by] / float(parameter.prior.scale)
         extended[parameter.name] = drawn
         parameters.append(parameter)
     return ParameterSpace(tuple(parameters)), extended

@@ -203,9 +203,12 @@ def pooling(
     """
     groups = gather_groups([*fitted, *others], experiment.model.groups)
     known = {group: members for group, members in groups.items() if set(members) & set(fitted)}
-    spreads = expand_groups(experiment.model.per_group, specs)
-    check_names(spreads, specs, where="[model.per_group]")
-    return {name: Pooled(spread, known) for name, spread in spreads.items()}
+    found: dict[str, Pooled] = {}
+    for family, spread in experiment.model.per_group.items():
+        members = expand_groups({family: spread}, specs)
+        check_names(members, specs, where="[model.per_group]")
+        found |= {name: Pooled(spread, known, family) for name in members}
+    return found
 
 
 def build_model(experiment: Experiment, simulator: AnySimulator, trajectories: Sequence[Trajectory]) -> TrajectoryModel:

@@ -419,6 +419,7 @@ def _model(
     gains = [spec for spec in measurement_specs(table) if spec == TENSION_GAIN]
     specs, groups = (*simulator.parameters, *gains), (recordings.names[:fitted], recordings.names[fitted:])
     space = model_space(experiment, simulator, specs, *groups, later=added)
+    space = space.holding(space.typical_scales)  # evidences are compared at one spread between groups
     of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
     base = sum(p.spec.name not in of_candidates for p in space.parameters)
     channels = gather_channels(experiment, simulator, trajectories, recordings, fitted)

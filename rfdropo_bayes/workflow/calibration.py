@@ -14,21 +14,25 @@ from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.pooling import Patterns
+from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
+from rfdropo_bayes.prediction.day import model_error
 from rfdropo_bayes.prediction.predictive import (
     BEGUN,
     FITTED,
     HELD,
     KNOWN_NOISE,
     MARKER_ERRORS,
+    MODEL_ERROR,
     NOISE,
     Batch,
     marker_errors,
+    match_cautions,
     predict_fitted,
     predict_new,
     thin,
@@ -128,8 +132,8 @@ def _fit(
         result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
     problem = problem.holding(result.held)
     attributes = {**_attributes(model.name, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
-    record = record_posterior(problem, result, test, predicting, attributes, model.experiment.model.groups)
-    facts = gather_facts(title, seed, problem, result, runs, test, record)
+    record, unmatched = record_posterior(problem, result, test, predicting, attributes, model.experiment.model.groups)
+    facts = gather_facts(title, seed, problem, result, runs, test, record, unmatched)
     return Calibration(record, build_summary(record, facts), text, model, out)
 
 
@@ -194,8 +198,9 @@ def record_posterior(
     key: jax.Array,
     attributes: dict[str, Any],
     groups: Patterns,
-) -> PosteriorRecord:
-    """Draws, prior draws and predictions of every recording, with the combinations of parameters that rollouts see."""
+) -> tuple[PosteriorRecord, list[Caution]]:
+    """Draws, prior draws and predictions of every recording, with the combinations of parameters that rollouts see, and
+    what speaks against the predictions."""
     prior_key, fit_key, test_key = jax.random.split(key, 3)
     rows = row_log_likelihood(problem, result)
     prior = {name: np.asarray(v) for name, v in problem.sample_prior(prior_key, PRIOR_DRAWS).items()}
@@ -203,10 +208,14 @@ def record_posterior(
     before = {name: column[:PRIOR_PREDICTIVE_DRAWS] for name, column in prior.items()}
     predictions: list[RecordingPrediction] = predict_fitted(problem, values, fit_key, prior=before)
     errors, fitted = marker_errors(predictions), list(problem.model.recordings.names)
+    left = model_error(predictions)
+    cautions: list[Caution] = []
     if tested:
-        predictions += predict_new(
+        found = predict_new(
             problem.model, tested, values, test_key, chunk=problem.chunk, fitted=fitted, errors=errors, groups=groups
         )
+        predictions += found.recordings
+        cautions = match_cautions(found)
     record = PosteriorRecord(
         tuple(
             ParameterInfo(p.name, p.spec.unit, p.spec.low, p.spec.high, dict(p.table or {}), p.spec.description)
@@ -224,10 +233,11 @@ def record_posterior(
             FITTED: fitted,
             MARKER_ERRORS: errors,
             HELD: result.held,
+            MODEL_ERROR: None if left is None else left._asdict(),
             **known_noise(problem),
         },
     )
-    return record.with_derived(scale_free_ratios(problem.names))
+    return record.with_derived(scale_free_ratios(problem.names)), cautions
 
 
 def row_log_likelihood(
@@ -276,6 +286,7 @@ def gather_facts(
     fitted: Sequence[Trajectory],
     tested: Sequence[Trajectory],
     record: PosteriorRecord,
+    unmatched: Sequence[Caution] = (),
 ) -> RunFacts:
     """What the report says beside the posterior."""
     unseen = [prediction for prediction in record.recordings if prediction.split == "test"]
@@ -296,7 +307,7 @@ def gather_facts(
         evaluations=result.evaluations,
         log_evidence=result.log_evidence,
         excluded=result.excluded,
-        cautions=[*result.cautions, *residual_cautions(checks, problem.model.noise)],
+        cautions=[*result.cautions, *unmatched, *residual_cautions(checks, problem.model.noise)],
         residuals=checks,
         recordings=[
             *(RecordingFacts.of_trajectory(t, "fit") for t in fitted),

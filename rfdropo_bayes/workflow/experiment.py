@@ -69,8 +69,9 @@ class ModelTable(Table):
     )
     per_group: dict[str, float] = Field(
         default_factory=dict,
-        description="parameters that differ between groups about the value they share, with their standard deviation "
-        "between groups, in their unit",
+        description="parameters that differ between groups about the value they share: the scale of the half-normal "
+        "prior of their standard deviation between groups, in their unit, which is inferred; a name such as "
+        "initial_displacement stands for those of all cables, with one standard deviation",
     )
     tension: bool = Field(
         default=False,

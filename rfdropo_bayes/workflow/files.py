@@ -39,6 +39,7 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "calibrate": Command(("summary.json", "posterior.nc", "report.html"), resumable=True),
+    "adapt": Command(("summary.json", "posterior.nc", "report.html")),
     "check": Command(("sbc.json", "sbc.jsonl"), resumable=True),
     "simulate": Command(("simulation.json",)),
     "predict": Command(("prediction.json", "prediction.nc", "prediction.csv")),

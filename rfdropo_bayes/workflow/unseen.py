@@ -18,7 +18,7 @@ from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import Autoregression
-from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
+from rfdropo_bayes.bayes.pooling import DEVIATION, SPREAD, Pooled
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
 from rfdropo_bayes.data import Trajectory, first_row_only, load_unseen, start_is_known
@@ -101,6 +101,7 @@ def predict(
     start: Any = None,
     draws: int = DRAWS,
     seed: int = 0,
+    group: str | None = None,
 ) -> Prediction:
     """Predict what the markers will do under given commands, from at most the start pose.
 
@@ -111,25 +112,23 @@ def predict(
         start: positions of the markers in the first row [m], (marker, 3), beside such a pair; unknown by default.
         draws: of the posterior that are rolled out.
         seed: of what is random.
+        group: the day, robot or other group that they belong to; as [model.groups] has it by default.
 
     Raises:
         InputError: a calibration without its model, or commands of another robot.
     """
-    model, record = fit.model, fit.record
-    if model is None:
-        raise InputError("the calibration has no model", where="predict", remedy="give the one that calibrate returned")
+    record, model = fit.record, model_of(fit)
     simulator, table = model.simulator, model.experiment.model
     _check_noise(record, table.noise)
     unseen = first_row_only(commands) if isinstance(commands, Trajectory) else _commanded(model, *commands, start)
-    fixed = {**fixed_values(model.experiment, simulator), **record.attrs.get(HELD, {})}
-    space = _fitted_space(record, simulator.parameters + measurement_specs(table))
+    fixed, space = fitted_parts(fit)
     recordings = gather_recordings(simulator, [unseen])
     channels = (_markers(recordings, table.noise, record.attrs.get(KNOWN_NOISE)),)
     program = TrajectoryModel(simulator, space, fixed, recordings, channels)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
     fitted, errors = record.attrs.get(FITTED, belonging), record.attrs.get(MARKER_ERRORS)
-    predicted = predict_new(
+    found = predict_new(
         program,
         [unseen],
         values,
@@ -137,11 +136,31 @@ def predict(
         chunk=simulator.lanes,
         fitted=fitted,
         errors=errors,
-        groups=table.groups,
-    )[0]
+        groups=table.groups if group is None else {group: unseen.name},
+    )
+    predicted = found.recordings[0]
     bands = summarise(predicted)
     bands.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": model.name, "recording": unseen.name}
+    bands.attrs["draws_that_did_not_match_the_first_row"] = found.unmatched
     return Prediction(bands, predicted)
+
+
+def model_of(fit: Calibration) -> Model:
+    """The model of a calibration.
+
+    Raises:
+        InputError: it was read from files that do not say which.
+    """
+    if fit.model is None:
+        raise InputError("the calibration has no model", where="predict", remedy="give the one that calibrate returned")
+    return fit.model
+
+
+def fitted_parts(fit: Calibration) -> tuple[dict[str, float], ParameterSpace]:
+    """Values that a calibration took for known, and the parameters that it inferred."""
+    model = model_of(fit)
+    fixed = {**fixed_values(model.experiment, model.simulator), **fit.record.attrs.get(HELD, {})}
+    return fixed, _fitted_space(fit.record, model.simulator.parameters + measurement_specs(model.experiment.model))
 
 
 def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
@@ -180,6 +199,7 @@ def run_prediction(
     rows: tuple[int, int] | None = None,
     overrides: Sequence[str] = (),
     seed: int | None = None,
+    group: str | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
     """Predict what the markers will do under the commands of a file, from at most the start pose.
@@ -196,6 +216,7 @@ def run_prediction(
         rows: predict observation rows first to last only; the pose of the first is then that of row ``first``.
         overrides: assignments that replace entries of the experiment file.
         seed: of the draws; that of the experiment by default.
+        group: see `predict`.
         overwrite: write whatever ``out`` holds.
 
     Raises:
@@ -208,8 +229,9 @@ def run_prediction(
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
     unseen = load_unseen(experiment.data, folder, commands, start, rows, record.attrs.get(BEGUN))
     fit = Calibration(record, {}, "", Model.of_experiment(experiment, folder))
-    found = predict(fit, unseen, seed=experiment.seed if seed is None else seed)
-    options = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
+    found = predict(fit, unseen, seed=experiment.seed if seed is None else seed, group=group)
+    options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
+    options["group"] = group
     settings: dict[str, Any] = {"tables": tables, "folder": folder, "options": options, "data": hashes([unseen])}
     with run_folder(out, "predict", **settings, overwrite=overwrite) as out:
         facts = {
@@ -221,6 +243,7 @@ def run_prediction(
             "first_command": unseen.first_command,
             "rows": len(found.drawn.time),
             "draws": int(found.drawn.predicted.shape[0]),
+            "draws_that_did_not_match_the_first_row": found.bands.attrs["draws_that_did_not_match_the_first_row"],
             "unit": "m",
             "frame": unseen.dataset.attrs["frame"],
             "simulator": fit.model.simulator.description if fit.model else {},
@@ -269,12 +292,17 @@ def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> Pa
     priors: dict[str, dict[str, Any]] = {}
     known = {spec.name for spec in specs}
     pooled: dict[str, Pooled] = {}
+    families = [i.name.removesuffix(SPREAD) for i in record.free if i.name.endswith(SPREAD) and i.name not in known]
+    families.sort(key=len, reverse=True)  # the longest name that fits: one cable's own spread, before that of all
     for info in record.free:
         name, _, recording = info.name.partition(SEPARATOR)
         shared = name.removesuffix(DEVIATION)
         if name not in known and shared in known:
             groups = pooled[shared].groups if shared in pooled else {}
-            pooled[shared] = Pooled(float(dict(info.prior)["scale"]), {**groups, recording: ()})
+            family = next((key for key in families if shared == key or shared.startswith(f"{key}_")), "")
+            pooled[shared] = Pooled(float(dict(info.prior)["scale"]), {**groups, recording: ()}, family)
+            continue
+        if name.removesuffix(SPREAD) in families:
             continue
         priors[name] = dict(info.prior)
         if recording:

@@ -148,3 +148,30 @@ def test_what_cannot_be_pooled_is_refused():
         build_space(SPECS, {"young_modulus": {}}, {}, ["b"], pooled={"offset_x": Pooled(0.1, {"april": ("b",)})})
     with pytest.raises(InputError, match="the spread between groups is 0"):
         build_space(SPECS, {"offset_x": {}}, {}, ["b"], pooled={"offset_x": Pooled(0.0, {"april": ("b",)})})
+
+
+def hierarchical(known=None):
+    """Three groups' offsets about a shared one, their spread inferred, or known."""
+    pooled = {"offset_x": Pooled(0.002, gather_groups(("a1", "b", "c"), DAYS), "offset")}
+    space = build_space(SPECS, {"offset_x": {}}, {}, ["a1", "b", "c"], pooled=pooled)
+    return space if known is None else space.holding({"offset_spread": known})
+
+
+def test_a_spread_between_groups_that_is_inferred_is_that_of_the_deviations():
+    """Deviations have the spread of their draw; the map to the real line is a bijection whose density carries the
+    Jacobian; held at a value, the space is that of a known spread."""
+    space = hierarchical()
+    assert space.scales == {"offset_spread": tuple(f"offset_x_deviation@{g}" for g in ("january", "april", "c"))}
+    values = space.sample(jax.random.key(0), 20000)
+    ratio = values["offset_x_deviation@april"] / values["offset_spread"]
+    assert np.std(ratio) == pytest.approx(1.0, rel=0.03)  # 5 standard errors
+    assert np.std(values["offset_spread"]) == pytest.approx(0.002 * np.sqrt(1 - 2 / np.pi), rel=0.05)
+    few = {name: column[:20] for name, column in values.items()}
+    u = space.to_unconstrained(few)
+    np.testing.assert_allclose(space.from_unconstrained(u)["offset_x_deviation@c"], few["offset_x_deviation@c"])
+    slope = jax.vmap(jax.jacfwd(lambda row: jnp.stack([space.from_unconstrained(row)[n] for n in space.names])))(u)
+    expected = space.log_prior(few) + jnp.linalg.slogdet(slope)[1]
+    np.testing.assert_allclose(space.log_prior_unconstrained(u), expected, rtol=1e-9)
+    held = hierarchical(0.001)
+    assert "offset_spread" not in held.names
+    assert held["offset_x_deviation@c"].prior.scale == 0.001

@@ -231,13 +231,15 @@ def test_deviations_given_a_first_row_are_draws_from_the_linear_model_s_posterio
         model=SimpleNamespace(space=space, recordings=recordings), n_recordings=1, rollouts=rollouts
     )
     drawn = [p for p in space.parameters if p.added_to]
-    found = match_first_row(problem, values, ["new"], drawn, errors, jax.random.key(2))["level_deviation@new"]
+    matched, unmatched = match_first_row(problem, values, ["new"], drawn, errors, jax.random.key(2))
+    found = matched["level_deviation@new"]
+    assert unmatched == 0
     weight = 3.0 / np.array([2.0, 5.0]) ** 2  # an error in 3-D is shared by three coordinates
     precision = 1.0 / 4.0 + np.sum(slope**2 * weight)
     assert abs(np.mean(found) - np.sum(slope * weight * measured[:, 0]) / precision) < 5.0 / np.sqrt(4000 * precision)
     assert np.std(found) == pytest.approx(precision**-0.5, rel=0.06)
     np.testing.assert_array_equal(
-        match_first_row(problem, values, ["new"], drawn, {}, jax.random.key(2))["level_deviation@new"],
+        match_first_row(problem, values, ["new"], drawn, {}, jax.random.key(2))[0]["level_deviation@new"],
         values["level_deviation@new"],
     )
 

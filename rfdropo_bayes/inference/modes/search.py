@@ -14,7 +14,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -24,12 +24,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from scipy.special import logsumexp
 
-from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, Values
+from rfdropo_bayes.bayes.problem import Hierarchy, Problem, ResidualProblem, Values
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.climb import Climbable, Laplace, LevenbergState, climb_cost, laplace, maximise
 from rfdropo_bayes.inference.modes.mixture import MIXTURES, draw_mixture, mixture_weights, rivals
+from rfdropo_bayes.inference.modes.scales import integrate_scales
 from rfdropo_bayes.inference.modes.targets import (
     SmoothTarget,
     log_likelihood_derivatives,
@@ -37,7 +38,7 @@ from rfdropo_bayes.inference.modes.targets import (
     prior_derivatives,
 )
 from rfdropo_bayes.inference.progress import UNRECORDED, UNSAVED, Checkpoint, Logbook, run_digest
-from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_cautions, prior_cautions
+from rfdropo_bayes.inference.result import Draws, InferenceResult, chains, exclusion_cautions, prior_cautions
 from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc.moves import StraightProblem, squared_distance
 from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES
@@ -513,18 +514,27 @@ def run(
     key: PRNGKeyArray,
     logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
-    """Posterior modes and draws of the normal approximations around them, mapped back to physical units."""
+    """Posterior modes and draws of the normal approximations around them, mapped back to physical units.
+
+    A `Hierarchy` is climbed with its standard deviations held, which are then integrated out (`integrate_scales`).
+    """
     mode_key, draw_key = jax.random.split(key)
     digest = run_digest(problem, "laplace", config, key)
     checkpoint = logbook.checkpoint("laplace", digest)
+    whole, held = problem, dict(getattr(problem, "typical_scales", {}))
+    if isinstance(whole, Hierarchy) and held:
+        problem = whole.holding(held)
 
     def explain_as_well(climbs: Climbs) -> Bool[np.ndarray, " start"]:
         return rivals(evaluate_rows(problem, climbs.positions, problem.n_rows, climbs.ledger))
 
     found = find_modes(problem, config, mode_key, checkpoint, logbook, chosen=explain_as_well)
     modes, ledger = found.modes, found.climbs.ledger
-    weights = mixture_weights(config.mixture, [mode.log_evidence for mode in modes])
-    draws = chains(problem, [draw_mixture(modes, weights, config.draws, draw_key)])
+    if isinstance(whole, Hierarchy) and held:
+        draws, modes, weights = _with_scales(whole, problem, held, modes, config, draw_key)
+    else:
+        weights = mixture_weights(config.mixture, [mode.log_evidence for mode in modes])
+        draws = chains(problem, [draw_mixture(modes, weights, config.draws, draw_key)])
     best = modes[0]
     return InferenceResult(
         method="laplace",
@@ -537,11 +547,11 @@ def run(
         cautions=[
             *found.cautions,
             *_several(weights, config.mixture),
-            *prior_cautions(problem, draws),
+            *prior_cautions(whole, draws),
             *exclusion_cautions(ledger.excluded, ledger.evaluations),
         ],
         seconds=found.climbs.seconds,
-        optimum=mode_values(problem, best),
+        optimum={**mode_values(problem, best), **held},
         details={
             "covariance_unconstrained": best.covariance.tolist(),
             "noise_coordinates": np.flatnonzero(np.asarray(found.climbs.noise)).tolist(),
@@ -552,6 +562,37 @@ def run(
             "modes": [{"log_evidence": m.log_evidence, **mode_values(problem, m)} for m in modes],
         },
     )
+
+
+def _with_scales(
+    whole: Hierarchy,
+    problem: Problem,
+    held: Mapping[str, float],
+    modes: Sequence[Laplace],
+    config: LaplaceConfig,
+    key: PRNGKeyArray,
+) -> tuple[Draws, list[Laplace], Float[np.ndarray, " mode"]]:
+    """Draws of a hierarchy whose modes were found with its standard deviations held; the modes in the order of their
+    evidence once these are integrated out, and the weights of their mixture."""
+    members = [[problem.names.index(name) for name in whole.scales[scale]] for scale in held]
+    order_key, *keys = jax.random.split(key, len(modes) + 1)
+    values = np.array(list(held.values()))
+    mixed = [
+        integrate_scales(mode, values, members, whole.scale_log_prior, config.draws, k)
+        for mode, k in zip(modes, keys, strict=True)
+    ]
+    order = np.argsort([-each.log_evidence for each in mixed])
+    weights = mixture_weights(config.mixture, [mixed[i].log_evidence for i in order])
+    ends = np.diff(np.round(np.cumsum(weights) * config.draws).astype(int), prepend=0)
+    shuffled = np.asarray(jax.random.permutation(order_key, config.draws))
+    position = np.concatenate([mixed[i].position[:n] for i, n in zip(order, ends, strict=True)])[shuffled]
+    scales = np.concatenate([mixed[i].scales[:n] for i, n in zip(order, ends, strict=True)])[shuffled]
+    draws = chains(problem, [position]) | {name: scales[None, :, j] for j, name in enumerate(held)}
+    integrated = [
+        modes[i]._replace(log_density=modes[i].log_density + mixed[i].log_evidence - modes[i].log_evidence)
+        for i in order
+    ]
+    return {name: draws[name] for name in whole.names}, integrated, weights
 
 
 def _several(weights: Float[np.ndarray, " mode"], mixture: str) -> list[Caution]:

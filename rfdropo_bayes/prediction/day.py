@@ -1,0 +1,160 @@
+"""What is a day's own, found from one short recording of it under every draw of the body.
+
+The body keeps its posterior. Under each of its draws the day's parameters are fitted to the recording and to draws
+from their priors, perturbed (`fit_own`), which makes the optimum a draw from their posterior given that body. Each body
+then counts by its evidence: the likelihood of the recording with the day's parameters integrated out. For a linear
+model with normal noise the draws are those of the joint posterior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from blackjax.smc import resampling
+from jax.scipy.stats import norm
+from jaxtyping import Float, Int, PRNGKeyArray
+from scipy.special import softmax
+
+from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, estimate_noise
+from rfdropo_bayes.bayes.space import Parameter
+from rfdropo_bayes.inference import next_step
+from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.prediction.first_row import LEAST_SHARE, spread_of_draws
+from rfdropo_bayes.prediction.own_fit import OwnFit, fit_own
+
+Batch = dict[str, Float[np.ndarray, " n"]]
+
+
+class DayFit(NamedTuple):
+    """Draws of body and day together.
+
+    Attributes:
+        values: of all parameters, each draw as often as its body counts.
+        chosen: which draw of the body each is.
+        log_evidence: of each body's draw, up to a constant.
+        power: that the evidences were raised to, so that a tenth of the draws is left; 1 where it is no less.
+        unconverged: draws whose fit did not converge.
+        steps: that the fits took.
+    """
+
+    values: Batch
+    chosen: Int[np.ndarray, " n"]
+    log_evidence: Float[np.ndarray, " n"]
+    power: float
+    unconverged: int
+    steps: int
+
+
+def fit_day(
+    problem: CalibrationProblem,
+    body: Batch,
+    own: Sequence[Parameter],
+    key: PRNGKeyArray,
+    report: Callable[[int, float], None] = lambda step, share: None,
+) -> DayFit:
+    """Draws of a day's parameters, and of the body, given one recording of the day.
+
+    Args:
+        problem: of that recording, under noise that is known.
+        body: draws of all other parameters.
+        own: the day's: deviations of its group, and parameters of the recording.
+        key: of draws from the priors, perturbations of the data, and the choice of the body's draws.
+        report: is told the step, and the share of the draws that have converged.
+    """
+    count = len(next(iter(body.values())))
+    centre_key, noise_key, choice_key = jax.random.split(key, 3)
+    centre = np.asarray(jax.random.normal(centre_key, (count, len(own))))
+    horizon = problem.n_rows
+
+    def values_at(point: Float[np.ndarray, "b k"], draw: Int[np.ndarray, " b"]) -> Batch:
+        given = {name: column[draw] for name, column in body.items()}
+        return given | {p.name: _physical(p, x, given) for p, x in zip(own, point.T, strict=True)}
+
+    def white(point: np.ndarray, draw: np.ndarray) -> np.ndarray:
+        return problem.residual_batch(values_at(point, draw), horizon)
+
+    seen = np.flatnonzero(_valid(problem))
+    noise = np.asarray(jax.random.normal(noise_key, (count, len(seen))))
+
+    def residuals(point: np.ndarray, draw: np.ndarray) -> np.ndarray:
+        return white(point, draw)[:, seen] + noise[draw]
+
+    fit = fit_own(residuals, centre, start=np.zeros_like(centre), report=report)
+    evidence = _log_evidence(fit, noise)
+    power, _ = next_step(partial(np.multiply, evidence), 1.0, LEAST_SHARE)
+    chosen = np.asarray(resampling.systematic(choice_key, softmax(power * evidence), count))
+    unconverged = int((~fit.converged).sum())
+    return DayFit(values_at(fit.point[chosen], chosen), chosen, evidence, float(power), unconverged, fit.steps)
+
+
+def _physical(parameter: Parameter, normal: Float[np.ndarray, " b"], given: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Values of a parameter at standard normal coordinates of its prior."""
+    if parameter.added_to:
+        return normal * spread_of_draws(parameter, given, len(normal))
+    return np.asarray(parameter.prior.icdf(norm.cdf(normal)))
+
+
+def _valid(problem: CalibrationProblem) -> np.ndarray:
+    """Which residuals belong to readings, laid out as `residual_batch` has them."""
+    return np.concatenate([np.asarray(channel.valid).reshape(-1) for channel in problem.model.channels])
+
+
+def _log_evidence(fit: OwnFit, noise: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
+    """Of the data as they were measured, for every body, from the linearisation at its own optimum."""
+    residual = fit.residual - noise
+    curvature = np.einsum("nij,nik->njk", fit.slope, fit.slope) + np.eye(fit.point.shape[1])
+    gradient = np.einsum("nij,ni->nj", fit.slope, residual) + fit.point
+    gain = np.einsum("nj,nj->n", gradient, np.linalg.solve(curvature, gradient[..., None])[..., 0])
+    cost = 0.5 * (np.sum(residual**2, axis=1) + np.sum(fit.point**2, axis=1) - gain)
+    found = -cost - 0.5 * np.linalg.slogdet(curvature)[1]
+    return np.where(np.isfinite(found), found, -np.inf)
+
+
+class ModelError(NamedTuple):
+    """What a fitted model leaves: its size for each coordinate of each marker, and how long it lasts.
+
+    Attributes:
+        markers: names.
+        scale: root mean square [m], marker by marker, x, y and z of each.
+        correlation_time: over which it forgets its sign [s].
+    """
+
+    markers: tuple[str, ...]
+    scale: tuple[float, ...]
+    correlation_time: float
+
+    def every(self, step: float) -> Autoregression:
+        """The same as noise of rows that are ``step`` seconds apart."""
+        memory = np.array([1.0, np.exp(-step / self.correlation_time)])
+        return Autoregression(np.array(self.scale), memory, RESIDUALS, np.inf)
+
+
+def model_error(predictions: Sequence[RecordingPrediction]) -> ModelError | None:
+    """What the mean prediction leaves in the recordings that were fitted; None without one.
+
+    It is taken for a first-order autoregression, which has a time constant: the error then counts as little in rows of
+    another rate. White noise of the same size would give three seconds of a recording the weight of three hundred
+    independent measurements, of a model whose error lasts for one of them.
+    """
+    fitted = [p for p in predictions if p.split == "fit" and p.mask.any()]
+    if not fitted:
+        return None
+    rows = max(len(p.time) for p in fitted)
+    markers = fitted[0].marker_names
+    error, valid = (
+        np.zeros((len(fitted), rows, 3 * len(markers))),
+        np.zeros((len(fitted), rows, 3 * len(markers)), bool),
+    )
+    for i, p in enumerate(fitted):
+        error[i, : len(p.time)] = (p.observed - p.central).reshape(len(p.time), -1)
+        valid[i, : len(p.time)] = np.repeat(p.mask, 3, axis=1)
+    noise = estimate_noise(error, valid, 1.0, source=RESIDUALS, order=1, pooled=False)
+    step = float(np.median(np.concatenate([np.diff(p.time) for p in fitted])))
+    memory = float(np.clip(noise.autocorrelation[1], 1e-3, 0.999))
+    return ModelError(tuple(markers), tuple(noise.scale.tolist()), float(-step / np.log(memory)))

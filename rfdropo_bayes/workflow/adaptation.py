@@ -1,0 +1,354 @@
+"""Another day: one short recording moves what a day changes, and the body stays: ``adapt``, and ``rfdropo adapt``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.channels import Markers
+from rfdropo_bayes.bayes.channels.markers import noise_of_markers
+from rfdropo_bayes.bayes.model import TrajectoryModel
+from rfdropo_bayes.bayes.noise import noise_specs
+from rfdropo_bayes.bayes.noise.autoregression import STATED
+from rfdropo_bayes.bayes.pooling import group_of
+from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.bayes.space import Parameter, ParameterSpace, deviations, spread_of
+from rfdropo_bayes.cautions import Caution, Code
+from rfdropo_bayes.data import Trajectory, load_recordings
+from rfdropo_bayes.data.spec import RecordingEntry
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.result import InferenceResult
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.prediction.day import DayFit, ModelError, fit_day
+from rfdropo_bayes.prediction.own_fit import MOST_STEPS
+from rfdropo_bayes.prediction.predictive import (
+    FITTED,
+    KNOWN_NOISE,
+    MODEL_ERROR,
+    NOISE,
+    Batch,
+    predict_fitted,
+    predict_new,
+    thin,
+)
+from rfdropo_bayes.report import build_summary
+from rfdropo_bayes.report.run_folder import CONFIG, POSTERIOR
+from rfdropo_bayes.workflow.assembly import pooling
+from rfdropo_bayes.workflow.calibrated import Calibration
+from rfdropo_bayes.workflow.calibration import gather_facts, scale_free_ratios
+from rfdropo_bayes.workflow.experiment import Experiment, NoiseTable, load_experiment
+from rfdropo_bayes.workflow.experiment_file import describe
+from rfdropo_bayes.workflow.files import hashes, run_folder
+from rfdropo_bayes.workflow.model import Model
+from rfdropo_bayes.workflow.unseen import fitted_parts, model_of
+
+DRAWS = 100
+
+
+def adapt(
+    fit: Calibration,
+    recording: Trajectory,
+    *,
+    seconds: float | None = None,
+    group: str | None = None,
+    draws: int = DRAWS,
+    seed: int = 0,
+    out: Path | str | None = None,
+    entry: RecordingEntry | None = None,
+    overwrite: bool = False,
+    show: bool | None = None,
+) -> Calibration:
+    """Move what a day changes to one short recording of it; the body keeps its posterior.
+
+    What moves are the deviations of the parameters in [model.per_group], and those in [model.per_recording]. A
+    parameter may be put into [model.per_group] now that was shared in the fit. The noise is what the fitted recordings
+    showed the model to leave, for as long as it lasted.
+
+    Args:
+        fit: a calibration, with its model.
+        recording: of the new day.
+        seconds: look at this much of it only, from its beginning; all by default. The report then shows how well the
+            rest is predicted.
+        group: name of the day; the group of [model.groups] that the recording belongs to by default, or else its name.
+        draws: of the posterior.
+        seed: of all that is random.
+        out: folder that gets what a calibration writes; None writes nothing.
+        entry: the recording's files, for the record.
+        overwrite: start anew whatever ``out`` holds.
+        show: whether to show progress, see `Progress`.
+
+    Raises:
+        InputError: nothing of the model differs between days, or the fit does not say what its model leaves.
+    """
+    model = model_of(fit)
+    head, rest = _parted(recording, seconds)
+    day = group_of(recording.name, model.experiment.model.groups) if group is None else group
+    left = _model_error(fit.record)
+    adapted = _experiment(model.experiment, left, recording, group, entry)
+    moved = Model.of_experiment(adapted, model.folder)
+    settings: dict[str, Any] = {"tables": moved.tables(), "folder": model.folder, "texts": moved.texts()}
+    settings |= {"data": hashes([recording]), "options": {"run": fit.folder, "seconds": seconds, "group": group}}
+    run = partial(_adapt, fit, moved, head, rest, day, left, draws, seed, show)
+    if out is None:
+        return run(None, describe(moved.tables()))
+    with run_folder(Path(out), "adapt", **settings, overwrite=overwrite) as folder:
+        found = run(folder, (folder / CONFIG).read_text(encoding="utf-8"))
+        found.save(folder)
+    return found
+
+
+def _adapt(
+    fit: Calibration,
+    model: Model,
+    head: Trajectory,
+    rest: Trajectory | None,
+    day: str,
+    left: ModelError,
+    draws: int,
+    seed: int,
+    show: bool | None,
+    out: Path | None,
+    text: str,
+) -> Calibration:
+    """Fit the day and predict its recording; ``text`` is the experiment as TOML."""
+    began = time.monotonic()
+    simulator, key = model.simulator, jax.random.key(seed)
+    fixed, space = fitted_parts(fit)
+    recordings = gather_recordings(simulator, [head])
+    noise = noise_of_markers(left.every(float(np.median(np.diff(head.time)))), left.markers, recordings)
+    space = _space(space, model, head.name, day, fit.record.attrs[FITTED])
+    body = thin(
+        {p.name: fit.record.posterior[p.name] for p in space.parameters if p.name in fit.record.posterior}, draws
+    )
+    spread_key, fit_key, fitted_key, rest_key = jax.random.split(key, 4)
+    body |= _drawn_spreads(space, body, spread_key)
+    own = [p for p in space.parameters if p.name not in body]
+    if not own:
+        raise InputError(
+            "nothing of the model differs between days",
+            where="[model.per_group]",
+            remedy="name what does, e.g. --set model.per_group.initial_displacement=0.002, and a new --group",
+        )
+    channel = Markers.gather(recordings, STATED, noise)
+    problem = CalibrationProblem(
+        TrajectoryModel(simulator, space, fixed, recordings, (channel,)), chunk=simulator.lanes
+    )
+    evaluations: list[float] = []
+    problem.watch = evaluations.append
+    with Progress("adapt", show=show) as progress:
+        words = {"draws": len(next(iter(body.values()))), "parameters": len(own)}
+        found = fit_day(
+            problem, body, own, fit_key, lambda step, share: progress.stage(max(share, step / MOST_STEPS), **words)
+        )
+    predictions = predict_fitted(problem, found.values, fitted_key)
+    if rest is not None:
+        groups = {day: [head.name, rest.name]}
+        chunk = simulator.lanes
+        predictions += predict_new(
+            problem.model, [rest], found.values, rest_key, chunk=chunk, fitted=[head.name], groups=groups
+        ).recordings
+    result = InferenceResult(
+        method="adapt",
+        draws={name: column[None] for name, column in found.values.items()},
+        rollouts=float(np.sum(evaluations)),
+        evaluations=round(float(np.sum(evaluations))),
+        cautions=_cautions(found),
+        seconds=time.monotonic() - began,
+        details={"power": found.power, "steps": found.steps, "unconverged": found.unconverged, "day": day},
+    )
+    before = {p.name: np.asarray(v) for p, v in zip(own, _prior(space, own, body, seed), strict=True)} | body
+    record = _record(fit.record, problem, result, before, predictions, noise.as_dict(), seed)
+    tested = [] if rest is None else [rest]
+    facts = gather_facts(
+        f"{fit.content.get('title', model.name)}: {day}", seed, problem, result, [head], tested, record
+    )
+    return Calibration(record, build_summary(record, facts), text, model, out)
+
+
+def run_adaptation(
+    run: Path,
+    recording: str,
+    out: Path,
+    *,
+    commands: str | None = None,
+    seconds: float | None = None,
+    group: str | None = None,
+    experiment: Path | None = None,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+    overwrite: bool = False,
+    show: bool | None = None,
+) -> Calibration:
+    """`adapt` a run's folder to a recording in the format of its experiment.
+
+    Args:
+        run: folder of a calibration, or of an earlier adaptation.
+        recording: file of observations; ``commands``: that of the commands, where the format has one of its own.
+        out, seconds, group, seed, overwrite, show: see `adapt`.
+        experiment: the experiment file, where the folder holds a posterior alone.
+        overrides: assignments that replace entries of the experiment file.
+
+    Raises:
+        InputError: bad input.
+    """
+    path = run / CONFIG if experiment is None else experiment
+    if not path.is_file():
+        raise InputError(f"{run} holds no {CONFIG}", where="RUN", remedy="name the experiment file with --experiment")
+    read, _ = load_experiment(path, overrides)
+    if read.data is None:
+        raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format recordings are")
+    folder = path.resolve().parent
+    entry = RecordingEntry(observations=recording, commands=commands)
+    found = load_recordings(read.data.model_copy(update={"fit": [entry], "test": []}), folder)
+    if len(found) > 1:
+        raise InputError(f"names {len(found)} files", where=recording, remedy="adapt to one at a time")
+    record = PosteriorRecord.load(run / POSTERIOR)
+    fit = Calibration(record, {"title": read.title or path.stem}, "", Model.of_experiment(read, folder), run)
+    chosen = read.seed if seed is None else seed
+    options: dict[str, Any] = {"seconds": seconds, "group": group, "seed": chosen, "overwrite": overwrite, "show": show}
+    return adapt(fit, found[0], out=out, entry=entry, **options)
+
+
+def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, Trajectory | None]:
+    """The first seconds, and the whole recording with their measurements taken out; None where nothing is left.
+
+    Raises:
+        InputError: less than two rows.
+    """
+    if seconds is None:
+        return recording, None
+    last = int(np.searchsorted(recording.time - recording.time[0], seconds, side="right")) - 1
+    if last < 1:
+        raise InputError(f"the first {seconds:g} s hold one row", where=recording.name, remedy="give more seconds")
+    if last >= len(recording.time) - 1:
+        return recording, None
+    mask = recording.position_mask.copy()
+    mask[: last + 1] = False
+    dataset = recording.dataset.copy()
+    dataset["position_mask"] = dataset["position_mask"].copy(data=mask)
+    return recording.slice_rows(0, last), Trajectory(dataset)
+
+
+def _model_error(record: PosteriorRecord) -> ModelError:
+    """What the fit says that its model leaves.
+
+    Raises:
+        InputError: it does not say.
+    """
+    given = record.attrs.get(MODEL_ERROR)
+    if given is None:
+        raise InputError(
+            "the posterior does not say what its model leaves of the fitted recordings",
+            where=POSTERIOR,
+            remedy="calibrate again: it was written by an earlier version",
+        )
+    return ModelError(tuple(given["markers"]), tuple(given["scale"]), float(given["correlation_time"]))
+
+
+def _experiment(
+    experiment: Experiment, left: ModelError, recording: Trajectory, group: str | None, entry: RecordingEntry | None
+) -> Experiment:
+    """The experiment file of the adapted run: its noise is known, and its group and its recording are named."""
+    groups = dict(experiment.model.groups)
+    if group is not None:
+        known = groups.get(group, [])
+        groups[group] = [*([known] if isinstance(known, str) else known), recording.name]
+    model = experiment.model.model_copy(update={"noise": STATED, "groups": groups})
+    noise = NoiseTable(
+        standard_deviation=float(np.sqrt(np.mean(np.square(left.scale)))), correlation_time=left.correlation_time
+    )
+    changes: dict[str, Any] = {"model": model, "noise": noise}
+    if entry is not None and experiment.data is not None:
+        changes["data"] = experiment.data.model_copy(update={"fit": [entry], "test": []})
+    return experiment.model_copy(update=changes)
+
+
+def _space(space: ParameterSpace, model: Model, recording: str, day: str, fitted: Sequence[str]) -> ParameterSpace:
+    """The body's parameters, and those of the day and its recording, whether they have draws or not."""
+    noise = {spec.name for name in ("auto", "white", "ar1", "student-t") for spec in noise_specs(name)}
+    shared = [p for p in space.parameters if not p.recording and p.spec.name not in noise]
+    kinds = {p.spec.name: p for p in space.parameters if p.added_to}
+    added = [replace(p, recording=day, members=(recording,)) for p in kinds.values()]
+    spreads: list[Parameter] = []
+    for name, pooled in pooling(model.experiment, model.simulator.parameters, [recording]).items():
+        if any(p.added_to == name for p in added):
+            continue
+        spec = next((p.spec for p in shared if p.spec.name == name), None)
+        if spec is None:
+            raise InputError(
+                f"{name} differs between groups about a value that all share, and has none",
+                where="[model.per_group]",
+                remedy="give it a prior, and calibrate again",
+            )
+        known = [p.name for p in [*shared, *spreads]]
+        spreads += [p for p in spread_of(spec, pooled) if p.name not in known]
+        added += deviations(spec, replace(pooled, groups={day: (recording,)}))
+    families: dict[str, list[Parameter]] = {}
+    for p in space.parameters:
+        if p.recording and not p.added_to:
+            families.setdefault(p.spec.name, []).append(p)
+    # A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone.
+    own = [replace(ps[0], recording=recording) for ps in families.values() if len(ps) == len(fitted)]
+    return ParameterSpace((*shared, *spreads, *added, *own))
+
+
+def _drawn_spreads(space: ParameterSpace, body: Batch, key: jax.Array) -> Batch:
+    """Draws from the prior of spreads that the fit did not have."""
+    count, drawn = len(next(iter(body.values()))), {}
+    for i, name in enumerate(space.scales):
+        if name not in body:
+            drawn[name] = np.asarray(space[name].prior.sample(jax.random.fold_in(key, i), (count,)))
+    return drawn
+
+
+def _prior(space: ParameterSpace, own: Sequence[Parameter], body: Mapping[str, np.ndarray], seed: int) -> list[Any]:
+    """Draws of the day's parameters from their priors."""
+    drawn = space.sample(jax.random.key(seed), len(next(iter(body.values()))))
+    return [drawn[p.name] for p in own]
+
+
+def _cautions(found: DayFit) -> list[Caution]:
+    cautions = []
+    if found.unconverged:
+        sentence = (
+            f"the day's parameters did not converge in {MOST_STEPS} steps under {found.unconverged} of "
+            f"{len(found.chosen)} draws of the body; these count as far as they explain the recording"
+        )
+        cautions.append(Caution(Code.DAY_UNMATCHED, sentence, grave=found.unconverged > len(found.chosen) // 2))
+    if found.power < 1.0:
+        sentence = (
+            f"few of the body's draws explain the recording: their evidences were raised to the power "
+            f"{found.power:.2g}, so that a tenth of the draws is left; the model lacks what this day shows"
+        )
+        cautions.append(Caution(Code.DAY_UNMATCHED, sentence))
+    return cautions
+
+
+def _record(
+    fit: PosteriorRecord,
+    problem: CalibrationProblem,
+    result: InferenceResult,
+    prior: Mapping[str, np.ndarray],
+    predictions: Sequence[RecordingPrediction],
+    noise: dict[str, Any],
+    seed: int,
+) -> PosteriorRecord:
+    """The draws, with what predictions of further recordings need."""
+    recordings = problem.model.recordings
+    infos = tuple(
+        ParameterInfo(p.name, p.spec.unit, p.spec.low, p.spec.high, dict(p.table or {}), p.spec.description)
+        for p in problem.model.space.parameters
+    )
+    known = {NOISE: STATED, KNOWN_NOISE: {"markers": list(recordings.markers), **noise}}
+    attributes = {**fit.attrs, **known, FITTED: list(recordings.names), "seed": seed}
+    record = PosteriorRecord(infos, result.draws, dict(prior), tuple(predictions), attrs=attributes)
+    return record.with_derived(scale_free_ratios(problem.names))
