@@ -28,7 +28,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
-from rfdropo_bayes.prediction.day import DayFit, ModelError, fit_day
+from rfdropo_bayes.prediction.day import DayFit, ModelError, fit_day, model_error
 from rfdropo_bayes.prediction.own_fit import MOST_STEPS
 from rfdropo_bayes.prediction.predictive import (
     FITTED,
@@ -241,19 +241,22 @@ def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, T
 
 
 def _model_error(record: PosteriorRecord) -> ModelError:
-    """What the fit says that its model leaves.
+    """What the fit's model leaves: as the fit says, or as its predictions of the fitted recordings show.
 
     Raises:
-        InputError: it does not say.
+        InputError: it holds neither.
     """
     given = record.attrs.get(MODEL_ERROR)
-    if given is None:
+    if given is not None:
+        return ModelError(tuple(given["markers"]), tuple(given["scale"]), float(given["correlation_time"]))
+    found = model_error(record.recordings)
+    if found is None:
         raise InputError(
             "the posterior does not say what its model leaves of the fitted recordings",
             where=POSTERIOR,
             remedy="calibrate again: it was written by an earlier version",
         )
-    return ModelError(tuple(given["markers"]), tuple(given["scale"]), float(given["correlation_time"]))
+    return found
 
 
 def _experiment(
