@@ -1,11 +1,12 @@
 """Leave recordings out in turn, fit the others, and predict those left out from their commands and first rows.
 
-    python benchmarks/leave_out.py EXPERIMENT PATTERN [PATTERN ...] [--out DIR] [--set ASSIGNMENT ...]
+    python benchmarks/leave_out.py EXPERIMENT PATTERN [PATTERN ...] [--adapt SECONDS] [--out DIR] [--set ASSIGNMENT ...]
 
 Every pattern stands for recordings that are left out together, such as those of a day. They are predicted whole, also
 where the experiment fits some rows of them. The table says how far the last marker is off [mm], and which share of the
 measured coordinates lies in the 90 % bands: of all markers, of the last, and of rows whose last marker is inside in all
-three. Fits that are done are read again.
+three. With --adapt each fit is then adapted to the first seconds of the first recording that was left out; further rows
+of the table are of the rest of it, and of the others. Fits that are done are read again.
 """
 
 from __future__ import annotations
@@ -30,25 +31,32 @@ from rfdropo_bayes.workflow.model import Model
 HEAD = ("left out", "recording", "start held [mm]", "error [mm]", "coordinates in", "of the tip", "tips in")
 
 
-def left_out(experiment: Experiment, folder: Path, pattern: str, out: Path) -> list[RecordingPrediction]:
-    """Predictions of the recordings that a pattern stands for, by a fit that has not seen them."""
+def whole_recordings(experiment: Experiment, folder: Path, pattern: str) -> list[rb.Trajectory]:
+    """The recordings that a pattern stands for, all rows of them."""
+    entries = experiment.data.model_dump(include={"fit", "test"}).values()
+    entire = {entry["observations"]: RecordingEntry(**{**entry, "rows": None}) for kind in entries for entry in kind}
+    data = experiment.data.model_copy(update={"fit": list(entire.values()), "test": []})
+    every = load_data(experiment.model_copy(update={"data": data}), folder, "fit")
+    return [run for run in every if fnmatchcase(run.name, pattern)]
+
+
+def left_out(experiment: Experiment, folder: Path, pattern: str, out: Path) -> rb.Calibration:
+    """A fit that has not seen the recordings that a pattern stands for, and predicts them."""
     if (out / "posterior.nc").exists():
-        found = rb.load(out)
-    else:
-        runs = load_data(experiment, folder, "fit")
-        entries = experiment.data.model_dump(include={"fit", "test"}).values()
-        entire = [RecordingEntry(**{**entry, "rows": None}) for kind in entries for entry in kind]
-        data = experiment.data.model_copy(update={"fit": entire, "test": []})
-        every = load_data(experiment.model_copy(update={"data": data}), folder, "fit")
-        found = calibrate(
-            Model.of_experiment(experiment, folder),
-            [run for run in runs if not fnmatchcase(whole(run.name), pattern)],
-            make_config(experiment.inference.method, inference_options(experiment)),
-            test=[run for run in every if fnmatchcase(run.name, pattern)],
-            seed=experiment.seed,
-            out=out,
-            overwrite=True,
-        )
+        return rb.load(out)
+    return calibrate(
+        Model.of_experiment(experiment, folder),
+        [run for run in load_data(experiment, folder, "fit") if not fnmatchcase(whole(run.name), pattern)],
+        make_config(experiment.inference.method, inference_options(experiment)),
+        test=whole_recordings(experiment, folder, pattern),
+        seed=experiment.seed,
+        out=out,
+        overwrite=True,
+    )
+
+
+def tested(found: rb.Calibration) -> list[RecordingPrediction]:
+    """Predictions of recordings that were not fitted."""
     return [prediction for prediction in found.record.recordings if prediction.split == "test"]
 
 
@@ -67,6 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("experiment", type=Path)
     parser.add_argument("patterns", nargs="+")
+    parser.add_argument("--adapt", type=float, help="seconds of the first recording left out that are then looked at")
     parser.add_argument("--out", type=Path, default=Path("reports/leave_out"))
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     given = parser.parse_args()
@@ -74,10 +83,17 @@ def main() -> None:
     print("| " + " | ".join(HEAD) + " |\n" + "|---" * len(HEAD) + "|", flush=True)
     for pattern in given.patterns:
         out = given.out / pattern.replace("*", "")
-        for prediction in left_out(experiment, given.experiment.resolve().parent, pattern, out):
+        folder = given.experiment.resolve().parent
+        found = left_out(experiment, folder, pattern, out)
+        rows = [(pattern, prediction) for prediction in tested(found)]
+        if given.adapt is not None:
+            first, *others = whole_recordings(experiment, folder, pattern)
+            adapted = rb.adapt(found, first, seconds=given.adapt, test=others, group="the day left out")
+            rows += [(f"{pattern}, adapted", prediction) for prediction in tested(adapted)]
+        for words, prediction in rows:
             held, off, *shares = figures(prediction)
-            words = " | ".join(f"{100 * share:.0f} %" for share in shares)
-            print(f"| {pattern} | {prediction.name} | {held:.1f} | {off:.1f} | {words} |", flush=True)
+            percent = " | ".join(f"{100 * share:.0f} %" for share in shares)
+            print(f"| {words} | {prediction.name} | {held:.1f} | {off:.1f} | {percent} |", flush=True)
 
 
 if __name__ == "__main__":

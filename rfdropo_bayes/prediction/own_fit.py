@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 STEP = 0.05  # of a central difference, in prior deviations
-TOLERANCE = 1e-3  # nats that a draw's next step promises: less than any cost is known to
-MOST_STEPS = 30
+TOLERANCE = 0.01  # nats that a step promises, or delivers: what remains is a seventh of a posterior deviation
+CREDIBLE = 100.0  # tolerances that a step may promise and not deliver: what differences promise has the size of kinks
+MOST_STEPS = 60
 DAMPINGS = (0.1, 1.0, 10.0, 100.0)  # of a draw's last one: the first that lowers its cost is taken
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e6
 
@@ -30,7 +31,7 @@ class OwnFit(NamedTuple):
         point: coordinates of each draw.
         residual: at the point; not finite where the draw has none.
         slope: of the residuals there.
-        converged: draws whose next step promises less than `TOLERANCE`.
+        converged: draws whose next step promises, or whose last one delivered, less than `TOLERANCE`.
         steps: that the last of them took.
     """
 
@@ -49,36 +50,68 @@ def fit_own(
 ) -> OwnFit:
     """Levenberg-Marquardt steps of all draws in one batch, until the next step of each promises nothing.
 
+    Slopes cost twice as many rollouts as there are coordinates. All draws begin with those of the first, and a step
+    corrects them by what it has found (Broyden 1965). A draw gets slopes of its own where the corrected ones lead
+    nowhere, and where it seems to be done.
+
     Args:
         residuals: whitened residuals of points, and of the draw that each belongs to.
         centre: a draw from the prior, which its prior pulls each to.
         start: where each begins; its centre by default.
         report: is told the step, and the share of the draws that have converged.
     """
-    draws = np.arange(len(centre))
+    draws, (count, k) = np.arange(len(centre)), centre.shape
     point = (centre if start is None else start).copy()
-    value = residuals(point, draws)
-    slope, damping = np.zeros((*value.shape, centre.shape[1])), np.full(len(centre), FIRST_DAMPING)
-    converged, todo, step = np.zeros(len(centre), dtype=bool), draws[np.isfinite(value).all(axis=1)], 0
+    value, damping = residuals(point, draws), np.full(count, FIRST_DAMPING)
+    todo, step = draws[np.isfinite(value).all(axis=1)], 0
+    converged, own = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    slope = np.zeros((*value.shape, k))
+    if len(todo):
+        slope[:] = _slopes(residuals, point[todo[:1]], todo[:1])
     while len(todo) and step < MOST_STEPS:
-        slope[todo] = _slopes(residuals, point[todo], todo)
-        todo = todo[np.isfinite(slope[todo]).all(axis=(1, 2))]
         gradient = np.einsum("nij,ni->nj", slope[todo], value[todo]) + (point - centre)[todo]
-        curvature = np.einsum("nij,nik->njk", slope[todo], slope[todo]) + np.eye(centre.shape[1])
+        curvature = np.einsum("nij,nik->njk", slope[todo], slope[todo]) + np.eye(k)
         promised = 0.5 * np.einsum("nj,nj->n", gradient, _solve(curvature, gradient))
-        done = promised < TOLERANCE
-        converged[todo[done]] = True
-        report(step, float(np.mean(converged)))
-        todo, gradient, curvature = todo[~done], gradient[~done], curvature[~done]
-        if not len(todo):
-            break
-        moved, found, damping[todo] = _step(
-            residuals, point[todo], value[todo], damping[todo], centre[todo], gradient, curvature, todo
-        )
-        point[todo], value[todo] = moved, found
+        going, delivered = todo[promised >= TOLERANCE], np.zeros(count)
+        if len(going):
+            before, chosen = _cost(value[going], point[going], centre[going]), promised >= TOLERANCE
+            moved, found, damping[going] = _step(
+                residuals,
+                point[going],
+                value[going],
+                damping[going],
+                centre[going],
+                gradient[chosen],
+                curvature[chosen],
+                going,
+            )
+            slope[going] = _corrected(slope[going], moved - point[going], found - value[going])
+            point[going], value[going] = moved, found
+            delivered[going] = before - _cost(found, moved, centre[going])
+        still = delivered[todo] < TOLERANCE
         # Six decades of damping that gain nothing: what differences promise there is rounding, or the edge of a cliff.
-        todo, step = todo[damping[todo] < MOST_DAMPING], step + 1
+        lost = todo[still & own[todo] & (promised >= CREDIBLE * TOLERANCE) & (damping[todo] >= MOST_DAMPING)]
+        done = todo[still & own[todo] & (promised < CREDIBLE * TOLERANCE)]
+        converged[done] = True
+        own[todo[~still]] = False
+        todo = np.setdiff1d(todo, np.concatenate([done, lost]))
+        anew = todo[(delivered[todo] < TOLERANCE) & ~own[todo]]
+        if len(anew):
+            slope[anew] = _slopes(residuals, point[anew], anew)
+            own[anew], damping[anew] = True, FIRST_DAMPING
+            todo = todo[np.isfinite(slope[todo]).all(axis=(1, 2))]
+        step += 1
+        report(step, float(np.mean(converged)))
     return OwnFit(point, value, slope, converged, step)
+
+
+def _corrected(
+    slope: Float[np.ndarray, "n m k"], moved: Float[np.ndarray, "n k"], changed: Float[np.ndarray, "n m"]
+) -> Float[np.ndarray, "n m k"]:
+    """Slopes that agree with what a step has changed; those of a draw that has not moved stay."""
+    length = np.sum(moved**2, axis=1)
+    missing = changed - np.einsum("nij,nj->ni", slope, moved)
+    return slope + missing[:, :, None] * (moved / np.where(length > 0.0, length, 1.0)[:, None])[:, None]
 
 
 def _step(

@@ -28,11 +28,12 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
-from rfdropo_bayes.prediction.day import DayFit, ModelError, fit_day
+from rfdropo_bayes.prediction.day import DayFit, ModelError, fit_day, model_error
 from rfdropo_bayes.prediction.own_fit import MOST_STEPS
 from rfdropo_bayes.prediction.predictive import (
     FITTED,
     KNOWN_NOISE,
+    MARKER_ERRORS,
     MODEL_ERROR,
     NOISE,
     Batch,
@@ -60,6 +61,7 @@ def adapt(
     *,
     seconds: float | None = None,
     group: str | None = None,
+    test: Sequence[Trajectory] = (),
     draws: int = DRAWS,
     seed: int = 0,
     out: Path | str | None = None,
@@ -79,6 +81,8 @@ def adapt(
         seconds: look at this much of it only, from its beginning; all by default. The report then shows how well the
             rest is predicted.
         group: name of the day; the group of [model.groups] that the recording belongs to by default, or else its name.
+        test: other recordings of the day, of which nothing but the first row is looked at; the report says how well
+            they are predicted.
         draws: of the posterior.
         seed: of all that is random.
         out: folder that gets what a calibration writes; None writes nothing.
@@ -96,8 +100,9 @@ def adapt(
     adapted = _experiment(model.experiment, left, recording, group, entry)
     moved = Model.of_experiment(adapted, model.folder)
     settings: dict[str, Any] = {"tables": moved.tables(), "folder": model.folder, "texts": moved.texts()}
-    settings |= {"data": hashes([recording]), "options": {"run": fit.folder, "seconds": seconds, "group": group}}
-    run = partial(_adapt, fit, moved, head, rest, day, left, draws, seed, show)
+    settings |= {"data": hashes([recording, *test]), "options": {"run": fit.folder, "seconds": seconds, "group": group}}
+    tested = [*([] if rest is None else [rest]), *test]
+    run = partial(_adapt, fit, moved, head, tested, day, left, draws, seed, show)
     if out is None:
         return run(None, describe(moved.tables()))
     with run_folder(Path(out), "adapt", **settings, overwrite=overwrite) as folder:
@@ -110,7 +115,7 @@ def _adapt(
     fit: Calibration,
     model: Model,
     head: Trajectory,
-    rest: Trajectory | None,
+    tested: Sequence[Trajectory],
     day: str,
     left: ModelError,
     draws: int,
@@ -150,12 +155,10 @@ def _adapt(
             problem, body, own, fit_key, lambda step, share: progress.stage(max(share, step / MOST_STEPS), **words)
         )
     predictions = predict_fitted(problem, found.values, fitted_key)
-    if rest is not None:
-        groups = {day: [head.name, rest.name]}
-        chunk = simulator.lanes
-        predictions += predict_new(
-            problem.model, [rest], found.values, rest_key, chunk=chunk, fitted=[head.name], groups=groups
-        ).recordings
+    if tested:
+        known: dict[str, Any] = {"fitted": [head.name], "errors": fit.record.attrs.get(MARKER_ERRORS)}
+        known |= {"groups": {day: [head.name, *(run.name for run in tested)]}, "chunk": simulator.lanes}
+        predictions += predict_new(problem.model, tested, found.values, rest_key, **known).recordings
     result = InferenceResult(
         method="adapt",
         draws={name: column[None] for name, column in found.values.items()},
@@ -167,7 +170,6 @@ def _adapt(
     )
     before = {p.name: np.asarray(v) for p, v in zip(own, _prior(space, own, body, seed), strict=True)} | body
     record = _record(fit.record, problem, result, before, predictions, noise.as_dict(), seed)
-    tested = [] if rest is None else [rest]
     facts = gather_facts(
         f"{fit.content.get('title', model.name)}: {day}", seed, problem, result, [head], tested, record
     )
@@ -239,19 +241,22 @@ def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, T
 
 
 def _model_error(record: PosteriorRecord) -> ModelError:
-    """What the fit says that its model leaves.
+    """What the fit's model leaves: as the fit says, or as its predictions of the fitted recordings show.
 
     Raises:
-        InputError: it does not say.
+        InputError: it holds neither.
     """
     given = record.attrs.get(MODEL_ERROR)
-    if given is None:
+    if given is not None:
+        return ModelError(tuple(given["markers"]), tuple(given["scale"]), float(given["correlation_time"]))
+    found = model_error(record.recordings)
+    if found is None:
         raise InputError(
             "the posterior does not say what its model leaves of the fitted recordings",
             where=POSTERIOR,
             remedy="calibrate again: it was written by an earlier version",
         )
-    return ModelError(tuple(given["markers"]), tuple(given["scale"]), float(given["correlation_time"]))
+    return found
 
 
 def _experiment(

@@ -302,7 +302,7 @@ def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> Pa
             family = next((key for key in families if shared == key or shared.startswith(f"{key}_")), "")
             pooled[shared] = Pooled(float(dict(info.prior)["scale"]), {**groups, recording: ()}, family)
             continue
-        if name.removesuffix(SPREAD) in families:
+        if name.endswith(SPREAD) and name.removesuffix(SPREAD) in families:
             continue
         priors[name] = dict(info.prior)
         if recording:
