@@ -110,6 +110,18 @@ def probe_all(target: Target, fit: Fit, candidates: Sequence[Candidate]) -> list
     return probes + _probe_grid(target, fit, base, jobs)
 
 
+def screening_rollouts(target: Target, candidates: Sequence[Candidate]) -> int:
+    """Rollouts that `probe_all` takes: a slope for each parameter, and the grids of those that are shapes."""
+    forward, parameters = target.forward, target.forward.coordinates.space.parameters
+    found = 0
+    for candidate in candidates:
+        own = [parameters[i] for i in candidate.indices]
+        touched = sum(any(p.holds_for(name) for p in own) for name in target.measurements.names)
+        shapes = [len(p.spec.grid) for p in own if p.spec.grid]
+        found += touched * (forward.lanes.slope_rollouts * len(own) + int(np.prod(shapes)) * bool(shapes))
+    return found
+
+
 def _shapes(target: Target, candidate: Candidate, size: dict[int, float]) -> list[int]:
     """Parameters without effect at null that may have one elsewhere."""
     coordinates = target.forward.coordinates

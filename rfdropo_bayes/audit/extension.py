@@ -8,10 +8,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rfdropo_bayes.audit.affordable import about, climb_rollouts
 from rfdropo_bayes.audit.bootstrap import p_in_words
-from rfdropo_bayes.audit.candidates import Candidate, Probe, discretisation_probe, fixed_drop, lead, probe_all
+from rfdropo_bayes.audit.candidates import (
+    Candidate,
+    Probe,
+    discretisation_probe,
+    fixed_drop,
+    lead,
+    probe_all,
+    screening_rollouts,
+)
 from rfdropo_bayes.audit.deadline import OutOfTime
-from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb
+from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb, heights
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.score import likeness, span
 from rfdropo_bayes.audit.screen import Look, Row, look
@@ -111,13 +120,19 @@ class Inquiry:
         ]
         names = [c.name for c in free]
         finer = None
-        probes = probe_all(self.target, fit, free)
+        clock, forward = self.target.forward.deadline, self.target.forward
+        count = screening_rollouts(self.target, free)
+        self.report(f"screening {len(free)} candidates: {count} rollouts, {about(count * forward.pace)}")
+        with clock.stage("screening"):
+            probes = probe_all(self.target, fit, free)
         if self.finer is not None and DISCRETISATION not in without:
             refined = replace(self.target, forward=self.finer)
-            finer = refined.recall("finer", [fit.x], lambda: {"left": refined.residual(fit.x[None])[0]})["left"]
+            with clock.stage("finer mesh"):
+                finer = refined.recall("finer", [fit.x], lambda: {"left": refined.residual(fit.x[None])[0]})["left"]
             probes.append(discretisation_probe(fit, DISCRETISATION, finer, span(fit.jacobian)))
             names.append(DISCRETISATION)
-        found = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer)
+        with clock.stage("joint test"):
+            found = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer)
         if found.finer is not None and found.row(DISCRETISATION).adjusted_p > self.rules.family:
             found = replace(found, omnibus=max(found.omnibus, found.finer, key=lambda test: test.p))
         return found, probes
@@ -147,7 +162,8 @@ class Inquiry:
             self.report(f"joint test p {p}; first: {found.rows[0].name if found.rows else 'none'}")
             if len(steps) >= self.rules.effects or found.omnibus.p > self.rules.extended_passes:
                 return found
-            step = self._extend(found, named)
+            with self.target.forward.deadline.stage("refits"):
+                step = self._extend(found, named)
             if step is None:
                 return found
             if len(steps) > renewed and (better := self._climbed_again(step, named)) is not None:
@@ -160,7 +176,8 @@ class Inquiry:
             steps.append(step)
             fit = step.fit
             if len(steps) > 1:
-                steps[:] = self._reconsider(base, steps)
+                with self.target.forward.deadline.stage("refits"):
+                    steps[:] = self._reconsider(base, steps)
                 fit = steps[-1].fit
 
     def _extend(self, found: Look, named: Sequence[str]) -> Step | None:
@@ -171,7 +188,12 @@ class Inquiry:
         leads = {row.name: self._lead(found.fit, row) for row in significant}
         # When the time is up, the refits that are done decide.
         with suppress(OutOfTime):
-            for row in self._leading(significant, {name: drop for name, (drop, _) in leads.items()}, found.fit):
+            leading = self._leading(significant, {name: drop for name, (drop, _) in leads.items()}, found.fit)
+            if leading:
+                count = len(leading) * climb_rollouts(self.target, len(found.fit.free) + 1)
+                seconds = count * self.target.forward.pace
+                self.report(f"refitting {len(leading)} leading candidates: up to {count} rollouts, {about(seconds)}")
+            for row in leading:
                 fits[row.name] = self._refit(found.fit, row, leads[row.name][1])
                 refits[row.name] = fits[row.name].log_evidence - found.fit.log_evidence
                 self.report(f"refit with {row.name}: log Bayes factor {refits[row.name]:.1f}")
@@ -195,10 +217,18 @@ class Inquiry:
         before = step.before.fit
         if any(other == DISCRETISATION for other in named):  # its fits are of another simulator
             return None
-        start = step.fit.x.copy()
-        added = np.setdiff1d(step.fit.free, before.free)
-        start[added] = before.x[added]
-        again = climb(self.target, start, before.free)
+        free, added = step.fit.free, np.setdiff1d(step.fit.free, before.free)
+        emptied = step.fit.x.copy()
+        emptied[added] = before.x[added]
+        # What base parameters can do, too, is theirs: a gain of all cables, beside the radius of their drums. Else it
+        # would be credited to the candidate.
+        place = {index: k for k, index in enumerate(free)}
+        own, others = ([place[index] for index in chosen] for chosen in (before.free, added))
+        done = step.fit.jacobian[:, others] @ (step.fit.x[added] - before.x[added])
+        imitated = emptied.copy()
+        imitated[before.free] += np.linalg.lstsq(step.fit.jacobian[:, own], done, rcond=1e-6)[0]
+        starts = np.clip(np.stack([emptied, imitated]), *self.target.forward.coordinates.bounds)
+        again = climb(self.target, starts[int(np.argmax(heights(self.target, starts, "without")))], before.free)
         return again if again.log_evidence > before.log_evidence + 1.0 else None
 
     def _lead(self, fit: Fit, row: Row) -> tuple[float, np.ndarray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -11,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.affordable import unaffordable
+from rfdropo_bayes.audit.affordable import about, climb_rollouts, unaffordable
 from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
@@ -37,6 +36,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
 
 DRAWS = 60
+SEARCH = 4  # climbs that the search for a base model is worth, over all horizons
 AGAIN = 3  # times that a base fit is climbed on from a better point beside it, before it counts as not converged
 # White noise of each channel in its own unit, until something better is known: millimetres, and the medians of priors.
 GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3}
@@ -88,7 +88,7 @@ class Answer:
     after each step; ``stages`` the explained fraction after each step; ``sizes`` is the last model's fit under priors
     that do not pull, and ``draws`` are from it; ``suspected`` is a noise under which the base model would pass, where a
     stated one leaves a discrepancy that is not explained; ``shift`` is the distance by which constants tell repeats
-    apart [m]; ``stopped`` says that the time was up before all was done.
+    apart [m]; ``stopped`` says that the time was up before all was done; ``profile`` are the seconds of each stage.
     """
 
     verdict: str
@@ -111,7 +111,12 @@ class Answer:
     shift: float | None
     stopped: bool
     rollouts: int
-    seconds: float
+    profile: dict[str, float]
+
+    @property
+    def seconds(self) -> float:
+        """Of all parts of an audit that was resumed."""
+        return sum(self.profile.values())
 
     @property
     def extended(self) -> Fit:
@@ -143,7 +148,8 @@ def audit(
         InputError: rollouts at the optimum do not end well.
     """
     deadline = deadline or Deadline(question.rules.minutes)
-    target, base = base_model(question, question.seed, journal, report, deadline)
+    with deadline.stage("base model"):
+        target, base = base_model(question, question.seed, journal, report, deadline)
     question = _with_differences_of(question, target)
     shared = "" if target.noise.first.correlation is None else ", shared between coordinates"
     report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.first.order}){shared}")
@@ -153,7 +159,8 @@ def audit(
     inquiry, base, steps, last = _inquired(inquiry, base)
     target = inquiry.target
     held_out = None
-    with suppress(OutOfTime):
+    with deadline.stage("gain"), suppress(OutOfTime):
+        report("measuring the gain on recordings that no fit has seen")
         held_out = _held_out(question, target, inquiry, base, steps)
     kept = held_out.supported() if held_out else 0
     unsupported = [step.name for step in steps[kept:]] if kept else []
@@ -193,7 +200,7 @@ def audit(
         target.measurements.shift,
         stopped,
         target.forward.rollouts + (finer.rollouts if finer else 0),
-        time.monotonic() - deadline.began,
+        deadline.profile,
     )
 
 
@@ -290,6 +297,7 @@ def base_model(
     journal = journal or Journal()
     target = first_target(question, journal, deadline)
     known = target.noise.source != RESIDUALS
+    _announce(target, question.start, report)
     try:
         target, fit = _base_fit(target, question.start, seed, report)
         return (target, fit) if known else _under_residual_noise(target, fit)
@@ -299,6 +307,17 @@ def base_model(
             where=(deadline or Deadline()).where,
             remedy="raise it, fit fewer or shorter recordings, or start from a calibration (--base)",
         ) from None
+
+
+def _announce(target: Target, start: dict[str, float] | None, report: Callable[[str], None]) -> None:
+    """Say what is fitted first, and how long it may take."""
+    forward, free = target.forward, target.forward.coordinates.base
+    counted = f"{forward.count} recording{'s' if forward.count > 1 else ''}, repeats taken together"
+    for _ in range(2):  # the first one compiles
+        forward.observe(forward.coordinates.null[None])
+    rollouts = (1 if start is not None else SEARCH) * climb_rollouts(target, free)
+    words = about(rollouts * forward.pace)
+    report(f"fitting the base model: {free} parameters, {counted}; up to {rollouts} rollouts, {words}")
 
 
 def first_target(question: Question, journal: Journal, deadline: Deadline | None = None) -> Target:

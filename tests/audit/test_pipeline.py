@@ -440,7 +440,7 @@ def test_the_smallest_p_value_of_a_bootstrap_is_a_bound():
     assert p_value(0.012) == "0.012"
 
 
-GAIN = Gain(2.0, 1.0, 50.0, 5.0, {}, 0.5, (0.3, 0.7), 0.5, 6)
+GAIN = Gain(2.0, 1.0, 50.0, 5.0, 0.02, {}, 0.5, (0.3, 0.7), 0.5, 6)
 
 
 @pytest.mark.parametrize(
@@ -450,8 +450,9 @@ GAIN = Gain(2.0, 1.0, 50.0, 5.0, {}, 0.5, (0.3, 0.7), 0.5, 6)
         ({"rmse_extended": 2.1}, True, False),  # the error grows
         ({"interval": (-0.9, -0.1)}, True, False),
         ({"interval": (-0.1, 0.7)}, False, False),  # perhaps nothing
-        ({"elpd_difference": 9.0}, False, False),  # less than two standard errors
-        ({"elpd_difference": 1.0, "elpd_difference_se": None}, False, True),  # too few recordings to have one
+        ({"elpd_p": 0.06}, False, False),  # perhaps chance
+        ({"elpd_difference": -1.0, "elpd_p": None}, False, False),
+        ({"elpd_difference": 1.0, "elpd_p": None}, False, True),  # too few recordings to tell from chance
     ],
 )
 def test_a_verdict_agrees_with_the_errors(changes, worse, clear):
