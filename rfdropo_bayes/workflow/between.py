@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from rfdropo_bayes.audit.candidates import Candidate
-from rfdropo_bayes.audit.differences import WHERE, Change, Groups
+from rfdropo_bayes.audit.differences import WHERE, Groups
 from rfdropo_bayes.audit.fit import widening
+from rfdropo_bayes.audit.held import OwnParameter
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.bayes.pooling import Patterns, gather_groups, whole
 from rfdropo_bayes.data import Trajectory
@@ -100,7 +101,7 @@ def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -
     factor = widening(answer.extended, coordinates)
     fitted = {trajectory.name for trajectory in answer.question.trajectories}
     scopes = {step.name for step in answer.adopted if step.name.partition("@")[0] == candidate.title}
-    alone = len(scopes) == 1 and not isinstance(candidate.mechanism, Change)
+    alone = len(scopes) == 1 and not isinstance(candidate.mechanism, OwnParameter)
     for index in candidate.indices:
         parameter = coordinates.space.parameters[index]
         if not parameter.added_to:
