@@ -47,18 +47,25 @@ class Probe:
 
     def start(self, fit: Fit) -> Float[np.ndarray, " d"]:
         """Where a fit of this candidate starts: base parameters and amplitudes moved as the linear model says."""
-        x = fit.x.copy()
-        for index, value in self.point.items():
-            x[index] = value
-        design = np.concatenate([fit.jacobian, self.columns], axis=1)
-        ridge = np.concatenate([np.sqrt(np.diag(np.linalg.inv(fit.covariance))) * 1e-3, np.ones(self.columns.shape[1])])
-        step = np.linalg.lstsq(
-            np.concatenate([design, np.diag(ridge)]), np.concatenate([fit.residual, np.zeros(len(ridge))]), rcond=None
-        )[0]
-        x[fit.free] += np.clip(step[: len(fit.free)], -1.0, 1.0)
-        for index, value in zip(self.amplitudes, step[len(fit.free) :], strict=False):
+        return start_together(fit, [self])
+
+
+def start_together(fit: Fit, probes: Sequence[Probe]) -> Float[np.ndarray, " d"]:
+    """Where a fit of several candidates starts, see `Probe.start`."""
+    x, columns = fit.x.copy(), np.concatenate([probe.columns for probe in probes], axis=1)
+    for probe in probes:
+        x[list(probe.point)] = list(probe.point.values())
+    design = np.concatenate([fit.jacobian, columns], axis=1)
+    ridge = np.concatenate([np.sqrt(np.diag(np.linalg.inv(fit.covariance))) * 1e-3, np.ones(columns.shape[1])])
+    step = np.linalg.lstsq(
+        np.concatenate([design, np.diag(ridge)]), np.concatenate([fit.residual, np.zeros(len(ridge))]), rcond=None
+    )[0]
+    x[fit.free] += np.clip(step[: len(fit.free)], -1.0, 1.0)
+    values = np.split(step[len(fit.free) :], np.cumsum([probe.columns.shape[1] for probe in probes])[:-1])
+    for probe, own in zip(probes, values, strict=True):
+        for index, value in zip(probe.amplitudes, own, strict=False):
             x[index] += value
-        return x
+    return x
 
 
 @dataclass(frozen=True)

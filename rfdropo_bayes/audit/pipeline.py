@@ -151,17 +151,15 @@ def audit(
     with deadline.stage("base model"):
         target, base = base_model(question, question.seed, journal, report, deadline)
     question = _with_differences_of(question, target)
-    shared = "" if target.noise.first.correlation is None else ", shared between coordinates"
-    report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.first.order}){shared}")
+    noise = target.noise.first
+    shared = "" if noise.correlation is None else ", shared between coordinates"
+    report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}")
     finer = None if question.finer is None else _forward(question, True, target.measurements, deadline)
     unexamined = unaffordable(question.candidates, target, base, question.rules.slowest * question.rules.minutes)
     inquiry = _inquiry(question, target, finer, unexamined, report)
     inquiry, base, steps, last = _inquired(inquiry, base)
     target = inquiry.target
-    held_out = None
-    with deadline.stage("gain"), suppress(OutOfTime):
-        report("measuring the gain on recordings that no fit has seen")
-        held_out = _held_out(question, target, inquiry, base, steps)
+    held_out = _held_out(question, target, inquiry, base, steps)
     kept = held_out.supported() if held_out else 0
     unsupported = [step.name for step in steps[kept:]] if kept else []
     if unsupported:
@@ -242,13 +240,13 @@ def _inquired(inquiry: Inquiry, base: Fit) -> tuple[Inquiry, Fit, list[Step], Lo
     """
     if not base.converged:
         return inquiry, base, [], look(inquiry.target, base, [], [], [inquiry.seed, 0], inquiry.rules.bootstraps)
-    steps, last = inquiry.name_causes(base)
+    base, steps, last = inquiry.name_causes(base)
     if steps and inquiry.target.noise.source == RESIDUALS:
         with suppress(OutOfTime):
             again, renewed = _asked_again(inquiry, base, steps[-1].fit)
             found = again.name_causes(renewed)
             if not inquiry.target.forward.deadline.reached:
-                return again, renewed, *found
+                return again, *found
     return inquiry, base, steps, last
 
 
@@ -454,9 +452,17 @@ class HeldOut:
 
 
 def _held_out(question: Question, target: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step]) -> HeldOut | None:
-    """The test recordings, or fitted ones that are left out in turn; None where the model was not extended."""
+    """The test recordings, or fitted ones that are left out in turn; None where the model was not extended, or the time
+    was up."""
     if not steps:
         return None
+    inquiry.report("measuring the gain on recordings that no fit has seen")
+    with target.forward.deadline.stage("gain"), suppress(OutOfTime):
+        return _predicted(question, target, inquiry, base, steps)
+    return None
+
+
+def _predicted(question: Question, target: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step]) -> HeldOut:
     count, every = len(question.trajectories), len(question.model.recordings.names)
     fits = [base, *(step.fit for step in steps)]
     names = ["", *(step.name for step in steps)]

@@ -40,7 +40,7 @@ from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.engine import effects_costly
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechanism, obstacle
-from rfdropo_bayes.simulators.parameters import nearest
+from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.workflow.assembly import (
@@ -236,12 +236,10 @@ def build_question(
     ]
     of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
     plain = [spec for spec in simulator.parameters if spec.name not in of_candidates]
-    space, held = with_held(model.space, plain, tuple(model.fixed)) if library else (model.space, [])
-    if groups is not None:
-        stated, known = expand_groups(spreads, simulator.parameters), tuple(model.fixed)
-        space, candidates = with_differences(space, base, plain, candidates, groups, spreads=stated, held=known)
-    model = replace(model, space=space)
-    candidates += [candidate for candidate in held if candidate.name not in experiment.audit.exclude]
+    if library:
+        stated = expand_groups(spreads, simulator.parameters)
+        model, candidates = _with_own(model, base, plain, candidates, groups, stated)
+        candidates = [c for c in candidates if c.name not in experiment.audit.exclude]
     coordinates = Coordinates(
         model.space,
         base,
@@ -268,6 +266,23 @@ def build_question(
         {name: why for name, why in left_out.items() if name not in experiment.audit.exclude},
         groups,
     )
+
+
+def _with_own(
+    model: TrajectoryModel,
+    base: int,
+    plain: Sequence[ParameterSpec],
+    candidates: list[Candidate],
+    groups: Groups | None,
+    spreads: Mapping[str, float],
+) -> tuple[TrajectoryModel, list[Candidate]]:
+    """The model with the robot's own parameters among its candidates, and all that may differ between groups."""
+    space, own = with_held(model.space, plain, tuple(model.fixed))
+    if groups is not None:
+        space, candidates = with_differences(
+            space, base, plain, candidates, groups, spreads=spreads, held=tuple(model.fixed)
+        )
+    return replace(model, space=space), [*candidates, *own]
 
 
 def candidate_names(experiment: Experiment, robot: Workpiece) -> list[str]:

@@ -16,7 +16,7 @@ from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.fit import Fit, widened
 from rfdropo_bayes.audit.gain import Gain, Unseen, _floor_error, _noise_power, explained_fraction, sign_flip_p
 from rfdropo_bayes.audit.omnibus import joint_test, statistics
-from rfdropo_bayes.audit.score import likeness, project_out, signature, span, statistic
+from rfdropo_bayes.audit.score import Signature, joint_statistic, likeness, project_out, signature, span, statistic
 from rfdropo_bayes.audit.verdict import decide
 from rfdropo_bayes.bayes.noise.autoregression import (
     REPEATS,
@@ -327,3 +327,16 @@ def test_a_joint_p_value_is_reached_no_more_often_than_it_says():
         found.append(joint_test({n: float(r[0]) for n, r in zip(names, drawn, strict=True)}, simulated, np.ones(1)).p)
     for level in (0.005, 0.01, 0.05):
         assert np.mean(np.array(found) <= level) <= level + 5.0 * np.sqrt(level / 4000)
+
+
+def test_two_candidates_that_pay_only_together_are_seen_together():
+    """One-sided first, which alone would have to be negative: only beside the second is its size positive."""
+    rng = np.random.default_rng(2)
+    columns = np.linalg.qr(rng.standard_normal((50, 2)))[0]
+    stiff, taut = columns[:, [0]], -0.9 * columns[:, [0]] + np.sqrt(0.19) * columns[:, [1]]
+    residual = 4.0 * stiff[:, 0] + 6.0 * taut[:, 0]
+    first, second = Signature(stiff, 1), Signature(taut, 0)
+    assert statistic(first, residual)[0] == 0.0
+    assert joint_statistic(first, second, residual) == pytest.approx(residual @ residual)
+    assert statistic(second, residual)[0] < 0.5 * (residual @ residual)
+    assert joint_statistic(Signature(stiff, -1), second, residual) == 0.0
