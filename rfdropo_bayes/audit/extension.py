@@ -168,14 +168,19 @@ class Inquiry:
                 return found
             with self.target.forward.deadline.stage("refits"):
                 step = self._extend(found, named)
-                pair = self._pair(found, named, step)
+                pair = list[Step]()
+                with suppress(OutOfTime):
+                    pair = self._pair(found, named, step)
             if pair:
                 steps += pair
                 fit = pair[-1].fit
                 continue
             if step is None:
                 return found
-            better = None if len(steps) in renewed else self._climbed_again(step, named)
+            better = None
+            if len(steps) not in renewed:
+                with suppress(OutOfTime):
+                    better = self._climbed_again(step, named)
             if better is not None:
                 renewed.add(len(steps))
                 self.report(f"without {step.name}, a better optimum than before: the question once more")

@@ -97,7 +97,7 @@ class Target:
 
         found = dict(self.journal.recall(digest(self.identity, what, *inputs), counted))
         self.forward.rollouts = before + int(found.pop("rollouts"))
-        seconds = float(found.pop("seconds"))
+        seconds = float(found.pop("seconds", 0.0))
         if looked_up:
             self.forward.deadline.recall(seconds)
         return found

@@ -295,8 +295,8 @@ def base_model(
     journal = journal or Journal()
     target = first_target(question, journal, deadline)
     known = target.noise.source != RESIDUALS
-    _announce(target, question.start, report)
     try:
+        _announce(target, question.start, report)
         target, fit = _base_fit(target, question.start, seed, report)
         return (target, fit) if known else _under_residual_noise(target, fit)
     except OutOfTime:

@@ -55,8 +55,8 @@ def find_groups(
                 remedy=f"fitted recordings: {', '.join(t.name for t in fitted)}",
             )
     groups = Groups(members, tuple(name for name in names if name not in first | second))
-    chosen = ([t for t in each if t.name in first | second] for each in (fitted, tested))
-    return groups, *chosen
+    known = first | second
+    return groups, [t for t in fitted if t.name in known], [t for t in tested if t.name in known]
 
 
 def _named(between: Sequence[str], patterns: Patterns, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
