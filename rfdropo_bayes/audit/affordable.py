@@ -35,6 +35,19 @@ def unaffordable(candidates: Sequence[Candidate], target: Target, base: Fit, min
     return found
 
 
+def climb_rollouts(target: Target, parameters: int) -> int:
+    """Rollouts that a refit of so many parameters may take."""
+    forward = target.forward
+    return forward.count * CLIMB * (1 + forward.lanes.slope_rollouts * parameters)
+
+
+def about(seconds: float) -> str:
+    """A time in words, as rough as it is known."""
+    if seconds < 90.0:
+        return f"about {max(round(seconds), 1)} s"
+    return f"about {seconds / 60.0:.0f} min"
+
+
 def _needs_slow(lanes: RoutedLanes, candidate: Candidate) -> bool:
     """Whether only the slower simulator knows a candidate."""
     return any(spec.name not in lanes.fast.physical for spec in candidate.mechanism.parameters)

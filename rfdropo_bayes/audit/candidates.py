@@ -47,18 +47,25 @@ class Probe:
 
     def start(self, fit: Fit) -> Float[np.ndarray, " d"]:
         """Where a fit of this candidate starts: base parameters and amplitudes moved as the linear model says."""
-        x = fit.x.copy()
-        for index, value in self.point.items():
-            x[index] = value
-        design = np.concatenate([fit.jacobian, self.columns], axis=1)
-        ridge = np.concatenate([np.sqrt(np.diag(np.linalg.inv(fit.covariance))) * 1e-3, np.ones(self.columns.shape[1])])
-        step = np.linalg.lstsq(
-            np.concatenate([design, np.diag(ridge)]), np.concatenate([fit.residual, np.zeros(len(ridge))]), rcond=None
-        )[0]
-        x[fit.free] += np.clip(step[: len(fit.free)], -1.0, 1.0)
-        for index, value in zip(self.amplitudes, step[len(fit.free) :], strict=False):
+        return start_together(fit, [self])
+
+
+def start_together(fit: Fit, probes: Sequence[Probe]) -> Float[np.ndarray, " d"]:
+    """Where a fit of several candidates starts, see `Probe.start`."""
+    x, columns = fit.x.copy(), np.concatenate([probe.columns for probe in probes], axis=1)
+    for probe in probes:
+        x[list(probe.point)] = list(probe.point.values())
+    design = np.concatenate([fit.jacobian, columns], axis=1)
+    ridge = np.concatenate([np.sqrt(np.diag(np.linalg.inv(fit.covariance))) * 1e-3, np.ones(columns.shape[1])])
+    step = np.linalg.lstsq(
+        np.concatenate([design, np.diag(ridge)]), np.concatenate([fit.residual, np.zeros(len(ridge))]), rcond=None
+    )[0]
+    x[fit.free] += np.clip(step[: len(fit.free)], -1.0, 1.0)
+    values = np.split(step[len(fit.free) :], np.cumsum([probe.columns.shape[1] for probe in probes])[:-1])
+    for probe, own in zip(probes, values, strict=True):
+        for index, value in zip(probe.amplitudes, own, strict=False):
             x[index] += value
-        return x
+    return x
 
 
 @dataclass(frozen=True)
@@ -108,6 +115,18 @@ def probe_all(target: Target, fit: Fit, candidates: Sequence[Candidate]) -> list
             probes.append(_probe(target, base, candidate, {}, columns, candidate.indices))
         jobs += [(candidate, point) for point in _grid(target, candidate, shapes)]
     return probes + _probe_grid(target, fit, base, jobs)
+
+
+def screening_rollouts(target: Target, candidates: Sequence[Candidate]) -> int:
+    """Rollouts that `probe_all` takes: a slope for each parameter, and the grids of those that are shapes."""
+    forward, parameters = target.forward, target.forward.coordinates.space.parameters
+    found = 0
+    for candidate in candidates:
+        own = [parameters[i] for i in candidate.indices]
+        touched = sum(any(p.holds_for(name) for p in own) for name in target.measurements.names)
+        shapes = [len(p.spec.grid) for p in own if p.spec.grid]
+        found += touched * (forward.lanes.slope_rollouts * len(own) + int(np.prod(shapes)) * bool(shapes))
+    return found
 
 
 def _shapes(target: Target, candidate: Candidate, size: dict[int, float]) -> list[int]:

@@ -7,18 +7,17 @@ coordinate would be infinite; a parameter that means nothing at null (a time con
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import expit, logit
 
-from rfdropo_bayes.bayes.batches import padded
+from rfdropo_bayes.bayes.priors import log_density
 from rfdropo_bayes.bayes.space import Parameter, ParameterSpace
 
 MEASURED_FROM_NULL = ("Normal", "TruncatedNormal", "HalfNormal")
@@ -195,29 +194,18 @@ class Coordinates:
         free = [support.slope(column) for support, column in zip(self._supports, x.T, strict=True)]
         return np.where(self.affine, self._scale, np.stack(free, axis=1))
 
-    @cached_property
-    def log_prior(self) -> Callable[[Float[np.ndarray, "n d"]], Float[np.ndarray, "n d"]]:
+    def log_prior(self, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Log density of each coordinate's prior in these coordinates."""
-        _ = self.affine, self._scale  # found by sampling, which must not be traced
-        compiled = jax.jit(jax.vmap(self._log_priors))
-        return lambda x: np.asarray(padded(compiled, x))
+        values, found = self.values(x), np.empty(x.shape)
+        for i, p in enumerate(self.space.parameters):
+            slope = self._scale[i] if self.affine[i] else self._supports[i].slope(x[:, i])
+            found[:, i] = log_density(p.spec, p.table or p.spec.prior, values[:, i]) + np.log(np.abs(slope))
+        return found
 
     def prior_slopes(self, x: Float[np.ndarray, " d"]) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
         """First and second derivatives of `log_prior` at one point; each depends on its own coordinate only."""
-        # Differences of what is smooth, in double precision: compiling derivatives takes seconds in each audit.
         behind, here, ahead = self.log_prior(x + STEP * np.array([[-1.0], [0.0], [1.0]]))
         return (ahead - behind) / (2.0 * STEP), (ahead - 2.0 * here + behind) / STEP**2
-
-    def _log_priors(self, x: jax.Array) -> jax.Array:
-        found = []
-        for i, parameter in enumerate(self.space.parameters):
-            if self.affine[i]:
-                found.append(parameter.prior.log_prob(self._null[i] + self._scale[i] * x[i]) + np.log(self._scale[i]))
-            else:
-                value = parameter.transform(x[i])
-                jacobian = parameter.transform.log_abs_det_jacobian(x[i], value)
-                found.append(parameter.prior.log_prob(value) + jacobian)
-        return jnp.stack(found)
 
     def gains(self, x: Float[np.ndarray, "n d"]) -> dict[str, Float[np.ndarray, " n"]]:
         """Values of parameters that channels want and rollouts do not, inferred or fixed."""

@@ -1,11 +1,17 @@
-"""How long an audit may take: when its time is up it stops between two batches of rollouts, and says what it knows."""
+"""How long an audit may take, and where its time goes: when it is up, the audit stops between two batches of rollouts,
+and says what it knows."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 KEPT = 0.15  # share of the time that is kept for measuring the gain and for the report
+
+
+BETWEEN_STAGES = "preparation and report"
 
 
 class OutOfTime(Exception):
@@ -28,6 +34,35 @@ class Deadline:
     share: float = 1.0 - KEPT
     began: float = field(default_factory=time.monotonic)
     reached: bool = False
+    _spent: dict[str, float] = field(default_factory=dict)
+    _stages: list[str] = field(default_factory=lambda: [BETWEEN_STAGES])
+    _charged: float = field(default_factory=time.monotonic)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count the time within as that of a stage; of stages within one another, as that of the innermost."""
+        self._charge()
+        self._stages.append(name)
+        try:
+            yield
+        finally:
+            self._charge()
+            self._stages.pop()
+
+    def recall(self, seconds: float) -> None:
+        """Count what an earlier part of the run has spent on what is now looked up."""
+        self._spent[self._stages[-1]] = self._spent.get(self._stages[-1], 0.0) + seconds
+
+    @property
+    def profile(self) -> dict[str, float]:
+        """Seconds of each stage up to now, in all parts of the run."""
+        self._charge()
+        return dict(self._spent)
+
+    def _charge(self) -> None:
+        now = time.monotonic()
+        self.recall(now - self._charged)
+        self._charged = now
 
     @property
     def left(self) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import MEASURED_FROM_NULL, PRIOR_DRAWS
+from rfdropo_bayes.audit.held import OwnParameter, families, stem
 from rfdropo_bayes.bayes.pooling import deviation_spec
 from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
@@ -40,17 +41,6 @@ class Groups:
         """Of the two."""
         first, second = self.members
         return first, second
-
-
-@dataclass(frozen=True)
-class Change:
-    """A parameter of the base model that is not the same in both groups, with what a record asks of a mechanism."""
-
-    name: str
-    parameters: tuple[ParameterSpec, ...]
-    cause: str
-    remedy: str
-    stage: str = ""
 
 
 @dataclass
@@ -105,20 +95,6 @@ def with_differences(
     return ParameterSpace(tuple(found.parameters)), candidates
 
 
-def families(specs: Sequence[ParameterSpec]) -> list[list[ParameterSpec]]:
-    """Parameters that are one quantity at several places (the zeros of all cables), by the start of their names."""
-    alike: dict[str, list[ParameterSpec]] = {}
-    for spec in specs:
-        alike.setdefault(repr((spec.unit, spec.low, spec.high, sorted(spec.prior.items()))), []).append(spec)
-    return [found for found in alike.values() if len(found) > 1 and _stem(found)]
-
-
-def _stem(specs: Sequence[ParameterSpec]) -> str:
-    """What the names of several parameters begin with, in whole words."""
-    words = zip(*(spec.name.split("_") for spec in specs), strict=False)
-    return "_".join(first for first, *others in words if all(other == first for other in others))
-
-
 def _deviation_of(spec: ParameterSpec, shared: Mapping[str, Parameter]) -> float:
     """Standard deviation of a parameter's prior: what the model allows the parameter, it allows the difference."""
     known = shared.get(spec.name)
@@ -135,10 +111,11 @@ def _difference(spec: ParameterSpec, spread: float, group: str, groups: Groups) 
 
 
 def _changed(specs: Sequence[ParameterSpec], places: Sequence[int], group: str, groups: Groups) -> Candidate:
-    name = specs[0].name if len(specs) == 1 else _stem(specs)
+    name = specs[0].name if len(specs) == 1 else stem(specs)
     described = specs[0].description if len(specs) == 1 else f"{name.replace('_', ' ')} ({len(specs)} of them)"
     cause = f"{described}: not the same in {' and '.join(groups.names)}"
-    change = Change(name, tuple(specs), cause, f"measure it in {' and in '.join(groups.names)}, and undo what changed")
+    remedy = f"measure it in {' and in '.join(groups.names)}, and undo what changed"
+    change = OwnParameter(name, tuple(specs), cause, remedy)
     return Candidate(f"{name}{SEPARATOR}{group}", tuple(places), change, name, group)
 
 

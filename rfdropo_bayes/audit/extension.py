@@ -8,17 +8,28 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rfdropo_bayes.audit.affordable import about, climb_rollouts
 from rfdropo_bayes.audit.bootstrap import p_in_words
-from rfdropo_bayes.audit.candidates import Candidate, Probe, discretisation_probe, fixed_drop, lead, probe_all
+from rfdropo_bayes.audit.candidates import (
+    Candidate,
+    Probe,
+    discretisation_probe,
+    fixed_drop,
+    lead,
+    probe_all,
+    screening_rollouts,
+    start_together,
+)
 from rfdropo_bayes.audit.deadline import OutOfTime
-from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb
+from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb, heights
 from rfdropo_bayes.audit.forward import Forward
-from rfdropo_bayes.audit.score import likeness, span
+from rfdropo_bayes.audit.score import joint_statistic, likeness, span
 from rfdropo_bayes.audit.screen import Look, Row, look
 
 DISCRETISATION = "discretisation"
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])
 TOLD_APART = 10.0  # nats: a candidate that is so much worse, once refitted, is excluded, and of no class with the best
+PAIRS = 3  # that are refitted
 POOR = 2.0  # squared residual per value from which on a climb may have ended far from where it should
 
 
@@ -111,33 +122,41 @@ class Inquiry:
         ]
         names = [c.name for c in free]
         finer = None
-        probes = probe_all(self.target, fit, free)
+        clock, forward = self.target.forward.deadline, self.target.forward
+        count = screening_rollouts(self.target, free)
+        self.report(f"screening {len(free)} candidates: {count} rollouts, {about(count * forward.pace)}")
+        with clock.stage("screening"):
+            probes = probe_all(self.target, fit, free)
         if self.finer is not None and DISCRETISATION not in without:
             refined = replace(self.target, forward=self.finer)
-            finer = refined.recall("finer", [fit.x], lambda: {"left": refined.residual(fit.x[None])[0]})["left"]
+            with clock.stage("finer mesh"):
+                finer = refined.recall("finer", [fit.x], lambda: {"left": refined.residual(fit.x[None])[0]})["left"]
             probes.append(discretisation_probe(fit, DISCRETISATION, finer, span(fit.jacobian)))
             names.append(DISCRETISATION)
-        found = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer)
+        with clock.stage("joint test"):
+            found = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer)
         if found.finer is not None and found.row(DISCRETISATION).adjusted_p > self.rules.family:
             found = replace(found, omnibus=max(found.omnibus, found.finer, key=lambda test: test.p))
         return found, probes
 
-    def name_causes(self, base: Fit) -> tuple[list[Step], Look]:
-        """Forward-stepwise extension: the steps taken, and the look at the final model.
+    def name_causes(self, base: Fit) -> tuple[Fit, list[Step], Look]:
+        """Forward-stepwise extension: the base model, the steps taken, and the look at the final model.
 
-        When the time is up, the steps so far, and a look without candidates.
+        The base model is another one where a candidate has led to a better optimum of it. When the time is up: the
+        steps so far, and a look without candidates.
         """
-        steps: list[Step] = []
+        bases, steps = [base], list[Step]()
         try:
-            return steps, self._name_causes(base, steps)
+            found = self._name_causes(bases, steps)
         except OutOfTime:
-            fit = steps[-1].fit if steps else base
-            return steps, look(self.target, fit, [], [], [self.seed, len(steps)], self.rules.bootstraps)
+            fit = steps[-1].fit if steps else bases[-1]
+            found = look(self.target, fit, [], [], [self.seed, len(steps)], self.rules.bootstraps)
+        return bases[-1], steps, found
 
-    def _name_causes(self, base: Fit, steps: list[Step]) -> Look:
-        """Append steps until no more are called for; the look at the final model."""
-        fit = base
-        renewed = 0  # number of steps at which the model was climbed again: once at each
+    def _name_causes(self, bases: list[Fit], steps: list[Step]) -> Look:
+        """Append steps until no more are called for, and better base models; the look at the final model."""
+        fit = bases[-1]
+        renewed: set[int] = set()  # numbers of steps at which the model was climbed again: once at each
         while True:
             named = [step.name for step in steps]
             found, _ = self.look_at(fit, named)
@@ -147,20 +166,36 @@ class Inquiry:
             self.report(f"joint test p {p}; first: {found.rows[0].name if found.rows else 'none'}")
             if len(steps) >= self.rules.effects or found.omnibus.p > self.rules.extended_passes:
                 return found
-            step = self._extend(found, named)
+            with self.target.forward.deadline.stage("refits"):
+                step = self._extend(found, named)
+                pair = list[Step]()
+                with suppress(OutOfTime):
+                    pair = self._pair(found, named, step)
+            if pair:
+                steps += pair
+                fit = pair[-1].fit
+                continue
             if step is None:
                 return found
-            if len(steps) > renewed and (better := self._climbed_again(step, named)) is not None:
-                renewed = len(steps)
-                self.report(f"without {step.name}, a better optimum than before: {steps[-1].name} once more")
-                gained = better.log_evidence - fit.log_evidence
-                steps[-1] = replace(steps[-1], fit=better, log_bayes_factor=steps[-1].log_bayes_factor + gained)
+            better = None
+            if len(steps) not in renewed:
+                with suppress(OutOfTime):
+                    better = self._climbed_again(step, named)
+            if better is not None:
+                renewed.add(len(steps))
+                self.report(f"without {step.name}, a better optimum than before: the question once more")
+                if steps:
+                    gained = better.log_evidence - fit.log_evidence
+                    steps[-1] = replace(steps[-1], fit=better, log_bayes_factor=steps[-1].log_bayes_factor + gained)
+                else:
+                    bases.append(better)
                 fit = better
                 continue
             steps.append(step)
             fit = step.fit
             if len(steps) > 1:
-                steps[:] = self._reconsider(base, steps)
+                with self.target.forward.deadline.stage("refits"):
+                    steps[:] = self._reconsider(bases[-1], steps)
                 fit = steps[-1].fit
 
     def _extend(self, found: Look, named: Sequence[str]) -> Step | None:
@@ -171,7 +206,12 @@ class Inquiry:
         leads = {row.name: self._lead(found.fit, row) for row in significant}
         # When the time is up, the refits that are done decide.
         with suppress(OutOfTime):
-            for row in self._leading(significant, {name: drop for name, (drop, _) in leads.items()}, found.fit):
+            leading = self._leading(significant, {name: drop for name, (drop, _) in leads.items()}, found.fit)
+            if leading:
+                count = len(leading) * climb_rollouts(self.target, len(found.fit.free) + 1)
+                seconds = count * self.target.forward.pace
+                self.report(f"refitting {len(leading)} leading candidates: up to {count} rollouts, {about(seconds)}")
+            for row in leading:
                 fits[row.name] = self._refit(found.fit, row, leads[row.name][1])
                 refits[row.name] = fits[row.name].log_evidence - found.fit.log_evidence
                 self.report(f"refit with {row.name}: log Bayes factor {refits[row.name]:.1f}")
@@ -189,16 +229,71 @@ class Inquiry:
         members = self._class_of(found.row(best), able)
         return Step(best, members, found, fits[best], refits[best], refits)
 
+    def _pair(self, found: Look, named: Sequence[str], single: Step | None) -> list[Step]:
+        """Two mechanisms at once, where the best one leaves most of a large misfit; none where they do not pay.
+
+        Of compliance and pretension of cables neither does much without the other. Pairs are ranked by what the linear
+        model says of them, and the leading ones are refitted.
+        """
+        fit, left = found.fit, (single.fit if single else found.fit).residual
+        taken = float(fit.residual @ fit.residual - left @ left)
+        if left @ left <= POOR * np.count_nonzero(left) or len(named) + 2 > self.rules.effects:
+            return []
+        rows = {row.name: row for row in found.rows if row.probe is not None and row.name != DISCRETISATION}
+        heads = sorted(rows.values(), key=lambda row: -row.lm)[: self.rules.members]
+        drops = {
+            tuple(sorted((a.name, b.name))): joint_statistic(a.probe.mark, b.probe.mark, fit.residual)
+            for a in heads
+            for b in rows.values()
+            if a.name != b.name and a.probe and b.probe
+        }
+        worth = self.rules.evidence + np.log(len(self.candidates))
+        leading = sorted((p for p in drops if drops[p] > taken + 2.0 * worth), key=lambda p: -drops[p])[:PAIRS]
+        fits = {}
+        with suppress(OutOfTime):
+            for names in leading:
+                fits[names] = self._refit_pair(fit, [rows[name] for name in names])
+                gained = fits[names].log_evidence - fit.log_evidence
+                self.report(f"refit with {' and '.join(names)}: log Bayes factor {gained:.1f}")
+        before = single.fit if single else fit
+        if not fits or max(f.log_evidence for f in fits.values()) < before.log_evidence + worth:
+            return []
+        best = max(fits, key=lambda names: fits[names].log_evidence)
+        alone = {name: self.refit(fit, rows[name]) for name in best}
+        first, second = sorted(best, key=lambda name: -alone[name].log_evidence)
+        between, _ = self.look_at(alone[first], [*named, first])
+        gains = [alone[first].log_evidence - fit.log_evidence, fits[best].log_evidence - alone[first].log_evidence]
+        return [
+            Step(first, (first,), found, alone[first], gains[0], single.refits if single else {}),
+            Step(second, (second,), between, fits[best], gains[1], {}),
+        ]
+
+    def _refit_pair(self, fit: Fit, rows: Sequence[Row]) -> Fit:
+        """The model of a fit with two candidates in it."""
+        probes = [row.probe for row in rows if row.probe is not None]
+        chosen = [c.indices for c in self.candidates if c.name in [row.name for row in rows]]
+        held = [index for probe in probes for index in probe.point]
+        start = best_between(self.target, fit.x, start_together(fit, probes), held, SHARES)
+        return climb(self.target, start, np.array([*fit.free, *np.setdiff1d(np.concatenate(chosen), fit.free)]))
+
     def _climbed_again(self, step: Step, named: Sequence[str]) -> Fit | None:
         """The model before a step, climbed from where the step led: a candidate must not be named for having moved a
         climb on that had stopped early. None where that is no better."""
         before = step.before.fit
         if any(other == DISCRETISATION for other in named):  # its fits are of another simulator
             return None
-        start = step.fit.x.copy()
-        added = np.setdiff1d(step.fit.free, before.free)
-        start[added] = before.x[added]
-        again = climb(self.target, start, before.free)
+        free, added = step.fit.free, np.setdiff1d(step.fit.free, before.free)
+        emptied = step.fit.x.copy()
+        emptied[added] = before.x[added]
+        # What base parameters can do, too, is theirs: a gain of all cables, beside the radius of their drums. Else it
+        # would be credited to the candidate.
+        place = {index: k for k, index in enumerate(free)}
+        own, others = ([place[index] for index in chosen] for chosen in (before.free, added))
+        done = step.fit.jacobian[:, others] @ (step.fit.x[added] - before.x[added])
+        imitated = emptied.copy()
+        imitated[before.free] += np.linalg.lstsq(step.fit.jacobian[:, own], done, rcond=1e-6)[0]
+        starts = np.clip(np.stack([emptied, imitated]), *self.target.forward.coordinates.bounds)
+        again = climb(self.target, starts[int(np.argmax(heights(self.target, starts, "without")))], before.free)
         return again if again.log_evidence > before.log_evidence + 1.0 else None
 
     def _lead(self, fit: Fit, row: Row) -> tuple[float, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -84,32 +85,39 @@ class Target:
         return digest(self.forward.identity, *readings, data.count, *known, repr(data.weighed))
 
     def recall(self, what: str, inputs: Sequence[np.ndarray], compute: Callable[[], Arrays]) -> Arrays:
-        """A computation with this target, looked up where the journal has it; its rollouts count either way."""
-        before = self.forward.rollouts
+        """A computation with this target, looked up where the journal has it; its rollouts and seconds count either
+        way."""
+        before, looked_up = self.forward.rollouts, True
 
         def counted() -> Arrays:
-            found = compute()
-            return {**found, "rollouts": np.asarray(self.forward.rollouts - before)}
+            nonlocal looked_up
+            began, found, looked_up = time.monotonic(), compute(), False
+            seconds = np.asarray(time.monotonic() - began)
+            return {**found, "rollouts": np.asarray(self.forward.rollouts - before), "seconds": seconds}
 
-        found = self.journal.recall(digest(self.identity, what, *inputs), counted)
-        self.forward.rollouts = before + int(found["rollouts"])
-        return {name: value for name, value in found.items() if name != "rollouts"}
+        found = dict(self.journal.recall(digest(self.identity, what, *inputs), counted))
+        self.forward.rollouts = before + int(found.pop("rollouts"))
+        seconds = float(found.pop("seconds", 0.0))
+        if looked_up:
+            self.forward.deadline.recall(seconds)
+        return found
 
     def residual(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n m"]:
         """Whitened residuals, measured less simulated, of a batch of points."""
         return self.evaluate(points)[0]
 
     def evaluate(
-        self, points: Float[np.ndarray, "n d"]
+        self, points: Float[np.ndarray, "n d"], rows: int | None = None
     ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, " n"], np.ndarray]:
         """Whitened residuals, the logarithms of the sizes that errors are relative to, and where rollouts ended well.
 
+        Only the first ``rows`` rows of every recording, all by default, are simulated; later ones hold no meaning.
         Half the sum of squares and the sum of logarithms make minus the log likelihood, up to a constant.
         """
-        shown, fine = self.forward.observe(points)
-        rows = [self._errors({name: part[i] for name, part in shown.items()}) for i in range(len(fine))]
-        white = self._whitened(np.stack([errors for errors, _ in rows]), self.weighed(points)[0])
-        return np.where(fine[:, None], white, FAILED), np.array([float(size) for _, size in rows]), fine
+        shown, fine = self.forward.observe(points, rows)
+        each = [self._errors({name: part[i] for name, part in shown.items()}) for i in range(len(fine))]
+        white = self._whitened(np.stack([errors for errors, _ in each]), self.weighed(points)[0])
+        return np.where(fine[:, None], white, FAILED), np.array([float(size) for _, size in each]), fine
 
     def errors(self, x: Float[np.ndarray, " d"]) -> Float[np.ndarray, "group time column"]:
         """Measured less simulated readings at one point, in the unit of the noise.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -63,13 +64,13 @@ class Lanes:
         self.physical = tuple(spec.name for spec in simulator.parameters)
 
     def _observe(
-        self, theta: jax.Array, start: jax.Array, commands: Commands
+        self, theta: jax.Array, start: jax.Array, commands: Commands, steps: jax.Array
     ) -> tuple[dict[str, jax.Array], jax.Array]:
         values: Any = dict(zip(self.physical, theta, strict=True))
         if "object_pose" in self.fields:
             assert isinstance(self.simulator, Placing)
             values = self.simulator.with_object_at(values, start)
-        observation = self.simulator.rollout(values, commands, jnp.asarray(commands.step.shape[0]))
+        observation = self.simulator.rollout(values, commands, steps)
         found = observation._replace(position=observation.position[:, self.marker_index])._asdict()
         lacking = [name for name in self.fields if found[name] is None]
         if lacking:
@@ -99,13 +100,13 @@ class Lanes:
 
     @cached_property
     def _rolled(self) -> Any:
-        return jax.jit(jax.vmap(self._observe))
+        return jax.jit(jax.vmap(self._observe, in_axes=(0, 0, 0, None)))
 
     @cached_property
     def _derived(self) -> Any:
         def one(theta: jax.Array, tangent: jax.Array, start: jax.Array, commands: Commands) -> dict[str, jax.Array]:
             def data(theta: jax.Array) -> dict[str, jax.Array]:
-                found, _ = self._observe(theta, start, commands)
+                found, _ = self._observe(theta, start, commands, jnp.asarray(commands.step.shape[0]))
                 return {name: found[name] for name in self.fields}
 
             return jax.jvp(data, (theta,), (tangent,))[1]
@@ -113,14 +114,20 @@ class Lanes:
         return jax.jit(jax.vmap(one))
 
     def roll(
-        self, theta: Thetas, start: np.ndarray, commands: Commands, check: Callable[[], None] = _no_limit
+        self,
+        theta: Thetas,
+        start: np.ndarray,
+        commands: Commands,
+        check: Callable[[], None] = _no_limit,
+        steps: int | None = None,
     ) -> tuple[Fields, np.ndarray]:
         """What each set of parameters shows under the commands of its lane, and result codes.
 
         ``start`` (lane, 7) are the poses that an object starts from. ``check`` is called before every batch, and may
-        raise.
+        raise. After ``steps`` time steps, all by default, rows hold no meaning.
         """
-        return self._chunks(self._rolled, commands, check, theta, start)
+        limit = jnp.asarray(commands.step.shape[1] if steps is None else steps)
+        return self._chunks(lambda *given: self._rolled(*given, limit), commands, check, theta, start)
 
     def differentiate(
         self,
@@ -172,12 +179,17 @@ class RoutedLanes(Lanes):
         return ~np.isclose(theta[:, self._further], self._null, rtol=1e-6, atol=1e-12).all(axis=1)
 
     def roll(
-        self, theta: Thetas, start: np.ndarray, commands: Commands, check: Callable[[], None] = _no_limit
+        self,
+        theta: Thetas,
+        start: np.ndarray,
+        commands: Commands,
+        check: Callable[[], None] = _no_limit,
+        steps: int | None = None,
     ) -> tuple[Fields, np.ndarray]:
         """See `Lanes.roll`."""
 
         def run(lanes: Lanes, chosen: np.ndarray, kept: Any) -> tuple[Fields, np.ndarray]:
-            return lanes.roll(theta[chosen][:, kept], start[chosen], commands.of(chosen), check)
+            return lanes.roll(theta[chosen][:, kept], start[chosen], commands.of(chosen), check, steps)
 
         return self._routed(self._needs_slow(theta), run)
 
@@ -236,6 +248,7 @@ class Forward:
         self.count = len(chosen)
         self.start = np.zeros((self.count, 7)) if start is None else start
         self.rollouts = 0
+        self.pace = 0.0  # seconds that a rollout took last, of those that run at once
 
     @cached_property
     def identity(self) -> str:
@@ -263,8 +276,10 @@ class Forward:
         changed.lanes = self.lanes.with_difference(step)
         return changed
 
-    def observe(self, points: Points) -> tuple[Fields, np.ndarray]:
+    def observe(self, points: Points, rows: int | None = None) -> tuple[Fields, np.ndarray]:
         """What every recording shows at each point (point, recording, ...), and True where all rollouts ended well.
+
+        Only the first ``rows`` rows, all by default, are simulated; later ones hold no meaning.
 
         Beside the parts of an observation there are ``offset`` [m], by which measured positions are shifted against
         simulated ones, and the parameters that channels want and rollouts do not.
@@ -273,12 +288,16 @@ class Forward:
         theta = self.coordinates.physical_values(points, self.slots)
         flat, start, commands = self._per_lane(theta)
         once, again = self._different(flat)
-        found, status = self.lanes.roll(flat[once], start[once], commands.of(once), self.deadline.check)
+        began = time.monotonic()
+        every = self.commands.step.shape[1]
+        steps = None if rows is None else min(int(self.commands.sample_step[:, :rows].max()) + 1, every)
+        found, status = self.lanes.roll(flat[once], start[once], commands.of(once), self.deadline.check, steps)
+        self.pace = (time.monotonic() - began) / len(status)
         self.rollouts += len(status)
         status, found = status[again], {name: part[again] for name, part in found.items()}
         fine = status == Result.OK
         for name in self.lanes.fields:
-            fine &= np.isfinite(found[name]).reshape(len(fine), -1).all(axis=1)
+            fine &= np.isfinite(found[name][:, :rows]).reshape(len(fine), -1).all(axis=1)
         shown = {name: part.reshape(len(points), self.count, *part.shape[1:]) for name, part in found.items()}
         shown |= {"offset": self._offset(theta), **self.coordinates.gains(points)}
         return shown, fine.reshape(len(points), -1).all(axis=1)

@@ -16,10 +16,11 @@ from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 
 DIFFERENCE_FROM = 6  # trajectories below which an ELPD difference has no standard error worth stating
+CHANCE = 0.05  # probability that unseen trajectories seem to support an extension that is worth nothing
+FLIPS = 4095  # draws of the signs of more differences than can all be gone through
 RESAMPLES = 2000
 BANDS = 12
 SURE = 3.0  # standard errors by which a discrepancy must exceed the noise to be taken for one
-CLEAR = 2.0  # standard errors of the ELPD difference from which on one model is clearly the better one
 LEVELS = (0.5, 0.9)
 
 
@@ -62,7 +63,8 @@ class Gain:
     Attributes:
         rmse_base, rmse_extended: root mean square distance of a marker [m].
         elpd_difference: log predictive density of the extended model less that of the base, summed over trajectories;
-            its standard error only from `DIFFERENCE_FROM` trajectories up.
+            its standard error, and the probability of so large a sum were each difference's sign a matter of chance,
+            only from `DIFFERENCE_FROM` trajectories up.
         coverage: share of measurements in the extended model's central intervals.
         explained: share of the base model's discrepancy that the extension takes away; interval: its 90 % interval.
         floor: the noise's root mean square distance of a marker [m].
@@ -73,6 +75,7 @@ class Gain:
     rmse_extended: float
     elpd_difference: float
     elpd_difference_se: float | None
+    elpd_p: float | None
     coverage: dict[float, float]
     explained: float
     interval: tuple[float, float]
@@ -88,7 +91,7 @@ class Gain:
     def clear(self) -> bool:
         """Whether unseen trajectories clearly support the extension: it surely takes a part of the discrepancy away,
         their error does not grow, and they are clearly likelier."""
-        likelier = self.elpd_difference > CLEAR * (self.elpd_difference_se or 0.0)
+        likelier = self.elpd_difference > 0.0 and (self.elpd_p is None or self.elpd_p <= CHANCE)
         return self.interval[0] > 0.0 and likelier and not self.worse
 
 
@@ -121,12 +124,29 @@ def measure_gain(
         rmse_extended=rmse[1],
         elpd_difference=float(difference.sum()),
         elpd_difference_se=float(np.sqrt(count) * difference.std(ddof=1)) if count >= DIFFERENCE_FROM else None,
+        elpd_p=sign_flip_p(difference, rng) if count >= DIFFERENCE_FROM else None,
         coverage=_coverage(unseen, extended, noise),
         explained=explained,
         interval=interval,
         floor=noise_distance(noise.first),
         trajectories=count,
     )
+
+
+def sign_flip_p(difference: Float[np.ndarray, " n"], rng: np.random.Generator) -> float:
+    """Probability of a sum as large as that of these differences, were the sign of each a matter of chance.
+
+    Fisher's randomisation test (1935, The Design of Experiments, section 21), exact for differences symmetric about
+    zero. A standard error is no measure here: one recording that shows an effect ten times as well as the others makes
+    the differences spread by more than their mean, though all of them favour one model.
+    """
+    count = len(difference)
+    if 2**count <= FLIPS + 1:
+        flips = 1.0 - 2.0 * (np.arange(2**count)[:, None] >> np.arange(count) & 1)
+    else:
+        flips = np.concatenate([np.ones((1, count)), rng.choice([-1.0, 1.0], (FLIPS, count))])
+    total = float(difference.sum())
+    return float(np.mean(flips @ difference >= total - 1e-9 * np.abs(difference).sum()))
 
 
 def noise_distance(noise: Autoregression) -> float:

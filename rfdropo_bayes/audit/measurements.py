@@ -154,8 +154,11 @@ def gather_measurements(
         kinds: of the recordings, by their parameters: those that have others are no repeats; all alike by default.
     """
     groups: Groups = tuple((index,) for index in range(len(recordings.names)))
+    apart: tuple[str, ...] = ()
     if repeats:
-        groups = _of_one_kind(group_recordings(recordings, repeats), kinds or [None] * len(recordings.names))
+        groups = group_recordings(recordings, repeats)
+        apart = repeats_apart(recordings, repeats, groups)
+        groups = _of_one_kind(groups, kinds or [None] * len(recordings.names))
     single = tuple(channel for channel in channels if isinstance(channel, Series))
     firsts, joined = [group[0] for group in groups], []
     for channel in single:
@@ -171,7 +174,7 @@ def gather_measurements(
         next((channel for channel in channels if isinstance(channel, WeighedParts)), None),
         np.concatenate(count, axis=-1),
         np.concatenate([spread(channel, groups) for channel in single], axis=-1),
-        repeats_apart(recordings, repeats, groups) if repeats else (),
+        apart,
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -11,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.affordable import unaffordable
+from rfdropo_bayes.audit.affordable import about, climb_rollouts, unaffordable
 from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
@@ -37,6 +36,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
 
 DRAWS = 60
+SEARCH = 4  # climbs that the search for a base model is worth, over all horizons
 AGAIN = 3  # times that a base fit is climbed on from a better point beside it, before it counts as not converged
 # White noise of each channel in its own unit, until something better is known: millimetres, and the medians of priors.
 GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3}
@@ -88,7 +88,7 @@ class Answer:
     after each step; ``stages`` the explained fraction after each step; ``sizes`` is the last model's fit under priors
     that do not pull, and ``draws`` are from it; ``suspected`` is a noise under which the base model would pass, where a
     stated one leaves a discrepancy that is not explained; ``shift`` is the distance by which constants tell repeats
-    apart [m]; ``stopped`` says that the time was up before all was done.
+    apart [m]; ``stopped`` says that the time was up before all was done; ``profile`` are the seconds of each stage.
     """
 
     verdict: str
@@ -111,7 +111,12 @@ class Answer:
     shift: float | None
     stopped: bool
     rollouts: int
-    seconds: float
+    profile: dict[str, float]
+
+    @property
+    def seconds(self) -> float:
+        """Of all parts of an audit that was resumed."""
+        return sum(self.profile.values())
 
     @property
     def extended(self) -> Fit:
@@ -143,18 +148,18 @@ def audit(
         InputError: rollouts at the optimum do not end well.
     """
     deadline = deadline or Deadline(question.rules.minutes)
-    target, base = base_model(question, question.seed, journal, report, deadline)
+    with deadline.stage("base model"):
+        target, base = base_model(question, question.seed, journal, report, deadline)
     question = _with_differences_of(question, target)
-    shared = "" if target.noise.first.correlation is None else ", shared between coordinates"
-    report(f"base model fitted; noise from {target.noise.source}, AR({target.noise.first.order}){shared}")
+    noise = target.noise.first
+    shared = "" if noise.correlation is None else ", shared between coordinates"
+    report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}")
     finer = None if question.finer is None else _forward(question, True, target.measurements, deadline)
     unexamined = unaffordable(question.candidates, target, base, question.rules.slowest * question.rules.minutes)
     inquiry = _inquiry(question, target, finer, unexamined, report)
     inquiry, base, steps, last = _inquired(inquiry, base)
     target = inquiry.target
-    held_out = None
-    with suppress(OutOfTime):
-        held_out = _held_out(question, target, inquiry, base, steps)
+    held_out = _held_out(question, target, inquiry, base, steps)
     kept = held_out.supported() if held_out else 0
     unsupported = [step.name for step in steps[kept:]] if kept else []
     if unsupported:
@@ -193,7 +198,7 @@ def audit(
         target.measurements.shift,
         stopped,
         target.forward.rollouts + (finer.rollouts if finer else 0),
-        time.monotonic() - deadline.began,
+        deadline.profile,
     )
 
 
@@ -235,13 +240,13 @@ def _inquired(inquiry: Inquiry, base: Fit) -> tuple[Inquiry, Fit, list[Step], Lo
     """
     if not base.converged:
         return inquiry, base, [], look(inquiry.target, base, [], [], [inquiry.seed, 0], inquiry.rules.bootstraps)
-    steps, last = inquiry.name_causes(base)
+    base, steps, last = inquiry.name_causes(base)
     if steps and inquiry.target.noise.source == RESIDUALS:
         with suppress(OutOfTime):
             again, renewed = _asked_again(inquiry, base, steps[-1].fit)
             found = again.name_causes(renewed)
             if not inquiry.target.forward.deadline.reached:
-                return again, renewed, *found
+                return again, *found
     return inquiry, base, steps, last
 
 
@@ -291,6 +296,7 @@ def base_model(
     target = first_target(question, journal, deadline)
     known = target.noise.source != RESIDUALS
     try:
+        _announce(target, question.start, report)
         target, fit = _base_fit(target, question.start, seed, report)
         return (target, fit) if known else _under_residual_noise(target, fit)
     except OutOfTime:
@@ -299,6 +305,17 @@ def base_model(
             where=(deadline or Deadline()).where,
             remedy="raise it, fit fewer or shorter recordings, or start from a calibration (--base)",
         ) from None
+
+
+def _announce(target: Target, start: dict[str, float] | None, report: Callable[[str], None]) -> None:
+    """Say what is fitted first, and how long it may take."""
+    forward, free = target.forward, target.forward.coordinates.base
+    counted = f"{forward.count} recording{'s' if forward.count > 1 else ''}, repeats taken together"
+    for _ in range(2):  # the first one compiles
+        forward.observe(forward.coordinates.null[None])
+    rollouts = (1 if start is not None else SEARCH) * climb_rollouts(target, free)
+    words = about(rollouts * forward.pace)
+    report(f"fitting the base model: {free} parameters, {counted}; up to {rollouts} rollouts, {words}")
 
 
 def first_target(question: Question, journal: Journal, deadline: Deadline | None = None) -> Target:
@@ -435,9 +452,17 @@ class HeldOut:
 
 
 def _held_out(question: Question, target: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step]) -> HeldOut | None:
-    """The test recordings, or fitted ones that are left out in turn; None where the model was not extended."""
+    """The test recordings, or fitted ones that are left out in turn; None where the model was not extended, or the time
+    was up."""
     if not steps:
         return None
+    inquiry.report("measuring the gain on recordings that no fit has seen")
+    with target.forward.deadline.stage("gain"), suppress(OutOfTime):
+        return _predicted(question, target, inquiry, base, steps)
+    return None
+
+
+def _predicted(question: Question, target: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step]) -> HeldOut:
     count, every = len(question.trajectories), len(question.model.recordings.names)
     fits = [base, *(step.fit for step in steps)]
     names = ["", *(step.name for step in steps)]

@@ -15,7 +15,7 @@ from rfdropo_bayes.audit.prequential import in_words, prequential
 from rfdropo_bayes.audit.score import likeness
 from rfdropo_bayes.audit.screen import Look, Row
 from rfdropo_bayes.audit.sentence import sentence
-from rfdropo_bayes.audit.verdict import NO_DISCREPANCY, UNEXPLAINED
+from rfdropo_bayes.audit.verdict import NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS
 from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.bayes.units import force_power
@@ -23,6 +23,8 @@ from rfdropo_bayes.bayes.units import force_power
 SCHEMA_VERSION = 1
 MILLIMETRES = 1e3
 STIFFNESS = "young_modulus"
+MORE_TESTS = 6  # recordings: all must favour a model by chance in one case of 64 only
+REFINE = "raise [simulator] refine and shorten its time_step"
 
 
 def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_experiment: Any) -> dict[str, Any]:
@@ -51,6 +53,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
             "rmse_extended_mm": MILLIMETRES * gain.rmse_extended,
             "elpd_difference": gain.elpd_difference,
             "elpd_difference_se": gain.elpd_difference_se,
+            "elpd_p": gain.elpd_p,
             "explained_fraction": gain.explained,
             "explained_fraction_interval": list(gain.interval),
             "test_trajectories": gain.trajectories,
@@ -68,9 +71,10 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         },
         "where": _where(answer),
         "base_parameters": _parameters(answer, answer.base.free, answer.base.x),
-        "next_experiment": None if answer.verdict == NO_DISCREPANCY else next_experiment,
+        "next_experiment": next_experiment,
         "rollouts": answer.rollouts,
         "seconds": round(answer.seconds, 2),
+        "profile": {stage: round(seconds, 2) for stage, seconds in answer.profile.items()},
         "seed": answer.question.seed,
         "versions": versions,
         "data_sha256": data_sha256,
@@ -92,36 +96,52 @@ def _noise(answer: Answer) -> dict[str, Any]:
     }
 
 
-def next_experiment(answer: Answer) -> dict[str, Any] | None:
-    """What to do next: how to split a class, or how to learn more where nothing was named; None if all is well."""
+def next_experiment(answer: Answer) -> dict[str, Any]:
+    """What to do at the robot next, in a sentence, and the candidates that this tells apart."""
+    name = answer.steps[0].name if answer.steps else ""
+    apart = next((step for step in answer.steps if len(step.members) > 1), None)
     if answer.verdict == NO_DISCREPANCY:
-        return None
-    if not answer.base.converged:
+        words = "Nothing is to be mended for commands like these; record larger and faster ones, and audit them."
+    elif not answer.base.converged:
         words = "Run `rfdropo calibrate`, look at its fit, and start the audit from it with --base."
-        return {"sentence": words, "separates": []}
-    if answer.suspected is not None:
+    elif answer.suspected is not None:
         words = "Repeat one command sequence three times: then it shows whether the noise is what [noise] states."
-        return {"sentence": words, "separates": []}
-    if answer.target.noise.doubtful:
+    elif answer.target.noise.doubtful:
         words = "Repeat one command sequence three times, or state the noise in [noise]: then a slow discrepancy shows."
-        return {"sentence": words, "separates": []}
-    by_name = {c.name: c.mechanism for c in answer.question.candidates}
-    if answer.verdict == UNEXPLAINED and answer.steps:
-        sentence_ = "No candidate explains it. Look where the residual is large for a cause that the library lacks"
-        return {"sentence": f"{sentence_}; docs/mechanisms.md says how to add one.", "separates": []}
-    for step in answer.steps:
-        if len(step.members) > 1:
-            checks = [f"{spoken(m)}: {by_name[m].remedy}" for m in step.members if m in by_name]
-            words = " from ".join(spoken(m) for m in step.members[:2])
-            sentence_ = f"To tell {words}: {'; '.join(checks)}. Or let `rfdropo design` propose commands that differ."
-            return {"sentence": sentence_, "separates": list(step.members)}
-    if not answer.steps:
+    elif answer.verdict == UNEXPLAINED and answer.steps:
+        words = f"No candidate explains it: {_watch(answer)}, for a cause that docs/mechanisms.md says how to add."
+    elif answer.verdict == NO_VERDICT:
+        words = "Nothing yet: raise [audit] minutes, and go on with --resume."
+    elif apart is not None:
+        checks = "; ".join(f"{spoken(member)}: {_remedy(answer, member)}" for member in apart.members)
+        both = " from ".join(spoken(member) for member in apart.members[:2])
+        words = f"To tell {both}: {checks}. Or let `rfdropo design` propose commands that differ."
+        return {"sentence": words, "separates": list(apart.members)}
+    elif not answer.steps:
         leading = [row.name for row in answer.looks[0].rows[:2]]
-        sentence_ = "Run `rfdropo design` for commands that would separate the leading candidates, and repeat each."
-        return {"sentence": sentence_, "separates": leading}
-    name = answer.steps[0].name
-    remedy = getattr(by_name.get(name), "remedy", "raise [simulator] refine and shorten its time_step")
-    return {"sentence": f"Check {spoken(name)} on the robot: {remedy}.", "separates": [name]}
+        asked = " and ".join(spoken(each) for each in leading) or "candidates of your own"
+        words = f"Send what `rfdropo design` proposes to separate {asked}, each three times; {_watch(answer)}."
+        return {"sentence": words, "separates": leading}
+    else:
+        words = f"Check {spoken(name)} on the robot: {_remedy(answer, name)}."
+        if not answer.adopted:
+            words = f"{words[:-1]}; and record {MORE_TESTS} more test recordings: they show whether the model needs it."
+        return {"sentence": words, "separates": [name]}
+    return {"sentence": words, "separates": []}
+
+
+def _remedy(answer: Answer, name: str) -> str:
+    candidate = answer.question.candidate(name)
+    return candidate.mechanism.remedy if candidate else REFINE
+
+
+def _watch(answer: Answer) -> str:
+    """Where on the robot to look: when and at which marker the base model fails most."""
+    found = prequential(answer.target, answer.base)
+    worst, markers = int(np.argmax(found.surprise)), answer.question.model.recordings.markers
+    marker = markers[int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))]
+    first, last = found.edges[worst : worst + 2]
+    return f"watch {marker} while what was sent from {first:.2g} to {last:.2g} s is sent again"
 
 
 def _other_noise(answer: Answer) -> dict[str, Any]:
@@ -163,7 +183,7 @@ def _finding(answer: Answer, step: Step, share: float | None) -> dict[str, Any]:
         "parameters": parameters,
         "relative": relative,
         "cause": getattr(mechanism, "cause", "the mesh or the time step of the simulator is too coarse"),
-        "remedy": getattr(mechanism, "remedy", "raise [simulator] refine and shorten its time_step"),
+        "remedy": mechanism.remedy if mechanism else REFINE,
         "explained_fraction": share,
         "explained_fraction_interval": list(answer.gain.interval) if only and answer.gain else None,
         "adjusted_p": row.adjusted_p,

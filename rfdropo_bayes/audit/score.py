@@ -74,6 +74,16 @@ def statistic(mark: Signature, residual: Float[np.ndarray, "*batch n"]) -> tuple
     return lm, surprise
 
 
+def joint_statistic(first: Signature, second: Signature, residual: Float[np.ndarray, " n"]) -> float:
+    """LM of two candidates together; 0 where the linear model gives one of them the sign that it cannot have."""
+    basis = np.concatenate([first.basis, second.basis], axis=1)
+    size, *_ = np.linalg.lstsq(basis, residual, rcond=1e-3)
+    own = size[: first.rank], size[first.rank :]
+    if any(mark.sign * part[0] < 0 for mark, part in zip((first, second), own, strict=True) if mark.sign):
+        return 0.0
+    return float(residual @ (basis @ size))
+
+
 def likeness(first: Signature, second: Signature) -> float:
     """Smallest cosine of the principal angles: 1 where the smaller signature lies within the larger one."""
     if first.rank == 0 or second.rank == 0:

@@ -86,10 +86,11 @@ def look(
         finer: residuals of the finer simulator with the same parameters.
     """
     seen = [probe for probe in probes if probe.mark.rank > 0]
-    residuals = [fit.residual]
-    if finer is not None:
-        residuals.append(fit.residual + project_out(span(fit.jacobian), (finer - fit.residual)[:, None])[:, 0])
-    observed, surprises = _statistics(target, np.stack(residuals), seen)
+    # As in the simulated data sets, what the parameters could still take is no discrepancy: a prior holds a size of
+    # many of its deviations back from where the data have it.
+    left = np.stack([fit.residual] if finer is None else [fit.residual, finer])
+    residuals = project_out(span(fit.jacobian), left.T).T
+    observed, surprises = _statistics(target, residuals, seen)
     simulated, reference = _simulated(target, fit, seen, np.random.default_rng(seed), bootstraps)
     if target.noise.source == RESIDUALS:  # whose mean square is that of the residuals by construction
         del observed["variance"], simulated["variance"]

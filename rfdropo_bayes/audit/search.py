@@ -121,7 +121,7 @@ class BaseProblem:
 
         What the sizes of relative errors add to the likelihood is left to the climb that goes on from here.
         """
-        white, _, fine = self.target.evaluate(self._points(self.to_unconstrained(values)))
+        white, _, fine = self.target.evaluate(self._points(self.to_unconstrained(values)), horizon)
         white = np.where(fine[:, None], white, 0.0)
         series = self.target.measurements.series(white)
         return series[:, :, :horizon], white[:, self.target.measurements.count.size :], fine

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import numpyro.distributions as dist
 from scipy import stats
 
@@ -99,6 +100,25 @@ def prior_from_table(spec: ParameterSpec, table: Mapping[str, Any], *, where: st
     numbers = {name: _number(name, arguments[name], where) for name in names}
     _check_inside(spec, family, numbers, where)
     return build(spec, **numbers)
+
+
+def log_density(spec: ParameterSpec, table: Mapping[str, Any], values: np.ndarray) -> np.ndarray:
+    """Log density of the prior that `prior_from_table` builds, without a compilation for each number of values."""
+    family = table["distribution"]
+    if family == "Uniform":
+        return np.full(np.shape(values), -math.log(table["high"] - table["low"]))
+    if family == "LogUniform":
+        return -np.log(values) - math.log(math.log(table["high"] / table["low"]))
+    low, high, scale, at = spec.low, spec.high, table.get("scale", table.get("sigma")), values
+    middle = table.get("loc", 0.0)
+    if family == "HalfNormal":
+        low = max(low, 0.0)
+    if family == "LogNormal":
+        middle, at = math.log(table["median"]), np.log(values)
+        low, high = (math.log(bound) if bound > 0.0 else -math.inf for bound in (low, high))
+    inside = stats.norm.cdf((high - middle) / scale) - stats.norm.cdf((low - middle) / scale)
+    found = -0.5 * ((at - middle) / scale) ** 2 - math.log(scale * math.sqrt(2.0 * math.pi) * inside)
+    return found - at if family == "LogNormal" else found
 
 
 def _number(name: str, value: Any, where: str) -> float:

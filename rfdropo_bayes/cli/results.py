@@ -78,6 +78,7 @@ def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: 
     ]
     if rows:
         console.print(_parameters(rows[:MOST_ROWS]))
+    console.print(f"next: {found['next_experiment']['sentence']}", soft_wrap=True)
     console.print(f"report: {files['report']}; extended model: {files['extended']}", soft_wrap=True)
 
 

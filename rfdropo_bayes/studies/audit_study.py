@@ -26,6 +26,7 @@ from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.studies.fits import Job, run_fits
 from rfdropo_bayes.studies.hidden_effects import Hidden, Setting, hide
 from rfdropo_bayes.workflow.audit import JOURNAL, Workshop, run_audit
+from rfdropo_bayes.workflow.experiment import CommandsTable
 from rfdropo_bayes.workflow.files import output_folder
 
 RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
@@ -36,16 +37,41 @@ LEARNT = 0.5  # of a prior's deviation that a posterior's is below where the dat
 TRIES = 8  # mechanisms that are tried until one reaches the wanted size
 
 
+SHARED = 0.8  # of the noise's variance
+# SOFA's trunk on its own mesh, which lies under $RFDROPO_DATA; made and audited on it and with one time step.
+BODY = {
+    "body": "tetrahedra",
+    "time_step": 0.02,
+    "tetrahedra": {"mesh": "sofa_trunk/trunk.vtk", "unit": "mm", "clamp_height": 0.02},
+}
+MESH = Setting(
+    robot="trunk_sofa_mesh",
+    commands=CommandsTable(
+        duration=3.0, interval=0.2, step=0.005, low=0.0, high=0.02, sample_time=0.1, recordings=["any"]
+    ),
+    audited=BODY,
+    made=BODY,
+    priors={
+        "young_modulus": {"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5},
+        "poisson_ratio": {"distribution": "Uniform", "low": 0.4, "high": 0.499},
+        "trunk_mass": {"distribution": "LogNormal", "median": 0.42, "sigma": 0.5},
+        "rayleigh_stiffness": {"distribution": "LogNormal", "median": 0.1, "sigma": 0.7},
+    },
+)
+
+
 @dataclass(frozen=True)
 class Condition:
-    """One kind of data set: how many effects of which size, whether the library has them, and whether the audit is
-    given repeats, from which it takes the noise."""
+    """One kind of data set: how many effects of which size, whether the library has them, whether the audit is given
+    repeats, from which it takes the noise, whether markers share most of that, and whether the body is a mesh."""
 
     name: str
     effects: int
     rho: float
     removed: bool = False
     repeats: bool = True
+    shared: bool = False
+    mesh: bool = False
 
     @property
     def right(self) -> tuple[str, ...]:
@@ -57,9 +83,12 @@ class Condition:
     @property
     def setting(self) -> Setting:
         """Meshes and time steps; where nothing is to be found, such that they differ by a rho of at most .02."""
+        if self.mesh:
+            return MESH
         if self.effects:
             return Setting()
-        return Setting(audited={"refine": 4, "time_step": 0.005}, made={"refine": 5, "time_step": 0.05 / 11})
+        audited, made = {"refine": 4, "time_step": 0.005}, {"refine": 5, "time_step": 0.05 / 11}
+        return Setting(audited=audited, made=made, shared=SHARED if self.shared else 0.0)
 
 
 CONDITIONS = (
@@ -69,6 +98,8 @@ CONDITIONS = (
     Condition("two_effects_rho_1", 2, 1.0),
     Condition("removed_rho_0.5", 1, 0.5, removed=True),
     Condition("null_without_repeats", 0, 0.0, repeats=False),
+    Condition("null_shared_noise", 0, 0.0, shared=True),
+    Condition("null_mesh", 0, 0.0, mesh=True),
 )
 
 

@@ -51,6 +51,7 @@ class Setting:
         spread: relative deviation of the truth from the middle of the priors.
         priors: of the base parameters.
         tension: whether cable tensions are recorded, and are data of the audit.
+        shared: share of the noise's variance that all markers have in common, as where a mount shakes.
     """
 
     robot: str = "smooth_arm"
@@ -71,6 +72,7 @@ class Setting:
         }
     )
     tension: bool = False
+    shared: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -284,9 +286,13 @@ def _write(
     for index, (recording, position) in enumerate(zip(blank, np.asarray(made.position), strict=True)):
         key = jax.random.fold_in(jax.random.key(seed), index)
         memory = jnp.asarray(-step / np.log(MEMORY))
-        noise = draw_noise(key, jnp.asarray(recording.time), position.shape[1], Noise(jnp.asarray(NOISE), memory))
+        time, size = jnp.asarray(recording.time), Noise(jnp.asarray(NOISE), memory)
+        noise = np.asarray(draw_noise(key, time, position.shape[1], size))
+        if setting.shared > 0.0:
+            common = np.asarray(draw_noise(jax.random.fold_in(key, 2), time, 1, size))
+            noise = np.sqrt(1.0 - setting.shared) * noise + np.sqrt(setting.shared) * common
         dataset = recording.dataset.copy()
-        dataset["position"] = dataset["position"].copy(data=position + np.asarray(noise))
+        dataset["position"] = dataset["position"].copy(data=position + noise)
         if setting.tension:
             pull = np.asarray(made.tension)[index]
             error = np.asarray(jax.random.normal(jax.random.fold_in(key, 1), pull.shape))

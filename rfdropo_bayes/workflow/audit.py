@@ -15,10 +15,11 @@ import numpy as np
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.deadline import Deadline
-from rfdropo_bayes.audit.differences import Change, Groups, with_differences
+from rfdropo_bayes.audit.differences import Groups, with_differences
 from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
 from rfdropo_bayes.audit.fit import widening
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
+from rfdropo_bayes.audit.held import OwnParameter
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.pipeline import Answer, Question
 from rfdropo_bayes.audit.pipeline import audit as ask
@@ -39,7 +40,7 @@ from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.engine import effects_costly
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechanism, obstacle
-from rfdropo_bayes.simulators.parameters import nearest
+from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.workflow.assembly import (
@@ -219,8 +220,9 @@ def build_question(
     robot = find_workpiece(experiment, folder)
     trajectories = [*fitted, *tested]
     left_out: dict[str, str] = {}
+    library = names is None
     if names is None:
-        names = candidate_names(experiment)
+        names = candidate_names(experiment, robot)
         left_out = obstacles(experiment, names, robot, folder, trajectories[0])
         names = [name for name in names if name not in left_out]
     simulator = build_simulator(_with(experiment, names), robot, folder)
@@ -232,8 +234,12 @@ def build_question(
         for name, m in zip(names, added, strict=True)
         if name not in experiment.audit.exclude
     ]
-    if groups is not None:
-        model, candidates = _compared(model, base, simulator, added, candidates, groups, spreads)
+    of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
+    plain = [spec for spec in simulator.parameters if spec.name not in of_candidates]
+    if library:
+        stated = expand_groups(spreads, simulator.parameters)
+        model, candidates = _with_own(model, base, plain, candidates, groups, stated)
+        candidates = [c for c in candidates if c.name not in experiment.audit.exclude]
     coordinates = Coordinates(
         model.space,
         base,
@@ -262,24 +268,24 @@ def build_question(
     )
 
 
-def _compared(
+def _with_own(
     model: TrajectoryModel,
     base: int,
-    simulator: AnySimulator,
-    added: Sequence[Mechanism],
+    plain: Sequence[ParameterSpec],
     candidates: list[Candidate],
-    groups: Groups,
+    groups: Groups | None,
     spreads: Mapping[str, float],
 ) -> tuple[TrajectoryModel, list[Candidate]]:
-    """The model in which parameters may differ between groups, and these differences among its candidates."""
-    later = {spec.name for mechanism in added for spec in mechanism.parameters}
-    plain = [spec for spec in simulator.parameters if spec.name not in later]
-    stated, held = expand_groups(spreads, simulator.parameters), tuple(model.fixed)
-    space, candidates = with_differences(model.space, base, plain, candidates, groups, spreads=stated, held=held)
-    return replace(model, space=space), candidates
+    """The model with the robot's own parameters among its candidates, and all that may differ between groups."""
+    space, own = with_held(model.space, plain, tuple(model.fixed))
+    if groups is not None:
+        space, candidates = with_differences(
+            space, base, plain, candidates, groups, spreads=spreads, held=tuple(model.fixed)
+        )
+    return replace(model, space=space), [*candidates, *own]
 
 
-def candidate_names(experiment: Experiment) -> list[str]:
+def candidate_names(experiment: Experiment, robot: Workpiece) -> list[str]:
     """What may be in the model: the registry and the experiment's own, less what is in its base model.
 
     Excluded ones are among them, so that what is compiled does not depend on what is excluded.
@@ -289,8 +295,9 @@ def candidate_names(experiment: Experiment) -> list[str]:
     """
     table = experiment.audit
     known = [*REGISTRY, *(name for name in table.candidates if name not in REGISTRY)]
+    own = robot.parameter_table() if isinstance(robot, Robot) else {}
     for name in table.exclude:
-        if name not in known:
+        if name not in known and not any(parameter.startswith(f"{name}_") for parameter in own):
             raise InputError(f"unknown mechanism {name!r}", where="[audit] exclude", remedy=nearest(name, known))
     return [name for name in known if name not in experiment.model.mechanisms]
 
@@ -485,7 +492,9 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path, out: P
         assert candidate is not None
         if candidate.group:
             extend_groups(model, answer, candidate)
-        if isinstance(candidate.mechanism, Change):
+        if isinstance(candidate.mechanism, OwnParameter):
+            if not candidate.group:
+                model.setdefault("priors", {}).update(sized_priors(answer, candidate))
             continue
         source = code_placed(candidate.source, folder, out)
         if source not in model.get("mechanisms", []):

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from rfdropo_bayes.audit.candidates import Candidate
-from rfdropo_bayes.audit.differences import WHERE, Change, Groups
+from rfdropo_bayes.audit.differences import WHERE, Groups
 from rfdropo_bayes.audit.fit import widening
+from rfdropo_bayes.audit.held import OwnParameter
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.bayes.pooling import Patterns, gather_groups, whole
 from rfdropo_bayes.data import Trajectory
@@ -54,8 +55,8 @@ def find_groups(
                 remedy=f"fitted recordings: {', '.join(t.name for t in fitted)}",
             )
     groups = Groups(members, tuple(name for name in names if name not in first | second))
-    chosen = ([t for t in each if t.name in first | second] for each in (fitted, tested))
-    return groups, *chosen
+    known = first | second
+    return groups, [t for t in fitted if t.name in known], [t for t in tested if t.name in known]
 
 
 def _named(between: Sequence[str], patterns: Patterns, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -100,7 +101,7 @@ def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -
     factor = widening(answer.extended, coordinates)
     fitted = {trajectory.name for trajectory in answer.question.trajectories}
     scopes = {step.name for step in answer.adopted if step.name.partition("@")[0] == candidate.title}
-    alone = len(scopes) == 1 and not isinstance(candidate.mechanism, Change)
+    alone = len(scopes) == 1 and not isinstance(candidate.mechanism, OwnParameter)
     for index in candidate.indices:
         parameter = coordinates.space.parameters[index]
         if not parameter.added_to:

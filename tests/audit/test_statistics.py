@@ -14,9 +14,9 @@ from rfdropo_bayes.audit.bootstrap import null_residuals, tail
 from rfdropo_bayes.audit.coordinates import Support
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.fit import Fit, widened
-from rfdropo_bayes.audit.gain import Gain, Unseen, _floor_error, _noise_power, explained_fraction
+from rfdropo_bayes.audit.gain import Gain, Unseen, _floor_error, _noise_power, explained_fraction, sign_flip_p
 from rfdropo_bayes.audit.omnibus import joint_test, statistics
-from rfdropo_bayes.audit.score import likeness, project_out, signature, span, statistic
+from rfdropo_bayes.audit.score import Signature, joint_statistic, likeness, project_out, signature, span, statistic
 from rfdropo_bayes.audit.verdict import decide
 from rfdropo_bayes.bayes.noise.autoregression import (
     REPEATS,
@@ -213,7 +213,7 @@ def test_coordinates_are_those_of_the_prior_s_own_transform(prior, low, high):
 
 
 def gain(explained: float, low: float) -> Gain:
-    return Gain(2e-3, 1e-3, 10.0, 2.0, {}, explained, (low, 1.0), 9e-4, 6)
+    return Gain(2e-3, 1e-3, 10.0, 2.0, 0.02, {}, explained, (low, 1.0), 9e-4, 6)
 
 
 @pytest.mark.parametrize(
@@ -301,3 +301,42 @@ def test_a_size_far_outside_its_prior_is_not_drawn_back_and_a_usual_one_is_left(
     assert abs(found.x[1] - 9.0) < 0.2 * deviation
     usual = replace(fit, x=np.array([2.0, 0.9, 0.5]))
     assert widened(usual, coordinates) is usual
+
+
+def test_recordings_that_all_favour_one_model_support_it_however_much_they_differ():
+    """Of six signs by chance all are right in one case of 64; a standard error would call the first row doubtful."""
+    rng = np.random.default_rng(0)
+    uneven = np.array([2000.0, 50.0, 30.0, 12.0, 5.0, 3.0])
+    assert uneven.sum() < 2.0 * np.sqrt(6) * uneven.std(ddof=1)
+    assert sign_flip_p(uneven, rng) == pytest.approx(1 / 64)
+    assert sign_flip_p(uneven * [1, 1, 1, 1, 1, -1], rng) == pytest.approx(2 / 64)
+    assert sign_flip_p(-uneven, rng) == 1.0
+    # Its level, where more differences than can be gone through are symmetric about zero: 400 trials, five deviations.
+    level = np.mean([sign_flip_p(rng.standard_t(3, 20), rng) <= 0.05 for _ in range(400)])
+    assert abs(level - 0.05) < 5.0 * np.sqrt(0.05 * 0.95 / 400)
+
+
+def test_a_joint_p_value_is_reached_no_more_often_than_it_says():
+    """Five independent statistics against 199 simulated ones each: the least p-value comes in one case of 200, and not
+    in five. 4000 data sets, five deviations."""
+    rng = np.random.default_rng(1)
+    names, found = "abcde", []
+    for _ in range(4000):
+        drawn = rng.standard_normal((5, 200))
+        simulated = {name: row[1:] for name, row in zip(names, drawn, strict=True)}
+        found.append(joint_test({n: float(r[0]) for n, r in zip(names, drawn, strict=True)}, simulated, np.ones(1)).p)
+    for level in (0.005, 0.01, 0.05):
+        assert np.mean(np.array(found) <= level) <= level + 5.0 * np.sqrt(level / 4000)
+
+
+def test_two_candidates_that_pay_only_together_are_seen_together():
+    """One-sided first, which alone would have to be negative: only beside the second is its size positive."""
+    rng = np.random.default_rng(2)
+    columns = np.linalg.qr(rng.standard_normal((50, 2)))[0]
+    stiff, taut = columns[:, [0]], -0.9 * columns[:, [0]] + np.sqrt(0.19) * columns[:, [1]]
+    residual = 4.0 * stiff[:, 0] + 6.0 * taut[:, 0]
+    first, second = Signature(stiff, 1), Signature(taut, 0)
+    assert statistic(first, residual)[0] == 0.0
+    assert joint_statistic(first, second, residual) == pytest.approx(residual @ residual)
+    assert statistic(second, residual)[0] < 0.5 * (residual @ residual)
+    assert joint_statistic(Signature(stiff, -1), second, residual) == 0.0

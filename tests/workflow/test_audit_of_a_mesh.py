@@ -80,7 +80,7 @@ def test_candidates_that_do_not_run_on_a_mesh_are_left_out_and_listed(bar_mesh, 
     assert set(asked.left_out) == layered - {"softening"} | {"own.py:Glue"}
     assert "layered bodies only" in asked.left_out["coulomb_friction"]
     assert "layered bodies only" in asked.left_out["own.py:Glue"]
-    assert {c.name for c in asked.candidates} == set(REGISTRY) - layered | {"fur"}
+    assert {c.name for c in asked.candidates} == set(REGISTRY) - layered | {"fur", "initial_displacement"}
     assert asked.finer is not None
     steps = [lanes.simulator.description["time_step_s"] for lanes in (asked.lanes, asked.finer[0])]
     assert steps[1] == steps[0] / 2
@@ -98,4 +98,4 @@ def test_beside_a_cube_every_candidate_runs():
     tables |= {"robot": "trunk_sofa", "simulator": {"push": True}}
     asked = build_question(Experiment.model_validate(tables), Path(), [recording()], [], seed=0)
     assert not asked.left_out
-    assert {c.name for c in asked.candidates} == set(REGISTRY)
+    assert {c.name for c in asked.candidates} == set(REGISTRY) | {"initial_displacement"}

@@ -1,0 +1,147 @@
+"""Audits that compare two groups of recordings, on a simulator that is a formula. Seeds are fixed; a null data set is
+called discrepant in 1 % of cases, and a size is missed by four deviations in one of 10^4."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.audit.coordinates import Coordinates
+from rfdropo_bayes.audit.differences import Groups, with_differences
+from rfdropo_bayes.audit.held import families
+from rfdropo_bayes.audit.journal import Journal
+from rfdropo_bayes.audit.pipeline import Question, audit, first_target
+from rfdropo_bayes.audit.record import next_experiment, record
+from rfdropo_bayes.bayes.channels import Markers
+from rfdropo_bayes.bayes.model import TrajectoryModel
+from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.workflow.between import find_groups
+
+from .toys import BASE, Toy, question, recordings
+
+TRUTH = {"gain": 1.3, "bend": -0.4}
+MONTHS = {"january": ("r0", "r1", "r3", "r5", "r7"), "april": ("r2", "r4", "r6", "r8")}
+FITTED = 7  # r0 to r6: three repeats, one of them on another day, and four more sequences
+GROUPS = Groups(MONTHS, ("r9",))
+
+
+def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> Question:
+    """A data set of the toy, half of it with another truth."""
+    asked, toy = question(TRUTH, seed), Toy()
+    days = [recordings({**TRUTH, **truth}, seed, toy) for truth in (january, april)]
+    chosen = [days[first.name in MONTHS["april"]][k] for k, first in enumerate(days[0][:9])]
+    gathered = gather_recordings(toy, chosen)
+    space, candidates = with_differences(
+        asked.coordinates.space, len(BASE), BASE, asked.candidates, groups, spreads={"bend": 0.5}
+    )
+    nominal = {spec.name: spec.nominal for spec in toy.parameters}
+    return replace(
+        asked,
+        coordinates=Coordinates(space, len(BASE), tuple(nominal), nominal, {}),
+        model=TrajectoryModel(toy, space, {}, gathered, (Markers.gather(gathered, "repeats"),)),
+        trajectories=chosen[:FITTED],
+        candidates=candidates,
+        groups=groups,
+    )
+
+
+def found(asked: Question) -> dict:
+    answer = audit(asked)
+    return json.loads(json.dumps(record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))))
+
+
+def test_a_mechanism_of_one_day_and_a_parameter_that_changed_are_named_with_their_sizes():
+    content = found(compared({}, {"play": 0.5, "bend": -0.1}, 1))
+    differences = {row["mechanism"]: row for row in content["between"]["differences"]}
+    assert set(differences) == {"play", "bend"}
+    assert content["between"]["in_both"] == []
+    assert content["verdict"] == "explained"
+    for name, parameter, truth in (("play", "play@april", 0.5), ("bend", "bend_deviation@april", 0.3)):
+        assert differences[name]["group"] == "april"
+        size = differences[name]["parameters"][parameter]
+        assert abs(size["mean"] - truth) < 4.0 * size["sd"]
+    assert "play in april" in content["sentence"]
+    assert "shared by january and april" in content["sentence"]
+
+
+def test_what_both_days_lack_is_no_difference():
+    content = found(compared({"play": 1.0}, {"play": 1.0}, 3))
+    assert content["between"]["differences"] == []
+    assert [row["mechanism"] for row in content["between"]["in_both"]] == ["play"]
+    assert "No parameter and no mechanism is found to differ" in content["sentence"]
+
+
+def test_nothing_is_named_where_nothing_changed():
+    content = found(compared({}, {}, 5))
+    assert content["verdict"] == "no_discrepancy"
+    assert content["between"]["groups"] == {name: list(own) for name, own in MONTHS.items()}
+    assert content["between"]["left_out"] == ["r9"]
+
+
+def test_a_difference_is_added_to_what_both_share_and_shapes_are_shared():
+    asked = compared({}, {}, 1)
+    names, coordinates = asked.coordinates.names, asked.coordinates
+    by_name = {candidate.name: [names[i] for i in candidate.indices] for candidate in asked.candidates}
+    assert by_name["play@april"] == ["play@april"]
+    assert by_name["creep@january"] == ["creep@january", "creep_time"]
+    assert by_name["bend@april"] == ["bend_deviation@april"]
+    assert "bend@january" not in by_name  # the same difference, seen from the other group
+    assert coordinates.prior_deviations["bend_deviation@april"] == pytest.approx(0.5 * np.sqrt(2), rel=0.05)
+    x = coordinates.encode({**TRUTH, "play@april": 0.7, "bend_deviation@april": 0.2})
+    theta = coordinates.physical_values(x[None], coordinates.slots(["r0", "r2"]))[0]
+    place = {name: k for k, name in enumerate(coordinates.physical)}
+    np.testing.assert_allclose(theta[:, place["play"]], [0.0, 0.7])
+    np.testing.assert_allclose(theta[:, place["bend"]], [-0.4, -0.2])
+    # Repeats of one command sequence on two days are two measurements: parameters of their own tell them apart.
+    target = first_target(asked, Journal())
+    assert target.measurements.members[0] == (0, 1)
+    assert target.measurements.has_repeats
+    assert sorted(len(group) for group in target.measurements.members) == [1, 1, 1, 1, 1, 2]
+    # What touches one day costs rollouts of that day alone.
+    forward, april = target.forward, np.eye(len(names))[[names.index("play@april")]]
+    before = forward.rollouts
+    slopes = forward.tangents(coordinates.null[None], april)["position"][0]
+    days = [name in MONTHS["april"] for name in target.measurements.names]
+    assert forward.rollouts - before == forward.lanes.slope_rollouts * sum(days)
+    assert [bool(np.any(part)) for part in slopes] == days
+
+
+def test_parameters_of_one_quantity_at_several_places_are_asked_for_together():
+    zero = ParameterSpec("zero_up", "m", -1.0, 1.0, 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 0.1}, "zero")
+    specs = [zero, zero._replace(name="zero_down"), zero._replace(name="mass", unit="kg")]
+    assert [[spec.name for spec in family] for family in families(specs)] == [["zero_up", "zero_down"]]
+
+
+@pytest.mark.parametrize(
+    ("between", "words"),
+    [
+        (("january", "may"), "unknown group 'may'"),
+        (("january", "january"), "1 groups are named"),
+        (("january", "june"), "no fitted recording is in the group 'june'"),
+        (("january", "august"), "no fitted recording is in the group 'august'"),
+        ({"a": ["r0", "r1"], "b": ["r1"]}, "r1 is in both groups, a and b"),
+        ({"a": ["r0"], "b": []}, "no fitted recording is in the group 'b'"),
+        ({"a": ["r0"], "b": ["r77"]}, "no recording of the group 'b' is called 'r77'"),
+        ({"a": ["r0"]}, "1 groups are named"),
+    ],
+)
+def test_groups_that_cannot_be_compared_are_refused_by_name(between, words):
+    runs = recordings(TRUTH, 1)
+    patterns = {"january": "r[01]", "april": ["r2", "r3"], "june": "r9", "august": "nothing*"}
+    with pytest.raises(InputError, match=words):
+        find_groups(between, patterns, runs[:8], runs[8:])
+
+
+def test_groups_are_found_by_wildcard_by_name_and_by_recording():
+    runs = recordings(TRUTH, 1)
+    groups, fitted, tested = find_groups(("january", "r3"), {"january": ["r[01]", "r8"]}, runs[:4], runs[4:])
+    assert groups.members == {"january": ("r0", "r1", "r8"), "r3": ("r3",)}
+    assert groups.left_out == ("r2", "r4", "r5", "r6", "r7", "r9")
+    assert ([t.name for t in fitted], [t.name for t in tested]) == (["r0", "r1", "r3"], ["r8"])
+    other, _, _ = find_groups({"a": runs[:2], "b": "r[23]"}, {}, runs[:4], [])
+    assert other.members == {"a": ("r0", "r1"), "b": ("r2", "r3")}
