@@ -66,7 +66,7 @@ def roll(
         progress = lax.scan(one, progress, commands)[0]
         return progress, recorded(progress.state)
 
-    def next_row(index: Int[Array, ""], carry: tuple[_Progress, Recorded]) -> tuple[_Progress, Recorded]:
+    def next_row(index: Int[Array, ""], carry: tuple[_Progress, Any]) -> tuple[_Progress, Any]:
         progress, here = row(carry[0], displacement[index])
         return progress, jax.tree.map(lambda rows, new: rows.at[index].set(new), carry[1], here)
 
