@@ -205,7 +205,7 @@ def _do(study: Study, task: str, row: str, seed: int) -> None:
     out = _place(study, task, "evaluations", row, seed)
     tables = _on_target(study, _tables(study, task))
     path = _written(tables, study.out / task / "experiments" / "target.toml")
-    run_evaluation(path, [policy], out, episodes=study.size.episodes, film=seed == 0, overwrite=True)
+    run_evaluation(path, [policy], out, episodes=study.size.episodes, film=False, overwrite=True)
     write_text(out / "policy.json", json.dumps({"sha256": _digest(policy / POLICY), **_learning(policy)}) + "\n")
 
 
