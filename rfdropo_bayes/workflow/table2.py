@@ -56,15 +56,14 @@ class Row:
     on_target: bool = False
 
 
-SMC = {"particles": 200, "blocks": 1}
 ROWS = {
     "no randomisation": Row(),
     "UDR": Row("udr", {}, "posterior"),
     "BayesSim": Row("bayessim", {}, "posterior"),
     "NPDR": Row("npdr", {"rounds": 10}, "posterior"),
     "RF-DROPO as published": Row("rfdropo", {"mended": False}, "phi"),
-    "ours": Row("smc", SMC, "posterior"),
-    "ours after the audit": Row("smc", SMC, "posterior", extended=True),
+    "ours": Row("smc", {}, "posterior"),
+    "ours after the audit": Row("smc", {}, "posterior", extended=True),
     "oracle": Row(on_target=True),
 }
 OURS, ORACLE = "ours after the audit", "oracle"
