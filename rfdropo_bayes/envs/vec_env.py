@@ -36,6 +36,11 @@ class TrunkVecEnv(VecEnv):
         super().__init__(episodes.lanes, observed, acted)
         self._actions: np.ndarray = np.zeros(0)
 
+    @property
+    def redrawn(self) -> int:
+        """Parameter sets for which no initial state was found, and others drawn."""
+        return self.episodes.redrawn
+
     def reset(self) -> np.ndarray:
         """Begin an episode in every lane, with the seeds and options that were set."""
         for lane, seed in enumerate(self._seeds):

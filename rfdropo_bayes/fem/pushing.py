@@ -127,6 +127,14 @@ def distance_to_box(
     return jnp.where(far, length, jnp.max(beyond, axis=1)), direction @ turn.T
 
 
+def smallest_gap(scene: PushScene, cube: Cube, state: CubeState, centre: Float[Array, "spheres 3"]) -> Float[Array, ""]:
+    """Distance of the trunk, given by the spheres' centres [m], from the nearer of cube and plate, less the contact
+    distance."""
+    beside = distance_to_box(centre, state.position, rotation_matrix(state.orientation), cube.side)[0]
+    above = centre @ jnp.asarray(scene.plate_normal) - scene.plate_height
+    return jnp.min(jnp.minimum(beside, above) - jnp.asarray(scene.spheres.radius)) - scene.contact_distance
+
+
 def _nearest(gap: Float[Array, " spheres"]) -> Int[Array, " contacts"]:
     """The nearest spheres, in ascending order, which rounding does not change."""
     return jnp.sort(lax.top_k(-lax.stop_gradient(gap), min(NEAREST, len(gap)))[1])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -15,10 +16,15 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import Material, point_positions, prepare, state_at_rest
 from rfdropo_bayes.fem import static_equilibrium as find_equilibrium
 from rfdropo_bayes.fem.dynamics import Prepared, State, remembering, step
+from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native.layered import NativeRollout
 from rfdropo_bayes.fem.native.layered_session import LayeredSession
+from rfdropo_bayes.fem.pushing import PushScene, smallest_gap
 from rfdropo_bayes.fem.rigid_body import Cube
 from rfdropo_bayes.simulators.engine import CubeInputs, Engine, cube_arrays
+
+TOUCHING = 0.001
+"""[m] A body that overlaps the cube by less starts in contact. The first step then moves the cube by as much."""
 
 
 class LaneMotion(NamedTuple):
@@ -66,7 +72,58 @@ def body_lanes(engine: Engine, count: int) -> BodyLanes:
     """
     if not engine.layered:
         raise InputError("a body of tetrahedra does not step", where="a session", remedy="use a layered body")
-    return ReferenceLanes(engine, count) if engine.backend.name == "jax" else CompiledLanes(engine, count)
+    kind = ReferenceLanes if engine.backend.name == "jax" else CompiledLanes
+    return kind(engine, count) if engine.scene is None else LanesBeforeCube(kind, engine, engine.scene, count)
+
+
+class LanesBeforeCube:
+    """Bodies that start clear of cube and plate: see `BodyLanes`.
+
+    The equilibrium of a body knows of neither, and a body that overlaps the cube would throw it away. Where it does,
+    the unbalanced force of the start counts as infinite.
+    """
+
+    def __init__(self, kind: Callable[[Engine, int], BodyLanes], engine: Engine, scene: PushScene, count: int) -> None:
+        markers, spheres, self._scene = engine.body.markers, scene.spheres, scene
+        self._shown = len(markers.node)
+        width = max(markers.node.shape[1], spheres.node.shape[1])
+        node, weight = (
+            np.concatenate([np.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts])
+            for parts in ((markers.node, spheres.node), (markers.weight, spheres.centre))
+        )
+        body: Any = engine.body._replace(markers=PointMap(node, weight))
+        self._bodies = kind(replace(engine, body=body), count)
+        self.save, self.restore = self._bodies.save, self._bodies.restore
+
+    @property
+    def nbytes(self) -> int:
+        """See `BodyLanes`."""
+        return self._bodies.nbytes
+
+    def reset(
+        self,
+        rows: Int[np.ndarray, " row"],
+        material: Material,
+        start: Float[np.ndarray, "row cable"],
+        cube: CubeInputs | None,
+    ) -> LaneMotion:
+        """See `BodyLanes`."""
+        found = self._bodies.reset(rows, material, start, cube)
+        assert cube is not None
+        gap = np.asarray(_gaps(self._scene, cube, found.position[:, self._shown :]))
+        return self._markers(found._replace(imbalance=np.where(gap < -TOUCHING, np.inf, found.imbalance)))
+
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> LaneMotion:
+        """See `BodyLanes`."""
+        return self._markers(self._bodies.advance(displacement))
+
+    def _markers(self, found: LaneMotion) -> LaneMotion:
+        return found._replace(position=found.position[:, : self._shown])
+
+
+def _gaps(scene: PushScene, cube: CubeInputs, centre: Float[np.ndarray, "row sphere 3"]) -> Float[Array, " row"]:
+    """Smallest gap [m] between a body and what is around it, in every row."""
+    return jax.vmap(partial(smallest_gap, scene))(cube.cube, cube.start, jnp.asarray(centre))
 
 
 class CompiledLanes:

@@ -33,7 +33,8 @@ _REMEDIES = {
     Result.DIVERGED: "shorten the time step or narrow the priors of stiffness, mass and damping",
     Result.CABLE_LIMIT: "the cables could not reach their commanded lengths: check limits and initial displacements",
     Result.CONTACT_NOT_CONVERGED: "shorten the time step: the contacts of a step were not solved",
-    Result.NOT_IN_EQUILIBRIUM: "the initial pose was not found: check gravity, stiffness and initial displacements",
+    Result.NOT_IN_EQUILIBRIUM: "the initial pose was not found, or overlaps the cube: check gravity, stiffness, "
+    "initial displacements and where the cube stands",
 }
 
 

@@ -38,6 +38,7 @@ class Trained:
         curve: a row for each leg: steps, seconds, mean reward of the evaluation, quantiles of the final distance [m].
         diverged: training episodes that ended because the simulation failed.
         seconds: of all legs.
+        redrawn: parameter sets for which no initial state was found, and others drawn.
     """
 
     model: Any
@@ -45,6 +46,7 @@ class Trained:
     curve: list[dict[str, float]]
     diverged: int
     seconds: float
+    redrawn: int = 0
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """The policy's most likely action for observations as the environments give them."""
@@ -66,7 +68,8 @@ def train(
     """Train a policy.
 
     Args:
-        environments: makes so many environments as one ``VecEnv`` with a ``layout`` and a ``log``.
+        environments: makes so many environments as one ``VecEnv`` with a ``layout``, a ``log`` and how many parameter
+            sets it has ``redrawn``.
         table: algorithm and budget.
         out: folder for ``log.jsonl``, ``episodes.jsonl`` (what every training episode began with and how it ended),
             TensorBoard's files and the checkpoint.
@@ -90,13 +93,13 @@ def train(
     state = _load_state(folder, known) if resume else None
     model, normalisation = _begin(maker, options, venv, table, folder, state, out, seed)
     cases = draw_cases(venv, table.evaluation_episodes, EVALUATION_SEED + seed)
-    state = state or {"known": known, "leg": 0, "seconds": 0.0, "diverged": 0, "curve": []}
+    state = state or {"known": known, "leg": 0, "seconds": 0.0, "diverged": 0, "redrawn": 0, "curve": []}
     with Progress(f"{table.algorithm} {table.task}", show=None, log=Path(out) / "log.jsonl") as progress:
         while model.num_timesteps < table.steps:
             state = _leg(model, normalisation, venv, cases, table, state, seed, Path(out) / EPISODES)
             _save(model, normalisation, folder, state)
             progress.stage(model.num_timesteps / table.steps, **state["curve"][-1])
-    return Trained(model, normalisation, state["curve"], state["diverged"], state["seconds"])
+    return Trained(model, normalisation, state["curve"], state["diverged"], state["seconds"], state["redrawn"])
 
 
 def _begin(
@@ -142,7 +145,7 @@ def _leg(
     log: Path,
 ) -> dict[str, Any]:
     """Learn until the next evaluation, and evaluate in the same environments: each leg resets them all."""
-    began = time.monotonic()
+    began, redrawn = time.monotonic(), venv.get_attr("redrawn")[0]
     leg = int(state["leg"]) + 1
     model.set_random_seed(int(np.random.SeedSequence([seed, leg]).generate_state(1)[0] % 2**31))
     model.set_env(normalisation or venv, force_reset=True)
@@ -169,6 +172,7 @@ def _leg(
         "leg": leg,
         "seconds": seconds,
         "diverged": state["diverged"] + count.failed,
+        "redrawn": state["redrawn"] + venv.get_attr("redrawn")[0] - redrawn,
         "curve": [*state["curve"], row],
     }
 

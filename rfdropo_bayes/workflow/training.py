@@ -332,6 +332,7 @@ def _summary(table: TrainingTable, found: Trained, policy: ExportedPolicy, facts
         "steps": found.curve[-1]["steps"],
         "seconds": found.seconds,
         "diverged_episodes": found.diverged,
+        "redrawn_parameters": found.redrawn,
         "evaluation": {key: value for key, value in found.curve[-1].items() if key not in ("steps", "seconds")},
         "curve": found.curve,
         "latency": latency(policy),

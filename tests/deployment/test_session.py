@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import rfdropo_bayes as rb
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.bus import BusTable
 from rfdropo_bayes.deployment.causes import Cause
@@ -57,7 +58,7 @@ def dry_run(tmp_path_factory) -> tuple[Path, Deployment]:
         robot="motor_arm", duration_s=2.0, policy=PolicyTable(file=str(policy)), safety=PATIENT,
         simulation=SimulationSettings(settings={"stiffness": 300.0, "pretension": 3.0}),
     )  # fmt: skip
-    outcome = deploy(settings, "dry-run", folder / "session")
+    outcome = rb.deploy(settings, "dry-run", folder / "session")
     assert outcome.cause is Cause.FINISHED, outcome.detail
     return folder / "session", settings
 

@@ -252,3 +252,17 @@ def test_a_lane_that_is_lost_says_so_and_leaves_the_others_alone():
         assert list(seen.status) == [Result.OK, Result.DIVERGED]
     assert session.reset(np.array([1]), {}).status == [Result.OK]
     np.testing.assert_array_equal(session.act(np.zeros((2, 8))).status, Result.OK)
+
+
+def test_a_body_that_would_overlap_the_cube_has_no_initial_state():
+    """Heavy trunks sag into the cube; one lane's cube is out of the way."""
+    model = simulator("numba", "float32", state="equilibrium").pushing()
+    values = {
+        "trunk_mass": np.array([0.3, 0.42, 0.55, 0.55]),
+        "cube_y": np.full(4, -0.082819),
+        "cube_x": np.array([0.0, 0.0, 0.0, 0.3]),
+    }
+    session = model.session(4, PERIOD)
+    found = session.reset(np.arange(4), values)
+    assert found.status.tolist() == [Result.OK, Result.OK, Result.NOT_IN_EQUILIBRIUM, Result.OK]
+    assert found.position.shape == (4, len(model.robot.marker_names), 3)

@@ -13,6 +13,8 @@ from scipy.stats import binomtest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.studies import table2
 from rfdropo_bayes.studies.table2 import ROWS, WITHOUT_CUBE, Size, Study, claims, list_jobs, run_table2, summarise
+from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.workflow.experiment_file import describe, read_tables
 
 VIRTUAL = Path(__file__).resolve().parents[2] / "experiments" / "virtual"
 PUSH, REACH, TRUTH, AUDIT = (VIRTUAL / f"{name}.toml" for name in ("push", "reach", "truth", "audit"))
@@ -75,6 +77,24 @@ def test_the_target_keeps_its_truth_and_takes_the_task(tmp_path) -> None:
     assert tables["training"]["task"] == "TrunkReach-v0"
     assert tables["model"]["fixed"]["young_modulus"] == 5.6e6
     assert "data" not in tables
+
+
+def test_the_model_takes_what_the_audit_adopted_and_keeps_its_own_priors(tmp_path) -> None:
+    """Mechanisms, their priors, and a finer body; the audit's own priors stay its own."""
+    found = read_tables(AUDIT)
+    found["model"] |= {"mechanisms": ["actuator_lag"], "priors": {**found["model"]["priors"], "actuator_lag": {}}}
+    found["simulator"] = {"refine": 2}
+    (tmp_path / "audit").mkdir()
+    (tmp_path / "audit" / "extended.toml").write_text(describe(found))
+    (tmp_path / "audit" / "run.json").write_text(json.dumps({"settings": {}, "command": "audit", "status": "done"}))
+    study = Study({"push": PUSH}, TRUTH, AUDIT, tmp_path, SMALL)
+    extended = table2._with_causes(study, table2._tables(study, "push"))
+    path = tmp_path / "extended.toml"
+    path.write_text(describe(extended))
+    experiment, _ = load_experiment(path)
+    assert experiment.model.mechanisms == ["actuator_lag"]
+    assert set(experiment.model.priors) == {*table2._tables(study, "push")["model"]["priors"], "actuator_lag"}
+    assert (experiment.simulator.push, experiment.simulator.refine) == (True, 2)
 
 
 def test_what_cannot_be_is_refused(tmp_path) -> None:

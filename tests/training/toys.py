@@ -33,6 +33,8 @@ class Points(VecEnv):
     A gain above 2 "diverges": the episode ends with a floor reward, as a failed simulation does.
     """
 
+    redrawn = 0
+
     def __init__(self, count: int, kind: str = "continuous") -> None:
         self.layout = layout(kind)
         space = spaces.Box(-1.0, 1.0, (1,), np.float32) if kind == "continuous" else spaces.Discrete(3)

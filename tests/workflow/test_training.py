@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
+import rfdropo_bayes as rb
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.training.export import ExportedPolicy
@@ -23,6 +25,9 @@ QUICK = [
     "training.evaluate_every=1792",
     "training.evaluation_episodes=16",
 ]
+
+
+SINGLE = {"precision": "float32"}
 
 
 def rfdropo(*words: object) -> None:
@@ -91,3 +96,33 @@ def test_an_experiment_without_training_is_refused(tmp_path) -> None:
 def test_a_policy_for_another_task_or_period_is_refused(tmp_path, override, words) -> None:
     with pytest.raises(InputError, match=f"the policy's {words}"):
         run_evaluation(REACH, [COMMITTED], tmp_path / "test", overrides=[override], episodes=2)
+
+
+def test_the_model_in_memory_makes_environments() -> None:
+    model = rb.Model("trunk_sofa", simulator=SINGLE, fixed={"young_modulus": 4e6})
+    venv = rb.make_vec("TrunkReach-v0", model, n=3, observation="markers", start={"trunk_mass": [0.3, 0.4]})
+    venv.seed(0)
+    assert venv.reset().shape == (3, 3 * 4 + 3 + 8 + 3 * 4)
+    drawn = [info["parameters"] for info in venv.reset_infos]
+    assert {values["young_modulus"] for values in drawn} == {4e6}
+    assert len({values["trunk_mass"] for values in drawn}) == 3
+    assert np.isfinite(venv.step(np.zeros((3, 8)))[1]).all()
+    with pytest.raises(rb.InputError, match="TrunkReach-v0"):
+        rb.make_vec("TrunkReech-v0", model)
+
+
+@pytest.mark.slow
+def test_same_seed_same_curve_from_python(tmp_path) -> None:
+    """Bit for bit, policies included; another seed is another curve. Evaluations of twins agree, too."""
+    model = rb.Model("trunk_sofa", simulator=SINGLE)
+    options = {"steps": 1024, "environments": 16, "evaluate_every": 512, "evaluation_episodes": 4}
+    ranges = {"randomisation": "uniform", "ranges": {"young_modulus": [4e6, 5e6]}}
+    runs = {}
+    for name, seed in (("first", 0), ("again", 0), ("other", 1)):
+        curve = rb.train(model, tmp_path / name, seed=seed, **options, **ranges)["curve"]
+        runs[name] = [{key: value for key, value in row.items() if key != "seconds"} for row in curve]
+    assert runs["first"] == runs["again"] != runs["other"]
+    twins = [tmp_path / "first", tmp_path / "again"]
+    found = rb.evaluate(model, twins, tmp_path / "test", episodes=4, film=False, **ranges)["policies"]
+    assert found["first"] == found["again"]
+    assert (tmp_path / "test" / "episodes.csv").exists()
