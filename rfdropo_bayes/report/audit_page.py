@@ -6,15 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
-from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.omnibus import BLOCK
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.score import likeness
 from rfdropo_bayes.report import audit_figures as figures
-from rfdropo_bayes.report.page import breakable, duration, number
+from rfdropo_bayes.report.page import render
 from rfdropo_bayes.report.robot_figure import robot_figure
 from rfdropo_bayes.report.style import Picture, embed
 from rfdropo_bayes.report.units import display_name
@@ -28,7 +25,6 @@ SECTIONS = (
     ("limits", "Limits"),
 )
 MOST_COSINES = 16
-LEAST_P = 1e-16
 
 
 def render_audit(
@@ -43,34 +39,14 @@ def render_audit(
         config: the experiment file as it was run.
         outline: of the robot, for its picture.
     """
-    environment = Environment(
-        loader=PackageLoader("rfdropo_bayes.report", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"number": number, "words": display_name, "duration": duration, "breakable": breakable}
-    environment.filters |= {"bootstrap_p": _bootstrap_p, "p_value": p_value}
-    stylesheet = environment.loader.get_source(environment, "page.css")[0] if environment.loader else ""
-    return environment.get_template("audit.html.j2").render(
+    return render(
+        "audit.html.j2",
         audit=content,
         title=title,
         sections=SECTIONS,
-        stylesheet=Markup(stylesheet),
         pictures=_pictures(seen, outline),
         config=config,
     )
-
-
-def _bootstrap_p(p: float, simulated: int) -> str:
-    """A bootstrap's p-value in a table."""
-    return p_in_words(p, simulated).removeprefix("= ")
-
-
-def p_value(p: float) -> str:
-    """A p-value from a distribution, which holds only so far out."""
-    return number(p, 2) if p >= LEAST_P else f"< {LEAST_P:.0e}"
 
 
 def residuals_of(answer: Answer) -> figures.Residuals:

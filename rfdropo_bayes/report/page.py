@@ -11,6 +11,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.posteriors.bounds import PILED
 from rfdropo_bayes.report import check_figures, posterior_figures, trajectory_figures
@@ -25,6 +26,7 @@ from rfdropo_bayes.report.units import display_name, display_unit
 MOST_RECORDINGS = 8
 NOTHING = "\u2013"
 OPEN_RECORDINGS = 2
+LEAST_P = 1e-16
 COVERAGE_CURVE = tuple(np.round(np.arange(0.1, 1.0, 0.1), 1))
 
 SECTIONS = (
@@ -55,14 +57,8 @@ class RecordingView:
     opened: bool
 
 
-def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str) -> str:
-    """HTML of the report.
-
-    Args:
-        record: posterior and predictions.
-        summary: content of summary.json, as `build_summary` made it.
-        config: the experiment file as it was run, TOML.
-    """
+def render(template: str, **content: Any) -> str:
+    """HTML of a template of this package, with the style of all pages."""
     environment = Environment(
         loader=PackageLoader("rfdropo_bayes.report", "templates"),
         autoescape=True,
@@ -71,12 +67,24 @@ def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str
         lstrip_blocks=True,
     )
     environment.filters |= {"number": number, "words": display_name, "duration": duration, "breakable": breakable}
+    environment.filters |= {"bootstrap_p": bootstrap_p, "p_value": p_value}
     environment.globals["interval"] = interval
     stylesheet = environment.loader.get_source(environment, "page.css")[0] if environment.loader else ""
-    return environment.get_template("page.html.j2").render(
+    return environment.get_template(template).render(stylesheet=Markup(stylesheet), **content)
+
+
+def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str) -> str:
+    """HTML of the report.
+
+    Args:
+        record: posterior and predictions.
+        summary: content of summary.json, as `build_summary` made it.
+        config: the experiment file as it was run, TOML.
+    """
+    return render(
+        "page.html.j2",
         summary=summary,
         sections=SECTIONS,
-        stylesheet=Markup(stylesheet),
         tiles=_tiles(summary),
         rows=_posterior_rows(summary),
         priors=_prior_rows(record),
@@ -99,6 +107,16 @@ def number(value: Any, digits: int = 3) -> str:
         return f"{int(value)}"
     text = f"{value:.{digits}g}"
     return f"{value:.0f}" if "e+0" in text and abs(value) < 1e6 else text
+
+
+def bootstrap_p(p: float, simulated: int) -> str:
+    """A bootstrap's p-value in a table."""
+    return p_in_words(p, simulated).removeprefix("= ")
+
+
+def p_value(p: float) -> str:
+    """A p-value from a distribution, which holds only so far out."""
+    return number(p, 2) if p >= LEAST_P else f"< {LEAST_P:.0e}"
 
 
 def breakable(name: str) -> Markup:

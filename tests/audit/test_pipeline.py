@@ -33,7 +33,8 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.report.audit_page import p_value, render_audit
+from rfdropo_bayes.report.audit_page import render_audit, shown
+from rfdropo_bayes.report.page import p_value
 from rfdropo_bayes.simulators.commands import Commands
 
 from .toys import CANDIDATES, NOISE, ROWS, STEP, Toy, question, recordings
@@ -263,7 +264,7 @@ def test_a_base_fit_that_has_not_converged_is_said_and_gives_no_verdict():
     assert content["findings"] == []
     assert "the fit of the base model has not converged" in content["sentence"]
     assert "--base" in content["next_experiment"]["sentence"]
-    assert "has not converged" in render_audit(answer, content, "rough", "")
+    assert "has not converged" in render_audit(shown(answer), content, "rough", "")
 
 
 def test_rollouts_go_to_the_simulator_that_knows_their_candidates():
