@@ -45,6 +45,7 @@ _HOMES = {
     "calibrate": "workflow.calibration",
     "deploy": "deployment.session",
     "design": "workflow.design",
+    "design_day": "workflow.day_design",
     "evaluate": "workflow.training:evaluate_policies",
     "load": "workflow.results",
     "make_vec": "workflow.training",

@@ -38,6 +38,8 @@ def whole(recording: str) -> str:
 def group_of(recording: str, patterns: Patterns) -> str:
     """Name of the group a recording belongs to; one that belongs to none is a group of its own.
 
+    A group that names the recording comes before those that it is in by a wildcard.
+
     Args:
         recording: its name, or that of a piece of it.
         patterns: names of recordings, or wildcards, by group.
@@ -46,11 +48,10 @@ def group_of(recording: str, patterns: Patterns) -> str:
         InputError: the recording is in two groups.
     """
     name = whole(recording)
-    found = [
-        group
-        for group, entries in patterns.items()
-        if any(fnmatchcase(name, entry) for entry in ([entries] if isinstance(entries, str) else entries))
-    ]
+    listed = {group: [entries] if isinstance(entries, str) else entries for group, entries in patterns.items()}
+    found = [group for group, entries in listed.items() if name in entries]
+    if not found:
+        found = [group for group, entries in listed.items() if any(fnmatchcase(name, entry) for entry in entries)]
     if len(found) > 1:
         raise InputError(
             f"{name} is in two groups: {found[0]} and {found[1]}", where="[model.groups]", remedy="keep it in one"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -21,6 +21,7 @@ from rfdropo_bayes.cli.options import (
     see_calibration,
 )
 from rfdropo_bayes.cli.results import say, show_audit
+from rfdropo_bayes.errors import InputError
 
 Base = Annotated[
     Path | None, typer.Option("--base", help="folder of an earlier calibration, to start the base model from")
@@ -94,6 +95,10 @@ def design(
     experiment: ExperimentFile,
     out: OutFolder = None,
     base: Base = None,
+    adapt: Annotated[
+        bool, typer.Option("--adapt", help="the shortest commands that determine another day, for rfdropo adapt")
+    ] = False,
+    seconds: Annotated[float, typer.Option(help="with --adapt: no proposal is longer")] = 10.0,
     seed: Seed = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -102,18 +107,18 @@ def design(
 ) -> None:
     """Propose the commands that best separate the leading explanations: writes next_commands.csv and design.json."""
     see_calibration(base, "--base")
+    if adapt and base is None:
+        raise InputError("a day is found under a calibration", where="--adapt", remedy="name its folder with --base")
     folder = folder_for("design", experiment, out, overrides, overwrite=overwrite)
+    from rfdropo_bayes.workflow.day_design import run_day_design
     from rfdropo_bayes.workflow.design import COMMANDS, run_design
 
-    found = run_design(
-        experiment,
-        folder,
-        overrides=overrides or [],
-        base=base,
-        seed=seed,
-        overwrite=overwrite,
-        report=say_progress(quiet),
-    )
+    options: dict[str, Any] = {"overrides": overrides or [], "seed": seed, "overwrite": overwrite}
+    options["report"] = say_progress(quiet)
+    if adapt and base is not None:
+        found = run_day_design(experiment, base, folder, seconds=seconds, **options)
+    else:
+        found = run_design(experiment, folder, base=base, **options)
     say(found, found["sentence"], f"commands: {folder / COMMANDS}", quiet=quiet, as_json=as_json)
 
 

@@ -74,7 +74,7 @@ def fit_day(
 
     def values_at(point: Float[np.ndarray, "b k"], draw: Int[np.ndarray, " b"]) -> Batch:
         given = {name: column[draw] for name, column in body.items()}
-        return given | {p.name: _physical(p, x, given) for p, x in zip(own, point.T, strict=True)}
+        return given | {p.name: physical_of_normal(p, x, given) for p, x in zip(own, point.T, strict=True)}
 
     def white(point: np.ndarray, draw: np.ndarray) -> np.ndarray:
         return problem.residual_batch(values_at(point, draw), horizon)
@@ -93,7 +93,9 @@ def fit_day(
     return DayFit(values_at(fit.point[chosen], chosen), chosen, evidence, float(power), unconverged, fit.steps)
 
 
-def _physical(parameter: Parameter, normal: Float[np.ndarray, " b"], given: Mapping[str, np.ndarray]) -> np.ndarray:
+def physical_of_normal(
+    parameter: Parameter, normal: Float[np.ndarray, " b"], given: Mapping[str, np.ndarray]
+) -> np.ndarray:
     """Values of a parameter at standard normal coordinates of its prior."""
     if parameter.added_to:
         return normal * spread_of_draws(parameter, given, len(normal))

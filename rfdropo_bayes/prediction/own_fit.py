@@ -18,6 +18,7 @@ STEP = 0.05  # of a central difference, in prior deviations
 TOLERANCE = 0.01  # nats that a step promises, or delivers: what remains is a seventh of a posterior deviation
 CREDIBLE = 100.0  # tolerances that a step may promise and not deliver: what differences promise has the size of kinks
 MOST_STEPS = 60
+LEAST_GAIN = 0.5  # of what a step promised, below which corrected slopes are not trusted with another
 DAMPINGS = (0.1, 1.0, 10.0, 100.0)  # of a draw's last one: the first that lowers its cost is taken
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e6
 
@@ -51,8 +52,8 @@ def fit_own(
     """Levenberg-Marquardt steps of all draws in one batch, until the next step of each promises nothing.
 
     Slopes cost twice as many rollouts as there are coordinates. All draws begin with those of the first, and a step
-    corrects them by what it has found (Broyden 1965). A draw gets slopes of its own where the corrected ones lead
-    nowhere, and where it seems to be done.
+    corrects them by what it has found (Broyden 1965). A draw gets slopes of its own where the corrected ones promise
+    more than twice what they deliver, and where it seems to be done.
 
     Args:
         residuals: whitened residuals of points, and of the draw that each belongs to.
@@ -94,8 +95,10 @@ def fit_own(
         done = todo[still & own[todo] & (promised < CREDIBLE * TOLERANCE)]
         converged[done] = True
         own[todo[~still]] = False
-        todo = np.setdiff1d(todo, np.concatenate([done, lost]))
-        anew = todo[(delivered[todo] < TOLERANCE) & ~own[todo]]
+        kept = delivered[todo] > LEAST_GAIN * np.maximum(promised, TOLERANCE)
+        left = ~np.isin(todo, np.concatenate([done, lost]))
+        todo, kept = todo[left], kept[left]
+        anew = todo[~kept & ~own[todo]]
         if len(anew):
             slope[anew] = _slopes(residuals, point[anew], anew)
             own[anew], damping[anew] = True, FIRST_DAMPING

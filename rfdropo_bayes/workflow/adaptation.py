@@ -96,7 +96,7 @@ def adapt(
     model = model_of(fit)
     head, rest = _parted(recording, seconds)
     day = group_of(recording.name, model.experiment.model.groups) if group is None else group
-    left = _model_error(fit.record)
+    left = model_error_of(fit.record)
     adapted = _experiment(model.experiment, left, recording, group, entry)
     moved = Model.of_experiment(adapted, model.folder)
     settings: dict[str, Any] = {"tables": moved.tables(), "folder": model.folder, "texts": moved.texts()}
@@ -130,7 +130,7 @@ def _adapt(
     fixed, space = fitted_parts(fit)
     recordings = gather_recordings(simulator, [head])
     noise = noise_of_markers(left.every(float(np.median(np.diff(head.time)))), left.markers, recordings)
-    space = _space(space, model, head.name, day, fit.record.attrs[FITTED])
+    space = day_space(space, model, [head.name], day, fit.record.attrs[FITTED])
     body = thin(
         {p.name: fit.record.posterior[p.name] for p in space.parameters if p.name in fit.record.posterior}, draws
     )
@@ -240,7 +240,7 @@ def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, T
     return recording.slice_rows(0, last), Trajectory(dataset)
 
 
-def _model_error(record: PosteriorRecord) -> ModelError:
+def model_error_of(record: PosteriorRecord) -> ModelError:
     """What the fit's model leaves: as the fit says, or as its predictions of the fitted recordings show.
 
     Raises:
@@ -277,14 +277,16 @@ def _experiment(
     return experiment.model_copy(update=changes)
 
 
-def _space(space: ParameterSpace, model: Model, recording: str, day: str, fitted: Sequence[str]) -> ParameterSpace:
-    """The body's parameters, and those of the day and its recording, whether they have draws or not."""
+def day_space(
+    space: ParameterSpace, model: Model, recordings: Sequence[str], day: str, fitted: Sequence[str]
+) -> ParameterSpace:
+    """The body's parameters, and those of the day and of its recordings, whether they have draws or not."""
     noise = {spec.name for name in ("auto", "white", "ar1", "student-t") for spec in noise_specs(name)}
     shared = [p for p in space.parameters if not p.recording and p.spec.name not in noise]
     kinds = {p.spec.name: p for p in space.parameters if p.added_to}
-    added = [replace(p, recording=day, members=(recording,)) for p in kinds.values()]
+    added = [replace(p, recording=day, members=tuple(recordings)) for p in kinds.values()]
     spreads: list[Parameter] = []
-    for name, pooled in pooling(model.experiment, model.simulator.parameters, [recording]).items():
+    for name, pooled in pooling(model.experiment, model.simulator.parameters, recordings).items():
         if any(p.added_to == name for p in added):
             continue
         spec = next((p.spec for p in shared if p.spec.name == name), None)
@@ -296,13 +298,14 @@ def _space(space: ParameterSpace, model: Model, recording: str, day: str, fitted
             )
         known = [p.name for p in [*shared, *spreads]]
         spreads += [p for p in spread_of(spec, pooled) if p.name not in known]
-        added += deviations(spec, replace(pooled, groups={day: (recording,)}))
+        added += deviations(spec, replace(pooled, groups={day: tuple(recordings)}))
     families: dict[str, list[Parameter]] = {}
     for p in space.parameters:
         if p.recording and not p.added_to:
             families.setdefault(p.spec.name, []).append(p)
     # A parameter that some fitted recordings only had free, as the payload of one of them, is theirs alone.
-    own = [replace(ps[0], recording=recording) for ps in families.values() if len(ps) == len(fitted)]
+    every = [ps[0] for ps in families.values() if len(ps) == len(fitted)]
+    own = [replace(p, recording=recordings[0], members=tuple(recordings)) for p in every]
     return ParameterSpace((*shared, *spreads, *added, *own))
 
 

@@ -126,10 +126,10 @@ def design(
     target, fitted = base_model(question, question.seed, report=report, deadline=clock)
     report("base model fitted")
     hypotheses = _hypotheses(Inquiry(target, question.candidates, question.rules, question.seed), fitted, clock, report)
-    proposals = list(_proposals(runs[0], runs, rng))
-    outlook = _outlooks(question, target, fitted, hypotheses, runs[0], proposals, clock, report)
+    tried = list(proposals(runs[0], runs, rng))
+    outlook = _outlooks(question, target, fitted, hypotheses, runs[0], tried, clock, report)
     chosen = best(outlook, len(hypotheses) > 1)
-    kind, times, value = proposals[chosen]
+    kind, times, value = tried[chosen]
     now = at_hand(target, hypotheses)
     content = {
         "sentence": _sentence(kind, outlook[chosen], now, SCREENING not in clock.missed) + _unfinished(clock),
@@ -148,7 +148,7 @@ def design(
         "seed": question.seed,
         "schema_version": 1,
     }
-    return Design(content, _table(experiment, runs[0], times, value))
+    return Design(content, command_table(experiment, runs[0], times, value))
 
 
 def run_design(
@@ -216,7 +216,7 @@ def _outlooks(
     return outlook
 
 
-def _table(experiment: Experiment, first: Trajectory, time: np.ndarray, value: np.ndarray) -> pd.DataFrame:
+def command_table(experiment: Experiment, first: Trajectory, time: np.ndarray, value: np.ndarray) -> pd.DataFrame:
     """The proposal in the columns of the experiment's recordings."""
     if experiment.data is not None and experiment.data.columns is not None:
         return pd.DataFrame(command_columns(experiment.data.columns, time, value))
@@ -239,7 +239,7 @@ def _shaped(sequences: Sequence[Commands], like: Commands) -> list[Commands]:
     ]
 
 
-def _proposals(
+def proposals(
     first: Trajectory, fitted: Sequence[Trajectory], rng: np.random.Generator
 ) -> list[tuple[str, Float[np.ndarray, " k"], Float[np.ndarray, "k channel"]]]:
     """Command sequences within the range that the recordings have used."""

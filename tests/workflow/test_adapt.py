@@ -149,6 +149,22 @@ def test_the_rest_of_the_day_is_predicted_from_the_folder(adapted, zeros):
     assert (adapted.folder / "report.html").stat().st_size > 10_000
 
 
+def test_the_shortest_commands_that_determine_a_day(known, zeros):
+    """One row of a marker that a zero moves says what there is to say; where it moves none, no commands do."""
+    runs = recorded(["day_0_a"], zeros[:1], 0)
+    found = rb.design_day(known, runs, seconds=1.0)
+    assert found.content["determined"]
+    assert found.content["seconds"] <= 5 * STEP
+    assert found.content["parameters_of_a_day"] == ["zero_deviation@another day"]
+    assert found.content["tip_uncertain_before_mm"] == pytest.approx(1e3 * GAIN * SPREAD, rel=0.1)
+    assert found.content["tip_uncertain_after_mm"] <= found.content["tip_error_of_the_model_mm"]
+    assert list(found.commands.columns) == ["time_s", "pull_m"]
+    assert f"Record the first {found.content['seconds']:.3g} s" in found.sentence
+    none = {**known.record.posterior, "zero_spread": np.full((1, 60), 1e-9)}
+    same = rb.design_day(replace(known, record=replace(known.record, posterior=none)), runs, seconds=1.0)
+    assert same.content["tip_uncertain_before_mm"] < 1e-3
+
+
 def test_a_model_that_is_the_same_on_all_days_says_what_to_name(known, zeros):
     record = known.record
     shared = tuple(info for info in record.parameters if info.name in (*PRIORS, "observation_noise"))

@@ -1,0 +1,221 @@
+"""The morning's calibration: the shortest command sequence that determines a day, ``design_day``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.channels import Markers
+from rfdropo_bayes.bayes.channels.markers import noise_of_markers
+from rfdropo_bayes.bayes.model import TrajectoryModel
+from rfdropo_bayes.bayes.noise.autoregression import STATED
+from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.prediction.day import physical_of_normal
+from rfdropo_bayes.prediction.own_fit import STEP
+from rfdropo_bayes.prediction.predictive import FITTED, Batch
+from rfdropo_bayes.report.run_folder import POSTERIOR
+from rfdropo_bayes.workflow.adaptation import day_space, model_error_of
+from rfdropo_bayes.workflow.assembly import load_data
+from rfdropo_bayes.workflow.calibrated import Calibration
+from rfdropo_bayes.workflow.design import COMMANDS, Design, command_table, proposals
+from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.workflow.files import hashes, run_folder
+from rfdropo_bayes.workflow.model import Model
+from rfdropo_bayes.workflow.unseen import fitted_parts, model_of
+
+LONGEST = 10.0  # [s] of a proposal, unless more is asked for
+DAY = "another day"
+
+
+class Outlook(NamedTuple):
+    """What a command sequence leaves unknown.
+
+    Attributes:
+        seconds: after which the day adds less to the error of the last marker than the model; infinite if never.
+        left: deviation [m] of the last marker, in the recordings at hand, by what is then not known of the day.
+    """
+
+    seconds: float
+    left: float
+
+
+def design_day(
+    fit: Calibration,
+    runs: Sequence[Trajectory],
+    *,
+    seconds: float = LONGEST,
+    seed: int = 0,
+    report: Callable[[str], None] = lambda line: None,
+) -> Design:
+    """Propose the shortest commands whose recording determines what a day changes.
+
+    Of random walks, holds, slow loops and chirps within the range of the recordings at hand, each is looked at from its
+    beginning. It is long enough where the last marker, under the commands of the recordings at hand, is as uncertain by
+    the day as it is by what the model misses. The noise is that of `adapt`, and so are the day's parameters.
+
+    Args:
+        fit: a calibration, with its model.
+        runs: recordings at hand.
+        seconds: no proposal is longer.
+        seed: of the proposals.
+        report: called with a line of words now and then.
+
+    Raises:
+        InputError: nothing of the model differs between days.
+    """
+    left = model_error_of(fit.record)
+    head = (
+        runs[0] if seconds >= runs[0].time[-1] else runs[0].slice_rows(0, int(np.searchsorted(runs[0].time, seconds)))
+    )
+    tried = list(proposals(head, runs, np.random.default_rng(seed)))
+    tried.sort(key=lambda proposal: proposal[0])
+    sequences = [_as_recording(head, f"proposal {k}", time, value) for k, (_, time, value) in enumerate(tried)]
+    problem, names, at = _problem(fit, sequences)
+    report(f"{len(sequences)} command sequences, {len(names)} parameters of a day")
+    white = problem.residual_batch(at, problem.n_rows).reshape(2, len(names), len(sequences), problem.n_rows, -1)
+    slope = (white[0] - white[1]) / (2.0 * STEP)
+    report("how the recordings at hand depend on them")
+    known, _, at = _problem(fit, [run.slice_rows(0, min(len(run.time) - 1, 2 * problem.n_rows)) for run in runs[:2]])
+    position, _ = known.predict(at)
+    tip = position[:, :, :, -1].reshape(2, len(names), -1)
+    weight = (tip[0] - tip[1]) / (2.0 * STEP)
+    rows = weight.shape[1] / 3.0
+    error = float(np.sqrt(np.sum(np.square(left.scale[-3:]))))
+
+    def uncertain(information: Float[np.ndarray, "k k"]) -> float:
+        covariance = np.linalg.inv(np.eye(len(names)) + information)
+        return float(np.sqrt(np.sum(weight * (covariance @ weight)) / rows))
+
+    found = [_outlook(slope[:, k], problem.model.recordings.time[k], uncertain, error) for k in range(len(sequences))]
+    best = min(range(len(found)), key=lambda k: (found[k].seconds, found[k].left))
+    kind, times, value = tried[best]
+    length = min(found[best].seconds, float(head.time[-1]))
+    kept = times <= length
+    before = uncertain(np.zeros((len(names), len(names))))
+    content = {
+        "sentence": _sentence(kind, found[best], length, before, error),
+        "kind": kind,
+        "seconds": length,
+        "determined": bool(np.isfinite(found[best].seconds)),
+        "tip_uncertain_before_mm": 1e3 * before,
+        "tip_uncertain_after_mm": 1e3 * found[best].left,
+        "tip_error_of_the_model_mm": 1e3 * error,
+        "parameters_of_a_day": names,
+        "tried": [
+            {
+                "kind": k,
+                "seconds": o.seconds if np.isfinite(o.seconds) else None,
+                "tip_uncertain_after_mm": 1e3 * o.left,
+            }
+            for (k, _, _), o in zip(tried, found, strict=True)
+        ],
+        "seed": seed,
+        "schema_version": 1,
+    }
+    return Design(content, command_table(model_of(fit).experiment, runs[0], times[kept], value[kept]))
+
+
+def run_day_design(
+    path: Path,
+    base: Path,
+    out: Path,
+    *,
+    seconds: float = LONGEST,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+    overwrite: bool = False,
+    report: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """`design_day` for a calibration's folder, and write design.json and next_commands.csv; return the former."""
+    experiment, tables = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    runs = load_data(experiment, folder, "fit")
+    fit = Calibration(PosteriorRecord.load(base / POSTERIOR), {}, "", Model.of_experiment(experiment, folder), base)
+    chosen = experiment.seed if seed is None else seed
+    options = {"base": base, "seed": chosen, "adapt": True, "seconds": seconds}
+    settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes(runs), "options": options}
+    with run_folder(out, "design", **settings, overwrite=overwrite) as out:
+        found = design_day(fit, runs, seconds=seconds, seed=chosen, report=report)
+        return {**found.content, "commands": str(found.save(out))}
+
+
+def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationProblem, list[str], Batch]:
+    """Recordings of one day, the names of its parameters, and values a step up and a step down along each of these from
+    the middle of its prior, at the body's mean."""
+    model, left = model_of(fit), model_error_of(fit.record)
+    fixed, space = fitted_parts(fit)
+    recordings = gather_recordings(model.simulator, runs)
+    noise = noise_of_markers(left.every(float(np.median(np.diff(runs[0].time)))), left.markers, recordings)
+    space = day_space(space, model, recordings.names, DAY, fit.record.attrs[FITTED])
+    drawn = fit.record.posterior
+    body = {name: value for name, value in space.typical_scales.items() if name not in drawn}
+    body |= {p.name: float(np.mean(drawn[p.name])) for p in space.parameters if p.name in drawn}
+    own = [p for p in space.parameters if p.name not in body]
+    if not own:
+        raise InputError(
+            "nothing of the model differs between days",
+            where="[model.per_group]",
+            remedy="name what does, and calibrate",
+        )
+    points = STEP * np.concatenate([np.eye(len(own)), -np.eye(len(own))])
+    values = {name: np.full(len(points), value) for name, value in body.items()}
+    values |= {p.name: physical_of_normal(p, x, values) for p, x in zip(own, points.T, strict=True)}
+    program = TrajectoryModel(model.simulator, space, fixed, recordings, (Markers.gather(recordings, STATED, noise),))
+    return CalibrationProblem(program, chunk=max(1, model.simulator.lanes // len(runs))), [p.name for p in own], values
+
+
+def _outlook(
+    slope: Float[np.ndarray, "k row column"],
+    time: Float[np.ndarray, " row"],
+    uncertain: Callable[[np.ndarray], float],
+    error: float,
+) -> Outlook:
+    """The first row at which a sequence has determined the day, by bisection: more rows never leave more unknown."""
+
+    def left(row: int) -> float:
+        seen = slope[:, : row + 1].reshape(len(slope), -1)
+        return uncertain(seen @ seen.T)
+
+    low, high = 0, len(time) - 1
+    if left(high) > error:
+        return Outlook(np.inf, left(high))
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if left(middle) <= error else (middle + 1, high)
+    return Outlook(float(time[low]), left(low))
+
+
+def _as_recording(head: Trajectory, name: str, time: np.ndarray, value: np.ndarray) -> Trajectory:
+    """Commands as a recording that is observed when another one was, by all of its markers."""
+    return Trajectory.build(
+        name=name,
+        robot=head.robot,
+        format="memory",
+        time=head.time,
+        position=np.array(head.position),
+        position_mask=np.ones(head.position_mask.shape, dtype=bool),
+        marker_names=head.marker_names,
+        command_time=time,
+        command=value,
+        command_unit=head.command_unit,
+        initial_command=head.initial_command,
+        cable_names=head.cable_names,
+        settings={"unseen": True},
+    )
+
+
+def _sentence(kind: str, outlook: Outlook, length: float, before: float, error: float) -> str:
+    what = f"Record the first {length:.3g} s of the {kind} in {COMMANDS}"
+    change = f"what is not known of the day then moves the last marker by {1e3 * outlook.left:.2g} mm"
+    change = f"{change}, and by {1e3 * before:.2g} mm without it"
+    if np.isfinite(outlook.seconds):
+        return f"{what}: {change}. The model's own error is {1e3 * error:.2g} mm."
+    return f"{what}: {change}. The model's own error is smaller, {1e3 * error:.2g} mm: allow more --seconds."
