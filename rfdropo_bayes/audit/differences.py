@@ -80,7 +80,8 @@ def with_differences(
     shared = {p.spec.name: p for p in space.parameters[:base] if not p.recording}
     free = {p.spec.name for p in space.parameters[:base] if p.recording}  # differ from one recording to the next
     places: dict[str, dict[str, int]] = {}  # by group, by parameter
-    specs = [spec for spec in simulated if spec.name not in held and spec.name not in free]
+    known = {*held, *free}
+    specs = [spec for spec in simulated if spec.name not in known and (spec.name in shared or spec.prior)]
     for spec in specs:
         spread = np.sqrt(2.0) * spreads[spec.name] if spec.name in spreads else _deviation_of(spec, shared)
         # A value that both share moves with it: the difference is the same, seen from either group.

@@ -42,7 +42,8 @@ def with_held(
         known: parameters whose values are known.
     """
     present = {*known, *(parameter.physical for parameter in space.parameters)}
-    specs = [spec for spec in simulated if spec.name not in present and not spec.name.startswith(MEASURED)]
+    absent = [spec for spec in simulated if spec.name not in present and spec.prior]
+    specs = [spec for spec in absent if not spec.name.startswith(MEASURED)]
     parameters, candidates = list(space.parameters), []
     for family in families(specs):
         first = len(parameters)

@@ -28,6 +28,7 @@ TRUTH = {"gain": 1.3, "bend": -0.4}
 MONTHS = {"january": ("r0", "r1", "r3", "r5", "r7"), "april": ("r2", "r4", "r6", "r8")}
 FITTED = 7  # r0 to r6: three repeats, one of them on another day, and four more sequences
 GROUPS = Groups(MONTHS, ("r9",))
+COORDINATES: list[Coordinates] = []  # whose priors are sampled once
 
 
 def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> Question:
@@ -40,9 +41,11 @@ def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> 
         asked.coordinates.space, len(BASE), BASE, asked.candidates, groups, spreads={"bend": 0.5}
     )
     nominal = {spec.name: spec.nominal for spec in toy.parameters}
+    if not COORDINATES:
+        COORDINATES.append(Coordinates(space, len(BASE), tuple(nominal), nominal, {}))
     return replace(
         asked,
-        coordinates=Coordinates(space, len(BASE), tuple(nominal), nominal, {}),
+        coordinates=COORDINATES[0],
         model=TrajectoryModel(toy, space, {}, gathered, (Markers.gather(gathered, "repeats"),)),
         trajectories=chosen[:FITTED],
         candidates=candidates,
