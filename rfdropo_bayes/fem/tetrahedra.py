@@ -182,7 +182,7 @@ def lumped_masses(body: TetrahedralBody, density: Float[Array, ""] | float) -> F
     """A quarter of every element's mass on each of its nodes [kg]."""
     volume = np.zeros(len(body.rest))
     np.add.at(volume, body.element, body.volume[:, None] / 4.0)
-    return density * volume
+    return jnp.asarray(density) * volume
 
 
 def locate(body: TetrahedralBody, points: Float[np.ndarray, "points 3"]) -> PointMap:
