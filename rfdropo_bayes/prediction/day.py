@@ -18,6 +18,7 @@ from blackjax.smc import resampling
 from jax.scipy.stats import norm
 from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.special import softmax
+from scipy.stats import chi2
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.noise import Autoregression
@@ -27,6 +28,8 @@ from rfdropo_bayes.inference import next_step
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.prediction.first_row import LEAST_SHARE, spread_of_draws
 from rfdropo_bayes.prediction.own_fit import OwnFit, fit_own
+
+SURE = 0.95  # probability that noise of the stated size leaves less, from which on it is taken for larger
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 
@@ -39,6 +42,7 @@ class DayFit(NamedTuple):
         chosen: which draw of the body each is.
         log_evidence: of each body's draw, up to a constant.
         power: that the evidences were raised to, so that a tenth of the draws is left; 1 where it is no less.
+        excess: how many times as large as stated the noise is, by what the fits leave; at least 1.
         unconverged: draws whose fit did not converge.
         steps: that the fits took.
     """
@@ -47,6 +51,7 @@ class DayFit(NamedTuple):
     chosen: Int[np.ndarray, " n"]
     log_evidence: Float[np.ndarray, " n"]
     power: float
+    excess: float
     unconverged: int
     steps: int
 
@@ -61,7 +66,8 @@ def fit_day(
     """Draws of a day's parameters, and of the body, given one recording of the day.
 
     Args:
-        problem: of that recording, under noise that is known.
+        problem: of that recording, under noise whose size is a lower bound: where the recording is fitted worse than it
+            says, the noise is taken for as much larger (the ratio of Birge 1932), and the day is fitted again.
         body: draws of all other parameters.
         own: the day's: deviations of its group, and parameters of the recording.
         key: of draws from the priors, perturbations of the data, and the choice of the body's draws.
@@ -82,15 +88,19 @@ def fit_day(
     seen = np.flatnonzero(_valid(problem))
     noise = np.asarray(jax.random.normal(noise_key, (count, len(seen))))
 
-    def residuals(point: np.ndarray, draw: np.ndarray) -> np.ndarray:
-        return white(point, draw)[:, seen] + noise[draw]
+    def residuals(point: np.ndarray, draw: np.ndarray, excess: float = 1.0) -> np.ndarray:
+        return white(point, draw)[:, seen] / excess + noise[draw]
 
-    fit = fit_own(residuals, centre, start=np.zeros_like(centre), report=report)
+    fit = fit_own(residuals, centre, start=np.zeros_like(centre), report=lambda step, share: report(step, 0.5 * share))
+    misfit, excess = 2.0 * float(np.median(_least_cost(fit, noise))), 1.0
+    if misfit > chi2.ppf(SURE, len(seen)):
+        excess = float(np.sqrt(misfit / len(seen)))
+        fit = fit_own(partial(residuals, excess=excess), centre, start=fit.point, report=report)
     evidence = _log_evidence(fit, noise)
     power, _ = next_step(partial(np.multiply, evidence), 1.0, LEAST_SHARE)
     chosen = np.asarray(resampling.systematic(choice_key, softmax(power * evidence), count))
     unconverged = int((~fit.converged).sum())
-    return DayFit(values_at(fit.point[chosen], chosen), chosen, evidence, float(power), unconverged, fit.steps)
+    return DayFit(values_at(fit.point[chosen], chosen), chosen, evidence, float(power), excess, unconverged, fit.steps)
 
 
 def physical_of_normal(
@@ -109,13 +119,21 @@ def _valid(problem: CalibrationProblem) -> np.ndarray:
 
 def _log_evidence(fit: OwnFit, noise: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
     """Of the data as they were measured, for every body, from the linearisation at its own optimum."""
-    residual = fit.residual - noise
-    curvature = np.einsum("nij,nik->njk", fit.slope, fit.slope) + np.eye(fit.point.shape[1])
-    gradient = np.einsum("nij,ni->nj", fit.slope, residual) + fit.point
-    gain = np.einsum("nj,nj->n", gradient, np.linalg.solve(curvature, gradient[..., None])[..., 0])
-    cost = 0.5 * (np.sum(residual**2, axis=1) + np.sum(fit.point**2, axis=1) - gain)
-    found = -cost - 0.5 * np.linalg.slogdet(curvature)[1]
+    found = -_least_cost(fit, noise) - 0.5 * np.linalg.slogdet(_curvature(fit))[1]
     return np.where(np.isfinite(found), found, -np.inf)
+
+
+def _least_cost(fit: OwnFit, noise: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:
+    """Half of the least sum of squares for the data as they were measured; half of their number is expected."""
+    residual = fit.residual - noise
+    gradient = np.einsum("nij,ni->nj", fit.slope, residual) + fit.point
+    gain = np.einsum("nj,nj->n", gradient, np.linalg.solve(_curvature(fit), gradient[..., None])[..., 0])
+    cost = 0.5 * (np.sum(residual**2, axis=1) + np.sum(fit.point**2, axis=1) - gain)
+    return np.where(np.isfinite(cost), cost, np.inf)
+
+
+def _curvature(fit: OwnFit) -> Float[np.ndarray, "n k k"]:
+    return np.einsum("nij,nik->njk", fit.slope, fit.slope) + np.eye(fit.point.shape[1])
 
 
 class ModelError(NamedTuple):

@@ -144,9 +144,8 @@ def _adapt(
             remedy="name what does, e.g. --set model.per_group.initial_displacement=0.002, and a new --group",
         )
     channel = Markers.gather(recordings, STATED, noise)
-    problem = CalibrationProblem(
-        TrajectoryModel(simulator, space, fixed, recordings, (channel,)), chunk=simulator.lanes
-    )
+    program = TrajectoryModel(simulator, space, fixed, recordings, (channel,))
+    problem = CalibrationProblem(program, chunk=simulator.lanes)
     evaluations: list[float] = []
     problem.watch = evaluations.append
     with Progress("adapt", show=show) as progress:
@@ -154,6 +153,8 @@ def _adapt(
         found = fit_day(
             problem, body, own, fit_key, lambda step, share: progress.stage(max(share, step / MOST_STEPS), **words)
         )
+    noise = replace(noise, scale=found.excess * noise.scale)
+    problem = CalibrationProblem(replace(program, channels=(replace(channel, known=noise),)), chunk=simulator.lanes)
     predictions = predict_fitted(problem, found.values, fitted_key)
     if tested:
         known: dict[str, Any] = {"fitted": [head.name], "errors": fit.record.attrs.get(MARKER_ERRORS)}
@@ -166,7 +167,7 @@ def _adapt(
         evaluations=round(float(np.sum(evaluations))),
         cautions=_cautions(found),
         seconds=time.monotonic() - began,
-        details={"power": found.power, "steps": found.steps, "unconverged": found.unconverged, "day": day},
+        details={**{name: getattr(found, name) for name in ("power", "excess", "steps", "unconverged")}, "day": day},
     )
     before = {p.name: np.asarray(v) for p, v in zip(own, _prior(space, own, body, seed), strict=True)} | body
     record = _record(fit.record, problem, result, before, predictions, noise.as_dict(), seed)
