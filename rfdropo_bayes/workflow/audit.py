@@ -19,7 +19,7 @@ from rfdropo_bayes.audit.differences import Groups, with_differences
 from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
 from rfdropo_bayes.audit.fit import widening
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
-from rfdropo_bayes.audit.held import OwnParameter
+from rfdropo_bayes.audit.held import OwnParameter, with_held
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.pipeline import Answer, Question
 from rfdropo_bayes.audit.pipeline import audit as ask
