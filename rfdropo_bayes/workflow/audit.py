@@ -19,7 +19,7 @@ from rfdropo_bayes.audit.differences import Groups, with_differences
 from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
 from rfdropo_bayes.audit.fit import widening
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
-from rfdropo_bayes.audit.held import OwnParameter
+from rfdropo_bayes.audit.held import OwnParameter, with_held
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.pipeline import Answer, Question
 from rfdropo_bayes.audit.pipeline import audit as ask
@@ -234,21 +234,14 @@ def build_question(
         for name, m in zip(names, added, strict=True)
         if name not in experiment.audit.exclude
     ]
-    of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
-    plain = [spec for spec in simulator.parameters if spec.name not in of_candidates]
+    specs = simulator.parameters
     if library:
-        stated = expand_groups(spreads, simulator.parameters)
+        of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
+        plain, stated = [s for s in specs if s.name not in of_candidates], expand_groups(spreads, specs)
         model, candidates = _with_own(model, base, plain, candidates, groups, stated)
         candidates = [c for c in candidates if c.name not in experiment.audit.exclude]
-    coordinates = Coordinates(
-        model.space,
-        base,
-        tuple(spec.name for spec in simulator.parameters),
-        {spec.name: spec.nominal for spec in simulator.parameters},
-        model.fixed,
-        {spec.name: (spec.low, spec.high) for spec in simulator.parameters},
-    )
-
+    nominal, limits = {s.name: s.nominal for s in specs}, {s.name: (s.low, s.high) for s in specs}
+    coordinates = Coordinates(model.space, base, tuple(nominal), nominal, model.fixed, limits)
     made = partial(
         _lanes_in, {} if workshop is None else workshop, names, robot, folder, trajectories, model, coordinates
     )

@@ -479,5 +479,5 @@ def test_a_verdict_agrees_with_the_errors(changes, worse, clear):
 
 def test_of_many_sizes_the_surest_are_said_in_their_order():
     sizes = {f"size_{k}": {"mean": float(m), "sd": 1.0, "unit": "m"} for k, m in enumerate((0, 5, -9, 1, 7, 6))}
-    finding = {"mechanism": "glue", "parameters": sizes, "relative": {}, "equivalence_class": ["glue"]}
+    finding = {"mechanism": "glue", "group": "", "parameters": sizes, "relative": {}, "equivalence_class": ["glue"]}
     assert re.findall(r"size (\d)", _named(finding)) == ["1", "2", "4", "5"]
