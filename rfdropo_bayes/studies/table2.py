@@ -19,13 +19,14 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
+from rfdropo_bayes.audit.verdict import NO_VERDICT
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.studies.table2_page import as_markdown, draw_figure
 from rfdropo_bayes.workflow.audit import run_audit
-from rfdropo_bayes.workflow.audited import EXTENDED
+from rfdropo_bayes.workflow.audited import AUDIT, EXTENDED
 from rfdropo_bayes.workflow.calibration import run_calibration
 from rfdropo_bayes.workflow.experiment_file import describe, read_tables, self_contained
 from rfdropo_bayes.workflow.files import LOG, output_folder, run_ended, run_folder
@@ -255,6 +256,9 @@ def _with_causes(study: Study, tables: dict[str, Any]) -> dict[str, Any]:
     if not run_ended(out):
         minutes = f"audit.minutes={study.size.minutes}"
         run_audit(study.audit, out, overrides=[minutes], resume=(out / "checkpoints").exists())
+    found = json.loads((out / AUDIT).read_text(encoding="utf-8"))
+    if found["verdict"] == NO_VERDICT:
+        raise InputError(found["sentence"], where=str(out), remedy="mend the audit's file, then remove this folder")
     before, after = read_tables(study.audit), read_tables(out / EXTENDED)
     model = tables["model"]
     model["mechanisms"] = [*model.get("mechanisms", []), *after["model"].get("mechanisms", [])]

@@ -87,6 +87,7 @@ def test_the_model_takes_what_the_audit_adopted_and_keeps_its_own_priors(tmp_pat
     (tmp_path / "audit").mkdir()
     (tmp_path / "audit" / "extended.toml").write_text(describe(found))
     (tmp_path / "audit" / "run.json").write_text(json.dumps({"settings": {}, "command": "audit", "status": "done"}))
+    (tmp_path / "audit" / "audit.json").write_text(json.dumps({"verdict": "explained", "sentence": "The drives lag."}))
     study = Study({"push": PUSH}, TRUTH, AUDIT, tmp_path, SMALL)
     extended = table2._with_causes(study, table2._tables(study, "push"))
     path = tmp_path / "extended.toml"
@@ -95,6 +96,9 @@ def test_the_model_takes_what_the_audit_adopted_and_keeps_its_own_priors(tmp_pat
     assert experiment.model.mechanisms == ["actuator_lag"]
     assert set(experiment.model.priors) == {*table2._tables(study, "push")["model"]["priors"], "actuator_lag"}
     assert (experiment.simulator.push, experiment.simulator.refine) == (True, 2)
+    (tmp_path / "audit" / "audit.json").write_text(json.dumps({"verdict": "no_verdict", "sentence": "No fit."}))
+    with pytest.raises(InputError, match="No fit"):
+        table2._with_causes(study, table2._tables(study, "push"))
 
 
 def test_what_cannot_be_is_refused(tmp_path) -> None:
