@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -84,8 +84,8 @@ class LanesBeforeCube:
     """
 
     def __init__(self, kind: Callable[[Engine, int], BodyLanes], engine: Engine, scene: PushScene, count: int) -> None:
-        markers, spheres, self._scene = engine.body.markers, scene.spheres, scene
-        self._shown = len(markers.node)
+        markers, spheres = engine.body.markers, scene.spheres
+        self._shown, self._count = len(markers.node), count
         width = max(markers.node.shape[1], spheres.node.shape[1])
         node, weight = (
             np.concatenate([np.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts])
@@ -94,6 +94,11 @@ class LanesBeforeCube:
         body: Any = engine.body._replace(markers=PointMap(node, weight))
         self._bodies = kind(replace(engine, body=body), count)
         self.save, self.restore = self._bodies.save, self._bodies.restore
+
+        def gap(cube: CubeInputs, centre: Float[Array, "sphere 3"]) -> Float[Array, ""]:
+            return smallest_gap(scene, cube.cube, cube.start, centre)
+
+        self._gaps = jax.jit(jax.vmap(gap))
 
     @property
     def nbytes(self) -> int:
@@ -109,8 +114,10 @@ class LanesBeforeCube:
     ) -> LaneMotion:
         """See `BodyLanes`."""
         found = self._bodies.reset(rows, material, start, cube)
-        assert cube is not None
-        gap = np.asarray(_gaps(self._scene, cube, found.position[:, self._shown :]))
+        spread = np.zeros(self._count, int)  # all lanes are computed, so that one program serves any number of rows
+        spread[rows] = np.arange(len(rows))
+        spheres = found.position[:, self._shown :]
+        gap = np.asarray(self._gaps(*jax.tree.map(lambda part: np.asarray(part)[spread], (cube, spheres))))[rows]
         return self._markers(found._replace(imbalance=np.where(gap < -TOUCHING, np.inf, found.imbalance)))
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> LaneMotion:
@@ -119,11 +126,6 @@ class LanesBeforeCube:
 
     def _markers(self, found: LaneMotion) -> LaneMotion:
         return found._replace(position=found.position[:, : self._shown])
-
-
-def _gaps(scene: PushScene, cube: CubeInputs, centre: Float[np.ndarray, "row sphere 3"]) -> Float[Array, " row"]:
-    """Smallest gap [m] between a body and what is around it, in every row."""
-    return jax.vmap(partial(smallest_gap, scene))(cube.cube, cube.start, jnp.asarray(centre))
 
 
 class CompiledLanes:
