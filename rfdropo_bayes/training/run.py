@@ -64,6 +64,7 @@ def train(
     gamma: float,
     resume: bool = False,
     fingerprint: Mapping[str, Any] | None = None,
+    show: bool | None = None,
 ) -> Trained:
     """Train a policy.
 
@@ -77,6 +78,7 @@ def train(
         gamma: discount factor of a control period, unless the options have one.
         resume: go on from the checkpoint in ``out``.
         fingerprint: what a checkpoint must agree with: settings, posterior, versions.
+        show: progress on stderr; None draws a bar on a terminal, and prints a line now and then elsewhere.
 
     Raises:
         InputError: an unknown algorithm or option, or a checkpoint of another run.
@@ -94,7 +96,7 @@ def train(
     model, normalisation = _begin(maker, options, venv, table, folder, state, out, seed)
     cases = draw_cases(venv, table.evaluation_episodes, EVALUATION_SEED + seed)
     state = state or {"known": known, "leg": 0, "seconds": 0.0, "diverged": 0, "redrawn": 0, "curve": []}
-    with Progress(f"{table.algorithm} {table.task}", show=None, log=Path(out) / "log.jsonl") as progress:
+    with Progress(f"{table.algorithm} {table.task}", show=show, log=Path(out) / "log.jsonl") as progress:
         while model.num_timesteps < table.steps:
             state = _leg(model, normalisation, venv, cases, table, state, seed, Path(out) / EPISODES)
             _save(model, normalisation, folder, state)

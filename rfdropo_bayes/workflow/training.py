@@ -78,6 +78,7 @@ def train_policy(
     seed: int = 0,
     resume: bool = False,
     overwrite: bool = False,
+    show: bool | None = None,
     tables: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> dict[str, Any]:
@@ -90,6 +91,7 @@ def train_policy(
         posterior: whose draws the episodes' parameters are, or its folder.
         seed: of all that is random.
         resume: go on from the checkpoint of an interrupted run in ``out``; overwrite: start anew whatever it holds.
+        show: progress on the terminal, as in `calibrate`.
         tables: of the experiment file that the model was read from, for the record.
         options: keys of an experiment file's [training].
 
@@ -113,7 +115,9 @@ def train_policy(
 
     record: dict[str, Any] = {"tables": tables, "folder": folder, "data": known, "texts": model.texts()}
     with run_folder(Path(out), "train", **record, resume=resume, overwrite=overwrite) as out:
-        found = train(environments, table, out, seed=seed, gamma=task.gamma, resume=resume, fingerprint=known)
+        found = train(
+            environments, table, out, seed=seed, gamma=task.gamma, resume=resume, fingerprint=known, show=show
+        )
         layout = found.model.get_env().get_attr("layout")[0]
         facts = {
             "rfdropo_version": software_versions()["rfdropo_bayes"],
