@@ -17,7 +17,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 MEASURED = "offset_"  # of the frame: `camera_offset` is the library's name for it
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class OwnParameter:
     """A robot's own parameters as a candidate, with what a record asks of a mechanism."""
 

@@ -99,7 +99,17 @@ def commands_of(simulator: Simulator, trajectory: Trajectory) -> Commands:
     """
     unit = getattr(simulator, "command_unit", trajectory.command_unit)
     check_channels(trajectory, simulator.channel_names, unit)
-    initial, command = trajectory.initial_command, trajectory.command
+    return commands_after(simulator, trajectory, trajectory.command_time, trajectory.command)
+
+
+def commands_after(
+    simulator: Simulator,
+    trajectory: Trajectory,
+    time: Float[np.ndarray, " command"],
+    value: Float[np.ndarray, "command channel"],
+) -> Commands:
+    """Other commands [m or rad] from the state that a recording begins with, as `commands_of` has its own."""
+    initial = trajectory.initial_command
     if isinstance(simulator, ExtendedSimulator):
-        command = simulator.taken(trajectory.name, initial, command)
-    return simulator.commands(trajectory.command_time, command, initial, trajectory.time)
+        value = simulator.taken(trajectory.name, initial, value)
+    return simulator.commands(time, value, initial, trajectory.time)

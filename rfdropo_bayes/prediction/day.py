@@ -21,6 +21,7 @@ from scipy.special import softmax
 from scipy.stats import chi2
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.channels.channel import Series
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, estimate_noise
 from rfdropo_bayes.bayes.space import Parameter
@@ -114,7 +115,8 @@ def physical_of_normal(
 
 def _valid(problem: CalibrationProblem) -> np.ndarray:
     """Which residuals belong to readings, laid out as `residual_batch` has them."""
-    return np.concatenate([np.asarray(channel.valid).reshape(-1) for channel in problem.model.channels])
+    parts = [c.valid if isinstance(c, Series) else np.ones(np.shape(c.measured), bool) for c in problem.model.channels]
+    return np.concatenate([np.asarray(part).reshape(-1) for part in parts])
 
 
 def _log_evidence(fit: OwnFit, noise: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.channels import Markers
@@ -131,18 +132,8 @@ def _adapt(
     recordings = gather_recordings(simulator, [head])
     noise = noise_of_markers(left.every(float(np.median(np.diff(head.time)))), left.markers, recordings)
     space = day_space(space, model, [head.name], day, fit.record.attrs[FITTED])
-    body = thin(
-        {p.name: fit.record.posterior[p.name] for p in space.parameters if p.name in fit.record.posterior}, draws
-    )
     spread_key, fit_key, fitted_key, rest_key = jax.random.split(key, 4)
-    body |= _drawn_spreads(space, body, spread_key)
-    own = [p for p in space.parameters if p.name not in body]
-    if not own:
-        raise InputError(
-            "nothing of the model differs between days",
-            where="[model.per_group]",
-            remedy="name what does, e.g. --set model.per_group.initial_displacement=0.002, and a new --group",
-        )
+    body, own = _body_and_day(fit, space, draws, spread_key)
     channel = Markers.gather(recordings, STATED, noise)
     program = TrajectoryModel(simulator, space, fixed, recordings, (channel,))
     problem = CalibrationProblem(program, chunk=simulator.lanes)
@@ -175,6 +166,27 @@ def _adapt(
         f"{fit.content.get('title', model.name)}: {day}", seed, problem, result, [head], tested, record
     )
     return Calibration(record, build_summary(record, facts), text, model, out)
+
+
+def _body_and_day(
+    fit: Calibration, space: ParameterSpace, draws: int, key: PRNGKeyArray
+) -> tuple[dict[str, np.ndarray], list[Parameter]]:
+    """Draws of what the body keeps, and the parameters that are the day's.
+
+    Raises:
+        InputError: nothing is the day's.
+    """
+    posterior = fit.record.posterior
+    body = thin({p.name: posterior[p.name] for p in space.parameters if p.name in posterior}, draws)
+    body |= _drawn_spreads(space, body, key)
+    own = [p for p in space.parameters if p.name not in body]
+    if not own:
+        raise InputError(
+            "nothing of the model differs between days",
+            where="[model.per_group]",
+            remedy="name what does, e.g. --set model.per_group.initial_displacement=0.002, and a new --group",
+        )
+    return body, own
 
 
 def run_adaptation(

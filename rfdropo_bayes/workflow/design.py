@@ -21,6 +21,7 @@ from rfdropo_bayes.audit.experiment_design import Hypothesis, Outlook, at_hand, 
 from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry
 from rfdropo_bayes.audit.fit import Fit, Target
 from rfdropo_bayes.audit.pipeline import Question, base_model
+from rfdropo_bayes.bayes.recordings import commands_after
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.plain_csv import command_columns
 from rfdropo_bayes.files import whole, write_text
@@ -141,7 +142,7 @@ def design(
         "information_gain_nats": outlook[chosen].information,
         "tried": [
             {"kind": k, "separation": o.separation, "information_nats": o.information}
-            for (k, _, _), o in zip(proposals, outlook, strict=False)
+            for (k, _, _), o in zip(tried, outlook, strict=False)
         ],
         "not_finished": clock.missed,
         "minutes": round((time.monotonic() - clock.began) / 60.0, 2),
@@ -203,8 +204,7 @@ def _outlooks(
 ) -> list[Outlook]:
     """Outlooks of the proposals, one of each kind at a time; of the first few, whatever the time."""
     simulator = question.lanes.simulator
-    held = first.initial_command
-    sequences = [simulator.commands(t, simulator.taken(first.name, held, v), held, first.time) for _, t, v in proposals]
+    sequences = [commands_after(simulator, first, t, v) for _, t, v in proposals]
     shaped = _shaped(sequences, question.model.recordings.commands)
     outlook = outlooks(target, base, hypotheses, shaped[:KINDS])
     for start in range(KINDS, len(shaped), KINDS):
