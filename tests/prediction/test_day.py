@@ -34,7 +34,7 @@ def test_a_linear_model_s_draws_are_those_of_the_joint_posterior():
         zero = (values["zero"] + values["zero_deviation@day"])[:, None]
         return (values["gain"][:, None] * command + zero - measured) / SIGMA
 
-    channel = SimpleNamespace(valid=np.ones(ROWS, dtype=bool))
+    channel = SimpleNamespace(measured=measured)
     model = SimpleNamespace(channels=(channel,))
     problem = SimpleNamespace(model=model, n_rows=ROWS, residual_batch=residual_batch)
     own = [p for p in space.parameters if p.added_to]
