@@ -258,7 +258,7 @@ def test_a_body_that_would_overlap_the_cube_has_no_initial_state():
     """Heavy trunks sag into the cube; one lane's cube is out of the way."""
     model = simulator("numba", "float32", state="equilibrium").pushing()
     values = {
-        "trunk_mass": np.array([0.3, 0.42, 0.55, 0.55]),
+        "trunk_mass": np.array([0.3, 0.42, 0.7, 0.7]),
         "cube_y": np.full(4, -0.082819),
         "cube_x": np.array([0.0, 0.0, 0.0, 0.3]),
     }
