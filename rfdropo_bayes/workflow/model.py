@@ -151,8 +151,8 @@ class Model:
     def tables(self) -> dict[str, Any]:
         """The tables of an experiment file that says the same, as far as a file can."""
         experiment = self.experiment
-        tables = experiment.model_dump(mode="json", exclude={"robot", "model"}, exclude_unset=True)
-        model = experiment.model.model_dump(mode="json", exclude={"mechanisms"}, exclude_unset=True)
+        tables = experiment.model_dump(mode="json", exclude={"robot", "model"}, exclude_unset=True, exclude_none=True)
+        model = experiment.model.model_dump(mode="json", exclude={"mechanisms"}, exclude_unset=True, exclude_none=True)
         names = [source_of(mechanism) for mechanism in experiment.model.mechanisms]
         robot = ROBOT_COPY if self.texts() else str(getattr(experiment.robot, "name", experiment.robot))
         model = {key: value for key, value in model.items() if value != {}}

@@ -216,6 +216,20 @@ def test_predict_says_where_new_commands_lead(bench, tmp_path) -> None:
 
 
 @pytest.mark.slow
+def test_adapt_finds_what_a_day_changes_and_predicts_on(bench, tmp_path) -> None:
+    day = [*bench.overrides, "model.per_group.young_modulus=1e5"]
+    rfdropo(
+        *("adapt", bench.run, "--recording", bench.unseen, "--group", "today", "--out", tmp_path / "today"),
+        overrides=day,
+    )
+    summary = json.loads((tmp_path / "today" / "summary.json").read_text())
+    assert summary["status"] == "done"
+    assert np.isfinite(summary["parameters"]["young_modulus_deviation@today"]["mean"])
+    rfdropo("predict", tmp_path / "today", "--commands", bench.unseen, "--group", "today", "--out", tmp_path / "next")
+    assert list((tmp_path / "next").glob("*.csv"))
+
+
+@pytest.mark.slow
 def test_export_writes_phi_and_a_small_posterior(bench, tmp_path) -> None:
     rfdropo("export", bench.run, "--phi", "--posterior", "--out", tmp_path)
     assert {path.name for path in tmp_path.iterdir()} >= {"phi.csv", "phi.json", "phi_draws.csv", "posterior.nc"}
