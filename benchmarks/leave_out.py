@@ -65,7 +65,7 @@ def figures(prediction: RecordingPrediction) -> tuple[float, ...]:
     bands, seen = predictive_bands(prediction.predicted), prediction.mask
     inside = (prediction.observed >= bands.low90) & (prediction.observed <= bands.high90)
     tip = seen[:, -1]
-    held = prediction.observed[tip, -1] - prediction.observed[0, -1]
+    held = prediction.observed[tip, -1] - prediction.observed[tip, -1][0]
     off = prediction.central[tip, -1] - prediction.observed[tip, -1]
     errors = [1e3 * float(np.sqrt(np.mean(np.sum(each**2, axis=-1)))) for each in (held, off)]
     return (*errors, inside[seen].mean(), inside[tip, -1].mean(), inside[tip, -1].all(axis=-1).mean())
