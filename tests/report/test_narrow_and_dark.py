@@ -10,6 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from rfdropo_bayes.report import build_summary, render_page
+from rfdropo_bayes.report import page as page_module
 from rfdropo_bayes.report.robot_figure import robot_figure
 from rfdropo_bayes.report.style import Panel, embed
 from rfdropo_bayes.robots import known_robots, load_robot, robot_shape
@@ -79,8 +80,11 @@ def test_every_robot_has_a_picture(name):
     assert text.count("<path") > 20
 
 
-def test_the_verdict_comes_first_and_has_its_colour(run):
+def test_the_verdict_comes_first_and_has_its_colour(run, monkeypatch):
     summary = build_summary(run.record, run.facts)
+    for name in ("_run_figures", "_recording_views"):  # drawn once, not for each page
+        drawn = getattr(page_module, name)(run.record, summary)
+        monkeypatch.setattr(page_module, name, lambda record, summary, drawn=drawn: drawn)
     for verdict, tone in (("safe", "safe"), ("with care", "with-care"), ("unsafe", "unsafe")):
         judged = {"verdict": verdict, "sentence": "So it is: for a reason.", "reasons": ["a reason"], "advice": []}
         page = render_page(run.record, {**summary, "randomisation": judged}, "")

@@ -24,11 +24,9 @@ SHORT = [
 ]
 
 # The smallest settings that each method accepts and that bring it to its end.
-FAST = {
+SETTINGS = {
     "udr": ["inference.draws=20"],
     "rfdropo": ["inference.rollouts=200", "inference.rollouts_per_candidate=4", "inference.finalists=2"],
-}
-SLOW = {
     "smc": ["inference.rollouts=600", "inference.particles=50", "inference.blocks=2"],
     "laplace": ["inference.rollouts=300", "inference.starts=1", "inference.draws=40"],
     "bridge": ["inference.rollouts=400", "inference.particles=50", "inference.replicates=2"],
@@ -38,7 +36,6 @@ SLOW = {
     "npdr": ["inference.rollouts=200", "inference.rounds=2", "inference.max_epochs=5", "inference.draws=40"],
 }
 NEEDS = {"bayessim": "sbi", "npdr": "sbi"}  # extras without which a method cannot run
-SETTINGS = FAST | SLOW
 
 
 def demo_without_method(folder: Path) -> Path:
@@ -61,7 +58,8 @@ def test_the_matrix_and_the_documents_name_every_method():
     assert set(SETTINGS) == set(METHODS) == documented - {"method"}
 
 
-@pytest.mark.parametrize("method", [*FAST, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", SETTINGS)
 def test_every_method_writes_a_posterior_and_its_report(method, tmp_path):
     if method in NEEDS and importlib.util.find_spec(NEEDS[method]) is None:
         pytest.skip(f"{method} needs the extra {NEEDS[method]}")
