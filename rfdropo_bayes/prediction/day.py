@@ -21,7 +21,6 @@ from scipy.special import softmax
 from scipy.stats import chi2
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
-from rfdropo_bayes.bayes.channels.channel import Series
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, estimate_noise
 from rfdropo_bayes.bayes.space import Parameter
@@ -86,7 +85,7 @@ def fit_day(
     def white(point: np.ndarray, draw: np.ndarray) -> np.ndarray:
         return problem.residual_batch(values_at(point, draw), horizon)
 
-    seen = np.flatnonzero(_valid(problem))
+    seen = np.flatnonzero(problem.model.markers.valid)
     noise = np.asarray(jax.random.normal(noise_key, (count, len(seen))))
 
     def residuals(point: np.ndarray, draw: np.ndarray, excess: float = 1.0) -> np.ndarray:
@@ -111,12 +110,6 @@ def physical_of_normal(
     if parameter.added_to:
         return normal * spread_of_draws(parameter, given, len(normal))
     return np.asarray(parameter.prior.icdf(norm.cdf(normal)))
-
-
-def _valid(problem: CalibrationProblem) -> np.ndarray:
-    """Which residuals belong to readings, laid out as `residual_batch` has them."""
-    parts = [c.valid if isinstance(c, Series) else np.ones(np.shape(c.measured), bool) for c in problem.model.channels]
-    return np.concatenate([np.asarray(part).reshape(-1) for part in parts])
 
 
 def _log_evidence(fit: OwnFit, noise: Float[np.ndarray, "n m"]) -> Float[np.ndarray, " n"]:

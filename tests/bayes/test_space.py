@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rfdropo_bayes.bayes.pooling import Pooled, gather_groups
+from rfdropo_bayes.bayes.pooling import Pooled, gather_groups, group_of
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -139,6 +139,12 @@ def test_a_climb_starts_from_a_group_s_own_deviation_and_from_no_other_s():
     values = pooled_space().sample_around(earlier, jax.random.key(1), 50)
     np.testing.assert_allclose(values["offset_x_deviation@january"], 0.001, rtol=1e-12)
     assert len(np.unique(values["offset_x_deviation@april"])) == 50
+
+
+def test_a_group_that_names_a_recording_comes_before_wildcards():
+    assert group_of("a1", {**DAYS, "winter": "a1"}) == "winter"
+    assert group_of("a1[0:45]", {**DAYS, "winter": ["a1", "b"]}) == "winter"
+    assert group_of("a2", {**DAYS, "winter": "a1"}) == "january"
 
 
 def test_what_cannot_be_pooled_is_refused():

@@ -34,8 +34,7 @@ def test_a_linear_model_s_draws_are_those_of_the_joint_posterior():
         zero = (values["zero"] + values["zero_deviation@day"])[:, None]
         return (values["gain"][:, None] * command + zero - measured) / SIGMA
 
-    channel = SimpleNamespace(measured=measured)
-    model = SimpleNamespace(channels=(channel,))
+    model = SimpleNamespace(markers=SimpleNamespace(valid=np.ones(ROWS, dtype=bool)))
     problem = SimpleNamespace(model=model, n_rows=ROWS, residual_batch=residual_batch)
     own = [p for p in space.parameters if p.added_to]
     found = fit_day(problem, body, own, jax.random.key(0))
