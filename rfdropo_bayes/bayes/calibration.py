@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, Shaped
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from rfdropo_bayes.bayes.batches import is_batch, padded
 from rfdropo_bayes.bayes.channels import Channel, FeatureChannel, Series
@@ -75,6 +75,7 @@ class CalibrationProblem:
             [(channel.name, _plain(channel)) for channel in self.model.channels],
             self.model.noise,
             sorted(self.model.simulator.description.items()),
+            sorted(self.model.shares.items()),
             *((name, draws.tobytes()) for name, draws in sorted(self.earlier.items())),
         )
         digest.update(repr(rest).encode())
@@ -244,6 +245,33 @@ class CalibrationProblem:
             other.__dict__.pop(derived, None)
         other.measured, other.jacobian = measured, "central"
         return other
+
+    def counting(self, shares: Mapping[str, float]) -> CalibrationProblem:
+        """The same problem with the log likelihood of some channels times a share."""
+        other = copy.copy(self)
+        for derived in ("fingerprint", "_rows", "_white"):
+            other.__dict__.pop(derived, None)
+        other.model = replace(self.model, shares=dict(shares))
+        return other
+
+    def independent_series(
+        self, residuals: Float[np.ndarray, "*batch m"]
+    ) -> dict[str, tuple[Float[np.ndarray, "*batch recording time column"], Bool[np.ndarray, "recording time column"]]]:
+        """Residuals of all rows, as `residuals` lays them out, by channel; and which of them were measured.
+
+        Only of channels whose noise is independent from row to row. Columns that stand for sizes are left out.
+        """
+        values = {name: jax.ShapeDtypeStruct((), float) for name in self.names}
+        steps = jnp.asarray(self.steps_for(self.n_rows))
+        shapes = jax.eval_shape(lambda v: self.model.residuals(v, steps, self.measured), values)
+        ends = np.cumsum([part.size for part in shapes.values()])
+        parts = dict(zip(shapes, np.split(residuals, ends[:-1], axis=-1), strict=True))
+        found = {}
+        for channel in self.model.channels:
+            if isinstance(channel, Series) and channel.independent:
+                part = parts[channel.name].reshape(*residuals.shape[:-1], *shapes[channel.name].shape)
+                found[channel.name] = part[..., : channel.valid.shape[-1]], channel.valid
+        return found
 
     def predict(self, values: Batch) -> tuple[Float[np.ndarray, "n recording time marker 3"], Int[np.ndarray, " n"]]:
         """Simulated marker positions [m] of every recording, without observation noise."""

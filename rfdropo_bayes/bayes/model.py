@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jaxtyping import Array, Float, Int
@@ -35,6 +36,7 @@ class TrajectoryModel:
             one (``name@recording``).
         recordings: what was commanded, and when it was observed.
         channels: what was measured, `Markers` first.
+        shares: what a row of a channel counts, by its name, where that is not 1.
     """
 
     simulator: Simulator
@@ -42,6 +44,7 @@ class TrajectoryModel:
     fixed: Mapping[str, float]
     recordings: RecordingSet
     channels: tuple[Channel, ...]
+    shares: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def markers(self) -> Markers:
@@ -125,7 +128,7 @@ class TrajectoryModel:
         seen = self.seen(self.simulate(values, steps), values)
         rows = jnp.zeros(self.recordings.time.shape[1])
         for channel in self.channels:
-            density = channel.row_log_density(seen, data[channel.name])
+            density = self.shares.get(channel.name, 1.0) * channel.row_log_density(seen, data[channel.name])
             rows = rows.at[: len(density)].add(density)
         return rows, jnp.max(seen.observation.status)
 
@@ -135,7 +138,8 @@ class TrajectoryModel:
         """Whitened residuals by channel, zero where masked; see `Channel.residuals`."""
         data = self.measured if measured is None else measured
         seen = self.seen(self.simulate(values, steps), values)
-        return {channel.name: channel.residuals(seen, data[channel.name]) for channel in self.channels}
+        root = {channel.name: np.sqrt(self.shares.get(channel.name, 1.0)) for channel in self.channels}
+        return {c.name: root[c.name] * c.residuals(seen, data[c.name]) for c in self.channels}
 
     def __call__(self, observe: bool = True) -> None:
         """The numpyro model; ``observe=False`` leaves the positions free, for predictive draws."""
@@ -148,6 +152,8 @@ class TrajectoryModel:
         for index, name in enumerate(self.recordings.names):
             rows = int(self.recordings.rows[index])
             measured = jnp.asarray(self.recordings.position[index, :rows]) if observe else None
-            numpyro.sample(f"position@{name}", self.markers.distribution(seen, index), obs=measured)
+            with numpyro.handlers.scale(scale=self.shares.get(self.markers.name, 1.0)):
+                numpyro.sample(f"position@{name}", self.markers.distribution(seen, index), obs=measured)
         for channel in self.channels[1:] if observe else ():
-            numpyro.factor(channel.name, channel.row_log_density(seen, channel.measured))
+            share = self.shares.get(channel.name, 1.0)
+            numpyro.factor(channel.name, share * channel.row_log_density(seen, channel.measured))

@@ -21,11 +21,8 @@ from scipy.special import softmax
 from scipy.stats import chi2
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
-from rfdropo_bayes.bayes.noise import Autoregression
-from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, estimate_noise
 from rfdropo_bayes.bayes.space import Parameter
 from rfdropo_bayes.inference import next_step
-from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.prediction.first_row import LEAST_SHARE, spread_of_draws
 from rfdropo_bayes.prediction.own_fit import OwnFit, fit_own
 
@@ -129,47 +126,3 @@ def _least_cost(fit: OwnFit, noise: Float[np.ndarray, "n m"]) -> Float[np.ndarra
 
 def _curvature(fit: OwnFit) -> Float[np.ndarray, "n k k"]:
     return np.einsum("nij,nik->njk", fit.slope, fit.slope) + np.eye(fit.point.shape[1])
-
-
-class ModelError(NamedTuple):
-    """What a fitted model leaves: its size for each coordinate of each marker, and how long it lasts.
-
-    Attributes:
-        markers: names.
-        scale: root mean square [m], marker by marker, x, y and z of each.
-        correlation_time: over which it forgets its sign [s].
-    """
-
-    markers: tuple[str, ...]
-    scale: tuple[float, ...]
-    correlation_time: float
-
-    def every(self, step: float) -> Autoregression:
-        """The same as noise of rows that are ``step`` seconds apart."""
-        memory = np.array([1.0, np.exp(-step / self.correlation_time)])
-        return Autoregression(np.array(self.scale), memory, RESIDUALS, np.inf)
-
-
-def model_error(predictions: Sequence[RecordingPrediction]) -> ModelError | None:
-    """What the mean prediction leaves in the recordings that were fitted; None without one.
-
-    It is taken for a first-order autoregression, which has a time constant: the error then counts as little in rows of
-    another rate. White noise of the same size would give three seconds of a recording the weight of three hundred
-    independent measurements, of a model whose error lasts for one of them.
-    """
-    fitted = [p for p in predictions if p.split == "fit" and p.mask.any()]
-    if not fitted:
-        return None
-    rows = max(len(p.time) for p in fitted)
-    markers = fitted[0].marker_names
-    error, valid = (
-        np.zeros((len(fitted), rows, 3 * len(markers))),
-        np.zeros((len(fitted), rows, 3 * len(markers)), bool),
-    )
-    for i, p in enumerate(fitted):
-        error[i, : len(p.time)] = (p.observed - p.central).reshape(len(p.time), -1)
-        valid[i, : len(p.time)] = np.repeat(p.mask, 3, axis=1)
-    noise = estimate_noise(error, valid, 1.0, source=RESIDUALS, order=1, pooled=False)
-    step = float(np.median(np.concatenate([np.diff(p.time) for p in fitted])))
-    memory = float(np.clip(noise.autocorrelation[1], 1e-3, 0.999))
-    return ModelError(tuple(markers), tuple(noise.scale.tolist()), float(-step / np.log(memory)))

@@ -17,6 +17,7 @@ from rfdropo_bayes.bayes.recordings import RecordingSet
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import next_step
+from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.prediction.own_fit import fit_own
 
 SMALLEST_ERROR = 1e-6  # [m]
@@ -30,7 +31,7 @@ def match_first_row(
     values: Batch,
     names: Sequence[str],
     deviations: Sequence[Parameter],
-    errors: Mapping[str, float],
+    left: ModelError | None,
     key: PRNGKeyArray,
 ) -> tuple[Batch, int]:
     """Condition what is a recording's own on its first row: the frame's offset, and deviations of a new group.
@@ -45,8 +46,8 @@ def match_first_row(
         values: draws of all its parameters.
         names: recordings whose offset is to be found.
         deviations: those that were drawn from their prior.
-        errors: how far [m] the model was off for each marker; without, offsets weigh all markers the same, and
-            deviations stay as they were drawn.
+        left: how far the model was off for each marker; without, offsets weigh all markers the same, and deviations
+            stay as they were drawn.
         key: of the perturbations.
 
     Returns:
@@ -58,8 +59,8 @@ def match_first_row(
     recordings = problem.model.recordings
     shifted = [p for p in problem.model.space.parameters if p.recording in names and p.spec.name in OFFSETS]
     if shifted:
-        values = _with_offsets(problem, values, names, errors)
-    if not errors or not deviations:
+        values = _with_offsets(problem, values, names, left)
+    if left is None or not deviations:
         return values, 0
     lost = 0
     for number, group in enumerate(dict.fromkeys(p.recording for p in deviations)):
@@ -68,16 +69,16 @@ def match_first_row(
         if seen:
             free = any(p.recording == seen[0] for p in shifted)
             own_key = jax.random.fold_in(key, number)
-            values, unmatched = _with_deviations(problem, values, seen[0], own, errors, own_key, shifted=free)
+            values, unmatched = _with_deviations(problem, values, seen[0], own, left, own_key, shifted=free)
             lost += unmatched
-    return (_with_offsets(problem, values, names, errors) if shifted else values), lost
+    return (_with_offsets(problem, values, names, left) if shifted else values), lost
 
 
 def weighed_by_first_row(
     recordings: RecordingSet,
     position: Float[np.ndarray, "n recording marker 3"],
     names: Sequence[str],
-    errors: Mapping[str, float],
+    left: ModelError | None,
     key: PRNGKeyArray,
 ) -> Int[np.ndarray, "n recording"]:
     """Draws to predict each recording with: resampled by how well they predict its first row.
@@ -89,15 +90,15 @@ def weighed_by_first_row(
         recordings: those to predict.
         position: simulated markers [m] in their first rows.
         names: those among them whose first row no draw has seen yet.
-        errors: how far [m] the model was off for each marker; without, all draws count the same.
+        left: how far the model was off for each marker; without, all draws count the same.
         key: of the resampling.
     """
     count = len(position)
     index = np.tile(np.arange(count)[:, None], (1, len(recordings.names)))
-    sd = _errors(recordings.markers, errors)[:, None] / np.sqrt(3.0)
+    sd = _errors(recordings.markers, left)[:, None] / np.sqrt(3.0)
     for place, name in enumerate(recordings.names):
         valid = recordings.line.valid[place, 0]
-        if not errors or name not in names or not valid.any():
+        if left is None or name not in names or not valid.any():
             continue
         error = ((recordings.position[place, 0] - position[:, place]) / sd)[:, valid]
         density = -0.5 * np.sum(error**2, axis=(1, 2))
@@ -106,12 +107,10 @@ def weighed_by_first_row(
     return index
 
 
-def _with_offsets(
-    problem: CalibrationProblem, values: Batch, names: Sequence[str], errors: Mapping[str, float]
-) -> Batch:
+def _with_offsets(problem: CalibrationProblem, values: Batch, names: Sequence[str], left: ModelError | None) -> Batch:
     recordings = problem.model.recordings
     position = _first_rows(problem, values)
-    precision = 1.0 / _errors(recordings.markers, errors) ** 2
+    precision = 1.0 / _errors(recordings.markers, left) ** 2
     shifted = dict(values)
     for index, name in enumerate(recordings.names):
         valid = recordings.line.valid[index, 0]
@@ -134,7 +133,7 @@ def _with_deviations(
     values: Batch,
     recording: str,
     own: Sequence[Parameter],
-    errors: Mapping[str, float],
+    left: ModelError | None,
     key: PRNGKeyArray,
     *,
     shifted: bool,
@@ -146,7 +145,7 @@ def _with_deviations(
     valid = recordings.line.valid[index, 0]
     spread = np.stack([spread_of_draws(p, values, len(values[p.name])) for p in own], axis=1)
     drawn = np.stack([values[p.name] for p in own], axis=1) / spread
-    sd = _errors(recordings.markers, errors)[valid, None] / np.sqrt(3.0)
+    sd = _errors(recordings.markers, left)[valid, None] / np.sqrt(3.0)
     noise = np.asarray(jax.random.normal(key, (len(drawn), int(valid.sum()), 3)))
     measured = recordings.position[index, 0, valid] + sd * noise
 
@@ -177,5 +176,7 @@ def _first_rows(problem: CalibrationProblem, values: Batch) -> Float[np.ndarray,
     return rows.reshape(len(rows), problem.n_recordings, -1, 3)
 
 
-def _errors(markers: Sequence[str], errors: Mapping[str, float]) -> Float[np.ndarray, " marker"]:
-    return np.array([max(errors.get(name, 1.0), SMALLEST_ERROR) for name in markers])
+def _errors(markers: Sequence[str], left: ModelError | None) -> Float[np.ndarray, " marker"]:
+    """How far [m] the model is off for each marker; a metre for one that was not fitted."""
+    known = () if left is None else left.markers
+    return np.array([max(left.of_marker(name), SMALLEST_ERROR) if left and name in known else 1.0 for name in markers])

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.pooling import Patterns, gather_groups, whole
 from rfdropo_bayes.bayes.recordings import gather_recordings
@@ -21,12 +22,12 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.prediction.cube_start import measured_objects, with_measured_starts
 from rfdropo_bayes.prediction.first_row import match_first_row, weighed_by_first_row
+from rfdropo_bayes.prediction.model_error import ModelError
 
 # Among the attributes of a posterior.
-FITTED, MARKER_ERRORS, HELD = "fitted_recordings", "marker_errors_m", "held_parameters"
+FITTED, HELD = "fitted_recordings", "held_parameters"
 NOISE, BEGUN = "noise_model", "fitted_recordings_begin"
 KNOWN_NOISE = "known_noise"  # of the positions, where its parameters are not inferred
-MODEL_ERROR = "model_error"  # see `day.ModelError`
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 
@@ -64,16 +65,6 @@ def predict_fitted(
     return _predictions(problem, values, key, "fit", prior)
 
 
-def marker_errors(predictions: Sequence[RecordingPrediction]) -> dict[str, float]:
-    """How far [m] the mean prediction of each marker was off in the recordings that were fitted, root mean square."""
-    fitted = [p for p in predictions if p.split == "fit" and p.mask.any()]
-    errors = {}
-    for index, name in enumerate(fitted[0].marker_names if fitted else ()):
-        square = [np.sum((p.central - p.observed)[p.mask[:, index], index] ** 2, axis=-1) for p in fitted]
-        errors[name] = float(np.sqrt(np.mean(np.concatenate(square))))
-    return errors
-
-
 def predict_new(
     model: TrajectoryModel,
     trajectories: Sequence[Trajectory],
@@ -82,7 +73,7 @@ def predict_new(
     *,
     chunk: int,
     fitted: Sequence[str],
-    errors: Mapping[str, float] | None = None,
+    left: ModelError | None = None,
     groups: Patterns | None = None,
 ) -> NewPredictions:
     """Predictions of recordings that no fit has seen, from their commands and at most their first row.
@@ -98,25 +89,30 @@ def predict_new(
 
     Args:
         fitted: names of the recordings that were fitted.
-        errors: `marker_errors` of the fit; all markers weigh the same without.
+        left: what the model left of the fitted recordings, which is its error in new ones where its noise is taken to
+            be independent from row to row; without, all markers weigh the same in a first row.
         groups: which recordings belong together, by name or wildcard; each is a group of its own without.
     """
     names = [t.name for t in trajectories]
     own_key, row_key, noise_key = jax.random.split(key, 3)
     space, extended = _for_new_recordings(model.space, values, names, fitted, own_key, groups or {})
     recordings = gather_recordings(model.simulator, trajectories)
-    fresh = replace(model, space=space, recordings=recordings, channels=(model.markers.like(recordings),))
+    markers = model.markers.like(recordings)
+    if left and markers.known is None and markers.independent and set(recordings.markers) <= set(left.markers):
+        step = float(np.median(np.concatenate([np.diff(t.time) for t in trajectories])))
+        markers = replace(markers, known=noise_of_markers(left.every(step), left.markers, recordings))
+    fresh = replace(model, space=space, recordings=recordings, channels=(markers,))
     problem = CalibrationProblem(fresh, chunk=chunk)
     own = {whole(name) for name in fitted}
     drawn = [p for p in space.parameters if p.added_to and p.name not in values]
     new = [n for n in names if whole(n) not in own]
-    extended, unmatched = match_first_row(problem, extended, new, drawn, errors or {}, row_key)
+    extended, unmatched = match_first_row(problem, extended, new, drawn, left, row_key)
     placed, extended = with_measured_starts(fresh, trajectories, extended)
     if placed is not fresh:
         problem = CalibrationProblem(placed, chunk=chunk)
     matched = {member for p in drawn for member in p.members}
     unseen = [n for n in new if n not in matched]
-    return NewPredictions(_predictions(problem, extended, noise_key, "test", unseen=unseen, errors=errors), unmatched)
+    return NewPredictions(_predictions(problem, extended, noise_key, "test", unseen=unseen, left=left), unmatched)
 
 
 def _for_new_recordings(
@@ -175,7 +171,7 @@ def _predictions(
     prior: Batch | None = None,
     *,
     unseen: Sequence[str] = (),
-    errors: Mapping[str, float] | None = None,
+    left: ModelError | None = None,
 ) -> list[RecordingPrediction]:
     """Predictions of the recordings of a problem; draws count for those ``unseen`` as they predict the first row."""
     recordings = problem.model.recordings
@@ -183,7 +179,7 @@ def _predictions(
     key, choice, again_key = jax.random.split(key, 3)
     if pose is not None:
         pose = measured_objects(problem, pose, fine, jax.random.fold_in(key, 1))
-    chosen = weighed_by_first_row(recordings, position[:, :, 0], unseen, errors or {}, choice)
+    chosen = weighed_by_first_row(recordings, position[:, :, 0], unseen, left, choice)
     noisy = position + problem.draw_noise(key, fine)
     before = None
     if prior is not None:

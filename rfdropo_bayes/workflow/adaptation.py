@@ -29,13 +29,12 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
-from rfdropo_bayes.prediction.day import DayFit, ModelError, fit_day, model_error
+from rfdropo_bayes.prediction.day import DayFit, fit_day
+from rfdropo_bayes.prediction.model_error import ModelError, recorded_model_error
 from rfdropo_bayes.prediction.own_fit import MOST_STEPS
 from rfdropo_bayes.prediction.predictive import (
     FITTED,
     KNOWN_NOISE,
-    MARKER_ERRORS,
-    MODEL_ERROR,
     NOISE,
     Batch,
     predict_fitted,
@@ -148,7 +147,7 @@ def _adapt(
     problem = CalibrationProblem(replace(program, channels=(replace(channel, known=noise),)), chunk=simulator.lanes)
     predictions = predict_fitted(problem, found.values, fitted_key)
     if tested:
-        known: dict[str, Any] = {"fitted": [head.name], "errors": fit.record.attrs.get(MARKER_ERRORS)}
+        known: dict[str, Any] = {"fitted": [head.name], "left": left}
         known |= {"groups": {day: [head.name, *(run.name for run in tested)]}, "chunk": simulator.lanes}
         predictions += predict_new(problem.model, tested, found.values, rest_key, **known).recordings
     result = InferenceResult(
@@ -259,10 +258,7 @@ def model_error_of(record: PosteriorRecord) -> ModelError:
     Raises:
         InputError: it holds neither.
     """
-    given = record.attrs.get(MODEL_ERROR)
-    if given is not None:
-        return ModelError(tuple(given["markers"]), tuple(given["scale"]), float(given["correlation_time"]))
-    found = model_error(record.recordings)
+    found = recorded_model_error(record)
     if found is None:
         raise InputError(
             "the posterior does not say what its model leaves of the fitted recordings",

@@ -21,17 +21,14 @@ from rfdropo_bayes.inference.methods import make_config, method_named, method_of
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
-from rfdropo_bayes.prediction.day import model_error
+from rfdropo_bayes.prediction.model_error import MODEL_ERROR, model_error
 from rfdropo_bayes.prediction.predictive import (
     BEGUN,
     FITTED,
     HELD,
     KNOWN_NOISE,
-    MARKER_ERRORS,
-    MODEL_ERROR,
     NOISE,
     Batch,
-    marker_errors,
     match_cautions,
     predict_fitted,
     predict_new,
@@ -207,12 +204,13 @@ def record_posterior(
     values = thin(result.draws, PREDICTIVE_DRAWS)
     before = {name: column[:PRIOR_PREDICTIVE_DRAWS] for name, column in prior.items()}
     predictions: list[RecordingPrediction] = predict_fitted(problem, values, fit_key, prior=before)
-    errors, fitted = marker_errors(predictions), list(problem.model.recordings.names)
-    left = model_error(predictions)
+    fitted = list(problem.model.recordings.names)
+    lasting = result.details.get("lasting", {}).get(problem.model.markers.name)
+    left = model_error(predictions, 1.0 if lasting is None else np.array(lasting["widened"]))
     cautions: list[Caution] = []
     if tested:
         found = predict_new(
-            problem.model, tested, values, test_key, chunk=problem.chunk, fitted=fitted, errors=errors, groups=groups
+            problem.model, tested, values, test_key, chunk=problem.chunk, fitted=fitted, left=left, groups=groups
         )
         predictions += found.recordings
         cautions = match_cautions(found)
@@ -231,7 +229,6 @@ def record_posterior(
             **attributes,
             NOISE: problem.model.noise,
             FITTED: fitted,
-            MARKER_ERRORS: errors,
             HELD: result.held,
             MODEL_ERROR: None if left is None else left._asdict(),
             **known_noise(problem),

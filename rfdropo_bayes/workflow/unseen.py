@@ -25,12 +25,12 @@ from rfdropo_bayes.data import Trajectory, first_row_only, load_unseen, start_is
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.prediction.model_error import recorded_model_error
 from rfdropo_bayes.prediction.predictive import (
     BEGUN,
     FITTED,
     HELD,
     KNOWN_NOISE,
-    MARKER_ERRORS,
     NOISE,
     predict_new,
     thin,
@@ -127,7 +127,7 @@ def predict(
     program = TrajectoryModel(simulator, space, fixed, recordings, channels)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
-    fitted, errors = record.attrs.get(FITTED, belonging), record.attrs.get(MARKER_ERRORS)
+    fitted = record.attrs.get(FITTED, belonging)
     found = predict_new(
         program,
         [unseen],
@@ -135,7 +135,7 @@ def predict(
         jax.random.key(seed),
         chunk=simulator.lanes,
         fitted=fitted,
-        errors=errors,
+        left=recorded_model_error(record),
         groups=table.groups if group is None else {group: unseen.name},
     )
     predicted = found.recordings[0]

@@ -100,6 +100,11 @@ class Series(Channel):
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
         """Parameters of its noise, where they are inferred."""
 
+    @property
+    def independent(self) -> bool:
+        """Whether its noise is independent from row to row and from column to column."""
+        return self.known is not None and self.known.order == 0 and self.known.correlation is None
+
     @abstractmethod
     def expected(self, seen: Seen) -> Float[Any, "recording time *reading"]:
         """What would be read without noise."""
@@ -185,6 +190,11 @@ class WhiteSeries(Series):
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
         """See `Series.noise_specs`."""
         return (self.size,)
+
+    @property
+    def independent(self) -> bool:
+        """See `Series.independent`."""
+        return self.known is None or super().independent
 
     def whiten_inferred(
         self, errors: Float[Any, "recording time column"], values: Mapping[str, Any]

@@ -73,6 +73,11 @@ class Markers(Series):
         """See `Series.noise_specs`."""
         return noise_specs(self.model)
 
+    @property
+    def independent(self) -> bool:
+        """See `Series.independent`."""
+        return self.model == "white" if self.known is None else super().independent
+
     def expected(self, seen: Seen) -> Float[Any, "recording time marker 3"]:
         """See `Series.expected`."""
         return seen.observation.position

@@ -29,6 +29,7 @@ from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.climb import Climbable, Laplace, LevenbergState, climb_cost, laplace, maximise
+from rfdropo_bayes.inference.modes.lasting import CountedProblem, Lasting, lasting_residuals
 from rfdropo_bayes.inference.modes.mixture import MIXTURES, draw_mixture, mixture_weights, rivals
 from rfdropo_bayes.inference.modes.scales import integrate_scales
 from rfdropo_bayes.inference.modes.targets import (
@@ -529,7 +530,8 @@ def run(
         return rivals(evaluate_rows(problem, climbs.positions, problem.n_rows, climbs.ledger))
 
     found = find_modes(problem, config, mode_key, checkpoint, logbook, chosen=explain_as_well)
-    modes, ledger = found.modes, found.climbs.ledger
+    ledger = found.climbs.ledger
+    problem, modes, lasting = _counted(problem, found, config)
     if isinstance(whole, Hierarchy) and held:
         draws, modes, weights = _with_scales(whole, problem, held, modes, config, draw_key)
     else:
@@ -553,6 +555,10 @@ def run(
         seconds=found.climbs.seconds,
         optimum={**mode_values(problem, best), **held},
         details={
+            "lasting": {
+                name: {"share": each.share, "rows": each.rows, "widened": each.widened.tolist()}
+                for name, each in lasting.items()
+            },
             "covariance_unconstrained": best.covariance.tolist(),
             "noise_coordinates": np.flatnonzero(np.asarray(found.climbs.noise)).tolist(),
             "optima": [
@@ -593,6 +599,33 @@ def _with_scales(
         for i in order
     ]
     return {name: draws[name] for name in whole.names}, integrated, weights
+
+
+def _counted(
+    problem: Problem, found: Modes, config: LaplaceConfig
+) -> tuple[Problem, list[Laplace], dict[str, Lasting]]:
+    """The problem whose rows count by how long residuals last, its modes, and what the residuals say there.
+
+    The modes are climbed to from those that were found; see `modes.lasting`.
+    """
+    modes, climbs = found.modes, found.climbs
+    if not isinstance(problem, CountedProblem):
+        return problem, modes, {}
+
+    def target_of(problem: Problem) -> Climbable:
+        return _targets(problem, config)[1](problem.n_rows, climbs.ledger, modes[0].mean, climbs.noise)
+
+    lasting = lasting_residuals(problem, target_of(problem), modes[0])
+    shares = {name: each.share for name, each in lasting.items() if each.share < 1.0}
+    if not shares:
+        return problem, modes, lasting
+    problem = problem.counting(shares)
+    target, moved = target_of(problem), []
+    for mode in modes:
+        state, _ = maximise(target, mode.mean, max_steps=config.max_steps, tolerance=config.tolerance)
+        moved.append(laplace(target, state))
+    again = lasting_residuals(problem, target, moved[0])
+    return problem, moved, {name: each._replace(widened=again[name].widened) for name, each in lasting.items()}
 
 
 def _several(weights: Float[np.ndarray, " mode"], mixture: str) -> list[Caution]:

@@ -1,0 +1,122 @@
+"""How much rows count whose residuals last: the likelihood of white noise, mended after the fit.
+
+What a simulator gets wrong lasts from row to row and is shared by neighbouring markers, so that rows repeat one piece
+of evidence. Noise that lasts may be inferred instead; but noise that lasts for seconds also takes up a pose that is
+wrong throughout, which only parameters can mend. Here the optimum is that of white noise, and its residuals say
+afterwards how much it is worth: the log likelihood is multiplied by one share below 1, so that parameters are as
+uncertain as the correlation of the residuals makes them (magnitude adjustment of Pauli, Racugno & Ventura 2011,
+Ribatet, Cooley & Davison 2012).
+
+The residuals also are smaller than the errors of new recordings, because parameters follow them. Their size is
+corrected block by block, a block being as long as residuals last (CR2, Bell & McCaffrey 2002).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, Autoregression, estimate_noise
+from rfdropo_bayes.bayes.problem import ResidualProblem
+from rfdropo_bayes.inference.modes.climb import Laplace
+from rfdropo_bayes.inference.modes.targets import Target
+
+SMALLEST = 1e-3  # share of a block's direction that parameters leave: less is rounding
+
+
+@runtime_checkable
+class CountedProblem(ResidualProblem, Protocol):
+    """A problem with series of residuals that its likelihood takes for independent, and that can be taken for less."""
+
+    def independent_series(
+        self, residuals: Float[np.ndarray, "*batch m"]
+    ) -> Mapping[
+        str, tuple[Float[np.ndarray, "*batch recording time column"], Bool[np.ndarray, "recording time column"]]
+    ]:
+        """Whitened residuals of all rows by channel, and which of them are there."""
+        ...
+
+    def counting(self, shares: Mapping[str, float]) -> ResidualProblem:
+        """The same problem with the log likelihood of some channels times a share."""
+        ...
+
+
+class Lasting(NamedTuple):
+    """What the residuals of a channel, at an optimum, say of the likelihood that led there.
+
+    Attributes:
+        share: what a row counts; 1 where residuals do not last.
+        rows: for which residuals last; 1 where they do not.
+        widened: what the residuals of each column have to be multiplied by for the size of errors in new recordings.
+    """
+
+    share: float
+    rows: float
+    widened: Float[np.ndarray, " column"]
+
+
+def lasting_residuals(problem: CountedProblem, target: Target, mode: Laplace) -> dict[str, Lasting]:
+    """What the residuals at a mode say, by channel.
+
+    Args:
+        problem: whose rows they are.
+        target: of it, at the full horizon.
+        mode: its optimum.
+    """
+    residual, jacobian = target.linearise(mode.mean)
+    physical = ~target.noise
+    factor = np.linalg.cholesky(mode.covariance[np.ix_(physical, physical)])
+    fitted = np.where(np.isfinite(jacobian).all(axis=0), jacobian, 0.0)[:, physical] @ factor
+    reach = problem.independent_series(fitted.T)  # outer products of these add to the covariance of the fitted values
+    return {
+        name: _of_channel(series, valid, reach[name][0])
+        for name, (series, valid) in problem.independent_series(residual).items()
+    }
+
+
+def _of_channel(
+    series: Float[np.ndarray, "recording time column"],
+    valid: Bool[np.ndarray, "recording time column"],
+    reach: Float[np.ndarray, "d recording time column"],
+) -> Lasting:
+    noise = estimate_noise(series, valid, 1.0, source=RESIDUALS, order=1, pooled=False, shared=None)
+    memory = float(np.clip(noise.autocorrelation[1], 0.0, 0.999))
+    rows = (1.0 + memory) / (1.0 - memory)
+    return Lasting(_share(reach, noise, memory), rows, _widened(series, valid, reach, int(np.ceil(rows))))
+
+
+def _share(reach: Float[np.ndarray, "d recording time column"], noise: Autoregression, memory: float) -> float:
+    """Variance of the fitted values under independent residuals of unit size, over that under the residuals' own
+    covariance; at most 1."""
+    lags = np.arange(reach.shape[2])
+    across = np.eye(reach.shape[3]) if noise.correlation is None else noise.correlation
+    sized = reach * noise.scale
+    seen = np.einsum("ts,drsc->drtc", memory ** np.abs(lags[:, None] - lags), sized @ across)
+    real = float(np.sum(seen * sized))
+    return min(1.0, float(np.sum(reach**2)) / real) if real > 0.0 else 1.0
+
+
+def _widened(
+    series: Float[np.ndarray, "recording time column"],
+    valid: Bool[np.ndarray, "recording time column"],
+    reach: Float[np.ndarray, "d recording time column"],
+    length: int,
+) -> Float[np.ndarray, " column"]:
+    corrected = np.zeros_like(series)
+    for recording in range(len(series)):
+        for first in range(0, series.shape[1], length):
+            block = recording, slice(first, first + length)
+            there = valid[block]
+            if there.any():
+                values, vectors = np.linalg.eigh(np.eye(there.sum()) - _outer(reach[(slice(None), *block)][:, there]))
+                root = (vectors / np.sqrt(np.maximum(values, SMALLEST))) @ vectors.T
+                corrected[block][there] = root @ series[block][there]
+    square = [np.sum(np.where(valid, each, 0.0) ** 2, axis=(0, 1)) for each in (corrected, series)]
+    return np.sqrt(np.where(square[1] > 0.0, square[0] / np.maximum(square[1], 1e-300), 1.0))
+
+
+def _outer(reach: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "n n"]:
+    return reach.T @ reach
