@@ -45,6 +45,8 @@ class Code(StrEnum):
     """Draws of a day's parameters did not converge, or few of the body's draws explain its recording."""
     RESIDUALS_CORRELATED = "residuals_correlated"
     """Residuals last from row to row beyond the noise model."""
+    RESIDUALS_LAST = "residuals_last"
+    """Residuals last from row to row, and rows count accordingly less."""
     RESIDUALS_HEAVY = "residuals_heavy"
     """More residuals are far off than the noise model allows."""
 

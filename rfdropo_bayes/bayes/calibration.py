@@ -43,6 +43,7 @@ class CalibrationProblem:
         self.model = model
         self.earlier = {} if earlier is None else {name: np.asarray(draws) for name, draws in earlier.items()}
         self.measured = model.measured
+        self.shares = dict.fromkeys(self.measured, 1.0)  # what each channel counts
         self.jacobian = "auto"
         self.watch: Callable[[float], None] | None = None  # told of rollouts, in full-length ones, as they are done
         self.chunk = chunk
@@ -75,7 +76,7 @@ class CalibrationProblem:
             [(channel.name, _plain(channel)) for channel in self.model.channels],
             self.model.noise,
             sorted(self.model.simulator.description.items()),
-            sorted(self.model.shares.items()),
+            sorted(self.shares.items()),
             *((name, draws.tobytes()) for name, draws in sorted(self.earlier.items())),
         )
         digest.update(repr(rest).encode())
@@ -153,7 +154,7 @@ class CalibrationProblem:
         Returns:
             rows, minus infinity throughout where the rollout did not end well, and the `Result` code of each set.
         """
-        rows, status = self._chunked(self._rows, values, horizon, self.measured)
+        rows, status = self._chunked(self._rows, values, horizon, self.measured, self.shares)
         rows = rows[:, :horizon]
         finite = np.isfinite(rows).all(axis=1)
         status = np.where((status == Result.OK) & ~finite, Result.DIVERGED, status)
@@ -165,7 +166,7 @@ class CalibrationProblem:
         Traceable; differentiable backwards where the engine is.
         """
         values = {name: value[0] for name, value in self.from_unconstrained(u[None]).items()}
-        rows, status = self.model.row_log_likelihood(values, None, self.measured)
+        rows, status = self.model.row_log_likelihood(values, None, self.measured, self.shares)
         return jnp.where(status == 0, jnp.sum(rows), -jnp.inf)
 
     def rollouts(
@@ -217,41 +218,45 @@ class CalibrationProblem:
 
     def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " residual"]:
         """Whitened residuals of the first ``horizon`` rows (zero where masked); traceable, for one set of values."""
-        white = self.model.residuals(values, jnp.asarray(self.steps_for(horizon)), self.measured)
+        white = self.model.residuals(values, jnp.asarray(self.steps_for(horizon)), self.measured, self.shares)
         return self._flat({name: part[None] for name, part in white.items()}, horizon)[0]
 
     def residual_batch(self, values: Batch, horizon: int) -> Float[np.ndarray, "n residual"]:
         """`residuals` of many sets of values at once, in compiled chunks."""
-        white = self._chunked(self._white, values, horizon, self.measured)
+        white = self._chunked(self._white, values, horizon, self.measured, self.shares)
         return np.asarray(self._flat(white, horizon))
 
     def white_positions(self, values: Mapping[str, float]) -> Float[np.ndarray, "recording time marker 3"]:
         """Whitened residuals of the markers at one set of values, NaN where masked."""
         single = {name: np.array([values[name]]) for name in self.names}
-        white = self._chunked(self._white, single, self.n_rows, self.measured)[self.model.markers.name][0]
+        white = self._chunked(self._white, single, self.n_rows, self.measured, dict.fromkeys(self.shares, 1.0))
+        positions = white[self.model.markers.name][0]
         valid = self.model.recordings.line.valid[..., None]
-        return np.where(valid, white.reshape(*valid.shape[:3], 3), np.nan)
+        return np.where(valid, positions.reshape(*valid.shape[:3], 3), np.nan)
 
     def with_measured(self, measured: Measured) -> CalibrationProblem:
         """The same problem with other data, which shares all that has been compiled.
 
         Its Jacobians are taken by differences of compiled rollouts: a derivative of its own would be compiled for it.
         """
-        coordinates = ("_unconstrained", "_constrained", "_log_prior", "prior_derivatives")
-        for shared in ("_rows", "_white", "_positions", "_features", "_observations", "actions", *coordinates):
-            getattr(self, shared)  # made before the copy, so that all copies have the same compiled functions
-        other = copy.copy(self)
-        for derived in ("fingerprint", "observed"):
-            other.__dict__.pop(derived, None)
+        other = self._copied()
+        other.__dict__.pop("observed", None)
         other.measured, other.jacobian = measured, "central"
         return other
 
     def counting(self, shares: Mapping[str, float]) -> CalibrationProblem:
         """The same problem with the log likelihood of some channels times a share."""
+        other = self._copied()
+        other.shares = {**self.shares, **shares}
+        return other
+
+    def _copied(self) -> CalibrationProblem:
+        """The same problem, which shares all that has been compiled."""
+        coordinates = ("_unconstrained", "_constrained", "_log_prior", "prior_derivatives")
+        for shared in ("_rows", "_white", "_positions", "_features", "_observations", "actions", *coordinates):
+            getattr(self, shared)  # made before the copy, so that all copies have the same compiled functions
         other = copy.copy(self)
-        for derived in ("fingerprint", "_rows", "_white"):
-            other.__dict__.pop(derived, None)
-        other.model = replace(self.model, shares=dict(shares))
+        other.__dict__.pop("fingerprint", None)
         return other
 
     def independent_series(
@@ -305,11 +310,11 @@ class CalibrationProblem:
 
     @cached_property
     def _rows(self) -> Callable:
-        return jax.jit(jax.vmap(self.model.row_log_likelihood, in_axes=(0, None, None)))
+        return jax.jit(jax.vmap(self.model.row_log_likelihood, in_axes=(0, None, None, None)))
 
     @cached_property
     def _white(self) -> Callable:
-        return jax.jit(jax.vmap(self.model.residuals, in_axes=(0, None, None)))
+        return jax.jit(jax.vmap(self.model.residuals, in_axes=(0, None, None, None)))
 
     @cached_property
     def _positions(self) -> Callable:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jaxtyping import Array, Float, Int
@@ -36,7 +35,6 @@ class TrajectoryModel:
             one (``name@recording``).
         recordings: what was commanded, and when it was observed.
         channels: what was measured, `Markers` first.
-        shares: what a row of a channel counts, by its name, where that is not 1.
     """
 
     simulator: Simulator
@@ -44,7 +42,6 @@ class TrajectoryModel:
     fixed: Mapping[str, float]
     recordings: RecordingSet
     channels: tuple[Channel, ...]
-    shares: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def markers(self) -> Markers:
@@ -118,28 +115,37 @@ class TrajectoryModel:
         return Seen(observation, {**self.fixed, **values}, offset)
 
     def row_log_likelihood(
-        self, values: Values, steps: Int[Array, ""] | None = None, measured: Measured | None = None
+        self,
+        values: Values,
+        steps: Int[Array, ""] | None = None,
+        measured: Measured | None = None,
+        shares: Mapping[str, Any] | None = None,
     ) -> tuple[Float[Array, " time"], Int[Array, ""]]:
         """Log density of each row given those before it, summed over recordings, and the worst result code.
 
-        ``measured`` puts other data in the place of the model's own.
+        ``measured`` puts other data in the place of the model's own; ``shares`` says how much each channel counts.
         """
         data = self.measured if measured is None else measured
         seen = self.seen(self.simulate(values, steps), values)
         rows = jnp.zeros(self.recordings.time.shape[1])
         for channel in self.channels:
-            density = self.shares.get(channel.name, 1.0) * channel.row_log_density(seen, data[channel.name])
+            density = channel.row_log_density(seen, data[channel.name])
+            density = density if shares is None else shares[channel.name] * density
             rows = rows.at[: len(density)].add(density)
         return rows, jnp.max(seen.observation.status)
 
     def residuals(
-        self, values: Values, steps: Int[Array, ""], measured: Measured | None = None
+        self,
+        values: Values,
+        steps: Int[Array, ""],
+        measured: Measured | None = None,
+        shares: Mapping[str, Any] | None = None,
     ) -> dict[str, Float[Array, "..."]]:
-        """Whitened residuals by channel, zero where masked; see `Channel.residuals`."""
+        """Whitened residuals by channel, zero where masked; see `Channel.residuals` and `row_log_likelihood`."""
         data = self.measured if measured is None else measured
         seen = self.seen(self.simulate(values, steps), values)
-        root = {channel.name: np.sqrt(self.shares.get(channel.name, 1.0)) for channel in self.channels}
-        return {c.name: root[c.name] * c.residuals(seen, data[c.name]) for c in self.channels}
+        white = {channel.name: channel.residuals(seen, data[channel.name]) for channel in self.channels}
+        return white if shares is None else {name: jnp.sqrt(shares[name]) * part for name, part in white.items()}
 
     def __call__(self, observe: bool = True) -> None:
         """The numpyro model; ``observe=False`` leaves the positions free, for predictive draws."""
@@ -152,8 +158,6 @@ class TrajectoryModel:
         for index, name in enumerate(self.recordings.names):
             rows = int(self.recordings.rows[index])
             measured = jnp.asarray(self.recordings.position[index, :rows]) if observe else None
-            with numpyro.handlers.scale(scale=self.shares.get(self.markers.name, 1.0)):
-                numpyro.sample(f"position@{name}", self.markers.distribution(seen, index), obs=measured)
+            numpyro.sample(f"position@{name}", self.markers.distribution(seen, index), obs=measured)
         for channel in self.channels[1:] if observe else ():
-            share = self.shares.get(channel.name, 1.0)
-            numpyro.factor(channel.name, share * channel.row_log_density(seen, channel.measured))
+            numpyro.factor(channel.name, channel.row_log_density(seen, channel.measured))

@@ -22,16 +22,19 @@ class ModelError(NamedTuple):
         markers: names.
         scale: root mean square [m], marker by marker, x, y and z of each.
         correlation_time: over which it forgets its sign [s].
+        share: what a coordinate of a row counts, because markers err together: independent coordinates of equal worth
+            are as many as their correlation matrix has eigenvalues of note (its participation ratio).
     """
 
     markers: tuple[str, ...]
     scale: tuple[float, ...]
     correlation_time: float
+    share: float = 1.0
 
     def of_marker(self, name: str) -> float:
-        """Root mean square distance [m] by which a marker is off."""
+        """How far [m] a marker is off, root mean square, where all coordinates of a row are taken for independent."""
         index = self.markers.index(name)
-        return float(np.linalg.norm(self.scale[3 * index : 3 * index + 3]))
+        return float(np.linalg.norm(self.scale[3 * index : 3 * index + 3]) / np.sqrt(self.share))
 
     def every(self, step: float) -> Autoregression:
         """The same as noise of rows that are ``step`` seconds apart."""
@@ -64,10 +67,12 @@ def model_error(
     for i, p in enumerate(fitted):
         error[i, : len(p.time)] = (p.observed - p.central).reshape(len(p.time), -1)
         valid[i, : len(p.time)] = np.repeat(p.mask, 3, axis=1)
-    noise = estimate_noise(error, valid, 1.0, source=RESIDUALS, order=1, pooled=False)
+    noise = estimate_noise(error, valid, 1.0, source=RESIDUALS, order=1, pooled=False, shared=None)
+    across = noise.correlation
+    share = 1.0 if across is None else len(across) / float(np.sum(across**2))
     step = float(np.median(np.concatenate([np.diff(p.time) for p in fitted])))
     memory = float(np.clip(noise.autocorrelation[1], 1e-3, 0.999))
-    return ModelError(tuple(markers), tuple((widened * noise.scale).tolist()), float(-step / np.log(memory)))
+    return ModelError(tuple(markers), tuple((widened * noise.scale).tolist()), float(-step / np.log(memory)), share)
 
 
 def recorded_model_error(record: PosteriorRecord) -> ModelError | None:
@@ -76,4 +81,5 @@ def recorded_model_error(record: PosteriorRecord) -> ModelError | None:
     given = record.attrs.get(MODEL_ERROR)
     if given is None:
         return model_error(record.recordings)
-    return ModelError(tuple(given["markers"]), tuple(given["scale"]), float(given["correlation_time"]))
+    lists = {name: tuple(given[name]) for name in ("markers", "scale")}
+    return ModelError(**{**given, **lists})

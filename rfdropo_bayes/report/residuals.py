@@ -48,19 +48,20 @@ class ResidualCheck(NamedTuple):
 
 
 def check_residuals(
-    white: Sequence[Float[np.ndarray, "time marker 3"]], markers: Sequence[str]
+    white: Sequence[Float[np.ndarray, "time marker 3"]], markers: Sequence[str], *, counted: bool = False
 ) -> dict[str, ResidualCheck]:
     """Check of each marker, and of all under the key ``all``.
 
     Args:
         white: whitened residuals of each recording, NaN where masked.
         markers: names of the markers.
+        counted: whether the fit counted rows by how long residuals last: no interval is too narrow then.
     """
-    own = {name: check([part[:, index] for part in white]) for index, name in enumerate(markers)}
-    return {**own, "all": check([part.reshape(len(part), -1) for part in white])}
+    own = {name: check([part[:, index] for part in white], counted) for index, name in enumerate(markers)}
+    return {**own, "all": check([part.reshape(len(part), -1) for part in white], counted)}
 
 
-def check(white: Sequence[Float[np.ndarray, "time series"]]) -> ResidualCheck:
+def check(white: Sequence[Float[np.ndarray, "time series"]], counted: bool = False) -> ResidualCheck:
     """Check of series that may have gaps (NaN); a lag counts rows that are there."""
     series = [column[np.isfinite(column)] for part in white for column in part.T]
     series = [column for column in series if len(column) > 1]
@@ -71,7 +72,7 @@ def check(white: Sequence[Float[np.ndarray, "time series"]]) -> ResidualCheck:
     ends = np.flatnonzero(correlation <= 0.0)
     lags = int(ends[0]) if len(ends) else len(correlation)
     total = float(correlation[:lags].sum())
-    narrowing = float(np.sqrt(1.0 + 2.0 * total))
+    narrowing = 1.0 if counted else float(np.sqrt(1.0 + 2.0 * total))
     chance = stats.norm.isf(MORE_THAN_CHANCE) * np.sqrt(max(lags, 1) / len(values))
     far = int(np.sum(np.abs(values) > FAR))
     expected = 2.0 * stats.norm.sf(FAR) * len(values)

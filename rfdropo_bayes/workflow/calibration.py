@@ -251,13 +251,13 @@ def row_log_likelihood(
     return rows.reshape(*next(iter(result.draws.values())).shape, -1)
 
 
-def check_fit(problem: CalibrationProblem, record: PosteriorRecord) -> dict[str, ResidualCheck]:
+def check_fit(problem: CalibrationProblem, record: PosteriorRecord, counted: bool) -> dict[str, ResidualCheck]:
     """Whether the residuals at the most likely draw are what the noise model says; empty without a likelihood."""
     if record.log_likelihood is None:
         return {}
     best = int(np.argmax(record.log_likelihood.sum(axis=-1).ravel()))
     white = problem.white_positions({name: float(record.flat(name)[best]) for name in problem.names})
-    return check_residuals(list(white), problem.model.recordings.markers)
+    return check_residuals(list(white), problem.model.recordings.markers, counted=counted)
 
 
 def scale_free_ratios(names: Sequence[str]) -> list[ProductOfPowers]:
@@ -290,7 +290,7 @@ def gather_facts(
     description = problem.model.simulator.description
     robot: Any = getattr(problem.model.simulator, "robot", None)
     added: Any = description.get("mechanisms", ())
-    checks = check_fit(problem, record)
+    checks = check_fit(problem, record, problem.model.markers.name in result.details.get("lasting", {}))
     floor = noise_floor([*fitted, *tested])
     return RunFacts(
         title=title,

@@ -103,8 +103,9 @@ def fit(data: CalibrationProblem, seed: int):
 
 def codes_of(data: CalibrationProblem, result) -> list[Code]:
     white = data.white_positions(result.optimum)
-    found = residual_cautions(check_residuals(list(white), LaggingArm.marker_names), data.model.noise)
-    return [caution.code for caution in found]
+    counted = bool(result.details["lasting"])
+    checks = check_residuals(list(white), LaggingArm.marker_names, counted=counted)
+    return [caution.code for caution in (*result.cautions, *residual_cautions(checks, data.model.noise))]
 
 
 def coverage(noise: str, phi: float, datasets: int) -> tuple[float, float]:
@@ -116,29 +117,27 @@ def coverage(noise: str, phi: float, datasets: int) -> tuple[float, float]:
         for name, truth in PHYSICAL.items():
             low, high = central_interval(result.draws[name].ravel())
             inside.append(low <= truth <= high)
-        warned.append(Code.RESIDUALS_CORRELATED in codes_of(data, result))
+        warned.append(bool({Code.RESIDUALS_CORRELATED, Code.RESIDUALS_LAST} & set(codes_of(data, result))))
     return float(np.mean(inside)), float(np.mean(warned))
 
 
 @pytest.mark.slow
-def test_intervals_hold_under_correlated_noise_and_white_noise_says_that_its_own_do_not():
+def test_intervals_hold_under_correlated_noise_and_white_noise_counts_rows_less():
     """AR(1) noise of 0.9, 40 data sets of 3 parameters. If 90 % is true, 120 intervals hold less than 82 % with
-    probability 0.002 if they are independent."""
-    white, warned = coverage("white", 0.9, 40)
-    assert white < 0.7
-    assert warned == 1.0
-    for noise in ("auto", "ar1"):
+    probability 0.002 if they are independent. Rows that all counted would hold 45 %."""
+    for noise in ("white", "auto", "ar1"):
         held, warned = coverage(noise, 0.9, 40)
         assert held >= 0.82, noise
-        assert warned <= 0.1, noise
+        assert warned == 1.0 if noise == "white" else warned <= 0.1, noise
 
 
 @pytest.mark.slow
 def test_the_default_loses_nothing_where_the_noise_is_white():
     """Its intervals hold what white noise's do (as above), and are hardly wider."""
-    held, warned = coverage("auto", 0.0, 40)
-    assert held >= 0.82
-    assert warned <= 0.1
+    for noise in ("white", "auto"):
+        held, warned = coverage(noise, 0.0, 40)
+        assert held >= 0.82, noise
+        assert warned <= 0.1, noise
     widths = {}
     for noise in ("white", "auto"):
         fits = [fit(with_error(noise, autoregressive(np.random.default_rng(s), 0.0)), s) for s in range(5)]

@@ -11,7 +11,8 @@ import pytest
 from rfdropo_bayes.bayes.pooling import Pooled
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.posteriors import RecordingPrediction
-from rfdropo_bayes.prediction.day import fit_day, model_error
+from rfdropo_bayes.prediction.day import fit_day
+from rfdropo_bayes.prediction.model_error import model_error
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SPREAD, SIGMA, ROWS = 0.7, 0.5, 6

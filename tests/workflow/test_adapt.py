@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 import rfdropo_bayes as rb
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
-from rfdropo_bayes.prediction.predictive import FITTED, MARKER_ERRORS, MODEL_ERROR, NOISE
+from rfdropo_bayes.prediction.model_error import MODEL_ERROR
+from rfdropo_bayes.prediction.predictive import FITTED, NOISE
 
 STEP, SIGMA, SPREAD = 0.02, 2e-4, 0.01
 GAIN, LAG = 1.4, 0.25
@@ -110,7 +111,7 @@ def known():
     draws = {name: value * (1.0 + 0.01 * rng.normal(size=(1, 60))) for name, value in middle.items()}
     draws["observation_noise"] = np.full((1, 60), SIGMA)
     left = {"markers": ["tip"], "scale": [SIGMA] * 3, "correlation_time": STEP}
-    attributes = {MODEL_ERROR: left, MARKER_ERRORS: {"tip": SIGMA}, FITTED: ["day_0_a"], NOISE: "white"}
+    attributes = {MODEL_ERROR: left, FITTED: ["day_0_a"], NOISE: "white"}
     parameters = tuple(ParameterInfo(name, unit, -1.0, 3.0, prior) for name, (unit, prior) in infos.items())
     model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"zero": 0.02})
     return rb.Calibration(PosteriorRecord(parameters, draws, attrs=attributes), {"title": "lag"}, "", model)

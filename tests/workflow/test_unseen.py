@@ -21,7 +21,8 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.prediction.first_row import match_first_row, weighed_by_first_row
-from rfdropo_bayes.prediction.predictive import MARKER_ERRORS, NOISE, _for_new_recordings
+from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError
+from rfdropo_bayes.prediction.predictive import NOISE, _for_new_recordings
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.workflow.assembly import pooling
@@ -85,9 +86,10 @@ def test_only_the_first_row_is_seen_and_sets_the_frame(posterior, tmp_path):
 def test_the_marker_that_the_model_knows_best_sets_the_frame(posterior, tmp_path):
     """All weight on the first marker: it agrees in the first row, draw by draw, and the others keep their error."""
     record = PosteriorRecord.load(posterior / "posterior.nc")
-    errors = {"m1": 1e-6, "m2": 1.0, "m3": 1.0, "m4": 1.0}
+    scale = [1e-6] * 3 + [1.0] * 9
+    left = {"markers": ["m1", "m2", "m3", "m4"], "scale": scale, "correlation_time": 0.1}
     (tmp_path / "weighed").mkdir()
-    attributes = {**record.attrs, MARKER_ERRORS: errors}
+    attributes = {**record.attrs, MODEL_ERROR: left}
     PosteriorRecord(record.parameters, record.posterior, attrs=attributes).save(tmp_path / "weighed" / "posterior.nc")
     start = predict(tmp_path / "weighed", COMMANDS, tmp_path / "a")["mean"].values[0]
     measured = Trajectory.load(EXPERIMENTS / COMMANDS).position[0]
@@ -213,7 +215,7 @@ def test_a_new_recording_of_a_known_day_has_that_day_s_values_and_one_of_a_new_d
 def test_deviations_given_a_first_row_are_draws_from_the_linear_model_s_posterior():
     """Two markers move by 1 and 3 along x per unit of the deviation; the closed form is that of a linear regression."""
     space, values = deviating(["new"], {})
-    slope, errors = np.array([1.0, 3.0]), {"a": 2.0, "b": 5.0}
+    slope, left = np.array([1.0, 3.0]), ModelError(("a", "b"), (2.0,) * 3 + (5.0,) * 3, 0.1)
     measured = np.array([[4.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     recordings = SimpleNamespace(
         names=("new",),
@@ -231,10 +233,10 @@ def test_deviations_given_a_first_row_are_draws_from_the_linear_model_s_posterio
         model=SimpleNamespace(space=space, recordings=recordings), n_recordings=1, rollouts=rollouts
     )
     drawn = [p for p in space.parameters if p.added_to]
-    matched, unmatched = match_first_row(problem, values, ["new"], drawn, errors, jax.random.key(2))
+    matched, unmatched = match_first_row(problem, values, ["new"], drawn, left, jax.random.key(2))
     found = matched["level_deviation@new"]
     assert unmatched == 0
-    weight = 3.0 / np.array([2.0, 5.0]) ** 2  # an error in 3-D is shared by three coordinates
+    weight = 1.0 / np.array([2.0, 5.0]) ** 2
     precision = 1.0 / 4.0 + np.sum(slope**2 * weight)
     assert abs(np.mean(found) - np.sum(slope * weight * measured[:, 0]) / precision) < 5.0 / np.sqrt(4000 * precision)
     assert np.std(found) == pytest.approx(precision**-0.5, rel=0.06)
@@ -250,7 +252,7 @@ def test_draws_count_as_they_predict_the_first_row():
     measured = np.full((2, 1, 1, 3), 1.0)
     line = SimpleNamespace(valid=np.ones((2, 1, 1), dtype=bool))
     recordings = SimpleNamespace(names=("seen", "new"), markers=("a",), position=measured, line=line)
-    index = weighed_by_first_row(recordings, simulated, ["new"], {"a": 2.0 * np.sqrt(3.0)}, jax.random.key(0))
+    index = weighed_by_first_row(recordings, simulated, ["new"], ModelError(("a",), (2.0,) * 3, 0.1), jax.random.key(0))
     np.testing.assert_array_equal(index[:, 0], np.arange(4000))
     drawn = simulated[index[:, 1], 1, 0]
     # prior N(0, 1), a measurement of 1 with deviation 2: the posterior is N(1/5, 4/5); 5 standard errors of the draws

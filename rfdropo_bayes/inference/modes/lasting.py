@@ -7,8 +7,9 @@ afterwards how much it is worth: the log likelihood is multiplied by one share b
 uncertain as the correlation of the residuals makes them (magnitude adjustment of Pauli, Racugno & Ventura 2011,
 Ribatet, Cooley & Davison 2012).
 
-The residuals also are smaller than the errors of new recordings, because parameters follow them. Their size is
-corrected block by block, a block being as long as residuals last (CR2, Bell & McCaffrey 2002).
+The residuals also are smaller than the errors of new recordings, because parameters follow them. How large these are is
+seen where rows are left out in blocks that are as long as residuals last: for a linear model no fit has to be repeated
+(jackknife, CR3 of Bell & McCaffrey 2002).
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from jaxtyping import Bool, Float
 
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, Autoregression, estimate_noise
 from rfdropo_bayes.bayes.problem import ResidualProblem
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.inference.modes.climb import Laplace
 from rfdropo_bayes.inference.modes.targets import Target
 
+WIDER = 1.2  # by a fifth
 SMALLEST = 1e-3  # share of a block's direction that parameters leave: less is rounding
 
 
@@ -50,7 +53,7 @@ class Lasting(NamedTuple):
     Attributes:
         share: what a row counts; 1 where residuals do not last.
         rows: for which residuals last; 1 where they do not.
-        widened: what the residuals of each column have to be multiplied by for the size of errors in new recordings.
+        widened: how many times larger the errors of each column are in rows that are left out of the fit.
     """
 
     share: float
@@ -72,16 +75,24 @@ def lasting_residuals(problem: CountedProblem, target: Target, mode: Laplace) ->
     fitted = np.where(np.isfinite(jacobian).all(axis=0), jacobian, 0.0)[:, physical] @ factor
     reach = problem.independent_series(fitted.T)  # outer products of these add to the covariance of the fitted values
     return {
-        name: _of_channel(series, valid, reach[name][0])
+        name: lasting_series(series, valid, reach[name][0])
         for name, (series, valid) in problem.independent_series(residual).items()
     }
 
 
-def _of_channel(
+def lasting_series(
     series: Float[np.ndarray, "recording time column"],
     valid: Bool[np.ndarray, "recording time column"],
     reach: Float[np.ndarray, "d recording time column"],
 ) -> Lasting:
+    """What the residuals of a channel say.
+
+    Args:
+        series: residuals, of unit size by the likelihood that led there.
+        valid: which of them were measured.
+        reach: by how much fitted values move along orthonormal directions of the posterior, in its deviations; zero
+            where not valid.
+    """
     noise = estimate_noise(series, valid, 1.0, source=RESIDUALS, order=1, pooled=False, shared=None)
     memory = float(np.clip(noise.autocorrelation[1], 0.0, 0.999))
     rows = (1.0 + memory) / (1.0 - memory)
@@ -105,18 +116,27 @@ def _widened(
     reach: Float[np.ndarray, "d recording time column"],
     length: int,
 ) -> Float[np.ndarray, " column"]:
-    corrected = np.zeros_like(series)
+    """Root mean square error of blocks that are left out of a linear fit, over that of the residuals."""
+    left_out = np.zeros_like(series)
     for recording in range(len(series)):
         for first in range(0, series.shape[1], length):
             block = recording, slice(first, first + length)
             there = valid[block]
-            if there.any():
-                values, vectors = np.linalg.eigh(np.eye(there.sum()) - _outer(reach[(slice(None), *block)][:, there]))
-                root = (vectors / np.sqrt(np.maximum(values, SMALLEST))) @ vectors.T
-                corrected[block][there] = root @ series[block][there]
-    square = [np.sum(np.where(valid, each, 0.0) ** 2, axis=(0, 1)) for each in (corrected, series)]
+            fitted = reach[(slice(None), *block)][:, there]
+            values, vectors = np.linalg.eigh(np.eye(there.sum()) - fitted.T @ fitted)
+            left_out[block][there] = (vectors / np.maximum(values, SMALLEST)) @ (vectors.T @ series[block][there])
+    square = [np.sum(np.where(valid, each, 0.0) ** 2, axis=(0, 1)) for each in (left_out, series)]
     return np.sqrt(np.where(square[1] > 0.0, square[0] / np.maximum(square[1], 1e-300), 1.0))
 
 
-def _outer(reach: Float[np.ndarray, "d n"]) -> Float[np.ndarray, "n n"]:
-    return reach.T @ reach
+def lasting_cautions(lasting: Mapping[str, Lasting]) -> list[Caution]:
+    """A caution for each channel whose rows count so much less than one that intervals are wider by a fifth."""
+    return [
+        Caution(
+            Code.RESIDUALS_LAST,
+            f"residuals of the {name} last for {each.rows:.2g} rows, and coordinates share them: a row counts "
+            f"{each.share:.2g}; rfdropo audit can tell what the simulator misses",
+        )
+        for name, each in lasting.items()
+        if each.share < WIDER**-2
+    ]

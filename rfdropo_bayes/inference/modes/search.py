@@ -29,7 +29,7 @@ from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.climb import Climbable, Laplace, LevenbergState, climb_cost, laplace, maximise
-from rfdropo_bayes.inference.modes.lasting import CountedProblem, Lasting, lasting_residuals
+from rfdropo_bayes.inference.modes.lasting import CountedProblem, Lasting, lasting_cautions, lasting_residuals
 from rfdropo_bayes.inference.modes.mixture import MIXTURES, draw_mixture, mixture_weights, rivals
 from rfdropo_bayes.inference.modes.scales import integrate_scales
 from rfdropo_bayes.inference.modes.targets import (
@@ -549,6 +549,7 @@ def run(
         cautions=[
             *found.cautions,
             *_several(weights, config.mixture),
+            *lasting_cautions(lasting),
             *prior_cautions(whole, draws),
             *exclusion_cautions(ledger.excluded, ledger.evaluations),
         ],
