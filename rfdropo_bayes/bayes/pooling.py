@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import SPREAD
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
-DEVIATION, SPREAD = "_deviation", "_spread"
+DEVIATION = "_deviation"
 
 Patterns = Mapping[str, str | Sequence[str]]
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from rfdropo_bayes.bayes.pooling import Pooled, deviation_spec, spread_spec
 from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import SPREAD
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
 
 SEPARATOR = "@"
@@ -67,8 +68,10 @@ class Parameter:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Where the prior ends: on the hard bounds or between them; infinite where there is neither."""
+        """Where the prior ends, see `ParameterInfo.ends`."""
         support = self.prior.support
+        if self.spec.name.endswith(SPREAD):
+            return -np.inf, self.spec.high
         low, high = getattr(support, "lower_bound", -np.inf), getattr(support, "upper_bound", np.inf)
         return max(self.spec.low, float(low)), min(self.spec.high, float(high))
 

@@ -25,6 +25,8 @@ from rfdropo_bayes.posteriors.inference_data import (
 
 AXES = ("x", "y", "z")
 
+SPREAD = "_spread"  # ends the name of a standard deviation between groups
+
 
 @dataclass(frozen=True)
 class ParameterInfo:
@@ -52,7 +54,12 @@ class ParameterInfo:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Where its prior ends: on the hard bounds or between them; infinite where there is neither."""
+        """Where its prior ends: on the hard bounds or between them; infinite where there is neither.
+
+        A spread between groups that is zero is no end of anything: the groups do not differ.
+        """
+        if self.name.endswith(SPREAD):
+            return -np.inf, min(self.high, self.prior.get("high", np.inf))
         low = 0.0 if self.prior.get("distribution") == "HalfNormal" else self.prior.get("low", -np.inf)
         return max(self.low, low), min(self.high, self.prior.get("high", np.inf))
 

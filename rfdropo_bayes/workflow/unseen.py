@@ -18,13 +18,13 @@ from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import Autoregression
-from rfdropo_bayes.bayes.pooling import DEVIATION, SPREAD, Pooled
+from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
 from rfdropo_bayes.data import Trajectory, first_row_only, load_unseen, start_is_known
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_text
-from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.model_error import recorded_model_error
 from rfdropo_bayes.prediction.predictive import (
     BEGUN,

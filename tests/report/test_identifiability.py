@@ -117,6 +117,13 @@ def test_piles_are_looked_for_where_the_prior_ends(prior, ends) -> None:
         np.testing.assert_allclose(build_space((spec,), {"p": prior}, {}, ["r"])["p"].ends, ends, rtol=1e-6)
 
 
+def test_a_spread_of_nothing_is_no_bound() -> None:
+    info = ParameterInfo("zero_spread", "m", 0.0, 10.0, {"distribution": "HalfNormal", "scale": 1.0})
+    assert bound_reached(np.random.default_rng(5).exponential(1e-2, 2000), info) is None
+    spec = ParameterSpec("zero_spread", "m", 0.0, 10.0, 1.0, info.prior, "")
+    assert build_space((spec,), {"zero_spread": info.prior}, {}, ["r"])["zero_spread"].ends == info.ends
+
+
 def test_logarithmic_parameters_are_compared_in_logarithms() -> None:
     rng = np.random.default_rng(3)
     info = ParameterInfo("p", "-", 1.0, 1e8, {"distribution": "LogUniform", "low": 1.0, "high": 1e8})

@@ -241,7 +241,7 @@ def test_deviations_given_a_first_row_are_draws_from_the_linear_model_s_posterio
     assert abs(np.mean(found) - np.sum(slope * weight * measured[:, 0]) / precision) < 5.0 / np.sqrt(4000 * precision)
     assert np.std(found) == pytest.approx(precision**-0.5, rel=0.06)
     np.testing.assert_array_equal(
-        match_first_row(problem, values, ["new"], drawn, {}, jax.random.key(2))[0]["level_deviation@new"],
+        match_first_row(problem, values, ["new"], drawn, None, jax.random.key(2))[0]["level_deviation@new"],
         values["level_deviation@new"],
     )
 
@@ -258,7 +258,9 @@ def test_draws_count_as_they_predict_the_first_row():
     # prior N(0, 1), a measurement of 1 with deviation 2: the posterior is N(1/5, 4/5); 5 standard errors of the draws
     np.testing.assert_allclose(drawn.mean(axis=0), 0.2, atol=5.0 * np.sqrt(0.8 / 3000))
     np.testing.assert_allclose(drawn.std(axis=0), np.sqrt(0.8), rtol=0.08)
-    few = weighed_by_first_row(recordings, simulated, ["new"], {"a": 1e-3}, jax.random.key(0))[:, 1]
+    few = weighed_by_first_row(recordings, simulated, ["new"], ModelError(("a",), (1e-3,) * 3, 0.1), jax.random.key(0))[
+        :, 1
+    ]
     share = np.bincount(few, minlength=4000) / 4000
     assert 1.0 / np.sum(share**2) == pytest.approx(400, rel=0.1)
 

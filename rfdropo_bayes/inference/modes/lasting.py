@@ -42,7 +42,7 @@ class CountedProblem(ResidualProblem, Protocol):
         """Whitened residuals of all rows by channel, and which of them are there."""
         ...
 
-    def counting(self, shares: Mapping[str, float]) -> ResidualProblem:
+    def counting(self, shares: Mapping[str, float]) -> CountedProblem:
         """The same problem with the log likelihood of some channels times a share."""
         ...
 

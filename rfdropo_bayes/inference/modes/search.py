@@ -34,6 +34,7 @@ from rfdropo_bayes.inference.modes.mixture import MIXTURES, draw_mixture, mixtur
 from rfdropo_bayes.inference.modes.scales import integrate_scales
 from rfdropo_bayes.inference.modes.targets import (
     SmoothTarget,
+    Target,
     log_likelihood_derivatives,
     make_target,
     prior_derivatives,
@@ -613,20 +614,22 @@ def _counted(
     if not isinstance(problem, CountedProblem):
         return problem, modes, {}
 
-    def target_of(problem: Problem) -> Climbable:
-        return _targets(problem, config)[1](problem.n_rows, climbs.ledger, modes[0].mean, climbs.noise)
+    def target_of(problem: CountedProblem) -> Target:
+        derivatives = prior_derivatives(problem)
+        at, noise = modes[0].mean, climbs.noise
+        return make_target(problem, problem.n_rows, climbs.ledger, at, derivatives, config.jacobian, noise)
 
     lasting = lasting_residuals(problem, target_of(problem), modes[0])
     shares = {name: each.share for name, each in lasting.items() if each.share < 1.0}
     if not shares:
         return problem, modes, lasting
-    problem = problem.counting(shares)
-    target, moved = target_of(problem), []
+    counted = problem.counting(shares)
+    target, moved = target_of(counted), []
     for mode in modes:
         state, _ = maximise(target, mode.mean, max_steps=config.max_steps, tolerance=config.tolerance)
         moved.append(laplace(target, state))
-    again = lasting_residuals(problem, target, moved[0])
-    return problem, moved, {name: each._replace(widened=again[name].widened) for name, each in lasting.items()}
+    again = lasting_residuals(counted, target, moved[0])
+    return counted, moved, {name: each._replace(widened=again[name].widened) for name, each in lasting.items()}
 
 
 def _several(weights: Float[np.ndarray, " mode"], mixture: str) -> list[Caution]:
