@@ -21,7 +21,7 @@ from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.pooling import DEVIATION, SPREAD, Pooled
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
-from rfdropo_bayes.data import Trajectory, first_row_only, load_unseen, start_is_known
+from rfdropo_bayes.data import Trajectory, commands_alone, first_row_only, load_unseen, start_is_known
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_text
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
@@ -165,27 +165,16 @@ def fitted_parts(fit: Calibration) -> tuple[dict[str, float], ParameterSpace]:
 
 def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
     """Commands as a recording whose measurements are unknown, but for the start pose."""
-    clock, sent = np.asarray(time, dtype=float), np.asarray(command, dtype=float)
-    simulator = model.simulator
-    clock = np.append(clock, clock[-1] + (float(np.median(np.diff(clock))) if len(clock) > 1 else 1.0))
-    position = np.zeros((len(clock), len(simulator.marker_names), 3))
-    mask = np.zeros(position.shape[:2], dtype=bool)
-    if start is not None:
-        position[:], mask[0] = np.asarray(start, dtype=float), True
-    return Trajectory.build(
+    return commands_alone(
+        np.asarray(time, dtype=float),
+        np.asarray(command, dtype=float),
+        model.simulator.marker_names,
+        start=None if start is None else np.asarray(start, dtype=float)[None],
         name="commands",
         robot=model.name,
         format="memory",
-        time=clock,
-        position=position,
-        position_mask=mask,
-        marker_names=simulator.marker_names,
-        command_time=clock[:-1],
-        command=sent,
-        command_unit=simulator.command_unit,
-        initial_command=sent[0],
-        cable_names=simulator.channel_names,
-        settings={"unseen": True},
+        command_unit=model.simulator.command_unit,
+        cable_names=model.simulator.channel_names,
     )
 
 
