@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from rfdropo_bayes.errors import InputError
 
@@ -70,6 +72,15 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
+def write_json(path: Path, content: Any, *, finite: bool = False) -> None:
+    """Write plain values as a JSON file, whole or not at all; where ``finite``, NaN in them is an error.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    write_text(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=not finite) + "\n")
+
+
 def append_line(path: Path, line: str) -> None:
     """Add a line to a text file, whose folder is made.
 
@@ -82,6 +93,31 @@ def append_line(path: Path, line: str) -> None:
             file.write(line + "\n")
     except OSError as error:
         raise unwritten(error, path) from None
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """The JSON object of each line of a file, up to the first one that a kill has cut; nothing without a file."""
+    found = []
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+        try:
+            found.append(json.loads(line))
+        except ValueError:
+            break
+    return found
+
+
+def output_folder(path: Path) -> Path:
+    """Make a folder, or say why it cannot be written to."""
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot make the output folder: {error.strerror}", where=str(path), remedy="choose another with --out"
+        ) from None
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError("the output folder is not writable", where=str(path), remedy="choose another with --out")
+    return path
 
 
 def unwritten(error: OSError, path: Path) -> InputError:

@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 KEPT = 0.15  # share of the time that is kept for measuring the gain and for the report
-
-
 BETWEEN_STAGES = "preparation and report"
 
 
@@ -78,3 +76,10 @@ class Deadline:
     def lift(self) -> None:
         """No limit from now on."""
         self.minutes = float("inf")
+
+
+def about(seconds: float) -> str:
+    """A time in words, as rough as it is known."""
+    if seconds < 90.0:
+        return f"about {max(round(seconds), 1)} s"
+    return f"about {seconds / 60.0:.0f} min"

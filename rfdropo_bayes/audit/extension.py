@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rfdropo_bayes.audit.affordable import about, climb_rollouts
 from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import (
     Candidate,
@@ -20,8 +19,8 @@ from rfdropo_bayes.audit.candidates import (
     screening_rollouts,
     start_together,
 )
-from rfdropo_bayes.audit.deadline import OutOfTime
-from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb, heights
+from rfdropo_bayes.audit.deadline import OutOfTime, about
+from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb, climb_rollouts, heights
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.score import joint_statistic, likeness, span
 from rfdropo_bayes.audit.screen import Look, Row, look
@@ -45,8 +44,7 @@ class Rules:
         evidence: log Bayes factor a mechanism must bring to be added; one after the first must bring the logarithm of
             the number of candidates more, since with so many to choose from a few together imitate most things.
         bootstraps: simulated data sets behind every p-value.
-        minutes, slowest: for the whole audit; when they are up it finishes with what it knows. A candidate that only
-            a slower simulator knows and that would need more than the share ``slowest`` of them is not examined.
+        minutes: for the whole audit; when they are up it finishes with what it knows.
         base_passes, extended_passes: p-values of the joint test from which a model is let pass.
         explained, significant: shares of the discrepancy for "explained" and for "partly explained".
     """
@@ -59,7 +57,6 @@ class Rules:
     evidence: float = 3.0
     bootstraps: int = 999
     minutes: float = 30.0
-    slowest: float = 0.3
     base_passes: float = 0.01
     extended_passes: float = 0.05
     explained: float = 0.8

@@ -23,6 +23,7 @@ from rfdropo_bayes.inference import LevenbergState, maximise, normal_at
 from rfdropo_bayes.simulators.protocol import Observation
 
 FIRST, ALL = 8, 40  # steps of a short climb, and most of one to its end
+USUAL = 12  # steps of a climb, each with a Jacobian
 TOLERANCE = 0.01  # nats that a step promises at the end of a climb
 CLOSE = 1e-3  # of the squared misfit: climbs end where steps bring less than a thousandth of that
 FAILED = 1e6  # whitened residual of a rollout that did not end well: no step is ever taken there
@@ -291,6 +292,12 @@ def _around(climbed: _Climb, state: LevenbergState) -> Fit:
     promise = 0.5 * float(slope @ found.covariance @ slope) if np.isfinite(state.log_density) else np.inf
     evidence = found.log_evidence + float(np.sum(inside))
     return Fit(x, climbed.free, residual, jacobian, found.covariance, evidence, promise)
+
+
+def climb_rollouts(target: Target, parameters: int) -> int:
+    """Rollouts that a climb of so many parameters may take."""
+    forward = target.forward
+    return forward.count * USUAL * (1 + forward.lanes.slope_rollouts * parameters)
 
 
 def best_between(

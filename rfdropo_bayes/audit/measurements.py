@@ -84,7 +84,7 @@ class Measurements:
         self, errors: Float[np.ndarray, "*batch group time column"], noise: Stacked
     ) -> Float[np.ndarray, "*batch n"]:
         """Errors of the means as independent unit normals, flattened."""
-        return noise.whiten_means(errors, self.count).reshape(*errors.shape[:-3], self.count.size)
+        return noise.whiten(errors, self.valid, self.count).reshape(*errors.shape[:-3], self.count.size)
 
     def mean_of(
         self, single: Float[np.ndarray, "*batch recording time column"]

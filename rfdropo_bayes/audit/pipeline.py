@@ -10,14 +10,13 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.affordable import about, climb_rollouts, unaffordable
 from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
-from rfdropo_bayes.audit.deadline import Deadline, OutOfTime
+from rfdropo_bayes.audit.deadline import Deadline, OutOfTime, about
 from rfdropo_bayes.audit.differences import Groups
 from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step
-from rfdropo_bayes.audit.fit import Fit, Target, climb, widened
+from rfdropo_bayes.audit.fit import Fit, Target, climb, climb_rollouts, widened
 from rfdropo_bayes.audit.forward import Forward, Lanes
 from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
 from rfdropo_bayes.audit.journal import Journal
@@ -83,19 +82,18 @@ class Question:
 class Answer:
     """What an audit found; see the attributes' own classes.
 
-    ``unexamined`` holds candidates that would have taken too long, with the minutes; ``unsupported`` names mechanisms
-    that the fitted recordings asked for and unseen ones do not support; ``looks`` are the looks at the base model and
-    after each step; ``stages`` the explained fraction after each step; ``sizes`` is the last model's fit under priors
-    that do not pull, and ``draws`` are from it; ``suspected`` is a noise under which the base model would pass, where a
-    stated one leaves a discrepancy that is not explained; ``shift`` is the distance by which constants tell repeats
-    apart [m]; ``stopped`` says that the time was up before all was done; ``profile`` are the seconds of each stage.
+    ``unsupported`` names mechanisms that the fitted recordings asked for and unseen ones do not support; ``looks`` are
+    the looks at the base model and after each step; ``stages`` the explained fraction after each step; ``sizes`` is the
+    last model's fit under priors that do not pull, and ``draws`` are from it; ``suspected`` is a noise under which the
+    base model would pass, where a stated one leaves a discrepancy that is not explained; ``shift`` is the distance by
+    which constants tell repeats apart [m]; ``stopped`` says that the time was up before all was done; ``profile`` are
+    the seconds of each stage.
     """
 
     verdict: str
     question: Question
     target: Target
     base: Fit
-    unexamined: dict[str, float]
     steps: list[Step]
     unsupported: list[str]
     looks: list[Look]
@@ -155,8 +153,7 @@ def audit(
     shared = "" if noise.correlation is None else ", shared between coordinates"
     report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}")
     finer = None if question.finer is None else _forward(question, True, target.measurements, deadline)
-    unexamined = unaffordable(question.candidates, target, base, question.rules.slowest * question.rules.minutes)
-    inquiry = _inquiry(question, target, finer, unexamined, report)
+    inquiry = Inquiry(target, question.candidates, question.rules, question.seed, finer, report)
     inquiry, base, steps, last = _inquired(inquiry, base)
     target = inquiry.target
     held_out = _held_out(question, target, inquiry, base, steps)
@@ -182,7 +179,6 @@ def audit(
         question,
         target,
         base,
-        unexamined,
         steps,
         unsupported,
         looks,
@@ -216,20 +212,6 @@ def _judged(
         with suppress(OutOfTime):
             suspected = _suspected(inquiry, base)
     return verdict, suspected
-
-
-def _inquiry(
-    question: Question,
-    target: Target,
-    finer: Forward | None,
-    unexamined: Mapping[str, float],
-    report: Callable[[str], None],
-) -> Inquiry:
-    """The inquiry into the candidates that can be afforded."""
-    for name, minutes in unexamined.items():
-        report(f"{name} is not examined: on the slower engine it would take {minutes:.0f} minutes")
-    examined = [c for c in question.candidates if c.name not in unexamined]
-    return Inquiry(target, examined, question.rules, question.seed, finer, report)
 
 
 def _inquired(inquiry: Inquiry, base: Fit) -> tuple[Inquiry, Fit, list[Step], Look]:

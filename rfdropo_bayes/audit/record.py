@@ -40,7 +40,6 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         "between": _between(answer, findings),
         "base_fit_converged": answer.base.converged,
         "out_of_time": answer.stopped,
-        "not_examined": {name: round(minutes, 1) for name, minutes in answer.unexamined.items()},
         "left_out": dict(answer.question.left_out),
         "adopted": [step.name for step in answer.adopted],
         "unsupported": list(answer.unsupported),

@@ -26,7 +26,7 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         + _compared(answer, findings)
         + _suspicion(answer)
         + _shifted(answer)
-        + _unexamined(answer)
+        + _left_out(answer)
         + _stopped(answer)
     )
     return words[0].upper() + words[1:]
@@ -46,12 +46,10 @@ def _compared(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     return f"{lacking} All else is shared by {names}.{left_out}"
 
 
-def _unexamined(answer: Answer) -> str:
-    names = " and ".join(spoken(name) for name in answer.unexamined)
-    slow = f" Not examined, as it would have taken too long: {names}." if names else ""
+def _left_out(answer: Answer) -> str:
     count = len(answer.question.left_out)
     does = "candidate does" if count == 1 else "candidates do"
-    return slow + (f" Left out: {count} {does} not run on this body or engine." if count else "")
+    return f" Left out: {count} {does} not run on this body or engine." if count else ""
 
 
 def _stopped(answer: Answer) -> str:

@@ -84,10 +84,6 @@ def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: 
 
 def show_simulation(found: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
     """Print how far a simulation is from its recordings; ``found`` is the content of simulation.json."""
-    lines = [
-        f"{name}: {one['status']}{_off(one['error_mm'])}; {one['files'][0]}"
-        for name, one in found["recordings"].items()
-    ]
     runs = found["recordings"].items()
     lines = [f"{name}: {run['status']}{_off(run['error_mm'])}; {run['files'][0]}" for name, run in runs]
     if found["error_mm"] is not None and len(lines) > 1:

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from rfdropo_bayes.data.commands_alone import commands_alone
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import Faults, fill_missing, find_faults
 from rfdropo_bayes.data.held_readings import hold_time
@@ -41,6 +42,14 @@ _DISKS = [f"{axis}{disk}" for disk in (1, 2, 3) for axis in "xyz"]
 _COMMANDS = [f"u{motor}" for motor in range(1, MOTORS + 1)]
 _ANGLES = [f"phi{motor}" for motor in range(1, MOTORS + 1)]
 _SETTLED_ROWS = 20
+_FACTS: dict[str, Any] = {
+    "robot": "asl_trunk",
+    "format": FORMAT,
+    "marker_names": ["disk1", "disk2", "disk3"],
+    "cable_names": [f"motor{motor}" for motor in range(1, MOTORS + 1)],
+    "command_unit": "rad",
+    "frame": FRAME,
+}
 
 
 class _Recording(NamedTuple):
@@ -74,78 +83,32 @@ def read_asl_csv(observations: Path, commands: Path | None, *, mask_missing: boo
     settings["payload_mass"] = 1e-3 * float(payload.group(1)) if payload else 0.0
     return Trajectory.build(
         name=_stem(observations),
-        robot="asl_trunk",
-        format=FORMAT,
-        marker_names=["disk1", "disk2", "disk3"],
-        cable_names=[f"motor{motor}" for motor in range(1, MOTORS + 1)],
-        command_unit="rad",
-        frame=FRAME,
         provenance=f"{observations.name}, commands {commands.name if commands else NO_COMMANDS}: ASL Trunk",
         settings=settings,
+        **_FACTS,
         **content,
     )
 
 
 def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> Trajectory:
-    """Commands with the start pose at most: positions of one observation row, all others masked.
-
-    Args:
-        commands: file of commands.
-        observations: file that holds the start pose; None where it is not known.
-        row: that of the start pose; a file of a single row has it there.
+    """Commands with the start pose at most, from ``row`` of a file of observations; see `commands_alone`.
 
     Raises:
         InputError: on a damaged file, or one without that row.
     """
-    command = _read_commands(commands)
-    time = np.arange(len(command) + 1) / RATE
-    position, mask = np.zeros((len(time), 3, 3)), np.zeros((len(time), 3), dtype=bool)
+    command, start = _read_commands(commands), None
     if observations is not None:
-        points = CsvTable(observations, ["ID", *_DISKS]).points(_DISKS, allow_missing=True) @ MOCAP_TO_BASE.T
-        if row >= len(time) or (len(points) != 1 and row >= len(points)):
-            raise InputError(f"has no row {row} to start from", where=str(observations), remedy="choose other --rows")
-        first = points[min(row, len(points) - 1)]
-        seen = np.all(np.isfinite(first), axis=1)
-        position[:], mask[row] = np.where(seen[:, None], first, 0.0), seen
-    return Trajectory.build(
+        start = CsvTable(observations, ["ID", *_DISKS]).points(_DISKS, allow_missing=True) @ MOCAP_TO_BASE.T
+    return commands_alone(
+        np.arange(len(command)) / RATE,
+        command,
+        start=start,
+        row=row,
+        start_file=str(observations),
         name=_stem(observations or commands),
-        robot="asl_trunk",
-        format=FORMAT,
-        time=time,
-        position=position,
-        position_mask=mask,
-        marker_names=["disk1", "disk2", "disk3"],
-        command_time=time[:-1],
-        command=command,
-        initial_command=command[0],
-        command_unit="rad",
-        cable_names=[f"motor{motor}" for motor in range(1, MOTORS + 1)],
         provenance=commands.name,
-        frame=FRAME,
-        settings={"unseen": True},
+        **_FACTS,
     )
-
-
-def read_motor_step(values: Path, times: Path) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows 6"]]:
-    """Times [s] after the command and motor angles [rad] of the 30-degree step on motor 1 (files without a header).
-
-    Raises:
-        InputError: if a file cannot be read as numbers or the two do not fit together.
-    """
-    tables = []
-    for path in (values, times):
-        try:
-            tables.append(np.loadtxt(path, delimiter=",", ndmin=2))
-        except (OSError, ValueError) as error:
-            raise InputError(f"cannot be read ({error})", where=str(path), remedy="fetch it again") from None
-    angle, time = np.deg2rad(tables[0]), tables[1].ravel()
-    if angle.shape != (len(time), MOTORS):
-        raise InputError(
-            f"holds {angle.shape[0]} rows of {angle.shape[1]} angles, but there are {len(time)} times",
-            where=str(values),
-            remedy=f"give {MOTORS} angles per time",
-        )
-    return time, angle
 
 
 def _motion(recording: _Recording, command: np.ndarray, commands: Path | None) -> dict[str, Any]:

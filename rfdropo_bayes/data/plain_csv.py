@@ -15,11 +15,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from scipy.spatial.transform import Rotation
 
+from rfdropo_bayes.data.commands_alone import commands_alone
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import fill_missing, find_faults
 from rfdropo_bayes.data.held_readings import hold_time
-from rfdropo_bayes.data.registration import rotate_pose
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 
@@ -175,10 +176,7 @@ def _coordinates(columns: CsvColumns) -> list[str]:
 
 def _recording(table: CsvTable, source: CsvTable, columns: CsvColumns, mask_missing: bool) -> Trajectory:
     """The recording in a table, whose commands are in ``source``."""
-    coordinates = _coordinates(columns)
-    rotation, metres = axes_matrix(columns.axes), METRES[columns.position_unit]
-    position = metres * table.points(coordinates, allow_missing=mask_missing) @ rotation.T
-    time = _times(table, columns)
+    position, time = _points(table, columns, mask_missing=mask_missing), _times(table, columns)
     faults = find_faults(time, position)
     command = _commands(table, source, columns)
     angle = None
@@ -186,69 +184,57 @@ def _recording(table: CsvTable, source: CsvTable, columns: CsvColumns, mask_miss
         degree = np.pi / 180.0 if columns.motor_angle_unit == "deg" else 1.0
         angle = degree * table.numbers(columns.motor_angles, allow_missing=True)
     return Trajectory.build(
-        name=table.path.name.removesuffix(".gz").removesuffix(".csv"),
-        robot=columns.robot,
-        format=FORMAT,
         time=time,
         position=fill_missing(time, position),
         position_mask=faults.mask,
-        marker_names=columns.markers or [f"m{marker}" for marker in range(1, len(columns.positions) + 1)],
         command_time=time[: len(command)],
         command=command,
-        command_unit=COMMAND_UNITS[columns.command_unit][0],
         initial_command=command[0],
-        cable_names=columns.cables or columns.commands,
         tension=None if columns.tensions is None else table.numbers(columns.tensions, allow_missing=True),
         motor_angle=angle,
         object_pose=_pose(table, columns),
-        provenance=table.path.name,
         settings={"faults": faults.counts} | ({} if angle is None else {"motor_angle_hold": hold_time(time, angle)}),
+        **_facts(table, columns),
     )
 
 
+def _facts(table: CsvTable, columns: CsvColumns) -> dict[str, Any]:
+    """What a recording is called, and its parts."""
+    return {
+        "name": table.path.name.removesuffix(".gz").removesuffix(".csv"),
+        "robot": columns.robot,
+        "format": FORMAT,
+        "marker_names": columns.markers or [f"m{marker}" for marker in range(1, len(columns.positions) + 1)],
+        "command_unit": COMMAND_UNITS[columns.command_unit][0],
+        "cable_names": columns.cables or columns.commands,
+        "provenance": table.path.name,
+    }
+
+
+def _points(table: CsvTable, columns: CsvColumns, *, mask_missing: bool) -> Float[np.ndarray, "rows marker 3"]:
+    """Positions of the markers [m] in the base frame."""
+    points = table.points(_coordinates(columns), allow_missing=mask_missing)
+    return METRES[columns.position_unit] * points @ axes_matrix(columns.axes).T
+
+
 def read_csv_start(path: Path, columns: CsvColumns, start: Path | None, row: int = 0) -> Trajectory:
-    """Commands with the start pose at most: positions of one observation row, all others masked.
-
-    Observations are due at the times of the commands, and once more as long after the last as two are apart.
-
-    Args:
-        path: file of the commands, with their times.
-        columns: what each column is; those of positions are looked for in ``start`` only.
-        start: file that holds the start pose; None where it is not known.
-        row: that of the start pose; a file of a single row has it there.
+    """Commands with the start pose at most, from ``row`` of the file ``start``; see `commands_alone`.
 
     Raises:
         InputError: on a damaged file, a column that is not there, or a start without that row.
     """
     table = CsvTable(path, columns.commands, machine_written=False)
-    time = _times(table, columns)
-    time = np.append(time, time[-1] + (float(np.median(np.diff(time))) if len(time) > 1 else 1.0))
-    markers = len(columns.positions)
-    position, mask = np.zeros((len(time), markers, 3)), np.zeros((len(time), markers), dtype=bool)
+    points = None
     if start is not None:
-        coordinates = [name for point in columns.positions for name in point]
-        points = CsvTable(start, coordinates, machine_written=False).points(coordinates, allow_missing=True)
-        if len(points) != 1 and row >= len(points):
-            raise InputError(f"has no row {row} to start from", where=str(start), remedy="choose other --rows")
-        first = METRES[columns.position_unit] * points[min(row, len(points) - 1)] @ axes_matrix(columns.axes).T
-        seen = np.isfinite(first).all(axis=1)
-        position[:], mask[row] = np.where(seen[:, None], first, 0.0), seen
-    command = _commands(table, table, columns)
-    return Trajectory.build(
-        name=path.name.removesuffix(".gz").removesuffix(".csv"),
-        robot=columns.robot,
-        format=FORMAT,
-        time=time,
-        position=position,
-        position_mask=mask,
-        marker_names=columns.markers or [f"m{marker}" for marker in range(1, markers + 1)],
-        command_time=time[:-1],
-        command=command,
-        command_unit=COMMAND_UNITS[columns.command_unit][0],
-        initial_command=command[0],
-        cable_names=columns.cables or columns.commands,
-        provenance=path.name,
-        settings={"unseen": True},
+        coordinates = _coordinates(columns)
+        points = _points(CsvTable(start, coordinates, machine_written=False), columns, mask_missing=True)
+    return commands_alone(
+        _times(table, columns),
+        _commands(table, table, columns),
+        start=points,
+        row=row,
+        start_file=str(start),
+        **_facts(table, columns),
     )
 
 
@@ -291,4 +277,7 @@ def _pose(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows 7"] |
     pose = table.numbers(columns.object_pose, allow_missing=True) * np.array(
         [METRES[columns.position_unit]] * 3 + [1.0] * 4
     )
-    return rotate_pose(pose, axes_matrix(columns.axes), np.zeros(3))
+    rotation, known = axes_matrix(columns.axes), np.isfinite(pose).all(axis=1)
+    turned = np.full((len(pose), 4), np.nan)
+    turned[known] = (Rotation.from_matrix(rotation) * Rotation.from_quat(pose[known, 3:])).as_quat()
+    return np.hstack([pose[:, :3] @ rotation.T, turned])

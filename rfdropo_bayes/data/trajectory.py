@@ -365,15 +365,7 @@ class Trajectory:
             InputError: if the file is missing, corrupt, written by something else, or its content does not match the
                 hash stored in it.
         """
-        if not Path(path).is_file():
-            raise InputError("no such file", where=str(path), remedy="correct the path")
-        try:
-            with xr.open_dataset(path, engine="h5netcdf") as opened:
-                dataset = opened.load()
-        except Exception as error:  # the HDF5 stack raises many types on damaged files, none of them ours
-            raise InputError(
-                f"is not a readable NetCDF file ({type(error).__name__})", where=str(path), remedy="fetch it again"
-            ) from None
+        dataset = open_netcdf(path)
         if dataset.attrs.get("schema") != SCHEMA:
             raise InputError(
                 f"is a NetCDF file, but not a trajectory of ours (attribute schema = {SCHEMA!r} is missing)",
@@ -390,6 +382,23 @@ class Trajectory:
         if stored != trajectory.sha256:
             raise InputError("its content does not match its hash", where=str(path), remedy="fetch it again")
         return trajectory
+
+
+def open_netcdf(path: Path) -> xr.Dataset:
+    """All of a NetCDF file.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    if not Path(path).is_file():
+        raise InputError("no such file", where=str(path), remedy="correct the path")
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as opened:
+            return opened.load()
+    except Exception as error:  # the HDF5 stack raises many types on damaged files, none of them ours
+        raise InputError(
+            f"is not a readable NetCDF file ({type(error).__name__})", where=str(path), remedy="fetch or make it again"
+        ) from None
 
 
 _INSTANT = 1e-9  # [s]: times that differ by less are the same instant

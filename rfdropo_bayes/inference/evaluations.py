@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
 
-SPACINGS = ("geometric", "linear", "every")
+SPACINGS = ("geometric", "linear")
 NOT_A_NUMBER = "not_a_number"
 REDRAWS = 256  # times as many prior draws as are wanted, at most
 
@@ -43,13 +43,18 @@ class Ledger:
         return ", ".join(f"{name} {count}" for name, count in sorted(self.excluded.items())) or "no reason given"
 
     def record(self) -> dict[str, Any]:
-        """For a checkpoint's JSON. (`dataclasses.asdict` counts the items of a Counter instead of copying them.)"""
+        """For a checkpoint and an `InferenceResult`. (`dataclasses.asdict` counts the items of a Counter instead.)"""
         return {"rollouts": self.rollouts, "evaluations": self.evaluations, "excluded": dict(self.excluded)}
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Ledger:
         """Inverse of `record`."""
         return cls(record["rollouts"], record["evaluations"], Counter(record["excluded"]))
+
+    def __add__(self, other: Ledger) -> Ledger:
+        """What both have spent."""
+        excluded = self.excluded + other.excluded
+        return Ledger(self.rollouts + other.rollouts, self.evaluations + other.evaluations, excluded)
 
     def charge(self, problem: Problem, n: int, horizon: int) -> None:
         """Count ``n`` rollouts of ``horizon`` rows."""
@@ -110,12 +115,10 @@ def block_boundaries(n_rows: int, blocks: int, spacing: str = "geometric") -> tu
         n_rows: rows of data.
         blocks: number of blocks wanted; fewer where rows do not suffice.
         spacing: ``"geometric"`` doubles (the sum of all prefixes stays below ``2 n_rows``), ``"linear"`` has equal
-            blocks, ``"every"`` has one block per row whatever ``blocks`` says.
+            blocks.
     """
     if n_rows < 1 or blocks < 1:
         raise InputError("a schedule needs at least one row and one block", where="[inference] blocks")
-    if spacing == "every":
-        return tuple(range(1, n_rows + 1))
     if spacing == "linear":
         raw = [n_rows * (k + 1) / blocks for k in range(blocks)]
     elif spacing == "geometric":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,6 +15,7 @@ from scipy.stats import skew
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.cautions import Caution, Code
+from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.posteriors import contradiction, contradicts, piled_at
 
 SCATTERED = 0.5  # nats
@@ -63,6 +65,11 @@ class InferenceResult:
     held: dict[str, float] = field(default_factory=dict)
     optimum: dict[str, float] | None = None
     details: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def spent(self) -> Ledger:
+        """Rollouts, evaluations and exclusions together."""
+        return Ledger(self.rollouts, self.evaluations, Counter(self.excluded))
 
 
 def chains(problem: Problem, positions: list[np.ndarray]) -> Draws:

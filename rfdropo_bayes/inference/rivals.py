@@ -278,9 +278,7 @@ def _run(
         method=name,
         draws=draws,
         trace=trace,
-        rollouts=ledger.rollouts,
-        evaluations=ledger.evaluations,
-        excluded=dict(ledger.excluded),
+        **ledger.record(),
         cautions=[
             *prior_cautions(problem, draws),
             *exclusion_cautions(ledger.excluded, ledger.evaluations),

@@ -21,6 +21,7 @@ from scipy.stats import chisquare
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.progress import Progress, run_digest
 from rfdropo_bayes.posteriors import central_interval
@@ -130,28 +131,21 @@ def calibrate(
         row = _one(simulate, method, options, jax.random.fold_in(data_key, index), prior.std(axis=0))
         rows.append({**row, "seconds": time.monotonic() - began})
         if log is not None:
-            log.parent.mkdir(parents=True, exist_ok=True)
-            with log.open("a" if index else "w", encoding="utf-8") as file:
-                file.write(json.dumps({"digest": digest, **rows[-1]}) + "\n")
+            append_line(log, json.dumps({"digest": digest, **rows[-1]}))
         if progress is not None:
             progress.stage((index + 1) / datasets, method="sbc", dataset=index, rollouts=row["rollouts"])
     return _judge(problem.names, rows)
 
 
 def _known(log: Path | None, digest: str, resume: bool) -> list[dict[str, Any]]:
-    if log is None or not resume or not log.exists():
+    """Data sets that the log holds, which is cleared of all else."""
+    if log is None or not log.exists():
         return []
-    rows = []
-    for line in log.read_text(encoding="utf-8").splitlines():
-        try:
-            row = json.loads(line)
-        except ValueError:
-            break  # a kill in the middle of a line
-        if row.pop("digest") != digest:
-            raise InputError("belongs to another check", where=str(log), remedy="start without --resume")
-        rows.append(row)
-    log.write_text("".join(json.dumps({"digest": digest, **row}) + "\n" for row in rows), encoding="utf-8")
-    return rows
+    rows = read_lines(log) if resume else []
+    if any(row["digest"] != digest for row in rows):
+        raise InputError("belongs to another check", where=str(log), remedy="start without --resume")
+    log.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
+    return [{name: value for name, value in row.items() if name != "digest"} for row in rows]
 
 
 def _one(

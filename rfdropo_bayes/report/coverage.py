@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy import stats
 
 from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.report.residuals import autocorrelations
 
 NOMINAL = (0.5, 0.9)
 
@@ -99,14 +100,11 @@ def transform_curve(recordings: Sequence[RecordingPrediction]) -> TransformCurve
 
 
 def _independent_values(transformed: Float[np.ndarray, " n"]) -> float:
+    """Honest scores are centred at zero, about which they are taken: a constant error is one value."""
     n = len(transformed)
     if n < 3:
         return float(n)
-    scores = stats.norm.ppf(transformed)
-    variance = float(np.mean(scores**2))  # about zero, where honest scores are centred: a constant error is one value
-    size = 2 ** int(np.ceil(np.log2(2 * n)))
-    spectrum = np.abs(np.fft.rfft(scores, size)) ** 2
-    correlation = np.fft.irfft(spectrum)[:n] / (n * max(variance, 1e-300))
+    correlation = autocorrelations([stats.norm.ppf(transformed)])
     negative = np.flatnonzero(correlation <= 0)
-    until = int(negative[0]) if len(negative) else n
-    return n / (1.0 + 2.0 * float(correlation[1:until].sum()))
+    until = int(negative[0]) if len(negative) else len(correlation)
+    return n / (1.0 + 2.0 * float(correlation[:until].sum()))

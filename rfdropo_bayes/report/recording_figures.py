@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.report import style
+from rfdropo_bayes.report.robot_figure import draw_side
 from rfdropo_bayes.report.trajectory_figures import AXES, shown_markers
 
 MILLIMETRES = 1e3
-BODY = "#DCE6EC"
 MOST_LABELS = 8
 
 
@@ -73,21 +73,10 @@ def _commands(axes: Axes, trajectory: Trajectory) -> None:
 
 def _rest(axes: Axes, trajectory: Trajectory, rest: Mapping[str, Any], across: int) -> None:
     """The undeformed robot with its cables and markers, the first row, and the path of the last marker."""
-    along = MILLIMETRES * np.concatenate([rest["station"], rest["station"][::-1]])
-    half = MILLIMETRES * np.array(rest["half_width"])[:, across]
-    axes.fill(along, np.concatenate([half, -half[::-1]]), color=BODY, label="at rest")
-    for cable in rest["cables"].values():
-        line = MILLIMETRES * np.array(cable)
-        axes.plot(line[:, 2], line[:, across], color=style.PRIOR, linewidth=0.6)
-    points = MILLIMETRES * np.array(list(rest["markers"].values()))
-    axes.plot(points[:, 2], points[:, across], "o", mfc="none", color=style.POSTERIOR, label="markers at rest")
-    for name, point in zip(rest["markers"], points, strict=True):
-        if len(points) <= MOST_LABELS:
-            axes.annotate(name, point[[2, across]], (0, 6), textcoords="offset points", ha="center", fontsize=8)
+    draw_side(axes, rest, across, {})
     position = MILLIMETRES * np.where(trajectory.position_mask[..., None], trajectory.position, np.nan)
     axes.plot(position[:, -1, 2], position[:, -1, across], color=style.PRIOR, linewidth=0.8, label="last marker's path")
-    axes.plot(position[0, :, 2], position[0, :, across], "x", color=style.TEST, label="first row")
-    axes.set(xlabel="z [mm], away from the clamp", ylabel=f"{AXES[across]} [mm]")
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.plot(position[0, :, 2], position[0, :, across], "x", color=style.POSTERIOR, label="first row")
+    axes.set_xlabel("z [mm], away from the clamp")
     if across == 0:
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)

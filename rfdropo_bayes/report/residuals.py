@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
+from scipy.signal import correlate
 
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.posteriors import RecordingPrediction
@@ -90,10 +91,11 @@ def check(white: Sequence[Float[np.ndarray, "time series"]], counted: bool = Fal
 def autocorrelations(series: Sequence[Float[np.ndarray, " time"]]) -> Float[np.ndarray, " lag"]:
     """Autocorrelation about zero at the lags 1, 2, ... up to half of the longest series, pooled over series."""
     most = max(1, max(len(column) for column in series) // 2)
-    power = sum(float(column @ column) for column in series)
-    return (
-        np.array([sum(float(column[lag:] @ column[:-lag]) for column in series) for lag in range(1, most + 1)]) / power
-    )
+    total = np.zeros(most + 1)
+    for column in series:
+        products = correlate(column, column, method="fft")[len(column) - 1 :][: most + 1]
+        total[: len(products)] += products
+    return total[1:] / total[0]
 
 
 def residual_cautions(checks: Mapping[str, ResidualCheck], noise: str) -> list[Caution]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from rfdropo_bayes.report import style
 
 MILLIMETRES = 1e3
-MOST_NAMED = 12  # cables; more names would lie on each other
+MOST_NAMED = 12  # cables, or markers; more names would lie on each other
 AXES = "xyz"
 
 
@@ -27,29 +27,32 @@ def robot_figure(outline: Mapping[str, Any]) -> Figure:
     side, section = figure.subplots(1, 2, width_ratios=(1.4, 1.0))
     colours = {name: style.CYCLE[i % (len(style.CYCLE) - 1)] for i, name in enumerate(outline["cables"])}
     gravity = np.abs(outline["gravity"])
-    _side(side, outline, 0 if gravity[0] > gravity[1] else 1, colours)
+    across = 0 if gravity[0] > gravity[1] else 1
+    draw_side(side, outline, across, colours)
+    _gravity(side, outline["gravity"], 2, across)
+    side.margins(0.04, 0.3)
     _section(section, outline, colours)
     return figure
 
 
-def _side(axes: Axes, outline: Mapping[str, Any], across: int, colours: Mapping[str, str]) -> None:
-    """Along the axis of the robot, one of the two directions across it upwards."""
+def draw_side(axes: Axes, outline: Mapping[str, Any], across: int, colours: Mapping[str, str]) -> None:
+    """Draw the robot along its axis, one of the two directions across it upwards; cables in their colours, if any."""
     station = MILLIMETRES * np.asarray(outline["station"])
     half = MILLIMETRES * np.asarray(outline["half_width"])[:, across]
-    axes.fill_between(station, -half, half, color=style.PRIOR, alpha=0.25, linewidth=0)
+    axes.fill_between(station, -half, half, color=style.PRIOR, alpha=0.25, linewidth=0, label="at rest")
     axes.axvline(station[0], color=style.PRIOR, linewidth=3)
     for name, points in outline["cables"].items():
         line = MILLIMETRES * np.asarray(points)
-        axes.plot(line[:, 2], line[:, across], ".-", color=colours[name], markersize=2.5, linewidth=0.9)
-    for name, point in outline["markers"].items():
-        place = MILLIMETRES * np.asarray(point)
-        axes.plot(place[2], place[across], "D", color=style.TEST, markersize=4.5)
-        axes.annotate(name, (place[2], place[across]), (0, 7), textcoords="offset points", ha="center", fontsize=8)
-    _gravity(axes, outline["gravity"], 2, across)
+        colour = colours.get(name, style.PRIOR)
+        axes.plot(line[:, 2], line[:, across], ".-", color=colour, markersize=2.5, linewidth=0.9)
+    points = MILLIMETRES * np.array(list(outline["markers"].values()))
+    axes.plot(points[:, 2], points[:, across], "D", color=style.TEST, markersize=4.5, label="markers at rest")
+    for name, point in zip(outline["markers"], points, strict=True):
+        if len(points) <= MOST_NAMED:
+            axes.annotate(name, point[[2, across]], (0, 7), textcoords="offset points", ha="center", fontsize=8)
     axes.set_xlabel("z [mm]")
     axes.set_ylabel(f"{AXES[across]} [mm]")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.04, 0.3)
 
 
 def _section(axes: Axes, outline: Mapping[str, Any], colours: Mapping[str, str]) -> None:

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import write_text
+from rfdropo_bayes.files import output_folder, write_text
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.report.page import render_page
 from rfdropo_bayes.report.summary import read_summary, write_summary
@@ -23,13 +22,7 @@ def write_run(folder: Path, record: PosteriorRecord, summary: Mapping[str, Any],
     Raises:
         InputError: if the folder cannot be written.
     """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot be made ({error.strerror or error})", where=str(folder), remedy="choose a writable folder"
-        ) from None
+    folder = output_folder(folder)
     record.save(folder / POSTERIOR)
     write_summary(summary, folder / SUMMARY)
     write_text(folder / CONFIG, config)

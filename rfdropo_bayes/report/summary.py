@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import write_text
+from rfdropo_bayes.files import write_json
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.report.coverage import Coverage, coverage
 from rfdropo_bayes.report.facts import RunFacts
@@ -184,7 +184,7 @@ def write_summary(summary: Mapping[str, Any], path: Path) -> None:
     Raises:
         InputError: if it cannot be written.
     """
-    write_text(path, json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+    write_json(path, summary, finite=True)
 
 
 def read_summary(path: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from rfdropo_bayes.audit.pipeline import Answer, measurements_of, simulated
 from rfdropo_bayes.audit.record import STIFFNESS
 from rfdropo_bayes.audit.verdict import EQUIVALENT, EXPLAINED, NO_DISCREPANCY, PARTLY, UNEXPLAINED
 from rfdropo_bayes.errors import InputError, Interrupted
-from rfdropo_bayes.files import write_text
+from rfdropo_bayes.files import output_folder, read_lines, write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.interrupts import running
 from rfdropo_bayes.mechanisms import REGISTRY
@@ -27,7 +27,6 @@ from rfdropo_bayes.studies.fits import Job, run_fits
 from rfdropo_bayes.studies.hidden_effects import Hidden, Setting, hide
 from rfdropo_bayes.workflow.audit import JOURNAL, Workshop, run_audit
 from rfdropo_bayes.workflow.experiment import CommandsTable
-from rfdropo_bayes.workflow.files import output_folder
 
 RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
 NEAR = 1.3  # times the error of the model that knows what is hidden
@@ -151,15 +150,14 @@ def run_study(
             "conditions": {c.name: summarise(c, _rows_of(c, done)) for c in chosen},
             "schema_version": 1,
         }
-        write_text(out / RESULT, json.dumps(content, indent=2) + "\n")
+        write_json(out / RESULT, content)
         write_text(out / TABLE, as_table(content))
     return content
 
 
 def _kept(ledger: Path, seed: int) -> list[dict[str, Any]]:
     """The data sets of a seed that are in the ledger."""
-    lines = ledger.read_text(encoding="utf-8").splitlines() if ledger.exists() else []
-    rows = [{**row["job"], **row["result"]} for row in map(json.loads, lines)]
+    rows = [{**row["job"], **row["result"]} for row in read_lines(ledger)]
     return [row for row in rows if row["seed"] == seed]
 
 

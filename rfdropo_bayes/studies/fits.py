@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.inference.progress import Progress
 
 LOCAL = "local"
@@ -41,11 +42,10 @@ def run_fits(
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     known = _read(log) if resume else {}
-    log.write_text("".join(_line(job, result) for job, result in known.values()), encoding="utf-8")
+    log.write_text("".join(_line(job, result) + "\n" for job, result in known.values()), encoding="utf-8")
     left = [job for job in jobs if _name(job) not in known]
     for count, (job, result) in enumerate(_results(left, fit, cluster)):
-        with log.open("a", encoding="utf-8") as file:
-            file.write(_line(job, result))
+        append_line(log, _line(job, result))
         known[_name(job)] = (dict(job), result)
         if progress is not None:
             progress.stage((len(jobs) - len(left) + count + 1) / len(jobs), **job)
@@ -96,15 +96,8 @@ def _name(job: Job) -> str:
 
 
 def _line(job: Job, result: Mapping[str, Any]) -> str:
-    return json.dumps({"job": dict(job), "result": dict(result)}) + "\n"
+    return json.dumps({"job": dict(job), "result": dict(result)})
 
 
 def _read(log: Path) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
-    known = {}
-    for line in log.read_text(encoding="utf-8").splitlines() if log.exists() else []:
-        try:
-            row = json.loads(line)
-            known[_name(row["job"])] = (row["job"], row["result"])
-        except (ValueError, KeyError):
-            break  # a kill in the middle of a line
-    return known
+    return {_name(row["job"]): (row["job"], row["result"]) for row in read_lines(log)}

@@ -27,13 +27,13 @@ from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot
 from rfdropo_bayes.workflow.audit import Workshop, build_question
 from rfdropo_bayes.workflow.commands import random_walk
 from rfdropo_bayes.workflow.experiment import AuditTable, CommandsTable, Experiment
 from rfdropo_bayes.workflow.experiment_file import describe
-from rfdropo_bayes.workflow.files import output_folder
 
 NOISE, MEMORY = 5e-4, 0.6  # standard deviation [m] and correlation from row to row
 TENSION_NOISE = 0.02  # of a tension reading

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,13 @@ from jaxtyping import PRNGKeyArray
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import write_text
+from rfdropo_bayes.files import write_json
 from rfdropo_bayes.inference import sbc
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.inference.progress import Progress
-from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
 from rfdropo_bayes.workflow.calibration import inference_options
-from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.files import LOG, hashes, run_folder
+from rfdropo_bayes.workflow.model import Model
 
 CHECKS = ("sbc",)
 MOST_FAILURES = 100
@@ -49,14 +47,13 @@ def run_check(
     """
     if check not in CHECKS:
         raise InputError(f"unknown check {check!r}", where="--check", remedy=f"one of {', '.join(CHECKS)}")
-    experiment, tables = load_experiment(path, overrides)
-    folder = Path(path).resolve().parent
-    simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
-    fitted = load_data(experiment, folder, "fit")
-    problem = build_problem(build_model(experiment, simulator, fitted))
+    model, tables = Model.read(path, overrides)
+    experiment, fitted = model.experiment, model.recordings("fit")
+    problem = model.problem(fitted)
     options = inference_options(experiment)
     make_config(experiment.inference.method, options)
-    settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": {"check": check}}
+    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(fitted)}
+    settings["options"] = {"check": check}
     with run_folder(out, "check", **settings, resume=resume, overwrite=overwrite) as out:
         with Progress("sbc", show=None, log=out / LOG) as progress:
             found = sbc.calibrate(
@@ -76,9 +73,9 @@ def run_check(
             "options": options,
             "seed": experiment.seed,
             "robot": experiment.robot,
-            "simulator": simulator.description,
+            "simulator": model.simulator.description,
         }
-        write_text(out / "sbc.json", json.dumps(content, indent=1) + "\n")
+        write_json(out / "sbc.json", content)
     return content
 
 

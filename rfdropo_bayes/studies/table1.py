@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -14,7 +13,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.cautions import grave, read_cautions
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import write_text
+from rfdropo_bayes.files import write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.rivals import import_sbi
 from rfdropo_bayes.report.facts import software_versions
@@ -124,7 +123,7 @@ def run_table1(
             "by_caution": by_caution(found),
             "versions": software_versions(),
         }
-        write_text(out / "table1.json", json.dumps(content, indent=1) + "\n")
+        write_json(out / "table1.json", content)
         write_text(out / "table1.md", as_markdown(content))
         draw_figure(content, out / "table1.png")
     return content

@@ -21,7 +21,7 @@ from scipy.stats import binomtest
 
 from rfdropo_bayes.audit.verdict import NO_VERDICT
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import write_text
+from rfdropo_bayes.files import output_folder, write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.studies.table2_page import as_markdown, draw_figure
@@ -29,7 +29,7 @@ from rfdropo_bayes.workflow.audit import run_audit
 from rfdropo_bayes.workflow.audited import AUDIT, EXTENDED
 from rfdropo_bayes.workflow.calibration import run_calibration
 from rfdropo_bayes.workflow.experiment_file import describe, read_tables, self_contained
-from rfdropo_bayes.workflow.files import LOG, output_folder, run_ended, run_folder
+from rfdropo_bayes.workflow.files import LOG, run_ended, run_folder
 from rfdropo_bayes.workflow.training import CSV, POLICY, run_evaluation, run_training
 
 THRESHOLDS = (0.01525, 0.02157, 0.030)  # m, those of the paper's Table II
@@ -175,7 +175,7 @@ def run_table2(
             "versions": software_versions(),
             "claims": claims(summaries),
         }
-        write_text(out / "table2.json", json.dumps(content, indent=1) + "\n")
+        write_json(out / "table2.json", content)
         write_text(out / "table2.md", as_markdown(content))
         if summaries:
             draw_figure(content).savefig(out / "table2.png", dpi=150)
@@ -206,7 +206,7 @@ def _do(study: Study, task: str, row: str, seed: int) -> None:
     tables = _on_target(study, _tables(study, task))
     path = _written(tables, study.out / task / "experiments" / "target.toml")
     run_evaluation(path, [policy], out, episodes=study.size.episodes, film=False, overwrite=True)
-    write_text(out / "policy.json", json.dumps({"sha256": _digest(policy / POLICY), **_learning(policy)}) + "\n")
+    write_json(out / "policy.json", {"sha256": _digest(policy / POLICY), **_learning(policy)})
 
 
 def _trained(study: Study, task: str, row: str, seed: int) -> Path:

@@ -46,7 +46,7 @@ from rfdropo_bayes.report.run_folder import CONFIG, POSTERIOR
 from rfdropo_bayes.workflow.assembly import pooling
 from rfdropo_bayes.workflow.calibrated import Calibration
 from rfdropo_bayes.workflow.calibration import gather_facts, scale_free_ratios
-from rfdropo_bayes.workflow.experiment import Experiment, NoiseTable, load_experiment
+from rfdropo_bayes.workflow.experiment import Experiment, NoiseTable
 from rfdropo_bayes.workflow.experiment_file import describe
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
@@ -217,16 +217,16 @@ def run_adaptation(
     path = run / CONFIG if experiment is None else experiment
     if not path.is_file():
         raise InputError(f"{run} holds no {CONFIG}", where="RUN", remedy="name the experiment file with --experiment")
-    read, _ = load_experiment(path, overrides)
+    model, _ = Model.read(path, overrides)
+    read = model.experiment
     if read.data is None:
         raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format recordings are")
-    folder = path.resolve().parent
     entry = RecordingEntry(observations=recording, commands=commands)
-    found = load_recordings(read.data.model_copy(update={"fit": [entry], "test": []}), folder)
+    found = load_recordings(read.data.model_copy(update={"fit": [entry], "test": []}), model.folder)
     if len(found) > 1:
         raise InputError(f"names {len(found)} files", where=recording, remedy="adapt to one at a time")
     record = PosteriorRecord.load(run / POSTERIOR)
-    fit = Calibration(record, {"title": read.title or path.stem}, "", Model.of_experiment(read, folder), run)
+    fit = Calibration(record, {"title": read.title or path.stem}, "", model, run)
     chosen = read.seed if seed is None else seed
     options: dict[str, Any] = {"seconds": seconds, "group": group, "seed": chosen, "overwrite": overwrite, "show": show}
     return adapt(fit, found[0], out=out, entry=entry, **options)

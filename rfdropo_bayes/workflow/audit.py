@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -34,7 +33,8 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.audit_page import render_audit, shown
-from rfdropo_bayes.report.summary import combined_hash
+from rfdropo_bayes.report.run_folder import SUMMARY
+from rfdropo_bayes.report.summary import combined_hash, read_summary
 from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.commands import Commands
@@ -50,7 +50,6 @@ from rfdropo_bayes.workflow.assembly import (
     find_workpiece,
     fixed_values,
     gather_channels,
-    load_data,
     measurement_specs,
     model_space,
     stated_noise,
@@ -58,7 +57,7 @@ from rfdropo_bayes.workflow.assembly import (
 from rfdropo_bayes.workflow.audited import Audit
 from rfdropo_bayes.workflow.between import Between, extend_groups, find_groups
 from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.experiment import AuditTable, Experiment, NoiseTable, Workpiece, load_experiment
+from rfdropo_bayes.workflow.experiment import AuditTable, Experiment, NoiseTable, Workpiece
 from rfdropo_bayes.workflow.experiment_file import code_placed, describe, self_contained
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model, source_of
@@ -182,15 +181,14 @@ def run_audit(
         seed: of the audit; that of the file by default.
         options: further arguments of `audit`.
     """
-    experiment, tables = load_experiment(path, overrides)
-    folder = Path(path).resolve().parent
+    model, tables = Model.read(path, overrides)
     found = audit(
-        Model.of_experiment(experiment, folder),
-        load_data(experiment, folder, "fit"),
-        test=load_data(experiment, folder, "test"),
-        seed=experiment.seed if seed is None else seed,
+        model,
+        model.recordings("fit"),
+        test=model.recordings("test"),
+        seed=model.experiment.seed if seed is None else seed,
         out=out,
-        title=experiment.title or path.stem,
+        title=model.experiment.title or path.stem,
         tables=tables,
         **options,
     )
@@ -451,17 +449,8 @@ def start_values(base: Calibration | Path | None) -> dict[str, float] | None:
     """Posterior means of an earlier calibration, or of its folder."""
     if base is None:
         return None
-    if isinstance(base, Calibration):
-        return {name: float(row["mean"]) for name, row in base.content["parameters"].items()}
-    path = Path(base) / "summary.json"
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-        rows = summary["parameters"]
-        return {name: float(row["mean"]) for name, row in rows.items()}
-    except (OSError, ValueError, KeyError, TypeError):
-        raise InputError(
-            "is not the folder of a finished calibration", where=str(base), remedy="run rfdropo calibrate first"
-        ) from None
+    content = base.content if isinstance(base, Calibration) else read_summary(Path(base) / SUMMARY)
+    return {name: float(row["mean"]) for name, row in content["parameters"].items()}
 
 
 def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path, out: Path | None = None) -> dict[str, Any]:

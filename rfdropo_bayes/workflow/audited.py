@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import write_text
+from rfdropo_bayes.files import write_json, write_text
 from rfdropo_bayes.report import audit_figures as figures
 from rfdropo_bayes.report.audit_figures import Shown
 from rfdropo_bayes.report.trajectory_figures import AXES
@@ -166,7 +165,7 @@ class Audit:
         """Write audit.json, extended.toml and report.html; return the path of the report."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / AUDIT, json.dumps(self.content, indent=2, allow_nan=False) + "\n")
+        write_json(folder / AUDIT, self.content, finite=True)
         write_text(folder / EXTENDED, describe(self.tables))
         return self.report(folder / REPORT)
 

@@ -39,9 +39,8 @@ from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
 from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.robots import Robot, robot_shape
-from rfdropo_bayes.workflow.assembly import load_data
 from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.experiment import Experiment, InferenceTable, load_experiment
+from rfdropo_bayes.workflow.experiment import Experiment, InferenceTable
 from rfdropo_bayes.workflow.experiment_file import describe
 from rfdropo_bayes.workflow.files import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
@@ -145,13 +144,13 @@ def run_calibration(
     show: bool | None = None,
 ) -> Calibration:
     """`calibrate` what an experiment file says; ``overrides`` are assignments that replace entries of the file."""
-    experiment, tables = load_experiment(path, overrides)
-    folder = Path(path).resolve().parent
+    model, tables = Model.read(path, overrides)
+    experiment = model.experiment
     return calibrate(
-        Model.of_experiment(experiment, folder),
-        load_data(experiment, folder, "fit"),
+        model,
+        model.recordings("fit"),
         make_config(experiment.inference.method, inference_options(experiment)),
-        test=load_data(experiment, folder, "test"),
+        test=model.recordings("test"),
         seed=experiment.seed,
         out=out,
         start=start,

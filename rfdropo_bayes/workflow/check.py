@@ -20,13 +20,13 @@ from rfdropo_bayes.data import (
 )
 from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.report.recording_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.workflow.assembly import build_model, build_simulator, find_robot, with_drives
 from rfdropo_bayes.workflow.calibration import inference_options
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
-from rfdropo_bayes.workflow.files import output_folder
 from rfdropo_bayes.workflow.listings import robot_facts
 from rfdropo_bayes.workflow.placement import far_from_rest, placement_hints
 

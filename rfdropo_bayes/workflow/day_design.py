@@ -23,10 +23,8 @@ from rfdropo_bayes.prediction.own_fit import STEP
 from rfdropo_bayes.prediction.predictive import FITTED, Batch
 from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.workflow.adaptation import day_space, model_error_of
-from rfdropo_bayes.workflow.assembly import load_data
 from rfdropo_bayes.workflow.calibrated import Calibration
 from rfdropo_bayes.workflow.design import COMMANDS, Design, command_table, proposals
-from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
 from rfdropo_bayes.workflow.unseen import fitted_parts, model_of
@@ -135,13 +133,12 @@ def run_day_design(
     report: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """`design_day` for a calibration's folder, and write design.json and next_commands.csv; return the former."""
-    experiment, tables = load_experiment(path, overrides)
-    folder = Path(path).resolve().parent
-    runs = load_data(experiment, folder, "fit")
-    fit = Calibration(PosteriorRecord.load(base / POSTERIOR), {}, "", Model.of_experiment(experiment, folder), base)
-    chosen = experiment.seed if seed is None else seed
+    model, tables = Model.read(path, overrides)
+    runs = model.recordings("fit")
+    fit = Calibration(PosteriorRecord.load(base / POSTERIOR), {}, "", model, base)
+    chosen = model.experiment.seed if seed is None else seed
     options = {"base": base, "seed": chosen, "adapt": True, "seconds": seconds}
-    settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes(runs), "options": options}
+    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(runs), "options": options}
     with run_folder(out, "design", **settings, overwrite=overwrite) as out:
         found = design_day(fit, runs, seconds=seconds, seed=chosen, report=report)
         return {**found.content, "commands": str(found.save(out))}

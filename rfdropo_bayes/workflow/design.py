@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,12 +23,11 @@ from rfdropo_bayes.audit.pipeline import Question, base_model
 from rfdropo_bayes.bayes.recordings import commands_after
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.plain_csv import command_columns
-from rfdropo_bayes.files import whole, write_text
+from rfdropo_bayes.files import whole, write_json
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
-from rfdropo_bayes.workflow.assembly import load_data
 from rfdropo_bayes.workflow.audit import build_question, start_values
 from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
+from rfdropo_bayes.workflow.experiment import Experiment
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
 
@@ -85,7 +83,7 @@ class Design:
         folder.mkdir(parents=True, exist_ok=True)
         with whole(folder / COMMANDS) as partial:
             self.commands.to_csv(partial, index=False, float_format="%.6f")
-        write_text(folder / DESIGN, json.dumps({**self.content, "commands": str(folder / COMMANDS)}, indent=2) + "\n")
+        write_json(folder / DESIGN, {**self.content, "commands": str(folder / COMMANDS)})
         return folder / COMMANDS
 
     def _repr_html_(self) -> str:
@@ -163,14 +161,13 @@ def run_design(
     report: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """`design` what an experiment file says, and write design.json and next_commands.csv; return the former."""
-    experiment, tables = load_experiment(path, overrides)
-    folder = Path(path).resolve().parent
-    fitted = load_data(experiment, folder, "fit")
-    chosen = experiment.seed if seed is None else seed
+    model, tables = Model.read(path, overrides)
+    fitted = model.recordings("fit")
+    chosen = model.experiment.seed if seed is None else seed
     options = {"base": base, "seed": chosen}
-    settings = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": options}
+    settings = {"tables": tables, "folder": model.folder, "data": hashes(fitted), "options": options}
     with run_folder(out, "design", **settings, overwrite=overwrite) as out:
-        found = design(Model.of_experiment(experiment, folder), fitted, base=base, seed=chosen, report=report)
+        found = design(model, fitted, base=base, seed=chosen, report=report)
         return {**found.content, "commands": str(found.save(out))}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,11 +11,10 @@ import numpy as np
 import pandas as pd
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import whole, write_text
+from rfdropo_bayes.files import output_folder, whole, write_json
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.report.run_folder import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import read_summary
-from rfdropo_bayes.workflow.files import output_folder
 
 TABLE, TABLE_JSON, DRAWS = "phi.csv", "phi.json", "phi_draws.csv"
 MOST_DRAWS = 2000
@@ -73,7 +71,7 @@ def export_phi(folder: Path, out: Path | None = None, *, overwrite: bool = False
     paths = [out / TABLE, out / TABLE_JSON, out / DRAWS]
     with whole(paths[0]) as partial:
         pd.DataFrame(rows).to_csv(partial, index=False)
-    write_text(paths[1], json.dumps(content, indent=2, allow_nan=False) + "\n")
+    write_json(paths[1], content, finite=True)
     with whole(paths[2]) as partial:
         pd.DataFrame(drawn.T, columns=names).to_csv(partial, index=False)
     return paths

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple
 
 from rfdropo_bayes import __version__
 from rfdropo_bayes.errors import InputError, Interrupted
-from rfdropo_bayes.files import unwritten, write_text
+from rfdropo_bayes.files import output_folder, unwritten, write_text
 from rfdropo_bayes.interrupts import interrupted, running
 from rfdropo_bayes.workflow.experiment_file import ROBOT_COPY, describe, self_contained
 
@@ -51,20 +50,6 @@ COMMANDS = {
     "benchmark table1": Command(("table1.json", "table1.md", "table1.png", "fits.jsonl"), resumable=True),
     "benchmark table2": Command(("table2.json", "table2.md", "table2.png"), resumable=True),
 }
-
-
-def output_folder(path: Path) -> Path:
-    """Make the folder, or say why it cannot be written to."""
-    path = Path(path)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot make the output folder: {error.strerror}", where=str(path), remedy="choose another with --out"
-        ) from None
-    if not os.access(path, os.W_OK | os.X_OK):
-        raise InputError("the output folder is not writable", where=str(path), remedy="choose another with --out")
-    return path
 
 
 @contextmanager

@@ -8,11 +8,11 @@ import os
 from pathlib import Path
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.robots.catalogue import load_robot
 from rfdropo_bayes.robots.outline import RobotOutline, robot_text
 from rfdropo_bayes.workflow.column_names import Guess, guess_columns
 from rfdropo_bayes.workflow.experiment import load_experiment
-from rfdropo_bayes.workflow.files import output_folder
 
 PRIORS = (
     ("young_modulus", "how stiff"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pandas as pd
 
@@ -27,9 +27,10 @@ from rfdropo_bayes.workflow.assembly import (
     expand_groups,
     find_workpiece,
     fixed_values,
+    load_data,
     measurement_specs,
 )
-from rfdropo_bayes.workflow.experiment import Experiment, Workpiece
+from rfdropo_bayes.workflow.experiment import Experiment, Workpiece, load_experiment
 from rfdropo_bayes.workflow.experiment_file import ROBOT_COPY, describe
 
 
@@ -97,6 +98,16 @@ class Model:
         model = cls.__new__(cls)
         model._set(experiment, folder)
         return model
+
+    @classmethod
+    def read(cls, path: Path, overrides: Sequence[str] = ()) -> tuple[Model, dict[str, Any]]:
+        """The model of an experiment file, and the file's tables with the overrides in place, for the record."""
+        experiment, tables = load_experiment(path, overrides)
+        return cls.of_experiment(experiment, Path(path).resolve().parent), tables
+
+    def recordings(self, role: Literal["fit", "test"]) -> list[Trajectory]:
+        """The recordings that its experiment file names."""
+        return load_data(self.experiment, self.folder, role)
 
     @cached_property
     def simulator(self) -> RobotSimulator | BlackBoxSimulator:

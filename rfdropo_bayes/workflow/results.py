@@ -12,7 +12,6 @@ from rfdropo_bayes.report import read_summary
 from rfdropo_bayes.report.run_folder import CONFIG, POSTERIOR, SUMMARY
 from rfdropo_bayes.workflow.audited import AUDIT, EXTENDED, REPORT, Audit
 from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.experiment_file import read_tables
 from rfdropo_bayes.workflow.model import Model
 
@@ -40,7 +39,7 @@ def load(folder: Path | str) -> Calibration | Audit:
 
 def _model(config: Path) -> Model | None:
     try:
-        return Model.of_experiment(load_experiment(config)[0], config.resolve().parent)
+        return Model.read(config)[0]
     except InputError:  # of something that no file describes
         return None
 

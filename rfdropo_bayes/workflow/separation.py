@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,14 +13,13 @@ from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.pipeline import Question, first_target
 from rfdropo_bayes.audit.separation import Separation, separate
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import write_text
+from rfdropo_bayes.files import write_json, write_text
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.separation_table import separation_figure, separation_markdown
 from rfdropo_bayes.report.summary import combined_hash
-from rfdropo_bayes.workflow.assembly import load_data
 from rfdropo_bayes.workflow.audit import build_question, start_values
-from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.files import hashes, run_folder
+from rfdropo_bayes.workflow.model import Model
 
 RESULT, TABLE, FIGURE, JOURNAL = "separation.json", "separation.md", "separation.png", "checkpoints/separation"
 DRAWS = 1000
@@ -55,8 +53,8 @@ def run_separation(
     Raises:
         InputError: bad input, before anything long has started.
     """
-    experiment, tables = load_experiment(path, overrides)
-    folder = Path(path).resolve().parent
+    model, tables = Model.read(path, overrides)
+    experiment, folder = model.experiment, model.folder
     table = experiment.separation
     if table is None:
         raise InputError("has no [separation]", where=str(path), remedy="name the mechanisms to tell apart")
@@ -65,7 +63,7 @@ def run_separation(
         raise InputError(
             f"{both[0]!r} is in the base model", where="[separation] mechanisms", remedy="leave it out of one of them"
         )
-    fitted = load_data(experiment, folder, "fit")
+    fitted = model.recordings("fit")
     start = start_values(base)
     question = build_question(experiment, folder, fitted, [], experiment.seed, start=start, names=table.mechanisms)
     settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": {"base": base}}
@@ -84,7 +82,7 @@ def run_separation(
             "versions": software_versions(),
             "data_sha256": combined_hash([trajectory.sha256 for trajectory in fitted]),
         }
-        write_text(out / RESULT, json.dumps(content, indent=2, allow_nan=False) + "\n")
+        write_json(out / RESULT, content, finite=True)
         write_text(out / TABLE, separation_markdown(content))
         separation_figure(content).savefig(out / FIGURE)
     return content

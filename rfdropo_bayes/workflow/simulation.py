@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +15,7 @@ from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.data import Trajectory, shared_markers
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import whole, write_text
+from rfdropo_bayes.files import output_folder, whole, write_json
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.protocol import Result
@@ -25,7 +24,7 @@ from rfdropo_bayes.workflow.assembly import AnySimulator, build_simulator, find_
 from rfdropo_bayes.workflow.balance import append_balance
 from rfdropo_bayes.workflow.commands import random_walk
 from rfdropo_bayes.workflow.experiment import CommandsTable, Experiment, NoiseTable, load_experiment
-from rfdropo_bayes.workflow.files import output_folder, run_folder
+from rfdropo_bayes.workflow.files import run_folder
 from rfdropo_bayes.workflow.model import Model
 
 # Number that the first marker's column carries in each source.
@@ -163,7 +162,7 @@ def simulate_all(experiment: Experiment, folder: Path, out: Path, balance: bool 
         if pose is not None and source.object_pose is not None:
             report["recordings"][source.name]["object_error"] = _object_errors(pose, source.object_pose)
     report["error_mm"] = _errors(distances) if experiment.data else None
-    write_text(out / "simulation.json", json.dumps(report, indent=2) + "\n")
+    write_json(out / "simulation.json", report)
     return report
 
 

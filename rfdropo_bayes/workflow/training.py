@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from rfdropo_bayes.envs.rendering import picture
 from rfdropo_bayes.envs.tasks import Task, observed_of, task_named
 from rfdropo_bayes.envs.vec_env import TrunkVecEnv
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import whole, write_text
+from rfdropo_bayes.files import whole, write_json, write_text
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.robots import OBJECT
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
@@ -38,7 +37,7 @@ from rfdropo_bayes.training.figures import curve_figure, save_animation, success
 from rfdropo_bayes.training.run import Trained, train
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values
 from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
+from rfdropo_bayes.workflow.experiment import Experiment
 from rfdropo_bayes.workflow.files import run_folder
 from rfdropo_bayes.workflow.model import Model
 
@@ -131,15 +130,14 @@ def train_policy(
         summary = _summary(table, found, policy, facts)
         curve_figure(found.curve).savefig(out / CURVE, dpi=150)
         write_text(out / CARD, policy_card(summary, layout))
-        write_text(out / SUMMARY, json.dumps(summary, indent=2) + "\n")
+        write_json(out / SUMMARY, summary)
     return summary
 
 
 def run_training(path: Path, out: Path, *, overrides: Sequence[str] = (), **options: Any) -> dict[str, Any]:
     """`train_policy` on what an experiment file with a table [training] says."""
-    experiment, tables = load_experiment(path, overrides)
-    model = Model.of_experiment(experiment, Path(path).resolve().parent)
-    return train_policy(model, out, seed=experiment.seed, tables=tables, **options)
+    model, tables = Model.read(path, overrides)
+    return train_policy(model, out, seed=model.experiment.seed, tables=tables, **options)
 
 
 def _with_training(model: Model, options: Mapping[str, Any]) -> Experiment:
@@ -215,7 +213,7 @@ def evaluate_policies(
             episode_table(found, cases).to_csv(partial, index=False)
         success_figure(found, THRESHOLDS).savefig(out / FIGURE, dpi=150)
         write_text(out / TABLE, evaluation_table(content))
-        write_text(out / EVALUATION, json.dumps(content, indent=2) + "\n")
+        write_json(out / EVALUATION, content)
     return content
 
 
@@ -223,8 +221,7 @@ def run_evaluation(
     path: Path, policies: Sequence[Path], out: Path, *, overrides: Sequence[str] = (), **options: Any
 ) -> dict[str, Any]:
     """`evaluate_policies` on what an experiment file with a table [training] says."""
-    experiment, tables = load_experiment(path, overrides)
-    model = Model.of_experiment(experiment, Path(path).resolve().parent)
+    model, tables = Model.read(path, overrides)
     return evaluate_policies(model, policies, out, tables=tables, **options)
 
 

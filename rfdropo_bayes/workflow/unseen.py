@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +20,9 @@ from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
-from rfdropo_bayes.data import Trajectory, first_row_only, load_unseen, start_is_known
+from rfdropo_bayes.data import Trajectory, commands_alone, first_row_only, load_unseen, start_is_known
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import whole, write_text
+from rfdropo_bayes.files import whole, write_json
 from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.model_error import recorded_model_error
 from rfdropo_bayes.prediction.predictive import (
@@ -40,7 +39,6 @@ from rfdropo_bayes.report.trajectory_figures import draw_band
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.workflow.assembly import KNOWN, fixed_values, measurement_specs
 from rfdropo_bayes.workflow.calibrated import Calibration, axes_or_new
-from rfdropo_bayes.workflow.experiment import load_experiment
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
 
@@ -165,27 +163,16 @@ def fitted_parts(fit: Calibration) -> tuple[dict[str, float], ParameterSpace]:
 
 def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
     """Commands as a recording whose measurements are unknown, but for the start pose."""
-    clock, sent = np.asarray(time, dtype=float), np.asarray(command, dtype=float)
-    simulator = model.simulator
-    clock = np.append(clock, clock[-1] + (float(np.median(np.diff(clock))) if len(clock) > 1 else 1.0))
-    position = np.zeros((len(clock), len(simulator.marker_names), 3))
-    mask = np.zeros(position.shape[:2], dtype=bool)
-    if start is not None:
-        position[:], mask[0] = np.asarray(start, dtype=float), True
-    return Trajectory.build(
+    return commands_alone(
+        np.asarray(time, dtype=float),
+        np.asarray(command, dtype=float),
+        model.simulator.marker_names,
+        start=None if start is None else np.asarray(start, dtype=float)[None],
         name="commands",
         robot=model.name,
         format="memory",
-        time=clock,
-        position=position,
-        position_mask=mask,
-        marker_names=simulator.marker_names,
-        command_time=clock[:-1],
-        command=sent,
-        command_unit=simulator.command_unit,
-        initial_command=sent[0],
-        cable_names=simulator.channel_names,
-        settings={"unseen": True},
+        command_unit=model.simulator.command_unit,
+        cable_names=model.simulator.channel_names,
     )
 
 
@@ -222,13 +209,13 @@ def run_prediction(
     Raises:
         InputError: bad input, or a posterior that does not belong to the experiment.
     """
-    experiment, tables = load_experiment(path, overrides)
-    folder = Path(path).resolve().parent
+    model, tables = Model.read(path, overrides)
+    experiment, folder = model.experiment, model.folder
     if experiment.data is None:
         raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format the commands are")
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
     unseen = load_unseen(experiment.data, folder, commands, start, rows, record.attrs.get(BEGUN))
-    fit = Calibration(record, {}, "", Model.of_experiment(experiment, folder))
+    fit = Calibration(record, {}, "", model)
     found = predict(fit, unseen, seed=experiment.seed if seed is None else seed, group=group)
     options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
     options["group"] = group
@@ -246,10 +233,10 @@ def run_prediction(
             "draws_that_did_not_match_the_first_row": found.bands.attrs["draws_that_did_not_match_the_first_row"],
             "unit": "m",
             "frame": unseen.dataset.attrs["frame"],
-            "simulator": fit.model.simulator.description if fit.model else {},
+            "simulator": model.simulator.description,
             "files": [str(file) for file in found.save(out)],
         }
-        write_text(out / "prediction.json", json.dumps(facts, indent=2) + "\n")
+        write_json(out / "prediction.json", facts)
     return facts
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,15 +10,16 @@ import xarray as xr
 from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.trajectory import open_netcdf
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.motion import Motion, cube_corners, smooth_line, upright
 from rfdropo_bayes.report.motion_export import save_frames, save_vtk
 from rfdropo_bayes.report.motion_figures import save_animation, save_still
 from rfdropo_bayes.robots import Robot, known_robots, load_robot
-from rfdropo_bayes.workflow.assembly import find_robot, load_data
-from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.workflow.assembly import find_robot
 from rfdropo_bayes.workflow.experiment_file import ROBOT_COPY
-from rfdropo_bayes.workflow.simulation import simulate_all
+from rfdropo_bayes.workflow.model import Model
+from rfdropo_bayes.workflow.simulation import simulate
 from rfdropo_bayes.workflow.unseen import OBJECT
 
 PREDICTED = "mean"  # variable of a prediction's file
@@ -63,24 +63,11 @@ def run_view(
 
 
 def _from_file(path: Path, robot: Path | None) -> Motion:
-    dataset = _open(path)
+    dataset = open_netcdf(path)
     own = _robot_of(path, str(dataset.attrs.get("robot", "")), robot)
     if PREDICTED in dataset:
         return _predicted(dataset, own)
-    trajectory = Trajectory.load(path)
-    return _motion(_shown(trajectory), own, None, None)
-
-
-def _open(path: Path) -> xr.Dataset:
-    if not path.is_file():
-        raise InputError("no such file", where=str(path), remedy="correct the path")
-    try:
-        with xr.open_dataset(path, engine="h5netcdf") as opened:
-            return opened.load()
-    except Exception as error:  # the HDF5 stack raises many types on damaged files, none of them ours
-        raise InputError(
-            f"is not a readable NetCDF file ({type(error).__name__})", where=str(path), remedy="make it again"
-        ) from None
+    return _motion(Trajectory.load(path), own, None, None)
 
 
 def _robot_of(path: Path, name: str, given: Path | None) -> Robot:
@@ -108,41 +95,32 @@ def _predicted(dataset: xr.Dataset, robot: Robot) -> Motion:
 
 
 def _from_experiment(path: Path, overrides: list[str], recording: str | None) -> Motion:
-    """Simulate one recording of an experiment, in a folder of its own that is thrown away."""
-    experiment, _ = load_experiment(path, overrides)
-    folder = path.resolve().parent
-    with tempfile.TemporaryDirectory() as scratch:
-        found = simulate_all(experiment, folder, Path(scratch))
-        names = list(found["recordings"])
-        if recording is not None and recording not in names:
-            raise InputError(f"no recording {recording!r}", where="view", remedy=f"recordings: {', '.join(names)}")
-        name = recording or names[0]
-        simulated = Trajectory.load(Path(found["recordings"][name]["files"][0]))
-    measured = None
-    if experiment.data is not None:
-        sources = [*load_data(experiment, folder, "fit"), *load_data(experiment, folder, "test")]
-        measured = next(entry for entry in sources if entry.name == name)
-    side = found["parameters"].get("cube_side")
-    return _motion(_shown(simulated), find_robot(experiment, folder), measured, side)
+    """Simulate one recording of an experiment."""
+    model, _ = Model.read(path, overrides)
+    table, runs = model.experiment.commands, {}
+    if table is None:
+        runs = {run.name: run for role in ("fit", "test") for run in model.recordings(role)}
+    names = list(runs) if table is None else table.recordings
+    name = recording or names[0]
+    if name not in names:
+        raise InputError(f"no recording {name!r}", where="view", remedy=f"recordings: {', '.join(names)}")
+    made = simulate(model, [runs[name]] if table is None else table.model_dump(), seed=model.experiment.seed)
+    simulated = next(run for run in made if run.name == name)
+    side = simulated.settings.get("parameters", {}).get("cube_side")
+    return _motion(simulated, find_robot(model.experiment, model.folder), runs.get(name), side)
 
 
 class _Shown(NamedTuple):
     """What moves: markers [m] and, if there is one, an object's pose."""
 
-    title: str
+    name: str
     time: Float[np.ndarray, " time"]
     marker_names: tuple[str, ...]
     position: Float[np.ndarray, "time marker 3"]
     object_pose: Float[np.ndarray, "time 7"] | None
 
 
-def _shown(trajectory: Trajectory) -> _Shown:
-    return _Shown(
-        trajectory.name, trajectory.time, trajectory.marker_names, trajectory.position, trajectory.object_pose
-    )
-
-
-def _motion(shown: _Shown, robot: Robot, measured: Trajectory | None, side: float | None) -> Motion:
+def _motion(shown: Trajectory | _Shown, robot: Robot, measured: Trajectory | None, side: float | None) -> Motion:
     """Geometry of a robot's motion; the tube has the robot's outer width, and passes through the markers' means where
     several have the same height."""
     rest = {name: point[2] for name, point in zip(robot.marker_names, robot.marker_points(), strict=True)}
@@ -150,7 +128,7 @@ def _motion(shown: _Shown, robot: Robot, measured: Trajectory | None, side: floa
     if not known:
         raise InputError(
             f"none of its markers ({', '.join(shown.marker_names)}) is the robot's ({', '.join(rest)})",
-            where=shown.title,
+            where=shown.name,
             remedy="give the robot that was recorded",
         )
     heights, group = np.unique([rest[shown.marker_names[index]] for index in known], return_inverse=True)
@@ -173,7 +151,7 @@ def _motion(shown: _Shown, robot: Robot, measured: Trajectory | None, side: floa
     if measured is not None:
         dots = np.where(measured.position_mask[..., None], measured.position, np.nan) @ turn.T
     return Motion(
-        shown.title,
+        shown.name,
         shown.time,
         line @ turn.T,
         np.interp(at, robot.body.station_m, width),

@@ -190,20 +190,6 @@ def test_commands_that_excite_only_one_of_two_effects_separate_them():
     assert moving.information > 0.1
 
 
-def test_a_candidate_that_would_take_too_long_is_named_and_not_examined():
-    class Without(Toy):
-        parameters = tuple(s for s in Toy.parameters if s.name != "play")
-
-    asked = question({**TRUTH, "play": 1.0}, 1)
-    routed = RoutedLanes(Lanes(Without(), np.arange(4)), asked.lanes, {"play": 0.0})
-    answer = audit(replace(asked, lanes=routed, rules=replace(asked.rules, slowest=0.0)))
-    assert list(answer.unexamined) == ["play"]
-    assert answer.verdict in ("unexplained", "partly_explained")
-    content = record(answer, versions={}, data_sha256="", next_experiment=None)
-    assert "play" not in {c["mechanism"] for c in content["candidates"]}
-    assert content["sentence"].endswith("Not examined, as it would have taken too long: play.")
-
-
 class Hurried(Deadline):
     """A deadline after a number of looks at the clock, each before a batch of rollouts."""
 

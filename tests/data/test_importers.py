@@ -10,7 +10,6 @@ import pytest
 from rfdropo_bayes.data import (
     CsvColumns,
     read_asl_csv,
-    read_motor_step,
     read_optitrack_csv,
     read_plain_csv,
     read_sofa_csv,
@@ -125,16 +124,6 @@ def test_asl_at_zero_command(datasets):
     assert recording.command.shape == (3000, 6)
     assert not recording.command.any()
     assert np.std(recording.position, axis=0).max() < 0.1e-3
-
-
-def test_motor_step(datasets, tmp_path):
-    folder = datasets / "asl_trunk"
-    time, angle = read_motor_step(folder / "motor_step_values.csv", folder / "motor_step_times.csv")
-    assert angle.shape == (len(time), 6)
-    np.testing.assert_allclose(np.rad2deg(angle[0, 0]), 3.259765625)
-    (tmp_path / "times.csv").write_text("0.1,0.2\n")
-    with pytest.raises(InputError, match="there are 2 times"):
-        read_motor_step(folder / "motor_step_values.csv", tmp_path / "times.csv")
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rfdropo_bayes.data import group_repeats, noise_floor, pure_error, read_asl_csv, read_optitrack_csv
+from rfdropo_bayes.data import group_repeats, noise_floor, read_asl_csv, read_optitrack_csv
 from rfdropo_bayes.errors import InputError
 
 
@@ -39,7 +39,6 @@ def test_pure_error_recovers_the_noise(build):
     standard_error = 1.0 / np.sqrt(2 * 3 * 4 * 400)  # relative, for 3 axes, 4 degrees of freedom, 400 rows
     for marker in ("m1", "m2"):
         assert floor[marker] == pytest.approx(np.sqrt(3.0) * 1e-3, rel=3 * standard_error)
-        assert pure_error(noisy).rms[marker] == pytest.approx(floor[marker] * np.sqrt(4 / 5))
 
 
 def test_masked_rows_do_not_count(build):
@@ -47,25 +46,25 @@ def test_masked_rows_do_not_count(build):
     position, mask = first.position.copy(), np.ones((11, 2), dtype=bool)
     position[3, 0] += 1.0
     mask[3, 0] = False
-    spread = pure_error([first, build(), build(position=position, position_mask=mask)])
-    assert max(spread.rms.values()) < 1e-15
+    floor = noise_floor([first, build(), build(position=position, position_mask=mask)])
+    assert floor is not None
+    assert max(floor.values()) < 1e-15
 
 
 def test_repeats_that_do_not_match_are_rejected(build):
-    with pytest.raises(InputError, match="no repeats"):
-        pure_error([build()])
     with pytest.raises(InputError, match="differ in rows or markers"):
-        pure_error([build(), build(rows=9)])
+        noise_floor([build(), build(marker_names=["m1", "m3"])])
     assert noise_floor([build(), build(command=2 * build().command)]) is None
 
 
 def test_spread_of_the_physical_trunk(datasets):
-    """The last marker about the mean of the repeats: 4.0 mm (January AKLWI), 2.8 mm (X0HBR), 1.1 mm (April)."""
+    """The last marker about the mean of n repeats, times sqrt(n / (n - 1)): 4.0 mm about it in January (AKLWI), 2.8 mm
+    (X0HBR), 1.1 mm in April."""
     paths = sorted((datasets / "sim2real_trunk").glob("*.csv"))
     recordings = [read_optitrack_csv(path) for path in paths]
     groups = {recordings[group[0]].name.split("_")[0]: group for group in group_repeats(recordings)}
     assert {name: len(group) for name, group in groups.items()} == {"AKLWI": 5, "AKLWI2": 3, "X0HBR": 3}
-    spread = {name: pure_error([recordings[index] for index in group]).rms["m4"] for name, group in groups.items()}
-    assert spread["AKLWI"] == pytest.approx(4.02e-3, abs=0.05e-3)
-    assert spread["X0HBR"] == pytest.approx(2.81e-3, abs=0.05e-3)
-    assert spread["AKLWI2"] == pytest.approx(1.08e-3, abs=0.05e-3)
+    for name, spread in (("AKLWI", 4.02e-3), ("X0HBR", 2.81e-3), ("AKLWI2", 1.08e-3)):
+        floor, count = noise_floor([recordings[index] for index in groups[name]]), len(groups[name])
+        assert floor is not None
+        assert floor["m4"] * np.sqrt((count - 1) / count) == pytest.approx(spread, abs=0.05e-3)

@@ -17,7 +17,7 @@ def test_blocks_are_increasing_prefixes_that_end_at_the_data(n_rows, blocks, spa
     assert ends[-1] == n_rows
     assert ends[0] >= 1
     assert all(np.diff(ends) > 0)
-    assert len(ends) == (n_rows if spacing == "every" else min(len(ends), blocks))
+    assert len(ends) == (min(n_rows, blocks) if spacing == "linear" else min(len(ends), blocks))
 
 
 def test_geometric_blocks_cost_less_than_two_full_looks():

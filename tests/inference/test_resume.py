@@ -34,7 +34,7 @@ OPTIONS = {
 CASES = [
     *OPTIONS.items(),
     ("laplace", {"starts": 4, "survey": 50, "rollouts": 2000.0, "draws": 50}),
-    ("rfdropo", {**OPTIONS["rfdropo"], "optimiser": "cem", "horizon": "adaptive"}),
+    ("rfdropo", {**OPTIONS["rfdropo"], "optimiser": "cem", "horizon": "linear"}),
 ]
 
 

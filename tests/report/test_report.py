@@ -200,7 +200,7 @@ def test_folders_that_are_no_run_are_refused(folder: Path, tmp_path: Path) -> No
 def test_an_unwritable_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     record, facts = bare()
-    with pytest.raises(InputError, match="cannot be made"):
+    with pytest.raises(InputError, match="cannot make the output folder"):
         write_run(tmp_path / "file" / "run", record, build_summary(record, facts), "")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
 
@@ -212,6 +214,40 @@ class WhiteSeries(Series):
         if self.known is not None:
             return self.known.draw_recordings(key, *self.readings.shape[:2])
         return values[self.size.name] * jax.random.normal(key, self.readings.shape)
+
+
+def padded_readings(
+    trajectories: Sequence[Trajectory],
+    length: int,
+    needed: int | None,
+    read: Callable[[Trajectory], tuple[np.ndarray, np.ndarray] | None],
+    key: str,
+    words: str,
+) -> tuple[Float[np.ndarray, "recording time reading"], Bool[np.ndarray, "recording time reading"]]:
+    """Readings of recordings, and where there are any, padded to ``length`` rows.
+
+    Args:
+        trajectories: the recordings.
+        length: rows.
+        needed: only so many recordings, the first ones, must have readings; all by default.
+        read: readings of one recording and where they count; None where it has none.
+        key: of [model] that makes them data; words: what they are.
+
+    Raises:
+        InputError: a recording without readings that needs them.
+    """
+    found: list[tuple[np.ndarray, ...]] = []
+    for index, trajectory in enumerate(trajectories):
+        own = read(trajectory)
+        if own is not None:
+            found.append(tuple(np.pad(part, ((0, length - len(part)), (0, 0))) for part in own))
+        elif needed is not None and index >= needed:
+            found.append(tuple(np.zeros_like(part) for part in found[0]))
+        else:
+            remedy = f"leave [model] {key} = true out, or record them"
+            raise InputError(f"has no {words}", where=trajectory.name, remedy=remedy)
+    measured, valid = zip(*found, strict=True)
+    return np.stack(measured), np.stack(valid)
 
 
 ABOVE_ZERO = 50.0  # larger than any logarithm of a ratio of sizes: keeps a root in `size_residuals` real

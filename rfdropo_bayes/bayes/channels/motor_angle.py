@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries
+from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries, padded_readings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -47,19 +47,10 @@ class MotorAngle(WhiteSeries):
         Raises:
             InputError: a recording without motor angles, or commands that are no angles.
         """
-        measured: list[np.ndarray] = []
-        valid: list[np.ndarray] = []
-        for index, trajectory in enumerate(trajectories):
-            if trajectory.motor_angle is None and needed is not None and index >= needed:
-                measured.append(np.zeros_like(measured[0]))
-                valid.append(np.zeros_like(valid[0]))
-                continue
+
+        def read(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray] | None:
             if trajectory.motor_angle is None:
-                raise InputError(
-                    "has no motor angles",
-                    where=trajectory.name,
-                    remedy="leave [model] motor_angle = true out, or record them",
-                )
+                return None
             if trajectory.command_unit != "rad":
                 raise InputError(
                     f"its commands are in {trajectory.command_unit}: motor angles tell of commands in rad only",
@@ -67,17 +58,16 @@ class MotorAngle(WhiteSeries):
                     remedy="leave [model] motor_angle = true out, or give the commands as angles of the motors",
                 )
             angle, mask = np.asarray(trajectory.motor_angle, dtype=float), trajectory.motor_angle_mask
-            missing = ((0, length - len(angle)), (0, 0))
-            measured.append(np.pad(angle, missing))
-            valid.append(np.pad(np.ones(angle.shape, dtype=bool) if mask is None else mask, missing))
-            if not valid[-1].any():
+            valid = np.ones(angle.shape, dtype=bool) if mask is None else mask
+            if not valid.any():
                 raise InputError(
                     "none of its motor angles is a new reading",
                     where=trajectory.name,
                     remedy="resample less coarsely: a row counts where the angles were just read",
                 )
-        known = np.stack(valid)
-        return cls(np.where(known, np.stack(measured), 0.0), known)
+            return np.where(valid, angle, 0.0), valid
+
+        return cls(*padded_readings(trajectories, length, needed, read, cls.name, "motor angles"))
 
     def expected(self, seen: Seen) -> Float[Any, "recording time channel"]:
         """See `Series.expected`.

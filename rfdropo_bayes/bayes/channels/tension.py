@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
-from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries
+from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries, padded_readings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -68,20 +68,11 @@ class Tension(WhiteSeries):
             InputError: a recording without tensions, or with columns that are no cables of the robot.
         """
         names = simulator.cable_names
-        measured: list[np.ndarray] = []
-        valid: list[np.ndarray] = []
         columns = []
-        for index, trajectory in enumerate(trajectories):
-            if trajectory.tension is None and needed is not None and index >= needed:
-                measured.append(np.zeros_like(measured[0]))
-                valid.append(np.zeros_like(valid[0]))
-                continue
+
+        def read(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray] | None:
             if trajectory.tension is None:
-                raise InputError(
-                    "has no cable tensions",
-                    where=trajectory.name,
-                    remedy="leave [model] tension = true out, or record them",
-                )
+                return None
             unknown = [name for name in trajectory.cable_names if name not in names]
             if unknown:
                 raise InputError(
@@ -90,14 +81,13 @@ class Tension(WhiteSeries):
                     remedy="name the columns after the robot's cables",
                 )
             columns.append([names.index(name) for name in trajectory.cable_names])
-            tension = np.asarray(trajectory.tension, dtype=float)
             known = np.asarray(trajectory.tension_mask)
-            missing = ((0, length - len(tension)), (0, 0))
-            measured.append(np.pad(np.where(known, tension, 0.0), missing))
-            valid.append(np.pad(known, missing))
+            return np.where(known, np.asarray(trajectory.tension, dtype=float), 0.0), known
+
+        readings, valid = padded_readings(trajectories, length, needed, read, cls.name, "cable tensions")
         if any(column != columns[0] for column in columns):
             raise InputError("the recordings measure different cables", where="[model] tension", remedy="use one set")
-        return cls(np.stack(measured), np.stack(valid), cables=np.array(columns[0]))
+        return cls(readings, valid, cables=np.array(columns[0]))
 
     @property
     def gain_specs(self) -> tuple[ParameterSpec, ...]:

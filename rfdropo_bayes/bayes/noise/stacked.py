@@ -48,28 +48,13 @@ class Stacked:
         return side_by_side([len(part.scale) for part in self.parts])
 
     def whiten(
-        self, series: Float[np.ndarray, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
-    ) -> Float[np.ndarray, "*batch time column"]:
-        """See `Autoregression.whiten`."""
-        return self._each(lambda part, x, ok: part.whiten(x, ok), series, valid)
-
-    def whiten_means(
         self,
         series: Float[np.ndarray, "*batch time column"],
-        count: Float[np.ndarray, "*rest time column"],
+        valid: Bool[np.ndarray, "*rest time column"],
+        count: Float[np.ndarray, "*rest time column"] | None = None,
     ) -> Float[np.ndarray, "*batch time column"]:
-        """The same of means over ``count`` repeats, whose noise is smaller by its root; zero where there is none."""
-
-        def whiten(part: Autoregression, x: np.ndarray, n: np.ndarray) -> np.ndarray:
-            return np.asarray(part.separate(part.innovations(x, n > 0) * np.sqrt(n), n > 0))
-
-        return self._each(whiten, series, count)
-
-    def gather(
-        self, white: Float[np.ndarray, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
-    ) -> Float[np.ndarray, "*batch time column"]:
-        """See `Autoregression.gather`."""
-        return self._each(lambda part, x, ok: part.gather(x, ok), white, valid)
+        """See `Autoregression.whiten`."""
+        return self._each(lambda part, *own: part.whiten(*own), series, valid, *([] if count is None else [count]))
 
     def colour(
         self, white: Float[np.ndarray, "*batch time column"], valid: Bool[np.ndarray, "*rest time column"]
@@ -81,12 +66,9 @@ class Stacked:
         """A realisation of shape (..., time, column)."""
         return np.concatenate([part.draw(rng, (*shape[:-1], len(part.scale))) for part in self.parts], axis=-1)
 
-    def _each(self, operate: Callable[..., np.ndarray], series: np.ndarray, beside: np.ndarray) -> np.ndarray:
-        found: Sequence[np.ndarray] = [
-            operate(part, series[..., own], beside[..., own])
-            for part, own in zip(self.parts, self.columns, strict=True)
-        ]
-        return np.concatenate(found, axis=-1)
+    def _each(self, operate: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
+        parts = zip(self.parts, self.columns, strict=True)
+        return np.concatenate([operate(part, *(a[..., own] for a in arrays)) for part, own in parts], axis=-1)
 
 
 def side_by_side(widths: Sequence[int]) -> list[slice]:

@@ -13,7 +13,6 @@ alike. Climbs look for optima beside it, and distributions around these join the
 from __future__ import annotations
 
 import warnings
-from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -124,20 +123,15 @@ def run(
     correlation, moves = min(config.correlation, FORGOTTEN), max(config.max_moves, MOST_MOVES)
     settings = replace(config, blocks=1, correlation=correlation, max_moves=moves)
     second = sampler.run(bridged, settings, second_key, logbook.part(0.5, 1.0, "refined"))
-    joined = _joined(problem, view, bridged, first, second)
+    joined = _joined(problem, bridged, first, second)
     if climbed is not None:
         ledger = climbed.climbs.ledger
-        joined = replace(
-            joined,
-            rollouts=joined.rollouts + ledger.rollouts,
-            evaluations=joined.evaluations + ledger.evaluations,
-            seconds=joined.seconds + climbed.climbs.seconds,
-        )
+        joined = replace(joined, **(joined.spent + ledger).record(), seconds=joined.seconds + climbed.climbs.seconds)
     assert second.log_evidence is not None
     comparable = not whole and view is problem and not lost
     if comparable and first.log_evidence[1] < second.log_evidence[1] and not _differ(first, second):
         # A shape that the fit does not cover: the way from the prior is as good, and misses no mode.
-        return replace(first, rollouts=joined.rollouts, evaluations=joined.evaluations, seconds=joined.seconds)
+        return replace(first, **joined.spent.record(), seconds=joined.seconds)
     return joined
 
 
@@ -217,18 +211,14 @@ def _clusters(u: Float[np.ndarray, "n d"], seed: int) -> list[Laplace]:
 
 def _joined(
     problem: NumpyroProblem,
-    view: SlopedProblem,
     bridged: BridgedProblem,
     first: InferenceResult,
     second: InferenceResult,
 ) -> InferenceResult:
-    u = np.stack([second.draws[name] for name in bridged.names], axis=-1)
-    values = view.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
-    draws = {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in problem.names}
-    ledger = Ledger()
+    u, draws = bridged.carried_back(second.draws, problem.names)
+    view, ledger = bridged.problem, Ledger()
     rows = evaluate_rows(view, u.reshape(-1, u.shape[-1]), problem.n_rows, ledger)
-    excluded = Counter(first.excluded) + Counter(second.excluded)
-    evaluations = first.evaluations + second.evaluations + ledger.evaluations
+    spent = first.spent + second.spent + ledger
     assert first.prefix_log_evidence is not None
     assert second.log_evidence is not None
     prefixes = np.full(problem.n_rows, np.nan)
@@ -253,12 +243,10 @@ def _joined(
         block_scores=blocks,
         log_likelihood=rows.reshape(*u.shape[:2], -1),
         trace=[*first.trace, *second.trace],
-        rollouts=first.rollouts + second.rollouts + ledger.rollouts,
-        evaluations=evaluations,
-        excluded=dict(excluded),
+        **spent.record(),
         cautions=[
             *prior_cautions(problem, draws),
-            *exclusion_cautions(excluded, evaluations),
+            *exclusion_cautions(spent.excluded, spent.evaluations),
             *([caution for caution in second.cautions if caution.code is Code.PARTICLES_STUCK] if apart else []),
             *apart,
         ],

@@ -14,7 +14,7 @@ import time
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -25,27 +25,14 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.progress import UNRECORDED, Checkpoint, Logbook, run_digest
 from rfdropo_bayes.inference.result import InferenceResult, exclusion_cautions
-from rfdropo_bayes.inference.rfdropo.families import FAMILIES, WIDTH, make_family, search_space
-from rfdropo_bayes.inference.rfdropo.scores import (
-    Plan,
-    Pool,
-    Simulated,
-    make_pool,
-    motion_scale,
-    row_scores,
-    simulate,
-    target_features,
-    uniforms,
-)
+from rfdropo_bayes.inference.rfdropo.scores import Plan, motion_scale, row_scores, simulate, uniforms
+from rfdropo_bayes.inference.rfdropo.space import WIDTH, search_space
 from rfdropo_bayes.inference.smc.moves import host_generator
-from rfdropo_bayes.inference.smc.tempering import log_effective_sample_size
 
 OPTIMISERS = ("cma", "cem")
-HORIZONS = ("paper", "linear", "adaptive", "full")
-AGREEING = 0.5  # share of effective candidates that an adaptive horizon keeps
+HORIZONS = ("paper", "linear", "full")
 FINAL = 10**6  # key of the finalists' random numbers, beyond any generation's
 DRAWS = FINAL + 1
-TRUST = 0.05  # initial step of the search, as a share of its range: the pool knows the neighbourhood only
 
 
 @dataclass(frozen=True)
@@ -59,18 +46,13 @@ class RfdropoConfig:
         optimiser: "cma" or "cem".
         population: candidates per generation; None for 4 + floor(3 ln d), or 5 d for "cem".
         sigma: initial step, as a share of the search range.
-        horizon: schedule "paper", "linear", "full", or "adaptive": as far as the candidates of a generation agree, so
-            that half of them stay effective when weighted by what lies beyond the present horizon, and at least on the
-            straight line that over the second half of the generations leads to the last row.
+        horizon: schedule "paper", "linear" or "full".
         levels: rollouts are simulated to one of this many horizons, the shortest that is long enough.
         variance_floor: added to the variances, in squared units of the trajectory's root mean square motion; mended,
             the observation noise at the prior's medians is added as well.
         finalists: candidates scored again at the full horizon.
         parameters: names to search; empty for all that rollouts depend on.
         search: ranges that differ from the central 99 % of the prior, by name.
-        family: "independent" truncated normals (the paper's), "full" covariance, or "mixture" of two.
-        polish: distributions tried at the end on the finalists' own rollouts, re-weighted; none costs a rollout.
-        bootstrap: repetitions of that with the recordings drawn again, for the scatter of phi; needs two recordings.
         draws: draws of the final distribution.
         mended: False gives the published schedule (99 of 100 rows), takes measurements for exact, and returns the
             lowest loss at any horizon.
@@ -88,9 +70,6 @@ class RfdropoConfig:
     finalists: int = 10
     parameters: tuple[str, ...] = ()
     search: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    family: str = "independent"
-    polish: int = 0
-    bootstrap: int = 0
     draws: int = 2000
     mended: bool = True
 
@@ -104,10 +83,6 @@ class RfdropoConfig:
         for name, lowest in least.items():
             if getattr(self, name) < lowest:
                 raise InputError(f"{name} = {getattr(self, name)} is less than {lowest}", where=where)
-        if self.family not in FAMILIES:
-            raise InputError(f"unknown family {self.family!r}", where=where, remedy=f"one of {', '.join(FAMILIES)}")
-        if self.polish < 0 or self.bootstrap < 0 or self.bootstrap == 1:
-            raise InputError("polish must be 0 or more, bootstrap 0 or 2 and more", where=where)
         if self.population is not None and self.population < 4:
             raise InputError(f"population = {self.population} is less than 4", where=where)
         if self.variance_floor <= 0.0 or self.sigma <= 0.0:
@@ -120,13 +95,11 @@ class SearchState(NamedTuple):
     Attributes:
         candidates: of every generation done.
         losses: theirs, each generation at its own horizon.
-        horizons: of every generation done, and of the next one.
         ledger, trace, seconds: as in every method.
     """
 
     candidates: Float[np.ndarray, "generation population k"]
     losses: Float[np.ndarray, "generation population"]
-    horizons: tuple[int, ...]
     ledger: Ledger
     trace: list[dict[str, Any]]
     seconds: float
@@ -140,7 +113,7 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
     """
     prior = {name: np.asarray(values) for name, values in problem.sample_prior(key, 1000).items()}
     names = config.parameters or tuple(getattr(problem, "physical_names", problem.names))
-    space = make_family(config.family, search_space(problem, names, config.search, prior))
+    space = search_space(problem, names, config.search, prior)
     population = config.population or default_population(config.optimiser, space.dimension)
     fixed = {name: float(np.median(prior[name])) for name in problem.names if name not in names}
     scale = motion_scale(np.asarray(problem.observed, dtype=float), np.asarray(problem.observed_mask))
@@ -159,9 +132,6 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
 def _horizons(generations: int, n_rows: int, config: RfdropoConfig) -> tuple[int, ...]:
     if config.horizon == "full":
         return (n_rows,) * generations
-    if config.horizon == "adaptive":
-        first = generations // 2
-        return (1,) * first + tuple(linear_horizon(i, generations - first, n_rows) for i in range(generations - first))
     if config.horizon == "linear":
         return tuple(linear_horizon(i, generations, n_rows) for i in range(generations))
     return tuple(paper_horizon(i, generations, n_rows, mended=config.mended) for i in range(generations))
@@ -179,8 +149,7 @@ def _affordable_generations(n_rows: int, population: int, finalists: int, config
     budget = config.rollouts / config.rollouts_per_candidate - finalists
 
     def cost(generations: int) -> float:
-        # How far an adaptive schedule looks is not known before: it may be all the way.
-        taus = (n_rows,) * generations if config.horizon == "adaptive" else _horizons(generations, n_rows, config)
+        taus = _horizons(generations, n_rows, config)
         return population * sum(_simulated(tau, n_rows, config.levels) for tau in taus) / n_rows
 
     if cost(1) > budget:
@@ -202,24 +171,19 @@ def _affordable_generations(n_rows: int, population: int, finalists: int, config
 def step(
     key: PRNGKeyArray, state: SearchState, problem: RolloutProblem, plan: Plan, config: RfdropoConfig, asked: np.ndarray
 ) -> SearchState:
-    """Score one generation at its horizon, and set that of the next."""
+    """Score one generation at its horizon."""
     began = time.monotonic()
-    i, n = len(state.losses), problem.n_rows
-    m, d, horizon = config.rollouts_per_candidate, plan.space.columns, state.horizons[-1]
+    i = len(state.losses)
+    m, d, horizon = config.rollouts_per_candidate, len(plan.space.names), plan.horizons[i]
     uniform = uniforms(jax.random.fold_in(key, i), m, d, stratified=config.mended)
-    adaptive = config.horizon == "adaptive"
-    simulated = _simulated(min(horizon + 1, n) if adaptive else horizon, n, config.levels)
+    simulated = _simulated(horizon, problem.n_rows, config.levels)
     found = simulate(problem, plan, asked, uniform, simulated, state.ledger)
-    rows = row_scores(problem, plan, found, simulated if adaptive else horizon)
-    values = -rows[:, :horizon].sum(axis=1)
+    values = -row_scores(problem, plan, found, horizon).sum(axis=1)
     facts = {"generation": i, "horizon": horizon, "loss": float(values.min())}
     state.trace.append(facts | {"rollouts": state.ledger.rollouts})
-    planned = plan.horizons[min(i + 1, len(plan.horizons) - 1)]
-    following = max(adaptive_horizon(rows, horizon, AGREEING), planned) if adaptive else planned
     return state._replace(
         candidates=np.concatenate([state.candidates, asked[None]]),
         losses=np.concatenate([state.losses, values[None]]),
-        horizons=(*state.horizons, following),
         seconds=state.seconds + time.monotonic() - began,
     )
 
@@ -231,7 +195,7 @@ def choose_finalists(state: SearchState, plan: Plan, centre: Float[np.ndarray, "
     """
     stages = np.array_split(np.arange(len(state.losses)), max(1, plan.finalists - 1))
     chosen = [centre]
-    per_row = state.losses / np.asarray(state.horizons[: len(state.losses)])[:, None]
+    per_row = state.losses / np.asarray(plan.horizons[: len(state.losses)])[:, None]
     for members in stages:
         if len(members):
             generation, index = np.unravel_index(np.argmin(per_row[members]), per_row[members].shape)
@@ -264,16 +228,14 @@ def run(
             remedy="narrow the search ranges to parameters that the simulator can handle",
         )
     chosen, details = _choose(problem, config, plan, state, centre, search_key)
-    uniform = uniforms(jax.random.fold_in(search_key, DRAWS), config.draws, plan.space.columns, stratified=False)
+    uniform = uniforms(jax.random.fold_in(search_key, DRAWS), config.draws, len(plan.space.names), stratified=False)
     draws = plan.space.draw(chosen, uniform)
     ledger = state.ledger
     return InferenceResult(
         method="rfdropo",
         draws={name: draws[None, :, j] for j, name in enumerate(plan.space.names)},
         trace=state.trace,
-        rollouts=ledger.rollouts,
-        evaluations=ledger.evaluations,
-        excluded=dict(ledger.excluded),
+        **ledger.record(),
         cautions=[*plan.space.edge_cautions(chosen), *exclusion_cautions(ledger.excluded, ledger.evaluations)],
         seconds=state.seconds,
         phi=plan.space.describe(chosen, problem.units),
@@ -298,7 +260,7 @@ def _search(
     )
     saved = checkpoint.load()
     nothing = np.empty((0, plan.population, k)), np.empty((0, plan.population))
-    empty = SearchState(*nothing, plan.horizons[:1], Ledger(), [], 0.0)
+    empty = SearchState(*nothing, Ledger(), [], 0.0)
     state = empty if saved is None else _unpack(*saved)
     for known in state.losses:
         optimiser.tell(optimiser.ask(), known)
@@ -321,62 +283,27 @@ def _choose(
 ) -> tuple[np.ndarray, dict[str, Any]]:
     best = np.unravel_index(np.argmin(state.losses), state.losses.shape)
     details: dict[str, Any] = {"generations": len(state.losses), "feature_scale": plan.scale}
-    details["lowest_loss_ever"] = {"loss": float(state.losses[best]), "horizon": state.horizons[int(best[0])]}
+    details["lowest_loss_ever"] = {"loss": float(state.losses[best]), "horizon": plan.horizons[int(best[0])]}
     if not config.mended:
         return state.candidates[best], details
     finalists = choose_finalists(state, plan, centre)
     m, n = config.rollouts_per_candidate, problem.n_rows
-    uniform = uniforms(jax.random.fold_in(key, FINAL), m, plan.space.columns, stratified=True)
+    uniform = uniforms(jax.random.fold_in(key, FINAL), m, len(plan.space.names), stratified=True)
     found = simulate(problem, plan, finalists, uniform, n, state.ledger)
     scores = -row_scores(problem, plan, found, n).sum(axis=1)
     details["finalist_losses"] = scores.tolist()
     state.trace.append({"horizon": n, "loss": float(scores.min()), "rollouts": state.ledger.rollouts, "final": True})
-    best_finalist = finalists[int(np.argmin(scores))]
-    if config.polish or config.bootstrap:
-        generator = host_generator(jax.random.fold_in(key, FINAL + 2))
-        return _reuse(problem, config, plan, finalists, found, best_finalist, generator, details), details
-    return best_finalist, details
-
-
-def _reuse(
-    problem: RolloutProblem,
-    config: RfdropoConfig,
-    plan: Plan,
-    finalists: np.ndarray,
-    found: Simulated,
-    best: np.ndarray,
-    generator: np.random.Generator,
-    details: dict[str, Any],
-) -> np.ndarray:
-    """Polish phi, and measure its scatter over recordings, on the finalists' rollouts alone."""
-    recordings = int(getattr(problem, "n_recordings", 1))
-    observed, mask = target_features(problem, plan, problem.n_rows)
-    pool = make_pool(plan.space, finalists, *found, observed, mask, recordings, plan.floor)
-    counts = np.ones(recordings)
-    before = pool.loss(best, counts)
-    polished = refine(pool, best, counts, config.polish, int(generator.integers(2**31))) if config.polish else best
-    details["reuse"] = {
-        "rollouts": len(pool.values),
-        "effective_sample_size": pool.weights(polished)[1],
-        "loss": [before, pool.loss(polished, counts)],
-    }
-    if config.bootstrap and recordings < 2:
-        details["bootstrap"] = "needs two recordings or more"
-    elif config.bootstrap:
-        tried = config.polish or 10 * plan.space.dimension
-        details["bootstrap"] = bootstrap(pool, polished, config.bootstrap, tried, generator)
-    return polished
+    return finalists[int(np.argmin(scores))], details
 
 
 def _pack(state: SearchState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    arrays = {"candidates": state.candidates, "losses": state.losses, "horizons": np.asarray(state.horizons)}
+    arrays = {"candidates": state.candidates, "losses": state.losses}
     return arrays, {"ledger": state.ledger.record(), "trace": state.trace, "seconds": state.seconds}
 
 
 def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SearchState:
     ledger = Ledger.from_record(meta["ledger"])
-    horizons = tuple(arrays["horizons"].tolist())
-    return SearchState(arrays["candidates"], arrays["losses"], horizons, ledger, meta["trace"], meta["seconds"])
+    return SearchState(arrays["candidates"], arrays["losses"], ledger, meta["trace"], meta["seconds"])
 
 
 def paper_horizon(iteration: int, iterations: int, n_rows: int, *, mended: bool = True) -> int:
@@ -401,96 +328,14 @@ def linear_horizon(iteration: int, iterations: int, n_rows: int) -> int:
     return min(n_rows, max(1, math.ceil(n_rows * (iteration + 1) / iterations)))
 
 
-def adaptive_horizon(row_scores: Float[np.ndarray, "n rows"], horizon: int, target: float) -> int:
-    """Longest horizon at which candidates still agree: weighted by the likelihood of the rows after ``horizon``, the
-    share ``target`` of them is effective.
-
-    Args:
-        row_scores: log likelihood of each row for each candidate; minus infinity for those that failed.
-        horizon: present one; the answer is not shorter.
-        target: share of effective candidates among those that did not fail.
-    """
-    alive = row_scores[np.isfinite(row_scores).all(axis=1)]
-    if len(alive) == 0:
-        return horizon
-    ahead = np.cumsum(alive[:, horizon:], axis=1)
-    for rows, weights in enumerate(ahead.T):
-        if log_effective_sample_size(weights) < math.log(target * len(weights)):
-            return horizon + rows
-    return horizon + ahead.shape[1]
-
-
-def refine(
-    pool: Pool, start: Float[np.ndarray, " k"], counts: Float[np.ndarray, " recordings"], evaluations: int, seed: int
-) -> Float[np.ndarray, " k"]:
-    """The best distribution near ``start`` that the pool can judge, without a single further rollout."""
-    k = len(start)
-    population = default_population("cma", k)
-    optimiser = make_optimiser("cma", k, high=WIDTH, sigma=TRUST, population=population, seed=seed, start=start)
-    best, lowest = start, pool.loss(start, counts)
-    for _ in range(max(1, evaluations // population)):
-        asked = np.clip(optimiser.ask(), 0.0, WIDTH)
-        losses = np.array([pool.loss(vector, counts) for vector in asked])
-        optimiser.tell(asked, losses)
-        if losses.min() < lowest:
-            best, lowest = asked[int(np.argmin(losses))], float(losses.min())
-    return best
-
-
-def bootstrap(
-    pool: Pool, start: Float[np.ndarray, " k"], repeats: int, evaluations: int, generator: np.random.Generator
-) -> dict[str, dict[str, Any]]:
-    """Scatter of each parameter's mean when the recordings are drawn again with replacement."""
-    means, effective = [], []
-    for _ in range(repeats):
-        counts = np.bincount(generator.integers(pool.recordings, size=pool.recordings), minlength=pool.recordings)
-        found = refine(pool, start, counts.astype(float), evaluations, int(generator.integers(2**31)))
-        table = pool.family.describe(found, dict.fromkeys(pool.family.names, ""))
-        means.append([table[name]["mean"] for name in pool.family.names])
-        effective.append(pool.weights(found)[1])
-    drawn = np.array(means)
-    low, high = np.quantile(drawn, [0.05, 0.95], axis=0)
-    return {
-        name: {"sd": float(drawn[:, j].std(ddof=1)), "q05": float(low[j]), "q95": float(high[j])}
-        for j, name in enumerate(pool.family.names)
-    } | {"effective_sample_size": {"mean": float(np.mean(effective)), "least": float(np.min(effective))}}
-
-
-@runtime_checkable
-class Optimiser(Protocol):
-    """Minimises a noisy loss over a box."""
-
-    def ask(self) -> Float[np.ndarray, "population d"]:
-        """Candidates of the next generation, inside the box."""
-        ...
-
-    def tell(self, candidates: Float[np.ndarray, "population d"], losses: Float[np.ndarray, " population"]) -> None:
-        """Losses of the candidates last asked for; infinite ones rank last."""
-        ...
-
-    @property
-    def centre(self) -> Float[np.ndarray, " d"]:
-        """Where the search distribution now stands."""
-        ...
-
-
 def default_population(name: str, d: int) -> int:
     """``4 + floor(3 ln d)``, Hansen's default for CMA-ES; the cross-entropy method wants 5 d, it keeps little."""
     hansen = 4 + math.floor(3.0 * math.log(d))
     return max(hansen, 5 * d) if name == "cem" else hansen
 
 
-def make_optimiser(
-    name: str,
-    d: int,
-    *,
-    high: float,
-    sigma: float,
-    population: int,
-    seed: int,
-    start: Float[np.ndarray, " d"] | None = None,
-) -> Optimiser:
-    """An optimiser over ``[0, high]^d`` that starts in the middle, or at ``start`` (CMA-ES only).
+def make_optimiser(name: str, d: int, *, high: float, sigma: float, population: int, seed: int) -> Optimiser:
+    """An optimiser over ``[0, high]^d`` that starts in the middle.
 
     Args:
         name: "cma" or "cem".
@@ -501,7 +346,7 @@ def make_optimiser(
         seed: of its random numbers.
     """
     if name == "cma":
-        return CovarianceAdaptation(d, high, sigma * high, population, seed, start)
+        return CovarianceAdaptation(d, high, sigma * high, population, seed)
     if name == "cem":
         return CrossEntropy(d, high, sigma * high, population, seed)
     raise InputError(f"unknown optimiser {name!r}", where="[inference]", remedy=f"one of {', '.join(OPTIMISERS)}")
@@ -546,9 +391,7 @@ class CrossEntropy:
 class CovarianceAdaptation:
     """CMA-ES of pycma, with random numbers of its own instead of numpy's global ones."""
 
-    def __init__(
-        self, d: int, high: float, sigma: float, population: int, seed: int, start: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, d: int, high: float, sigma: float, population: int, seed: int) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # pycma warns of optional plotting packages when imported
             import cma
@@ -563,7 +406,7 @@ class CovarianceAdaptation:
             "tolfun": 0.0,  # the number of generations is the schedule's to decide, not a tolerance's
             "tolx": 0.0,
         }
-        self._strategy = cma.CMAEvolutionStrategy(np.full(d, 0.5 * high) if start is None else start, sigma, options)
+        self._strategy = cma.CMAEvolutionStrategy(np.full(d, 0.5 * high), sigma, options)
 
     def ask(self) -> Float[np.ndarray, "population d"]:
         """Candidates of the next generation."""
@@ -579,3 +422,8 @@ class CovarianceAdaptation:
     def centre(self) -> Float[np.ndarray, " d"]:
         """Mean of the search distribution, inside the box."""
         return np.asarray(self._strategy.result.xfavorite)
+
+
+Optimiser = CrossEntropy | CovarianceAdaptation
+"""Minimises a noisy loss over a box: `ask` for the candidates of a generation, `tell` their losses (infinite ones rank
+last), and `centre`, where the search distribution stands."""

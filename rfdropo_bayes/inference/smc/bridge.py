@@ -16,7 +16,6 @@ distribution, with the likelihood as it is there and the prior by its mean and c
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -34,6 +33,7 @@ from rfdropo_bayes.inference.modes.climb import SAME, Laplace, divergence
 from rfdropo_bayes.inference.modes.search import LaplaceConfig, Modes, find_modes, mode_values
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook, run_digest
 from rfdropo_bayes.inference.result import (
+    Draws,
     InferenceResult,
     exclusion_cautions,
     prior_cautions,
@@ -134,6 +134,13 @@ class BridgedProblem:
         density = evaluate_prior(self.problem, u) + np.asarray(rows).sum(axis=1)
         return (density - self.mixture.log_density(u))[:, None], np.asarray(status)
 
+    def carried_back(self, draws: Draws, names: tuple[str, ...]) -> tuple[Float[np.ndarray, "chain draw d"], Draws]:
+        """Draws from the bridge as points of the other problem, and as draws of its parameters, or of those that it is
+        a view of."""
+        u = np.stack([draws[name] for name in self.names], axis=-1)
+        values = self.problem.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
+        return u, {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in names}
+
 
 def run(
     problem: Problem,
@@ -165,11 +172,8 @@ def sample_from_modes(
         modes = [straight.mode(mode) for mode in modes]
     bridged = BridgedProblem(view, covering(view, modes, moment_key), config)
     sampled = sampler.run(bridged, sampling, run_key, logbook)
-    u = np.stack([sampled.draws[name] for name in bridged.names], axis=-1)
-    values = view.from_unconstrained(jnp.asarray(u.reshape(-1, u.shape[-1])))
-    draws = {name: np.asarray(values[name], dtype=float).reshape(u.shape[:2]) for name in problem.names}
-    excluded = ledger.excluded + Counter(sampled.excluded)
-    evaluations = ledger.evaluations + sampled.evaluations
+    _, draws = bridged.carried_back(sampled.draws, problem.names)
+    spent = ledger + sampled.spent
     # Several optima are what the mixture is for: no caution here, unlike in Laplace alone.
     # What the sampler says of coordinates, and of its share of rollouts, is said below of parameters and of all.
     kept = stage_cautions(sampled.trace, sampling.rollouts, sampling.correlation)
@@ -183,10 +187,8 @@ def sample_from_modes(
         block_scores=[],
         log_likelihood=None,
         trace=[*found.climbs.trace, *sampled.trace],
-        rollouts=ledger.rollouts + sampled.rollouts,
-        evaluations=evaluations,
-        excluded=dict(excluded),
-        cautions=[*kept, *prior_cautions(problem, draws), *exclusion_cautions(excluded, evaluations)],
+        **spent.record(),
+        cautions=[*kept, *prior_cautions(problem, draws), *exclusion_cautions(spent.excluded, spent.evaluations)],
         seconds=found.climbs.seconds + sampled.seconds,
         optimum=mode_values(problem, found.modes[0]),
         details=sampled.details

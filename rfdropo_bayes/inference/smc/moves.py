@@ -1,6 +1,6 @@
 """How SMC moves its particles: proposals that the population tunes by itself, and coordinates that suit them.
 
-- `propose`: random walks and preconditioned Crank-Nicolson steps, shaped by the covariance of the particles.
+- `propose`: preconditioned Crank-Nicolson steps, shaped by the covariance of the particles.
 - `Flow`: trajectories along the gradient of the posterior, for many parameters.
 - `StraightProblem`: logarithms of positive parameters, in which ridges are straight.
 """
@@ -22,7 +22,7 @@ from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, Values
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.modes.climb import Laplace
 
-KERNELS = ("auto", "crank_nicolson", "random_walk", "hamiltonian")
+KERNELS = ("auto", "crank_nicolson", "hamiltonian")
 FOLLOWED = 0.75  # acceptance that trajectories are adapted to
 WORTHWHILE = 15  # parameters from which on "auto" follows gradients; with fewer, moves by the covariance cost less
 TRAVEL = 1.5  # length of a trajectory in deviations: about a quarter of an orbit, which forgets the start
@@ -71,18 +71,15 @@ def distinct_size(position: Float[np.ndarray, "n d"], weights: Float[np.ndarray,
 
 
 def initial_scale(kernel: str, d: int) -> float:
-    """Step before anything is known of the acceptance: 2.38 / sqrt(d) for a random walk, d^(-1/4) for a trajectory, at
-    most 1 for Crank-Nicolson."""
-    if kernel == "hamiltonian":
-        return float(d**-0.25)
-    walk = 2.38 / np.sqrt(d)
-    return float(walk if kernel == "random_walk" else min(walk, 1.0))
+    """Step before anything is known of the acceptance: d^(-1/4) for a trajectory; for Crank-Nicolson that of a random
+    walk, 2.38 / sqrt(d), at most 1."""
+    return float(d**-0.25 if kernel == "hamiltonian" else min(2.38 / np.sqrt(d), 1.0))
 
 
 def adapt_scale(kernel: str, scale: float, acceptance: float, target: float) -> float:
     """Next step size from the acceptance of the whole population (Robbins-Monro on its logarithm)."""
     longer = scale * np.exp(1.5 * (acceptance - (FOLLOWED if kernel == "hamiltonian" else target)))
-    return float(np.clip(longer, 1e-4, 10.0 if kernel == "random_walk" else 1.0))
+    return float(np.clip(longer, 1e-4, 1.0))
 
 
 def host_generator(key: PRNGKeyArray) -> np.random.Generator:
@@ -100,12 +97,10 @@ def propose(
     reference: Reference,
     scale: float,
     degrees: float,
-    kernel: str,
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
     """Propose for all particles at once.
 
-    ``random_walk``: ``x' = x + scale L z``.
-    ``crank_nicolson``: ``x' = m + sqrt(1 - scale^2) (x - m) + scale sqrt(s) L z`` with ``s`` inverse gamma, reversible
+    ``x' = m + sqrt(1 - scale^2) (x - m) + scale sqrt(s) L z`` with ``s`` inverse gamma, reversible
     with respect to a Student-t of the reference's location and spread (the t-preconditioned Crank-Nicolson proposal of
     Grumitt, Karamanis and Seljak 2024). At scale 1 it nearly forgets where it came from, so that one move decorrelates
     a population that is close to normal; at small scales it is a random walk.
@@ -115,8 +110,6 @@ def propose(
     """
     n, d = position.shape
     step = generator.standard_normal((n, d)) @ reference.cholesky.T
-    if kernel == "random_walk":
-        return position + scale * step, np.zeros(n)
     centred = position - reference.mean
     distance = squared_distance(reference.cholesky, centred)
     spread = 0.5 * (degrees + distance) / generator.standard_gamma(0.5 * (d + degrees), n)

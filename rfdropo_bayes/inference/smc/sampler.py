@@ -59,10 +59,10 @@ class SmcConfig:
         replicates: independent repetitions; they become chains, and their scatter is the evidence's deviation. None
             takes as many as the budget serves, up to four, and one without a budget: see `decided`.
         blocks: number of times the horizon is lengthened.
-        spacing: of the blocks: "geometric", "linear" or "every" (row).
+        spacing: of the blocks: "geometric" or "linear".
         target_ess: share of effective particles kept from one target to the next; closer to 1 is slower and more exact.
-        kernel: "crank_nicolson" (adapts between independent draws and small steps), "random_walk", "hamiltonian"
-            (follows gradients), or "auto": see `hamiltonian.chosen_kernel`.
+        kernel: "crank_nicolson" (adapts between independent draws and small steps), "hamiltonian" (follows gradients),
+            or "auto": see `moves.chosen_kernel`.
         degrees: degrees of freedom of the Student-t behind "crank_nicolson".
         acceptance: acceptance rate that the step size is adapted to.
         correlation: moves of a stage end once no direction is more correlated than this with its start.
@@ -371,8 +371,7 @@ def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcSta
     draws = chains(problem, [state.population.position[:count] for state in states])
     values = np.array([state.log_evidence for state in states])
     prefixes = np.stack([state.prefix_log_evidence for state in states])
-    excluded: Counter[str] = sum((state.ledger.excluded for state in states), Counter())
-    evaluations = sum(state.ledger.evaluations for state in states)
+    spent = sum((state.ledger for state in states), Ledger())
     trace = [{"replicate": index, **row} for index, state in enumerate(states) for row in state.trace]
     sd = float(values.std(ddof=1)) if len(values) > 1 else float("nan")
     return InferenceResult(
@@ -383,12 +382,10 @@ def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcSta
         block_scores=_block_scores(plan.horizons, prefixes),
         log_likelihood=np.stack([state.population.rows[:count] for state in states]),
         trace=trace,
-        rollouts=sum(state.ledger.rollouts for state in states),
-        evaluations=evaluations,
-        excluded=dict(excluded),
+        **spent.record(),
         cautions=[
             *prior_cautions(problem, draws),
-            *exclusion_cautions(excluded, evaluations),
+            *exclusion_cautions(spent.excluded, spent.evaluations),
             *stage_cautions(trace, config.rollouts, config.correlation),
             *replicate_cautions(draws, values),
         ],

@@ -19,7 +19,6 @@ evenly along the data, b is also the prefix that a stage needs, which sets its c
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 from typing import Any, NamedTuple, TypeGuard
 
@@ -161,12 +160,7 @@ def _several(way: Way, config: SmcConfig, left: float | None) -> SmcConfig:
 
 def _with_cost(result: InferenceResult, ledger: Ledger) -> InferenceResult:
     """What was spent before the sampler began, too."""
-    return replace(
-        result,
-        rollouts=result.rollouts + ledger.rollouts,
-        evaluations=result.evaluations + ledger.evaluations,
-        excluded=dict(Counter(result.excluded) + ledger.excluded),
-    )
+    return replace(result, **(result.spent + ledger).record())
 
 
 def _from_optima(
@@ -201,8 +195,7 @@ def _from_optima(
         method="smc",
         prefix_log_evidence=every,
         block_scores=block_scores([*prefixes, whole]),
-        rollouts=result.rollouts + ledger.rollouts,
-        evaluations=result.evaluations + ledger.evaluations,
+        **(result.spent + ledger).record(),
         details=result.details
         | {
             "algorithm": FROM_OPTIMA,

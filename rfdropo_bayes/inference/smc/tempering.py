@@ -58,7 +58,7 @@ class Tuning(NamedTuple):
 
     Attributes:
         target_ess: effective sample size kept from one target to the next, as a share of the live particles.
-        kernel: ``"crank_nicolson"``, ``"random_walk"`` or ``"hamiltonian"``.
+        kernel: ``"crank_nicolson"`` or ``"hamiltonian"``.
         degrees: degrees of freedom of the Student-t behind ``crank_nicolson``.
         acceptance: acceptance that step sizes are adapted to.
         correlation: moves go on until no direction is more correlated than this with where the stage began.
@@ -253,9 +253,7 @@ def _by_halves(
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, " n"]]:
     proposal, ratio = np.empty_like(position), np.empty(len(position))
     for members, reference in zip((~second, second), references, strict=True):
-        proposal[members], ratio[members] = propose(
-            generator, position[members], reference, scale, tuning.degrees, tuning.kernel
-        )
+        proposal[members], ratio[members] = propose(generator, position[members], reference, scale, tuning.degrees)
     return proposal, ratio
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rfdropo_bayes.inference.rfdropo.search import adaptive_horizon, linear_horizon, paper_horizon
+from rfdropo_bayes.inference.rfdropo.search import linear_horizon, paper_horizon
 
 
 def test_published_schedule_is_the_formula_and_never_sees_the_last_row():
@@ -30,15 +29,3 @@ def test_mended_schedules_grow_and_end_at_the_last_row(iterations, n_rows):
 def test_the_mended_curve_stays_close_to_the_published_one():
     differences = [paper_horizon(i, 500, 100) - paper_horizon(i, 500, 100, mended=False) for i in range(500)]
     assert 0 <= min(differences) <= max(differences) <= 2
-
-
-def test_an_adaptive_horizon_ends_where_candidates_part():
-    """Ten candidates alike up to row 7; from row 8 on one of them is so much better that it alone is left."""
-    scores = np.zeros((10, 20))
-    scores[3, 7:] = 5.0
-    assert adaptive_horizon(scores, 2, 0.5) == 7
-    assert adaptive_horizon(scores, 7, 0.5) == 7
-    assert adaptive_horizon(np.ones((10, 20)), 2, 0.5) == 20
-    failed = np.full((1, 20), -np.inf)
-    assert adaptive_horizon(np.concatenate([scores, failed]), 2, 0.5) == 7
-    assert adaptive_horizon(failed, 5, 0.5) == 5

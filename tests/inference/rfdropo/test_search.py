@@ -9,9 +9,9 @@ from scipy.stats import multivariate_normal
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.rfdropo import search as rfdropo
-from rfdropo_bayes.inference.rfdropo.families import search_space
 from rfdropo_bayes.inference.rfdropo.scores import motion_scale, step_log_likelihood
 from rfdropo_bayes.inference.rfdropo.search import RfdropoConfig, default_population, make_optimiser
+from rfdropo_bayes.inference.rfdropo.space import search_space
 
 from ..toys import Spring
 
@@ -103,21 +103,6 @@ def test_a_known_distribution_is_recovered(optimiser):
     assert result.draws["frequency"].shape == (1, 2000)
     assert result.rollouts <= 20000.0
     assert sum(n * h for n, h in problem.calls) / problem.n_rows == pytest.approx(result.rollouts)
-
-
-def test_an_adaptive_horizon_grows_with_the_agreement_of_the_candidates():
-    """It looks ahead sooner than the line that it must not fall behind, and never back."""
-    problem = Spring()
-    config = RfdropoConfig(rollouts=20000.0, rollouts_per_candidate=20, horizon="adaptive")
-    result = rfdropo.run(problem, config, KEY)
-    horizons = [row["horizon"] for row in result.trace]
-    assert all(np.diff(horizons) >= 0)
-    assert horizons[0] == 1
-    assert horizons[len(horizons) // 2] > 1
-    assert horizons[-1] == 40
-    assert result.phi["frequency"]["mean"] == pytest.approx(2.3, abs=0.03)
-    assert sum(n * h for n, h in problem.calls) / problem.n_rows == pytest.approx(result.rollouts)
-    assert result.rollouts <= 20000.0
 
 
 def test_spread_in_the_data_is_recovered_as_spread():

@@ -82,14 +82,6 @@ def test_what_a_budget_has_left_becomes_further_draws():
     assert np.abs((drawn - mean) / np.sqrt(np.diag(covariance))).max() < 0.18
 
 
-def test_random_walk_agrees_and_costs_more(linear):
-    problem, reference = linear
-    config = SmcConfig(particles=1000, replicates=4, kernel="random_walk")
-    result = sampler.run(problem, config, KEY)
-    assert result.log_evidence[0] == pytest.approx(problem.prefix_log_evidence()[-1], abs=0.25)
-    assert result.rollouts / 4 > 2.0 * reference.rollouts / 10
-
-
 def test_nothing_is_evaluated_twice():
     """Rollouts charged are those made, and only first looks at a block and proposals are made."""
     problem = LinearGaussian()

@@ -242,5 +242,5 @@ def test_a_budget_decides_on_replicates_and_without_one_there_is_one():
     assert sampler.decided(30, SmcConfig(rollouts=1000.0)).chains == 1
     assert sampler.decided(30, SmcConfig(rollouts=5000.0)).chains == 2
     assert sampler.decided(30, SmcConfig(rollouts=1e5)).chains == 4
-    assert sampler.decided(200, SmcConfig(rollouts=5000.0, spacing="every")).chains == 1
+    assert sampler.decided(200, SmcConfig(rollouts=5000.0, spacing="linear", blocks=200)).chains == 1
     assert sampler.decided(30, SmcConfig()).chains == 1

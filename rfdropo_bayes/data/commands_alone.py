@@ -1,0 +1,59 @@
+"""Commands as a recording whose measurements are unknown, but for where the markers are in one row."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.data.trajectory import Trajectory
+from rfdropo_bayes.errors import InputError
+
+
+def commands_alone(
+    time: Float[np.ndarray, " command"],
+    command: Float[np.ndarray, "command channel"],
+    marker_names: list[str] | tuple[str, ...],
+    *,
+    start: Float[np.ndarray, "row marker 3"] | None = None,
+    row: int = 0,
+    start_file: str = "",
+    **facts: Any,
+) -> Trajectory:
+    """Commands with the start pose at most; they begin from the first one.
+
+    Observations are due at the times of the commands, and once more as long after the last as two are apart.
+
+    Args:
+        time: of the commands [s].
+        command: in the robot's unit.
+        marker_names: of the robot.
+        start: places of the markers [m], of which one row counts; None where none is known.
+        row: that of the start pose; a single row has it, whatever its number.
+        start_file: that it was read from.
+        facts: further arguments of `Trajectory.build`.
+
+    Raises:
+        InputError: a start without that row.
+    """
+    clock = np.append(time, time[-1] + (float(np.median(np.diff(time))) if len(time) > 1 else 1.0))
+    position = np.zeros((len(clock), len(marker_names), 3))
+    mask = np.zeros(position.shape[:2], dtype=bool)
+    if start is not None:
+        if row >= len(clock) or (len(start) != 1 and row >= len(start)):
+            raise InputError(f"has no row {row} to start from", where=start_file, remedy="choose other --rows")
+        first = start[min(row, len(start) - 1)]
+        seen = np.isfinite(first).all(axis=1)
+        position[:], mask[row] = np.where(seen[:, None], first, 0.0), seen
+    return Trajectory.build(
+        time=clock,
+        position=position,
+        position_mask=mask,
+        marker_names=marker_names,
+        command_time=time,
+        command=command,
+        initial_command=command[0],
+        settings={"unseen": True},
+        **facts,
+    )
