@@ -63,8 +63,8 @@ ROWS = {
     "BayesSim": Row("bayessim", {}, "posterior"),
     "NPDR": Row("npdr", {"rounds": 10}, "posterior"),
     "RF-DROPO as published": Row("rfdropo", {"mended": False}, "phi"),
-    "ours": Row("smc", {}, "posterior"),
-    "ours after the audit": Row("smc", {}, "posterior", extended=True),
+    "ours": Row("laplace", {}, "posterior"),
+    "ours after the audit": Row("laplace", {}, "posterior", extended=True),
     "oracle": Row(on_target=True),
 }
 OURS, ORACLE = "ours after the audit", "oracle"
