@@ -26,7 +26,7 @@ SPHERES_PER_METRE = 230.0
 """Spheres along the axis: 4.3 mm apart, a third of the trunk's radius, so that the chain is smooth to 0.2 mm."""
 
 FITTED = 24
-"""Nodes of a mesh that a sphere follows: about two rings of SOFA's trunk."""
+"""Nodes of a mesh that a sphere follows, at least: about two rings of SOFA's trunk."""
 
 
 class Spheres(NamedTuple):
@@ -95,10 +95,27 @@ def mesh_spheres(
     best.
     """
     height = sphere_heights(float(station[0]), float(station[-1]), float(radius[-1]))
-    node = np.sort(np.argsort(np.abs(rest[:, 2] - height[:, None]), axis=1)[:, :FITTED], axis=1)
-    place = rest[node] - np.stack([0.0 * height, 0.0 * height, height], axis=1)[:, None]
-    fit = np.linalg.pinv(np.concatenate([np.ones((*place.shape[:2], 1)), place], axis=2))
+    fits = [_affine_fit(rest, at) for at in height]
+    width = max(len(node) for node, _ in fits)
+    node = np.stack([np.pad(node, (0, width - len(node))) for node, _ in fits])
+    fit = np.stack([np.pad(weight, ((0, 0), (0, width - len(node)))) for node, weight in fits])
     return Spheres(node, fit[:, 0], np.swapaxes(fit[:, 1:], 1, 2), np.interp(height, station, radius))
+
+
+def _affine_fit(
+    rest: Float[np.ndarray, "nodes 3"], height: float
+) -> tuple[Int[np.ndarray, " width"], Float[np.ndarray, "4 width"]]:
+    """Nodes nearest to a height on the z axis, and weights of their positions for the point there and its gradient.
+
+    Nodes in one plane say nothing of the motion across it: as many are taken as it needs.
+    """
+    nearest, count = np.argsort(np.abs(rest[:, 2] - height)), FITTED
+    while True:
+        node = np.sort(nearest[:count])
+        place = np.concatenate([np.ones((len(node), 1)), rest[node] - [0.0, 0.0, height]], axis=1)
+        if np.linalg.matrix_rank(place) == 4 or len(node) == len(rest):
+            return node, np.linalg.pinv(place)
+        count += 1
 
 
 def contact_frame(normal: Float[Array, "contacts 3"]) -> Float[Array, "contacts 3 3"]:

@@ -20,7 +20,7 @@ from rfdropo_bayes.fem.constraints import (
     Slips,
     solve_constraints,
 )
-from rfdropo_bayes.fem.pushing import contact_frame, distance_to_box
+from rfdropo_bayes.fem.pushing import FITTED, contact_frame, distance_to_box, mesh_spheres
 from rfdropo_bayes.fem.rigid_body import (
     CORNERS,
     Cube,
@@ -238,3 +238,21 @@ def test_derivatives_are_those_of_the_solution(seed):
     ahead, behind = solved(1e-6), solved(-1e-6)
     np.testing.assert_allclose(forward, (ahead - behind) / 2e-6, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(backward, weight @ forward, rtol=1e-8)
+
+
+def test_spheres_of_a_mesh_follow_affine_motions():
+    """Also at an end whose plane holds more nodes than a sphere follows: they say nothing of the motion across it."""
+    rng = np.random.default_rng(11)
+    rest = rng.uniform([-0.01, -0.01, 0.0], [0.01, 0.01, 0.2], (300, 3))
+    rest[: 2 * FITTED, 2] = 0.0
+    turn, shift = np.eye(3) + 0.3 * rng.normal(size=(3, 3)), rng.normal(size=3)
+    spheres = mesh_spheres(rest, np.array([0.0, 0.2]), np.array([0.012, 0.005]))
+    moved_nodes = (rest @ turn.T + shift)[spheres.node]
+    centre = np.einsum("sk,ski->si", spheres.centre, rest[spheres.node])
+    np.testing.assert_allclose(centre[:, :2], 0.0, atol=1e-12)
+    assert centre[0, 2] == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(
+        np.einsum("sk,ski->si", spheres.centre, moved_nodes), centre @ turn.T + shift, atol=1e-12
+    )
+    deformation = np.einsum("ski,skj->sij", moved_nodes, spheres.gradient)
+    np.testing.assert_allclose(deformation, np.broadcast_to(turn, deformation.shape), atol=1e-9)
