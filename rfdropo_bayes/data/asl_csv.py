@@ -2,7 +2,8 @@
 
 Timing. Both files run at 100 Hz. Row k of the observations is the state just before command row k is sent, so command
 row k is in force from ``time[k]`` until ``time[k + 1]``, and the observations have one row more than the commands. What
-was in force before row 0 is not recorded (`first_command`); ``initial_command`` repeats command row 0.
+was in force before row 0 is not recorded, but the motors' angles show it (`first_command`); ``initial_command`` repeats
+command row 0.
 
 Frame. Motion capture has y up and the trunk hangs. Base frame: x = mocap x, y = mocap z, z = -mocap y (down, along the
 axis); right-handed. No origin is subtracted: the mocap origin is arbitrary and moved by a centimetre between days, so a
@@ -87,7 +88,8 @@ def read_asl_csv(observations: Path, commands: Path | None, *, mask_missing: boo
 
 
 def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> Trajectory:
-    """Commands with the start pose at most: positions of one observation row, all others masked.
+    """Commands with the start pose at most: positions of one observation row, all others masked; of row 0 the motors'
+    angles, too.
 
     Args:
         commands: file of commands.
@@ -100,13 +102,18 @@ def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> T
     command = _read_commands(commands)
     time = np.arange(len(command) + 1) / RATE
     position, mask = np.zeros((len(time), 3, 3)), np.zeros((len(time), 3), dtype=bool)
+    angle = None
     if observations is not None:
-        points = CsvTable(observations, ["ID", *_DISKS]).points(_DISKS, allow_missing=True) @ MOCAP_TO_BASE.T
+        table = CsvTable(observations, ["ID", *_DISKS])
+        points = table.points(_DISKS, allow_missing=True) @ MOCAP_TO_BASE.T
         if row >= len(time) or (len(points) != 1 and row >= len(points)):
             raise InputError(f"has no row {row} to start from", where=str(observations), remedy="choose other --rows")
         first = points[min(row, len(points) - 1)]
         seen = np.all(np.isfinite(first), axis=1)
         position[:], mask[row] = np.where(seen[:, None], first, 0.0), seen
+        if row == 0 and all(name in table for name in _ANGLES):
+            angle = np.full((len(time), MOTORS), np.nan)
+            angle[0] = np.deg2rad(table.numbers(_ANGLES, allow_missing=True)[0])
     return Trajectory.build(
         name=_stem(observations or commands),
         robot="asl_trunk",
@@ -118,6 +125,7 @@ def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> T
         command_time=time[:-1],
         command=command,
         initial_command=command[0],
+        motor_angle=angle,
         command_unit="rad",
         cable_names=[f"motor{motor}" for motor in range(1, MOTORS + 1)],
         provenance=commands.name,
