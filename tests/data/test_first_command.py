@@ -138,7 +138,7 @@ def test_no_later_row_has_a_say_in_a_prediction(files):
 
 @pytest.mark.parametrize("hold", [1, 5], ids=["every row", "held"])
 def test_motors_show_where_they_stand_before_the_first_command(asl_tables, write, tmp_path, hold):
-    """Angles of the first row [degrees] come before the first command, also of a prediction, which sees no later one."""
+    """Angles of the first row come before the first command, also of a prediction, which sees no later row."""
     observations, commands = asl_tables()
     turned = np.arange(60)[:, None] // hold * hold + np.array([2.0, 3.0, -1.0, 0.5, 0.0, 4.0])
     observations[[f"phi{motor}" for motor in range(1, 7)]] = turned
