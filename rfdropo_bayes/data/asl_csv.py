@@ -2,7 +2,8 @@
 
 Timing. Both files run at 100 Hz. Row k of the observations is the state just before command row k is sent, so command
 row k is in force from ``time[k]`` until ``time[k + 1]``, and the observations have one row more than the commands. What
-was in force before row 0 is not recorded (`first_command`); ``initial_command`` repeats command row 0.
+was in force before row 0 is not recorded, but the motors' angles show it (`first_command`); ``initial_command`` repeats
+command row 0.
 
 Frame. Motion capture has y up and the trunk hangs. Base frame: x = mocap x, y = mocap z, z = -mocap y (down, along the
 axis); right-handed. No origin is subtracted: the mocap origin is arbitrary and moved by a centimetre between days, so a
@@ -91,14 +92,20 @@ def read_asl_csv(observations: Path, commands: Path | None, *, mask_missing: boo
 
 
 def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> Trajectory:
-    """Commands with the start pose at most, from ``row`` of a file of observations; see `commands_alone`.
+    """Commands with the start pose at most, from ``row`` of a file of observations, and of row 0 the motors' angles, too;
+    see `commands_alone`.
 
     Raises:
         InputError: on a damaged file, or one without that row.
     """
-    command, start = _read_commands(commands), None
+    command = _read_commands(commands)
+    start = angle = None
     if observations is not None:
-        start = CsvTable(observations, ["ID", *_DISKS]).points(_DISKS, allow_missing=True) @ MOCAP_TO_BASE.T
+        table = CsvTable(observations, ["ID", *_DISKS])
+        start = table.points(_DISKS, allow_missing=True) @ MOCAP_TO_BASE.T
+        if row == 0 and all(name in table for name in _ANGLES):
+            angle = np.full((len(command) + 1, MOTORS), np.nan)
+            angle[0] = np.deg2rad(table.numbers(_ANGLES, allow_missing=True)[0])
     return commands_alone(
         np.arange(len(command)) / RATE,
         command,
@@ -106,6 +113,7 @@ def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> T
         row=row,
         start_file=str(observations),
         name=_stem(observations or commands),
+        motor_angle=angle,
         provenance=commands.name,
         **_FACTS,
     )

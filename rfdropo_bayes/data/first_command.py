@@ -1,6 +1,7 @@
 """The command in force before the first row, which many files do not hold.
 
-It is given, or recognised from how the recording begins. Either the first command was in force already, so that the
+It is given, or measured, or recognised from how the recording begins. Motors whose angles are measured show where they
+stand in the first row. Without them, either the first command was in force already, so that the
 robot stays where it is until commands change; or no command was, and the robot sets out from its rest. Each says what
 a linear robot with a dead time and a lag would do, and the one that meets the first rows better is taken.
 """
@@ -29,9 +30,11 @@ CLEARLY = 0.7  # ratio of two errors below which the smaller decides; of 160 sta
 UNTOLD = ("asl-csv", "csv")
 """Formats whose files do not tell what was in force before their first command."""
 
+MEASURED = {"rule": "measured", "why": "the motors' angles in the first row"}
+
 
 def begun_from(trajectory: Trajectory, rule: Rule | None) -> Trajectory:
-    """The recording with the command before its first row as a rule has it, or else its file, or else as recognised.
+    """The recording with the command before its first row as a rule has it, its file, its motors, or as recognised.
 
     Args:
         trajectory: a whole recording.
@@ -44,6 +47,9 @@ def begun_from(trajectory: Trajectory, rule: Rule | None) -> Trajectory:
     if rule is None:
         if settled or trajectory.dataset.attrs["format"] not in UNTOLD:
             return trajectory
+        angle = angle_at_first(trajectory)
+        if angle is not None:
+            return trajectory.with_initial_command(angle, MEASURED)
         rule, why = recognised(trajectory)
     elif settled:
         raise InputError(
@@ -64,6 +70,18 @@ def begun_from(trajectory: Trajectory, rule: Rule | None) -> Trajectory:
         return trajectory.with_initial_command(np.asarray(rule, dtype=float), {"rule": "given", "why": why})
     first = trajectory.command[0]
     return trajectory.with_initial_command(first if rule == "first" else 0.0 * first, {"rule": rule, "why": why})
+
+
+def angle_at_first(trajectory: Trajectory) -> Float[np.ndarray, " channel"] | None:
+    """Motor angles [rad] in the first row, where all were measured and commands are angles; None elsewhere.
+
+    A reading that a slower loop holds counts, too: it is a few rows old, of a robot that stood still.
+    """
+    angle, mask = trajectory.motor_angle, trajectory.motor_angle_mask
+    if angle is None or trajectory.command_unit != "rad":
+        return None
+    held = trajectory.settings.get("motor_angle_hold", 0.0) > 0.0
+    return np.asarray(angle[0]) if held or mask is None or mask[0].all() else None
 
 
 def common_beginning(trajectories: Sequence[Trajectory]) -> str | None:

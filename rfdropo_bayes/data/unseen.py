@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from rfdropo_bayes.data.asl_csv import read_asl_start
-from rfdropo_bayes.data.first_command import UNTOLD, begun_from
+from rfdropo_bayes.data.first_command import MEASURED, UNTOLD, angle_at_first, begun_from
 from rfdropo_bayes.data.plain_csv import holds_commands_alone, read_csv_start
 from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, load_recordings
 from rfdropo_bayes.data.trajectory import Trajectory
@@ -47,7 +47,7 @@ def load_unseen(
     if spec.format == "asl-csv":
         observations = None if start is None else find_data_file(start, base)
         whole = read_asl_start(find_data_file(commands, base), observations, rows[0] if rows else 0)
-        return spec.piece(_begun(whole, spec, begun), rows)
+        return first_row_only(spec.piece(_begun(whole, spec, begun), rows))
     if spec.format == "csv" and spec.columns is not None:
         path = find_data_file(commands, base)
         if holds_commands_alone(path, spec.columns):
@@ -74,9 +74,12 @@ def load_unseen(
 
 
 def _begun(whole: Trajectory, spec: DataSpec, begun: str | None) -> Trajectory:
-    """With the command before the first row as [data], the file or the fitted recordings have it; else the first."""
+    """With the command before the first row as [data], file, motors or fitted recordings have it; else the first."""
     if spec.initial_command is not None or spec.format not in UNTOLD:
         return begun_from(whole, spec.initial_command)
+    angle = angle_at_first(whole)
+    if angle is not None:
+        return whole.with_initial_command(angle, MEASURED)
     why = "assumed" if begun is None else "as in the fitted recordings"
     initial = 0.0 * whole.command[0] if begun == "zero" else whole.command[0]
     beginning = {"rule": begun or "first", "why": f"{why}; set data.initial_command where it was another"}

@@ -134,3 +134,22 @@ def test_no_later_row_has_a_say_in_a_prediction(files):
     assert seen.first_command.endswith("(assumed; set data.initial_command where it was another)")
     np.testing.assert_array_equal(seen.initial_command, seen.command[0])
     assert not load_unseen(DataSpec.parse(table | {"initial_command": "zero"}), folder, "own.csv").initial_command.any()
+
+
+@pytest.mark.parametrize("hold", [1, 5], ids=["every row", "held"])
+def test_motors_show_where_they_stand_before_the_first_command(asl_tables, write, tmp_path, hold):
+    """Angles of the first row come before the first command, also of a prediction, which sees no later row."""
+    observations, commands = asl_tables()
+    turned = np.arange(60)[:, None] // hold * hold + np.array([2.0, 3.0, -1.0, 0.5, 0.0, 4.0])
+    observations[[f"phi{motor}" for motor in range(1, 7)]] = turned
+    write(observations, tmp_path / "o.csv"), write(commands, tmp_path / "c.csv")
+    entry = {"observations": "o.csv", "commands": "c.csv"}
+    spec = DataSpec.parse({"format": "asl-csv", "fit": [entry]})
+    for found in (load_recordings(spec, tmp_path)[0], load_unseen(spec, tmp_path, "c.csv", "o.csv", begun="zero")):
+        np.testing.assert_allclose(np.rad2deg(found.initial_command), turned[0])
+        assert found.first_command.endswith("rad (the motors' angles in the first row)")
+    assert found.motor_angle is None
+    later = load_unseen(spec, tmp_path, "c.csv", "o.csv", rows=(20, 50))
+    np.testing.assert_array_equal(later.initial_command, later.command_at(np.array([-1.0]))[0])
+    given = load_recordings(DataSpec.parse({"format": "asl-csv", "fit": [entry], "initial_command": "zero"}), tmp_path)
+    assert not given[0].initial_command.any()
