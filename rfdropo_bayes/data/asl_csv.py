@@ -92,8 +92,9 @@ def read_asl_csv(observations: Path, commands: Path | None, *, mask_missing: boo
 
 
 def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> Trajectory:
-    """Commands with the start pose at most, from ``row`` of a file of observations, and of row 0 the motors' angles, too;
-    see `commands_alone`.
+    """Commands with the start pose at most, from ``row`` of a file of observations; see `commands_alone`.
+
+    Of row 0 the motors' angles are taken, too.
 
     Raises:
         InputError: on a damaged file, or one without that row.

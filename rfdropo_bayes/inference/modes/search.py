@@ -486,7 +486,6 @@ def _affordable_steps(n_rows: int, config: LaplaceConfig, climbs: Climbs, horizo
 
 def _collect(climbs: Climbs, target: Climbable, matter: Bool[np.ndarray, " start"]) -> Modes:
     """Laplace at every optimum that could matter, in the order of their evidence."""
-    cautions = []
     modes: list[Laplace] = []
     for index in np.argsort(-climbs.log_density, kind="stable"):
         state = LevenbergState(
@@ -497,10 +496,13 @@ def _collect(climbs: Climbs, target: Climbable, matter: Bool[np.ndarray, " start
             modes += [mode] if _apart(mode.mean, modes) else []
     modes.sort(key=lambda mode: -mode.log_evidence)
     best = np.argmin(np.max(np.abs(climbs.positions - modes[0].mean), axis=1))
-    if not climbs.converged[best]:
-        sentence = "the best climb had not converged when its steps or its budget ran out; raise max_steps or rollouts"
-        cautions.append(Caution(Code.CLIMB_UNFINISHED, sentence, grave=True))
-    return Modes(modes, climbs, cautions)
+    return Modes(modes, climbs, _unfinished(bool(climbs.converged[best])))
+
+
+def _unfinished(converged: bool) -> list[Caution]:
+    """A caution where the best climb has not converged."""
+    sentence = "the best climb had not converged when its steps or its budget ran out; raise max_steps or rollouts"
+    return [] if converged else [Caution(Code.CLIMB_UNFINISHED, sentence, grave=True)]
 
 
 def _apart(position: Float[np.ndarray, " d"], modes: list[Laplace]) -> bool:
@@ -532,7 +534,8 @@ def run(
 
     found = find_modes(problem, config, mode_key, checkpoint, logbook, chosen=explain_as_well)
     ledger = found.climbs.ledger
-    problem, modes, lasting = _counted(problem, found, config)
+    problem, found, lasting = _counted(problem, found, config)
+    modes = found.modes
     if isinstance(whole, Hierarchy) and held:
         draws, modes, weights = _with_scales(whole, problem, held, modes, config, draw_key)
     else:
@@ -603,16 +606,14 @@ def _with_scales(
     return {name: draws[name] for name in whole.names}, integrated, weights
 
 
-def _counted(
-    problem: Problem, found: Modes, config: LaplaceConfig
-) -> tuple[Problem, list[Laplace], dict[str, Lasting]]:
+def _counted(problem: Problem, found: Modes, config: LaplaceConfig) -> tuple[Problem, Modes, dict[str, Lasting]]:
     """The problem whose rows count by how long residuals last, its modes, and what the residuals say there.
 
     The modes are climbed to from those that were found; see `modes.lasting`.
     """
     modes, climbs = found.modes, found.climbs
     if not isinstance(problem, CountedProblem):
-        return problem, modes, {}
+        return problem, found, {}
 
     def target_of(problem: CountedProblem) -> Target:
         derivatives = prior_derivatives(problem)
@@ -622,14 +623,21 @@ def _counted(
     lasting = lasting_residuals(problem, target_of(problem), modes[0])
     shares = {name: each.share for name, each in lasting.items() if each.share < 1.0}
     if not shares:
-        return problem, modes, lasting
+        return problem, found, lasting
     counted = problem.counting(shares)
     target, moved = target_of(counted), []
-    for mode in modes:
-        state, _ = maximise(target, mode.mean, max_steps=config.max_steps, tolerance=config.tolerance)
-        moved.append(laplace(target, state))
-    again = lasting_residuals(counted, target, moved[0])
-    return counted, moved, {name: each._replace(widened=again[name].widened) for name, each in lasting.items()}
+    for waiting, mode in zip(range(len(modes), 0, -1), modes, strict=True):
+        steps = config.max_steps
+        if config.rollouts is not None:
+            grid, step = climb_cost(len(mode.mean), int(target.noise.sum()))
+            left = (config.rollouts - climbs.ledger.rollouts) / waiting
+            steps = int(np.clip((left - grid) / step, 0, steps))
+        state, _ = maximise(target, mode.mean, max_steps=steps, tolerance=config.tolerance)
+        moved.append((laplace(target, state), state.converged))
+    moved.sort(key=lambda each: -each[0].log_evidence)
+    again = lasting_residuals(counted, target, moved[0][0])
+    lasting = {name: each._replace(widened=again[name].widened) for name, each in lasting.items()}
+    return counted, Modes([mode for mode, _ in moved], climbs, _unfinished(moved[0][1])), lasting
 
 
 def _several(weights: Float[np.ndarray, " mode"], mixture: str) -> list[Caution]:
