@@ -272,10 +272,11 @@ def _experiment(
     experiment: Experiment, left: ModelError, recording: Trajectory, group: str | None, entry: RecordingEntry | None
 ) -> Experiment:
     """The experiment file of the adapted run: its noise is known, and its group and its recording are named."""
-    groups = dict(experiment.model.groups)
-    if group is not None:
-        known = groups.get(group, [])
-        groups[group] = [*([known] if isinstance(known, str) else known), recording.name]
+    listed = {name: [each] if isinstance(each, str) else list(each) for name, each in experiment.model.groups.items()}
+    if group is not None:  # which the recording belongs to now, whatever group named it
+        listed = {name: [entry for entry in entries if entry != recording.name] for name, entries in listed.items()}
+        listed[group] = [*listed.get(group, []), recording.name]
+    groups = {name: entries for name, entries in listed.items() if entries}
     model = experiment.model.model_copy(update={"noise": STATED, "groups": groups})
     noise = NoiseTable(
         standard_deviation=float(np.sqrt(np.mean(np.square(left.scale)))), correlation_time=left.correlation_time

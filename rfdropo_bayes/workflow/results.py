@@ -25,8 +25,8 @@ def load(folder: Path | str) -> Calibration | Audit:
         InputError: the folder holds neither, or a damaged file.
     """
     folder = Path(folder)
-    if (folder / AUDIT).is_file():
-        return _audit(folder)
+    if (folder / AUDIT).is_file() and ((folder / EXTENDED).is_file() or not (folder / POSTERIOR).is_file()):
+        return _audit(folder)  # a report's folder may hold a calibration, and the answer of an audit beside it
     if not (folder / POSTERIOR).is_file():
         raise InputError(
             "holds neither a calibration nor an audit", where=str(folder), remedy="give the folder that --out named"

@@ -113,7 +113,7 @@ def known():
     left = {"markers": ["tip"], "scale": [SIGMA] * 3, "correlation_time": STEP}
     attributes = {MODEL_ERROR: left, FITTED: ["day_0_a"], NOISE: "white"}
     parameters = tuple(ParameterInfo(name, unit, -1.0, 3.0, prior) for name, (unit, prior) in infos.items())
-    model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"zero": 0.02})
+    model = rb.Model(BOX, noise="white", priors=PRIORS, groups={**DAYS, "before": "morning"}, per_group={"zero": 0.02})
     return rb.Calibration(PosteriorRecord(parameters, draws, attrs=attributes), {"title": "lag"}, "", model)
 
 

@@ -88,6 +88,11 @@ def test_what_is_no_model_is_told_so():
         rb.load(REPOSITORY / "docs")
 
 
+def test_a_report_that_holds_an_audit_s_answer_too_is_a_calibration():
+    for name in ("asl_trunk", "sim2real_trunk"):
+        assert isinstance(rb.load(REPOSITORY / "reports" / name), rb.Calibration)
+
+
 def test_a_robot_from_answers_goes_through_its_tables():
     robot = rb.Robot.outline(name="finger", length=0.12, radius=0.012, markers={"tip": 0.12}, mass=0.04)
     model = rb.Model(robot, priors={"young_modulus": {}})
