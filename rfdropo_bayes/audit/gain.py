@@ -84,7 +84,7 @@ class Gain:
 
     @property
     def worse(self) -> bool:
-        """Whether unseen trajectories are predicted worse: their error grows, or surely more of the discrepancy."""
+        """Whether unseen trajectories are predicted worse: their error grows, or the discrepancy surely does."""
         return self.rmse_extended > self.rmse_base or self.interval[1] < 0.0
 
     @property
@@ -137,7 +137,7 @@ def sign_flip_p(difference: Float[np.ndarray, " n"], rng: np.random.Generator) -
     """Probability of a sum as large as that of these differences, were the sign of each a matter of chance.
 
     Fisher's randomisation test (1935, The Design of Experiments, section 21), exact for differences symmetric about
-    zero. A standard error is no measure here: one recording that shows an effect ten times as well as the others makes
+    zero. A standard error does not decide: one recording that shows an effect ten times as well as the others makes
     the differences spread by more than their mean, though all of them favour one model.
     """
     count = len(difference)

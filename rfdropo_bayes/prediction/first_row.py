@@ -1,4 +1,8 @@
-"""What the first row of a recording says of the parameters that are its own."""
+"""What the first row of a recording says of the parameters that are its own, and of all others.
+
+`match_first_row` moves what is a recording's or a new group's own until the row agrees. `weighed_by_first_row` chooses
+among draws for recordings whose group was fitted: nothing of theirs is free, but some draws fit the row better.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +42,9 @@ def match_first_row(
 
     Offsets are set: each draw is shifted so that the weighted mean over the markers agrees, and a marker weighs as
     little as the model is wrong about it. Deviations are drawn given the row, in which the model is as wrong as it was
-    in the fitted recordings: each draw from their prior is moved to the optimum under a perturbed row (`fit_own`), the
-    offsets set anew at every step. Of a group's recordings the first that has a first row is used.
+    in the fitted recordings: each draw from their prior is moved to the optimum under a perturbed row, pulled back to
+    where it was drawn (`fit_own`). The offset is taken out of the row's error at every step of that. Of a group's
+    recordings the first that has a first row is used.
 
     Args:
         problem: of the new recordings.
@@ -89,7 +94,7 @@ def weighed_by_first_row(
     Args:
         recordings: those to predict.
         position: simulated markers [m] in their first rows.
-        names: those among them whose first row no draw has seen yet.
+        names: those among them whose first row `match_first_row` has not used.
         left: how far the model was off for each marker; without, all draws count the same.
         key: of the resampling.
     """

@@ -2,10 +2,10 @@
 
 What a simulator gets wrong lasts from row to row and is shared by neighbouring markers, so that rows repeat one piece
 of evidence. Noise that lasts may be inferred instead; but noise that lasts for seconds also takes up a pose that is
-wrong throughout, which only parameters can mend. Here the optimum is that of white noise, and its residuals say
-afterwards how much it is worth: the log likelihood is multiplied by one share below 1, so that parameters are as
-uncertain as the correlation of the residuals makes them (magnitude adjustment of Pauli, Racugno & Ventura 2011,
-Ribatet, Cooley & Davison 2012).
+wrong throughout, which only parameters can mend. Here the residuals at the optimum of white noise say how much a row is
+worth. The log likelihood is then multiplied by one share below 1, and climbed anew, so that parameters are as uncertain
+as the correlation of the residuals makes them (magnitude adjustment of Pauli, Racugno & Ventura 2011, Ribatet, Cooley &
+Davison 2012).
 
 The residuals also are smaller than the errors of new recordings, because parameters follow them. How large these are is
 seen where rows are left out in blocks that are as long as residuals last: for a linear model no fit has to be repeated
