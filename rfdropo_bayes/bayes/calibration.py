@@ -139,7 +139,7 @@ class CalibrationProblem:
         gradient = jax.jit(jax.vmap(jax.grad(single)))
 
         def hessian(u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "d d"]:
-            # Differences of exact gradients: XLA takes eight times as long to compile a Hessian.
+            # Differences of exact gradients: a Hessian takes XLA several times as long to compile.
             steps = np.diag(1e-5 * np.maximum(1.0, np.abs(u)))
             above, below = np.split(np.asarray(gradient(np.concatenate([u + steps, u - steps]))), 2)
             found = (above - below) / (2.0 * np.diag(steps)[:, None])
