@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.priors import table_of
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.workflow.unseen import fitted_parts
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.02
@@ -88,9 +89,11 @@ def test_what_is_no_model_is_told_so():
         rb.load(REPOSITORY / "docs")
 
 
-def test_a_report_that_holds_an_audit_s_answer_too_is_a_calibration():
-    for name in ("asl_trunk", "sim2real_trunk"):
-        assert isinstance(rb.load(REPOSITORY / "reports" / name), rb.Calibration)
+@pytest.mark.parametrize("name", ["asl_trunk", "sim2real_trunk"])
+def test_a_report_that_holds_an_audit_s_answer_too_is_a_calibration_for_other_days(name):
+    fit = rb.load(REPOSITORY / "reports" / name)
+    assert isinstance(fit, rb.Calibration)
+    assert set(fitted_parts(fit)[1].names) == {info.name for info in fit.record.free}
 
 
 def test_a_robot_from_answers_goes_through_its_tables():
