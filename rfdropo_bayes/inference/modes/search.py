@@ -533,9 +533,9 @@ def run(
         return rivals(evaluate_rows(problem, climbs.positions, problem.n_rows, climbs.ledger))
 
     found = find_modes(problem, config, mode_key, checkpoint, logbook, chosen=explain_as_well)
-    ledger = found.climbs.ledger
+    ledger, began = found.climbs.ledger, time.monotonic()
     problem, found, lasting = _counted(problem, found, config)
-    modes = found.modes
+    modes, seconds = found.modes, found.climbs.seconds + time.monotonic() - began
     if isinstance(whole, Hierarchy) and held:
         draws, modes, weights = _with_scales(whole, problem, held, modes, config, draw_key)
     else:
@@ -557,7 +557,7 @@ def run(
             *prior_cautions(whole, draws),
             *exclusion_cautions(ledger.excluded, ledger.evaluations),
         ],
-        seconds=found.climbs.seconds,
+        seconds=seconds,
         optimum={**mode_values(problem, best), **held},
         details={
             "lasting": {
