@@ -3,11 +3,11 @@
     A dv = h (f(x) + M g + f_ext - (h + b) K v - a M v) - h J' T,    A = (1 + h a) M + h (h + b) K,    x += h (v + dv)
 
 with Rayleigh damping a M + b K, the corotational tangent K, cable Jacobian J = dl/dx and tensions T >= 0 (Baraff and
-Witkin 1998; the same linearised step as SOFA's EulerImplicitSolver). What taut cables and layers hold against twist and
-lateral motion is implicit too: under opposed cables it exceeds the body's own stiffness, and steps that leave it out
-swing. What ``effects`` add is implicit in the same way: their force, linearised, at the end of the step. Everything is
-a pure function of arrays: batch with ``jax.vmap``, differentiate with ``jax.jvp`` or ``jax.grad``. A ``System`` is
-static and is closed over, never traced.
+Witkin 1998; the same linearised step as SOFA's EulerImplicitSolver). What taut cables and layers hold against lateral
+motion (`cable_strings`, `tension_stiffening`) is implicit too: under opposed cables it exceeds the body's own
+stiffness, and steps that leave it out swing. What ``effects`` add is implicit in the same way: their force, linearised,
+at the end of the step. Everything is a pure function of arrays: batch with ``jax.vmap``, differentiate with
+``jax.jvp`` or ``jax.grad``. A ``System`` is static and is closed over, never traced.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rfdropo_bayes.fem import corotational, layered
 from rfdropo_bayes.fem.bending_law import Sections, moments, sections
 from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, multiply, solve
 from rfdropo_bayes.fem.cable_friction import slip_problem, slipped, start_slip
-from rfdropo_bayes.fem.cable_twist import twist_stiffening
+from rfdropo_bayes.fem.cable_strings import crossing_weights, string_stiffness
 from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian
 from rfdropo_bayes.fem.constrained_step import Pull, Solve, constrained_step, meet
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
@@ -246,6 +246,20 @@ def remembering(system: System, prepared: Prepared, state: State, scene: PushSce
     return state._replace(memory=memory._replace(slip=friction.slip, segment=friction.segment))
 
 
+def strings(
+    system: System,
+    prepared: Prepared,
+    frame: Float[Array, "layers 3 3"],
+    position: Float[Array, "nodes 3"],
+    tension: Float[Array, " cables"],
+) -> Float[Array, "layers 9 pairs"]:
+    """What taut cables add to the stiffness of every layer in its frame, packed."""
+    turned = corotational.turned_back(frame, layered.layer_positions(system.body, position))
+    weights, nodes = crossing_weights(system.body, system.cables), 2 * system.body.section_nodes
+    added = string_stiffness(system.body, weights, prepared.gradient, turned.reshape(-1, nodes, 3), tension)
+    return corotational.pack(added)
+
+
 class _Elastic(NamedTuple):
     """Elastic forces of a step: what acts at its start, and how that changes to its end."""
 
@@ -278,8 +292,9 @@ def _elastic(system: System, prepared: Prepared, state: State, time_step: Scalar
         clock = memory.clock + time_step
         left = jnp.exp(-rate * clock)
         force, packed, memory = left * force, left * packed, memory._replace(clock=clock)
-    tangent = corotational.tangent(packed, frame)
     lookahead = time_step * (1.0 + gain) + prepared.rayleigh_stiffness
+    taut = strings(system, prepared, frame, state.position, state.tension)
+    tangent = corotational.tangent(packed + time_step / lookahead * taut, frame)
     moving = corotational.turned_back(frame, layered.layer_positions(system.body, state.velocity))
     viscous_force = left * lookahead * jnp.einsum("lij,lj->li", prepared.stiffness, moving)
     nodal = corotational.internal_force(frame, force).reshape(-1, 3)
@@ -303,13 +318,11 @@ def _surround(
 
 
 def _taut(system: System, prepared: Prepared, state: State, elastic: _Elastic, time_step: Scalar) -> BlockTridiagonal:
-    """What taut cables and layers hold against twist and lateral motion, times the time step squared."""
+    """What layers in tension hold against lateral motion, times the time step squared."""
     jacobian = lengths_and_jacobian(system.cables, prepared.guides, state.position)[1]
     cable = -jnp.einsum("cni,c->ni", jacobian, state.tension)
     tension = layer_tension(system.body, elastic.resistance, cable, elastic.frame)
-    twist = twist_stiffening(system.body, system.cables, elastic.frame, time_step**2 * state.tension)
-    lateral = lateral_stiffening(system.body, elastic.frame, time_step**2 * tension)
-    return jax.tree.map(jnp.add, twist, lateral)
+    return lateral_stiffening(system.body, elastic.frame, time_step**2 * tension)
 
 
 class Linear(NamedTuple):

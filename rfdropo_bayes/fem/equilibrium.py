@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem import corotational
 from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal
-from rfdropo_bayes.fem.cable_twist import twist_stiffening
 from rfdropo_bayes.fem.cables import lengths_and_jacobian
 from rfdropo_bayes.fem.constrained_step import Pull, constrained_step
 from rfdropo_bayes.fem.dynamics import (
@@ -25,6 +24,7 @@ from rfdropo_bayes.fem.dynamics import (
     section_means,
     shared,
     state_at_rest,
+    strings,
     with_section_matrix,
 )
 from rfdropo_bayes.fem.surroundings import section_load
@@ -69,8 +69,8 @@ def _forces(system: System, prepared: Prepared, iterate: _Iterate) -> _Forces:
     length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, iterate.position)
     cable = -jnp.einsum("cni,c->ni", jacobian, iterate.tension)
     stiffening = lateral_stiffening(system.body, frame, layer_tension(system.body, local_force, cable, frame))
-    twist = twist_stiffening(system.body, system.cables, frame, iterate.tension)
-    tangent = jax.tree.map(lambda *parts: sum(parts), corotational.tangent(packed, frame), stiffening, twist)
+    packed = packed + strings(system, prepared, frame, iterate.position, iterate.tension)
+    tangent = jax.tree.map(jnp.add, corotational.tangent(packed, frame), stiffening)
     centre = section_means(system, iterate.position)
     around = section_load(system.body, prepared.effects, centre, jnp.zeros_like(centre))
     if around is not None:

@@ -145,6 +145,8 @@ def measurement_specs(table: ModelTable) -> tuple[ParameterSpec, ...]:
     """Parameters of the channels that are data: the noise of the positions, and of what else is measured."""
     noise = () if table.noise in KNOWN else noise_specs(table.noise)
     further = [spec for key, specs in SWITCHED.items() if getattr(table, key) for spec in specs]
+    if table.noise == "white":
+        further = [spec for spec in further if spec != OBJECT_CORRELATION_TIME]
     return (*noise, *(s for s in further if table.noise != REPEATS or s == TENSION_GAIN))
 
 
@@ -163,7 +165,8 @@ def check_used(names: Iterable[str], experiment: Experiment, simulator: AnySimul
     table = experiment.model
     specs = simulator.parameters + measurement_specs(table)
     known = [spec.name for spec in specs]
-    further = {f"set [model] {key} = true": found for key, found in SWITCHED.items()}
+    further = {f"set [model] {key} = true": found for key, found in SWITCHED.items() if not getattr(table, key)}
+    further['let the noise last, [model] noise = "auto"'] = (OBJECT_CORRELATION_TIME,)
     further |= {f'set [model] noise = "{model}"': noise_specs(model) for model in NOISE_MODELS}
     for mechanism in mechanisms_named(REGISTRY, simulator.robot):
         further[f"add {mechanism.name!r} to [model] mechanisms"] = mechanism.parameters
@@ -288,7 +291,7 @@ def gather_channels(
     if table.motor_angle:
         channels.append(MotorAngle.gather(trajectories, length, fitted))
     if table.object_pose:
-        channels.append(ObjectPose.gather(simulator, trajectories, length))
+        channels.append(ObjectPose.gather(simulator, trajectories, length, lasting=table.noise != "white"))
     if table.noise == REPEATS:
         groups = group_recordings(recordings, trajectories)
         channels = [with_noise_of_repeats(channel, groups) for channel in channels if isinstance(channel, Series)]

@@ -2,7 +2,9 @@
 
 The body starts where its first pose shows it (`Placing.with_object_at`), and what is measured of it are its centre and
 its turn since then. What the model misses of a push lasts, since a body at rest stays where it was left: the noise is
-an Ornstein-Uhlenbeck process (`bayes.noise`) with its own sizes and its own correlation time.
+an Ornstein-Uhlenbeck process (`bayes.noise`) with its own sizes and its own correlation time. Where the noise of the
+positions is white, so is this one, and `inference.modes.lasting` says what a row counts: noise that lasts as long as
+the recording also takes up a push that is wrong throughout.
 """
 
 from __future__ import annotations
@@ -81,16 +83,20 @@ class ObjectPose(Series):
     Attributes:
         line: which rows have a pose, and which one came before, as of a single marker.
         time: observation times [s].
+        lasting: whether its noise, where that is inferred, lasts from row to row.
     """
 
     name: ClassVar[str] = "object_pose"
     linear: ClassVar[bool] = False
     line: Timeline
     time: Float[np.ndarray, "recording time"]
+    lasting: bool = True
 
     @classmethod
-    def gather(cls, simulator: object, trajectories: Sequence[Trajectory], length: int) -> ObjectPose:
-        """Poses of recordings padded to ``length`` rows.
+    def gather(
+        cls, simulator: object, trajectories: Sequence[Trajectory], length: int, lasting: bool = True
+    ) -> ObjectPose:
+        """Poses of recordings padded to ``length`` rows, under noise that lasts or white noise.
 
         Raises:
             InputError: a simulator without a body to push, or a recording whose first pose is missing.
@@ -118,7 +124,7 @@ class ObjectPose(Series):
             times.append(np.concatenate([trajectory.time, tail]) - trajectory.time[0])
             seen_rows.append(seen)
             measured.append(np.where(seen[:, None], pose, 0.0))
-        return cls.of(np.stack(measured), np.stack(seen_rows), np.stack(times))
+        return cls.of(np.stack(measured), np.stack(seen_rows), np.stack(times), lasting)
 
     @classmethod
     def of(
@@ -126,13 +132,14 @@ class ObjectPose(Series):
         pose: Float[np.ndarray, "recording time 7"],
         seen: Bool[np.ndarray, "recording time"],
         time: Float[np.ndarray, "recording time"],
+        lasting: bool = True,
     ) -> ObjectPose:
         """Poses at some times [s], of which those that were not seen do not count."""
         lines = [timeline(clock, rows[:, None]) for clock, rows in zip(time, seen, strict=True)]
         counted = seen.copy()
         counted[:, 0] = False
         line = Timeline(*(np.stack(part) for part in zip(*lines, strict=True)))
-        return cls(pose, np.repeat(counted[..., None], 6, axis=-1), line=line, time=time)
+        return cls(pose, np.repeat(counted[..., None], 6, axis=-1), line=line, time=time, lasting=lasting)
 
     def of_recordings(self, index: list[int], rows: int | None = None) -> ObjectPose:
         """See `Series.of_recordings`."""
@@ -143,7 +150,12 @@ class ObjectPose(Series):
     @property
     def noise_specs(self) -> tuple[ParameterSpec, ...]:
         """See `Series.noise_specs`."""
-        return (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME)
+        return (OBJECT_NOISE, OBJECT_TURN_NOISE, *([OBJECT_CORRELATION_TIME] if self.lasting else []))
+
+    @property
+    def independent(self) -> bool:
+        """See `Series.independent`."""
+        return not self.lasting if self.known is None else super().independent
 
     def expected(self, seen: Seen) -> Float[Any, "recording time 7"]:
         """See `Series.expected`: in the measuring frame."""
@@ -163,10 +175,10 @@ class ObjectPose(Series):
     def whiten_inferred(
         self, errors: Float[Any, "recording time 6"], values: Mapping[str, Any]
     ) -> tuple[Float[Any, "recording time 6"], Float[Any, "recording time 6"]]:
-        """See `Series.whiten_inferred`: Ornstein-Uhlenbeck processes."""
+        """See `Series.whiten_inferred`: Ornstein-Uhlenbeck processes, or white noise."""
         parts, logarithms = [], []
         for part, spec in ((errors[..., :3], OBJECT_NOISE), (errors[..., 3:], OBJECT_TURN_NOISE)):
-            noise = Noise(values[spec.name], values[OBJECT_CORRELATION_TIME.name])
+            noise = Noise(values[spec.name], values.get(OBJECT_CORRELATION_TIME.name))
             white, scale = jax.vmap(lambda r, line, noise=noise: whiten(r, noise, line))(part[:, :, None], self.line)
             parts.append(white[:, :, 0])
             logarithms.append(jnp.repeat(jnp.log(scale), 3, axis=-1))
@@ -187,8 +199,9 @@ class ObjectPose(Series):
     def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
         """See `Series.stated`."""
         sizes = np.repeat([values[OBJECT_NOISE.name], values[OBJECT_TURN_NOISE.name]], 3)
-        memory = np.array([1.0, np.exp(-step / values[OBJECT_CORRELATION_TIME.name])])
-        return Autoregression(sizes, memory, STATED, np.inf)
+        tau = values.get(OBJECT_CORRELATION_TIME.name)
+        memory = [] if tau is None else [float(np.exp(-step / tau))]
+        return Autoregression(sizes, np.array([1.0, *memory]), STATED, np.inf)
 
     def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time 7"]:
         """See `Channel.draw`."""
@@ -250,9 +263,11 @@ def _error(
     """
     if known is not None:
         return known.draw_rows(key, len(time)).at[0].set(0.0).reshape(-1, 2, 3)
-    tau = values[OBJECT_CORRELATION_TIME.name]
+    tau = values.get(OBJECT_CORRELATION_TIME.name)
     sizes = jnp.stack([values[OBJECT_NOISE.name], values[OBJECT_TURN_NOISE.name]])
     error = sizes[:, None] * draw_noise(key, time, 2, Noise(jnp.ones(()), tau))
+    if tau is None:
+        return error.at[0].set(0.0)
     return error - jnp.exp(-(time - time[0]) / tau)[:, None, None] * error[0]
 
 

@@ -8,6 +8,7 @@ only, held in ``factors``. ``tables``, ``samples``, ``factors`` and ``work`` are
 
 from __future__ import annotations
 
+from rfdropo_bayes.fem.native.cable_strings import add_string_reaction, add_strings, measure_strings
 from rfdropo_bayes.fem.native.fields import clear
 from rfdropo_bayes.fem.native.layered_effects import (
     BENDING,
@@ -20,7 +21,7 @@ from rfdropo_bayes.fem.native.layered_effects import (
     subtract_surroundings_product,
 )
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, store
-from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral, resist_twist
+from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral
 
 POLAR_ITERATIONS = 6
 
@@ -114,20 +115,17 @@ def _layer_reaction(row, column, entries, modes, stiffness, first, local, reacti
 
 
 @kernel
-def _subtract_reaction(tables, samples, layer, work, field, token):
-    """Subtract R K ``local`` from a field; leaves K ``local`` in ``reaction``."""
-    modes, axes, reaction, first = tables.modes, work.axes, work.reaction, layer * tables.entries
-    _layer_reaction(
-        tables.entry_row,
-        tables.entry_column,
-        tables.entries,
-        modes,
-        samples.stiffness,
-        first,
-        work.local,
-        reaction,
-        token,
-    )
+def _react(tables, samples, layer, work, token):
+    """K ``local`` into ``reaction``."""
+    rows, columns, first = tables.entry_row, tables.entry_column, layer * tables.entries
+    stiffness, local, reaction = samples.stiffness, work.local, work.reaction
+    _layer_reaction(rows, columns, tables.entries, tables.modes, stiffness, first, local, reaction, token)
+
+
+@kernel
+def _subtract_reaction(tables, layer, work, field, token):
+    """Subtract ``reaction``, turned out of the layer's frame, from a field."""
+    modes, axes, reaction = tables.modes, work.axes, work.reaction
     for k in range(2 * modes):
         x, y, z = load3(reaction, 3 * k, token)
         for i in range(3):
@@ -244,25 +242,34 @@ def layer_frame(tables, layer, work, token):
 
 
 @kernel
-def add_layer_force(tables, samples, factors, layer, work, token):
-    """Add the elastic force of a layer to ``field``; leaves in ``reaction`` what its section resists in its frame."""
+def add_layer_force(tables, samples, factors, layer, work, strings, token):
+    """Add the elastic force of a layer to ``field``, and what its ``strings`` put against velocities where they are
+    measured; leaves in ``held`` the axial force that the layer resists."""
     _local_field(tables.rest, tables.modes, layer, factors, work, token)
     if samples.present[BRANCH]:
         add_branch(tables, factors, layer, work, token)
     if samples.present[BENDING]:
         add_bending_law(tables, samples, factors, layer, work, token)
-    _subtract_reaction(tables, samples, layer, work, work.field, token)
+    _react(tables, samples, layer, work, token)
+    store(work.held, layer, load(work.reaction, 3 * tables.modes + 2, token))
+    if strings:
+        one = fill(1.0, work.local, token)
+        _local_change(work.velocity, one, tables.modes, layer, work, token)
+        add_string_reaction(tables, layer, one, work, token)
+    _subtract_reaction(tables, layer, work, work.field, token)
 
 
 @kernel
 def subtract_tangent_product(tables, samples, factors, change, field, work, token):
     """Subtract the matrix, in its factors and not as it was summed, times a change of velocity from a field."""
     elasticity, inertia = load(factors.elasticity, 0, token), load(factors.inertia, 0, token)
+    inverse = fill(1.0, elasticity, token) / elasticity
     for layer in range(tables.stations - 1):
         _local_change(change, elasticity, tables.modes, layer, work, token)
-        _subtract_reaction(tables, samples, layer, work, field, token)
+        _react(tables, samples, layer, work, token)
+        add_string_reaction(tables, layer, inverse, work, token)
+        _subtract_reaction(tables, layer, work, field, token)
         resist_lateral(tables, layer, change, field, work, token)
-        resist_twist(tables, layer, change, field, work, token)
         if samples.present[BENDING]:
             subtract_law_product(tables, layer, elasticity, change, field, work, token)
     add_momentum(tables, samples, fill(0.0, inertia, token), inertia, change, field, token)
@@ -271,12 +278,14 @@ def subtract_tangent_product(tables, samples, factors, change, field, work, toke
 
 
 @kernel
-def assemble_layer(tables, samples, factors, layer, work, whole, token):
+def assemble_layer(tables, samples, factors, layer, rate, work, whole, token):
     """Frame and force of a layer, and its part of the matrix; see `_layer_tangent` for ``whole``."""
     layer_frame(tables, layer, work, token)
-    add_layer_force(tables, samples, factors, layer, work, token)
+    measure_strings(tables, layer, rate, work, token)
+    add_layer_force(tables, samples, factors, layer, work, True, token)
     first = layer * tables.entries
     _layer_tangent(tables.parity, tables.modes, samples.stiffness, first, layer, whole, factors, work, token)
+    add_strings(tables, layer, work, whole, token)
     if samples.present[BENDING]:
         add_law_tangent(tables, factors, layer, work, whole, token)
 

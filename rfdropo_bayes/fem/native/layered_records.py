@@ -70,8 +70,11 @@ class Work(NamedTuple):
     relaxation: Float[np.ndarray, "1 lanes"]
     beyond: Float[np.ndarray, "layers3 lanes"]  # force of the cables on the stations beyond each layer
     imbalance: Float[np.ndarray, "1 lanes"]
-    string: Float[np.ndarray, "layers lanes"]  # of layers in tension against lateral motion, in the matrix
-    twist: Float[np.ndarray, "layers lanes"]  # of the cables against the twist of each layer, in the matrix
+    held: Float[
+        np.ndarray, "layers lanes"
+    ]  # of layers in tension against lateral motion, in the matrix; first their force
+    string: Float[np.ndarray, "layers_cables_2 lanes"]  # spring of every cable, in the matrix, and its lever [m]
+    web: Float[np.ndarray, "sums lanes"]  # sums over the strings of a layer
     softness: Float[np.ndarray, "1 lanes"]  # what time has left of the moduli
     branch: Float[np.ndarray, "layer_values lanes"]  # strain of the dashpots, as displacements
     slope: Float[np.ndarray, "layers6 lanes"]  # derivatives of the bending law's moments

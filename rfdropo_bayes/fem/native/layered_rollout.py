@@ -79,6 +79,7 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> tuple[Samples, Fa
         return {name: aligned_zeros((max(count, 1), lanes), dtype) for name, count in sizes.items()}
 
     values, section = stations * size, 2 * size
+    web = modes * (2 * modes + 1) + 2 * modes + 1
     samples = rows(
         moduli=3, density=1, layer_scale=layers, point_mass=stations, stiffness=layers * tables.entries,
         station_mass=tables.station_mass.size, layer_mass=tables.layer_mass.size, gravity=3, damping=2,
@@ -89,8 +90,8 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> tuple[Samples, Fa
         condensed=9 * panels * panels, solution=values, field=values, correction=values, weight=3 * panels,
         axes=9 * layers, dyads=54, local=section, reaction=section, pull=3 * (len(tables.guide_first) - 1),
         slack=cables, tension=cables, commanded=cables, points=3 * tables.points, before=values, beyond=3 * layers,
-        twist=layers, string=layers, branch=layers * section, slope=6 * layers, around=2 * stations,
-        unsolved=1, accepted=1, lost=1, failed=1, relaxation=1, imbalance=1, softness=1,
+        held=layers, string=2 * layers * cables, web=web, branch=layers * section, slope=6 * layers,
+        around=2 * stations, unsolved=1, accepted=1, lost=1, failed=1, relaxation=1, imbalance=1, softness=1,
     )  # fmt: skip
     factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))
     return Samples(**samples, present=np.zeros(FLAGS, dtype=np.int64)), factors, Work(**work)

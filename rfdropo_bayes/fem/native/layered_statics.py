@@ -98,7 +98,7 @@ def _imbalance(tables, samples, factors, work, token):
             add_surroundings(tables, samples, factors, station, work, token)
     for layer in range(tables.stations - 1):
         layer_frame(tables, layer, work, token)
-        add_layer_force(tables, samples, factors, layer, work, token)
+        add_layer_force(tables, samples, factors, layer, work, False, token)
     _add_cable_forces(tables, work, token)
     for station in range(tables.held, tables.stations):
         for node in range(modes):

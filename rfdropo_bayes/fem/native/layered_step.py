@@ -14,13 +14,7 @@ from rfdropo_bayes.fem.native.layered_assembly import (
 )
 from rfdropo_bayes.fem.native.layered_effects import SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, load3, square_root, store, where_greater
-from rfdropo_bayes.fem.native.tension_stiffening import (
-    resist_lateral,
-    resist_twist,
-    stiffen,
-    stiffen_twist,
-    sum_cable_forces,
-)
+from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral, stiffen, sum_cable_forces
 
 LARGEST = 1e30
 """Tensions beyond this [N] are not finite."""
@@ -135,11 +129,9 @@ def condense_increment(tables, samples, factors, work, rate, token):
     for station in range(stations - 1, held - 1, -1):
         last = station == held
         if station > 0:
-            assemble_layer(tables, samples, factors, station - 1, work, not last, token)
+            assemble_layer(tables, samples, factors, station - 1, rate, work, not last, token)
             stiffen(tables, station - 1, rate, work, not last, token)
             resist_lateral(tables, station - 1, work.velocity, work.field, work, token)
-            stiffen_twist(tables, station - 1, rate, work, not last, token)
-            resist_twist(tables, station - 1, work.velocity, work.field, work, token)
         entry, t = station * tables.pairs, station * block
         add_station_mass(tables.parity, tiles, work.pivot, t, samples.station_mass, entry, inertia, token)
         if not last:

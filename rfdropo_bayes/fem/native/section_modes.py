@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from rfdropo_bayes.fem.cable_twist import twist_arms
+from rfdropo_bayes.fem.cable_strings import crossing_weights
 from rfdropo_bayes.fem.cables import CableLayout
 from rfdropo_bayes.fem.dynamics import LOST, System
 from rfdropo_bayes.fem.layered import PointMap, centre_gradient, rest_positions
@@ -53,7 +53,7 @@ class LayeredTables(NamedTuple):
     guide_slot: Int[np.ndarray, " entries"]  # of border row 0
     anchor: Float[np.ndarray, "cables 3"]
     rest_length: Float[np.ndarray, " cables"]
-    twist_arm: Float[np.ndarray, "layers cables"]  # r^2 / L [m]
+    crossing: Float[np.ndarray, "layers cables 2 modes"]  # way of every cable through every layer
     section_length: Float[np.ndarray, " stations"]  # of the body that a station stands for [m]
     section_area: Float[np.ndarray, " stations"]  # that times the body's width [m2]
     point_first: Int[np.ndarray, " points_1"]
@@ -170,7 +170,7 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
         rest=np.linalg.solve(shape, rest.reshape(layers + 1, modes, 3)).ravel(),
         **_guides(system.cables, shape),
         rest_length=_rest_lengths(system.cables, rest),
-        twist_arm=twist_arms(body, system.cables),
+        crossing=crossing_weights(body, system.cables) @ faces,
         section_length=tributary_lengths(body),
         section_area=drag_areas(body),
         point_first=point_first,

@@ -1,4 +1,4 @@
-"""Geometric stiffness of layers in tension and of taut cables; see ``fem.tension_stiffening``, ``fem.cable_twist``."""
+"""Geometric stiffness of layers in tension; see ``fem.tension_stiffening``."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def stiffen(tables, layer, rate, work, whole, token):
     """Add N / L against lateral motion of the mean of one face relative to the other, N > 0 of body and cables
     together, over ``rate`` squared.
 
-    ``reaction`` must hold what the layer resists over ``rate``; ``whole`` as in ``layered_assembly``.
+    ``held`` must hold the axial force that the layer resists, over ``rate``; ``whole`` as in ``layered_assembly``.
     """
     modes, axes, zero = tables.modes, work.axes, fill(0.0, work.axes, token)
     length = tables.rest[3 * (layer + 1) * modes + 2] - tables.rest[3 * layer * modes + 2]
-    tension = load(work.reaction, 3 * modes + 2, token) * fill(rate, axes, token)
+    tension = load(work.held, layer, token) * fill(rate, axes, token)
     for i in range(3):
         tension = fnma(load(work.beyond, 3 * layer + i, token), load(axes, 9 * layer + 3 * i + 2, token), tension)
     spring = where_greater(tension, zero, tension, zero) / fill(length * rate * rate, axes, token)
-    store(work.string, layer, spring)
+    store(work.held, layer, spring)
     block = 9 * modes * modes
     upper = (layer + 1) * block
     for c in range(3):
@@ -50,10 +50,10 @@ def stiffen(tables, layer, rate, work, whole, token):
 
 @kernel
 def resist_lateral(tables, layer, change, field, work, token):
-    """Subtract what a layer in tension puts against lateral motion, its stiffness in ``string``, times a change."""
+    """Subtract what a layer in tension puts against lateral motion, its stiffness in ``held``, times a change."""
     modes, axes, a = tables.modes, work.axes, 9 * layer
     low, high = 3 * layer * modes, 3 * (layer + 1) * modes
-    spring, along = load(work.string, layer, token), fill(0.0, axes, token)
+    spring, along = load(work.held, layer, token), fill(0.0, axes, token)
     for i in range(3):
         gap = load(change, high + i, token) - load(change, low + i, token)
         along = fma(load(axes, a + 3 * i + 2, token), gap, along)
@@ -72,61 +72,3 @@ def add_dyad(matrix, t, scale, axes, a, i, b, j, token):
         for r in range(3):
             k = t + 3 * c + r
             store(matrix, k, fma(load(axes, a + 3 * r + i, token), right, load(matrix, k, token)))
-
-
-@kernel
-def stiffen_twist(tables, layer, rate, work, whole, token):
-    """Add T r^2 / L of all cables against the twist of a layer, over ``rate`` squared; see ``fem.cable_twist``.
-
-    The twist of a face is half of q_x . e_y / h_x - q_y . e_x / h_y, where q_x and q_y are its modes linear in x and y
-    and h their values at rest.
-    """
-    modes, across, axes, a = tables.modes, tables.across, work.axes, 9 * layer
-    stiffness = fill(0.0, axes, token)
-    for c in range(tables.cables):
-        arm = fill(tables.twist_arm[layer * tables.cables + c], axes, token)
-        stiffness = fma(arm, load(work.tension, c, token), stiffness)
-    stiffness = stiffness * fill(1.0 / (rate * rate), axes, token)
-    store(work.twist, layer, stiffness)
-    low, high = 3 * layer * modes, 3 * (layer + 1) * modes
-    x0, y0 = 0.5 / tables.rest[low + 3], 0.5 / tables.rest[low + 3 * across + 1]
-    x1, y1 = 0.5 / tables.rest[high + 3], 0.5 / tables.rest[high + 3 * across + 1]
-    size, block = 3 * modes, 9 * modes * modes
-    upper = (layer + 1) * block
-    xx, xy = 3 * (size + 3), 3 * (size + 3 * across)
-    yx, yy = 3 * (across * size + 3), 3 * (across * size + 3 * across)
-    add_dyad(work.pivot, upper + xx, stiffness * x1 * x1, axes, a, 1, a, 1, token)
-    add_dyad(work.pivot, upper + yx, -(stiffness * y1 * x1), axes, a, 0, a, 1, token)
-    add_dyad(work.pivot, upper + yy, stiffness * y1 * y1, axes, a, 0, a, 0, token)
-    if whole:
-        lower = upper - block
-        add_dyad(work.pivot, lower + xx, stiffness * x0 * x0, axes, a, 1, a, 1, token)
-        add_dyad(work.pivot, lower + yx, -(stiffness * y0 * x0), axes, a, 0, a, 1, token)
-        add_dyad(work.pivot, lower + yy, stiffness * y0 * y0, axes, a, 0, a, 0, token)
-        add_dyad(work.coupling, upper + xx, -(stiffness * x0 * x1), axes, a, 1, a, 1, token)
-        add_dyad(work.coupling, upper + xy, stiffness * x0 * y1, axes, a, 1, a, 0, token)
-        add_dyad(work.coupling, upper + yx, stiffness * y0 * x1, axes, a, 0, a, 1, token)
-        add_dyad(work.coupling, upper + yy, -(stiffness * y0 * y1), axes, a, 0, a, 0, token)
-
-
-@kernel
-def resist_twist(tables, layer, change, field, work, token):
-    """Subtract what the cables put against the twist of a layer, its stiffness in ``twist``, times a change."""
-    modes, axes, a = tables.modes, work.axes, 9 * layer
-    low, high = 3 * layer * modes, 3 * (layer + 1) * modes
-    x, y = 3, 3 * tables.across
-    x0, y0 = fill(0.5 / tables.rest[low + x], axes, token), fill(0.5 / tables.rest[low + y + 1], axes, token)
-    x1, y1 = fill(0.5 / tables.rest[high + x], axes, token), fill(0.5 / tables.rest[high + y + 1], axes, token)
-    twist = fill(0.0, axes, token)
-    for i in range(3):
-        along_x = x1 * load(change, high + x + i, token) - x0 * load(change, low + x + i, token)
-        along_y = y1 * load(change, high + y + i, token) - y0 * load(change, low + y + i, token)
-        twist = fma(load(axes, a + 3 * i + 1, token), along_x, twist)
-        twist = fnma(load(axes, a + 3 * i, token), along_y, twist)
-    moment = load(work.twist, layer, token) * twist
-    for i in range(3):
-        first, second = moment * load(axes, a + 3 * i, token), moment * load(axes, a + 3 * i + 1, token)
-        store(field, high + x + i, fnma(second, x1, load(field, high + x + i, token)))
-        store(field, low + x + i, fma(second, x0, load(field, low + x + i, token)))
-        store(field, high + y + i, fma(first, y1, load(field, high + y + i, token)))
-        store(field, low + y + i, fnma(first, y0, load(field, low + y + i, token)))

@@ -108,6 +108,14 @@ def init(target: Climbable, u: Float[np.ndarray, " d"]) -> LevenbergState:
     return LevenbergState(u, float(target.density(u[None])[0]), 1e-3, False)
 
 
+def _solved(matrix: Float[np.ndarray, "d d"], right: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
+    """Solution of a linear system, the shortest one where coordinates that do the same leave many."""
+    try:
+        return np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:
+        return np.linalg.lstsq(matrix, right)[0]
+
+
 def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[LevenbergState, StepInfo]:
     """One Levenberg-Marquardt step; damping grows until the log posterior rises.
 
@@ -122,10 +130,10 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
         curvature = np.where(held[:, None] | held, np.diag(np.diag(curvature)), curvature)
     diagonal = np.diag(np.maximum(np.diag(curvature), 1e-12))
     dampings = state.damping * 10.0 ** np.arange(-1.0, 5.0)
-    moves = np.stack([np.linalg.solve(curvature + damping * diagonal, gradient) for damping in dampings])
+    moves = np.stack([_solved(curvature + damping * diagonal, gradient) for damping in dampings])
     # No coordinate moves further than 2: a logistic or a logarithm is beyond any quadratic model there.
     moves *= np.minimum(1.0, 2.0 / np.maximum(np.abs(moves).max(axis=1, keepdims=True), 1e-300))
-    newton = np.linalg.solve(curvature + 1e-12 * diagonal, gradient)
+    newton = _solved(curvature + 1e-12 * diagonal, gradient)
     promised = 0.5 * float(gradient @ newton)
     if promised < tolerance:
         return state._replace(converged=True), StepInfo(0.0, promised, 0)
