@@ -41,7 +41,7 @@ from rfdropo_bayes.fem.native.simd import (
 
 SETTLED = {"float64": 1e-11, "float32": 1e-5}
 """Error of a velocity, relative to the largest that a row has or its impulse makes, that ends a lane's iterations. In
-single precision 43 of 600 prior draws of the demo never came to 3e-6; all come to 1e-5."""
+single precision less gains nothing: the demo's prior draws err by up to 1.8e-6 m with this, and by 1.7e-6 with 1e-6."""
 SOFTNESS = {"float64": CABLE_SOFTNESS, "float32": 1e-6}  # of cables, relative to W: single precision holds no less
 ROUNDING = 0.03
 """Share of that error up to which the velocities are rounded."""
