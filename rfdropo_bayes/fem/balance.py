@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import corotational
 from rfdropo_bayes.fem.blocktridiagonal import multiply
 from rfdropo_bayes.fem.cables import CableLayout, lengths_and_jacobian
@@ -75,12 +76,13 @@ class _Step(NamedTuple):
 
 def check_effects(effects: BodyEffects) -> None:
     """Raise InputError for friction of the cables: their pull is then not given by one tension each."""
-    effects.refuse(
-        ("coulomb_friction", "capstan_friction"),
-        "forces and energies are not available with {}",
-        where="balance",
-        remedy="remove the mechanism, or do without them",
-    )
+    for name in ("coulomb_friction", "capstan_friction"):
+        if getattr(effects, name) is not None:
+            raise InputError(
+                f"forces and energies are not available with {name.replace('_', ' ')}",
+                where="balance",
+                remedy="remove the mechanism, or do without them",
+            )
 
 
 def _pull(

@@ -22,9 +22,8 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem import corotational, layered
 from rfdropo_bayes.fem.bending_law import Sections, moments, sections
-from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, multiply, solve
+from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, at_stations, multiply, solve
 from rfdropo_bayes.fem.cable_friction import slip_problem, slipped, start_slip
-from rfdropo_bayes.fem.cable_twist import twist_stiffening
 from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian
 from rfdropo_bayes.fem.constrained_step import Pull, Solve, constrained_step, meet
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
@@ -32,7 +31,7 @@ from rfdropo_bayes.fem.layered import LayeredBody
 from rfdropo_bayes.fem.pushing import PushScene, unchanged, untouched
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.surroundings import SectionLoad, section_load
-from rfdropo_bayes.fem.tension_stiffening import lateral_stiffening, layer_tension
+from rfdropo_bayes.fem.tension_stiffening import lateral_stiffening, layer_tension, twist_stiffening
 
 POISSON_LIMIT = 0.499
 """Larger Poisson ratios are taken as this one: the displacement element has no incompressible limit."""
@@ -140,12 +139,9 @@ def prepare(system: System, material: Material) -> Prepared:
     stiffness = stiffness * material.stiffness_scale[:, None, None]
     section = body.section_nodes
     layer_mass = layered.layer_mass(body) * material.density
-    none = jnp.zeros((1, section, section))
     lumped = (material.point_mass / section)[:, None, None] * jnp.eye(section)
     mass = BlockTridiagonal(
-        jnp.concatenate([layer_mass[:, :section, :section], none])
-        + jnp.concatenate([none, layer_mass[:, section:, section:]])
-        + lumped,
+        at_stations(layer_mass[:, :section, :section], layer_mass[:, section:, section:]) + lumped,
         layer_mass[:, section:, :section],
     )
     rest = jnp.asarray(layered.rest_positions(body))

@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem import corotational
 from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal
-from rfdropo_bayes.fem.cable_twist import twist_stiffening
 from rfdropo_bayes.fem.cables import lengths_and_jacobian
 from rfdropo_bayes.fem.constrained_step import Pull, constrained_step
 from rfdropo_bayes.fem.dynamics import (
@@ -28,7 +27,7 @@ from rfdropo_bayes.fem.dynamics import (
     with_section_matrix,
 )
 from rfdropo_bayes.fem.surroundings import section_load
-from rfdropo_bayes.fem.tension_stiffening import lateral_stiffening, layer_tension
+from rfdropo_bayes.fem.tension_stiffening import lateral_stiffening, layer_tension, twist_stiffening
 
 ITERATIONS = 60
 TOLERANCE = 1e-6

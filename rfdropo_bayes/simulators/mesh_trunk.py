@@ -12,10 +12,11 @@ from jaxtyping import Array, Float
 
 from rfdropo_bayes.fem import LayeredBody
 from rfdropo_bayes.fem.balance import Balance, tetrahedral_balance
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, animated_on_grid
-from rfdropo_bayes.simulators.engine import Engine, Motion
+from rfdropo_bayes.simulators.engine import Engine
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_body import MeshAssembly, TetrahedraTable
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values

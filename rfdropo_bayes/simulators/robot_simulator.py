@@ -17,10 +17,11 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import LayeredBody, Material
 from rfdropo_bayes.fem.balance import Balance
 from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
 from rfdropo_bayes.simulators.cube import cube_at_measured, cube_inputs, push_table, scene_of
-from rfdropo_bayes.simulators.engine import Backend, CubeInputs, Engine, Motion
+from rfdropo_bayes.simulators.engine import Backend, CubeInputs, Engine
 from rfdropo_bayes.simulators.extended import ExtendedSimulator
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms, code_of
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of

@@ -18,11 +18,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem import Material
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Travel
-from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneMotion, body_lanes, flat_lanes, lanes_like
+from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneStart, body_lanes, flat_lanes, lanes_like
 from rfdropo_bayes.simulators.commands import carried_out
-from rfdropo_bayes.simulators.engine import CubeInputs
 from rfdropo_bayes.simulators.mechanisms import (
     ActuationMechanism,
     Mechanism,
@@ -146,7 +145,7 @@ class Session:
         chosen[rows] = True
         self._drives = _chosen(chosen, fresh, self._drives)
         inputs = self._bodies_of(self._values, fresh.wound)
-        found = self.bodies.reset(rows, *jax.tree.map(lambda part: np.asarray(part)[rows], inputs))
+        found = self.bodies.reset(rows, jax.tree.map(lambda part: np.asarray(part)[rows], inputs))
         position = np.zeros((self.lanes, *found.position.shape[1:]))
         position[rows] = found.position
         cameras, seen = self._look(self._values, None, position, np.zeros(self.lanes))
@@ -330,11 +329,11 @@ class Session:
 
     @cached_property
     def _bodies_of(self) -> Any:
-        """Material of all lanes, displacements [m] that their initial states belong to, and cubes."""
+        """What the bodies of all lanes start from."""
 
-        def of(values: Values, wound: Wound) -> tuple[Material, Float[Array, " cable"], CubeInputs | None]:
+        def of(values: Values, wound: Wound) -> LaneStart:
             material, cube = self.simulator.body_inputs(values)
-            return material, wound.level + self.simulator.pretension(values), cube
+            return LaneStart(material, wound.level + self.simulator.pretension(values), cube)
 
         return self._by_lane(of)
 
@@ -365,7 +364,7 @@ class Session:
 
         return self._by_lane(look)
 
-    def _observation(self, found: LaneMotion, position: np.ndarray, angle: np.ndarray) -> Observation:
+    def _observation(self, found: Motion, position: np.ndarray, angle: np.ndarray) -> Observation:
         cases = found.diverged, found.imbalance > EQUILIBRIUM_TOLERANCE, ~found.converged
         codes = Result.DIVERGED, Result.NOT_IN_EQUILIBRIUM, self.simulator.unsolved
         status = np.select(cases, [int(code) for code in codes], int(Result.OK))

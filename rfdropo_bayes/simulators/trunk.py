@@ -12,9 +12,10 @@ from jaxtyping import Array
 
 from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, cable_layout, prepare, profile_body
 from rfdropo_bayes.fem.balance import Balance, layered_balance
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands
-from rfdropo_bayes.simulators.engine import Engine, Motion
+from rfdropo_bayes.simulators.engine import Engine
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
 from rfdropo_bayes.simulators.session import Session

@@ -76,7 +76,6 @@ class Problem(NamedTuple):
     factor: Float[np.ndarray, "rows2 lanes"]
     answer: Float[np.ndarray, "rows lanes"]  # y
     going: Float[np.ndarray, "1 lanes"]
-    share: Float[np.ndarray, "1 lanes"]  # of a change that is taken
     column: Int[np.ndarray, " rows"]  # of L that act in any lane: row of a line or of a contact's column
 
 
@@ -88,7 +87,7 @@ def problem_storage(lines: int, contacts: int, lanes: int, dtype: type) -> Probl
         "left": rows, "moving": rows,
         "firmness": lines, "limit": lines, "trial": lines, "opening": contacts, "held": 2 * contacts,
         "normal": contacts, "tangent": contacts, "friction": 1, "sign": lines, "root": lines + 6 * contacts,
-        "tilted": rows**2, "factor": rows**2, "answer": rows, "going": 1, "share": 1,
+        "tilted": rows**2, "factor": rows**2, "answer": rows, "going": 1,
     }  # fmt: skip
     arrays = {name: aligned_zeros((max(size, 1), lanes), dtype) for name, size in sizes.items()}
     return Problem(**arrays, column=np.zeros(max(rows, 1), dtype=np.int64))

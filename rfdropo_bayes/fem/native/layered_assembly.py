@@ -14,7 +14,6 @@ from rfdropo_bayes.fem.native.layered_effects import (
     BRANCH,
     SURROUNDED,
     add_bending_law,
-    add_branch,
     add_law_tangent,
     subtract_law_product,
     subtract_surroundings_product,
@@ -89,6 +88,25 @@ def _local_field(rest, modes, layer, factors, work, token):
             still = rest[row + i] - rest[base + i] if constant else rest[row + i]
             strain = _turned(axes, frame, x, y, z, i, token) - still
             store(work.local, 3 * k + i, fma(force, strain, rate * _turned(axes, frame, u, v, w, i, token)))
+
+
+@kernel
+def add_branch(tables, factors, layer, work, token):
+    """Let the dashpot of a layer's Prony branch follow, and add to ``local`` what the branch makes of its strain."""
+    modes, rest, frame = tables.modes, tables.rest, 9 * layer
+    share, gain = load(factors.share, 0, token), load(factors.branch, 0, token)
+    base = 3 * layer * modes
+    for k in range(2 * modes):
+        row = base + 3 * k
+        constant = k == 0 or k == modes
+        x, y, z = _relative(work.position, row, base, constant, token)
+        for i in range(3):
+            still = rest[row + i] - rest[base + i] if constant else rest[row + i]
+            strain, t = _turned(work.axes, frame, x, y, z, i, token) - still, 2 * base + 3 * k + i
+            behind = load(work.branch, t, token)
+            behind = fma(share, strain - behind, behind)
+            store(work.branch, t, behind)
+            store(work.local, 3 * k + i, fma(gain, strain - behind, load(work.local, 3 * k + i, token)))
 
 
 @kernel
@@ -211,23 +229,11 @@ def _layer_tangent(parity, modes, stiffness, first, layer, whole, factors, work,
 
 
 @kernel
-def add_station_mass(parity, modes, target, t, mass, entry, inertia, token):
-    """Add the inertia of a station to its pivot, whose tiles start at ``t``."""
+def add_mass(parity, modes, target, t, mass, entry, inertia, triangle, token):
+    """Add the inertia of a station, a ``triangle``, or that which couples the stations of a layer, to tiles from ``t``
+    on."""
     for m in range(modes):
-        for n in range(m + 1):
-            if parity[m] == parity[n]:
-                value = inertia * load(mass, entry, token)
-                tile = t + 9 * (m * modes + n)
-                for i in range(3):
-                    store(target, tile + 4 * i, load(target, tile + 4 * i, token) + value)
-                entry += 1
-
-
-@kernel
-def add_layer_mass(parity, modes, target, t, mass, entry, inertia, token):
-    """Add the inertia that couples the stations of a layer, in tiles from ``t`` on."""
-    for m in range(modes):
-        for n in range(modes):
+        for n in range(m + 1 if triangle else modes):
             if parity[m] == parity[n]:
                 value = inertia * load(mass, entry, token)
                 tile = t + 9 * (m * modes + n)

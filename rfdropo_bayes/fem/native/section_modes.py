@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from rfdropo_bayes.fem.cable_twist import twist_arms
-from rfdropo_bayes.fem.cables import CableLayout
+from rfdropo_bayes.fem.cables import CableLayout, routes
 from rfdropo_bayes.fem.dynamics import LOST, System
 from rfdropo_bayes.fem.layered import PointMap, centre_gradient, rest_positions
 from rfdropo_bayes.fem.native.layer_moduli import layer_moduli, layer_volume
 from rfdropo_bayes.fem.surroundings import drag_areas, tributary_lengths
+from rfdropo_bayes.fem.tension_stiffening import twist_arms
 
 # Entries (row, column) of a block of two modes, by the parity (bit 0: odd in x, bit 1: odd in y) in which the modes
 # differ.
@@ -50,7 +50,7 @@ class LayeredTables(NamedTuple):
     guide_first: Int[np.ndarray, " guides_1"]
     guide_place: Int[np.ndarray, " entries"]
     guide_weight: Float[np.ndarray, " entries"]
-    guide_slot: Int[np.ndarray, " entries"]  # of border row 0
+    guide_station: Int[np.ndarray, " entries"]
     anchor: Float[np.ndarray, "cables 3"]
     rest_length: Float[np.ndarray, " cables"]
     twist_arm: Float[np.ndarray, "layers cables"]  # r^2 / L [m]
@@ -114,24 +114,16 @@ def sparse_points(node: np.ndarray, weight: np.ndarray, shape: np.ndarray) -> tu
 
 
 def _guides(layout: CableLayout, shape: np.ndarray) -> dict[str, np.ndarray]:
-    used, size = layout.guide_used, 3 * len(shape)
+    used = layout.guide_used
     first, place, weight = sparse_points(layout.guide_node[used], layout.guide_weight[used], shape)
     return {
         "cable_first": np.concatenate([[0], np.cumsum(used.sum(axis=1))]).astype(np.int64),
         "guide_first": first,
         "guide_place": place,
         "guide_weight": weight,
-        "guide_slot": place // size * border_panels(len(used)) * 3 * size + 3 * (place % size),
+        "guide_station": place // (3 * len(shape)),
         "anchor": np.asarray(layout.anchor, dtype=float).reshape(-1, 3),
     }
-
-
-def _rest_lengths(layout: CableLayout, rest: np.ndarray) -> Float[np.ndarray, " cables"]:
-    lengths = []
-    for anchor, node, weight, used in zip(*layout, strict=True):
-        points = np.vstack([anchor, np.einsum("gk,gki->gi", weight, rest[node])[used]])
-        lengths.append(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-    return np.array(lengths, dtype=float)
 
 
 def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTables:
@@ -169,7 +161,7 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
         gradient=slopes,
         rest=np.linalg.solve(shape, rest.reshape(layers + 1, modes, 3)).ravel(),
         **_guides(system.cables, shape),
-        rest_length=_rest_lengths(system.cables, rest),
+        rest_length=np.array([np.linalg.norm(np.diff(r, axis=0), axis=1).sum() for r in routes(system.cables, rest)]),
         twist_arm=twist_arms(body, system.cables),
         section_length=tributary_lengths(body),
         section_area=drag_areas(body),

@@ -1,4 +1,4 @@
-"""Geometric stiffness of layers in tension and of taut cables; see ``fem.tension_stiffening``, ``fem.cable_twist``."""
+"""Geometric stiffness of layers in tension and of taut cables; see ``fem.tension_stiffening``."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def add_dyad(matrix, t, scale, axes, a, i, b, j, token):
 
 @kernel
 def stiffen_twist(tables, layer, rate, work, whole, token):
-    """Add T r^2 / L of all cables against the twist of a layer, over ``rate`` squared; see ``fem.cable_twist``.
+    """Add T r^2 / L of all cables against the twist of a layer, over ``rate`` squared; see ``fem.tension_stiffening``.
 
     The twist of a face is half of q_x . e_y / h_x - q_y . e_x / h_y, where q_x and q_y are its modes linear in x and y
     and h their values at rest.

@@ -11,20 +11,21 @@ import scipy.sparse as sparse
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.cables import CableLayout
+from rfdropo_bayes.fem.cables import CableLayout, routes
 from rfdropo_bayes.fem.drives import DriveLimits
 from rfdropo_bayes.fem.dynamics import LOST, POISSON_LIMIT
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
+from rfdropo_bayes.fem.native.compilation import kernel_sources
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
 from rfdropo_bayes.fem.native.contact_records import PushOutput, Touch, cube_rows, pairs_of, scene_tables, touch_storage
-from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
-from rfdropo_bayes.fem.native.layered import NativeRollout, available_threads
+from rfdropo_bayes.fem.native.layered import available_threads
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
 from rfdropo_bayes.fem.native.tetrahedral import Mesh, Samples, Work
 from rfdropo_bayes.fem.pushing import PushScene
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
 
 
@@ -74,7 +75,7 @@ class TetrahedralEngine:
         time_step: float,
         stride: int = 1,
         cube: tuple[Float[np.ndarray, "*samples 13"], Float[np.ndarray, "*samples 4"]] | None = None,
-    ) -> NativeRollout:
+    ) -> Motion:
         """Rollouts from rest through the commanded displacements [m] of every step, recorded every ``stride`` steps.
 
         ``parameters`` holds, with a leading axis of samples: ``young_modulus`` [Pa], ``poisson_ratio``, ``node_mass``
@@ -95,12 +96,12 @@ class TetrahedralEngine:
             poses = PushOutput(np.zeros((samples, 1 + commands.shape[1] // stride, 7)))
         chunks = [np.arange(first, first + self.lanes) for first in range(0, samples, self.lanes)]
         rows, points = commands.shape[1] // stride, len(self._nodes)
-        result = NativeRollout(
+        result = Motion(
             np.zeros((samples, 1 + rows, points, 3)),
             np.zeros((samples, 1 + rows, commands.shape[2])),
             np.zeros(samples, dtype=bool),
-            np.ones(samples, dtype=bool),
             np.zeros(samples),
+            np.ones(samples, dtype=bool),
             None if poses is None else poses.pose,
         )
         result.position[:, 0] = np.einsum("pk,pki->pi", self.points.weight, self.body.rest[self.points.node])
@@ -245,15 +246,14 @@ def _mesh(
 def _cables(
     layout: CableLayout, limits: DriveLimits, body: TetrahedralBody, number: np.ndarray, dtype: np.dtype
 ) -> kernels.Cables:
-    first, node, weight, segment = [0], [], [], [np.zeros(0)]
+    first, node, weight = [0], [], []
+    legs = [np.linalg.norm(np.diff(route, axis=0), axis=1) for route in routes(layout, body.rest)]
+    segment = [np.concatenate([[0.0], lengths]) for lengths in legs]
     for cable, used in enumerate(layout.guide_used):
         guides = layout.guide_node[cable, used], layout.guide_weight[cable, used]
         node.append(np.concatenate([guides[0][:1] * 0, guides[0]]))
         weight.append(np.concatenate([guides[1][:1] * 0.0, guides[1]]))
         first.append(first[-1] + len(node[-1]))
-        place = np.einsum("gk,gki->gi", guides[1], body.rest[guides[0]])
-        route = np.concatenate([layout.anchor[cable : cable + 1], place])
-        segment.append(np.concatenate([[0.0], np.linalg.norm(np.diff(route, axis=0), axis=1)]))
     width = max([int(np.max(np.nonzero(w)[1])) + 1 for w in weight if np.any(w)], default=1)
     shape = (0, layout.guide_node.shape[2])
     return kernels.Cables(
@@ -261,7 +261,7 @@ def _cables(
         np.ascontiguousarray(number[np.concatenate([np.zeros(shape, dtype=int), *node])][:, :width], dtype=np.int32),
         np.ascontiguousarray(np.concatenate([np.zeros(shape), *weight])[:, :width], dtype=dtype),
         layout.anchor.astype(dtype),
-        np.concatenate(segment).astype(dtype),
+        np.concatenate([np.zeros(0), *segment]).astype(dtype),
         np.asarray(limits.displacement, dtype=dtype),
         float(limits.rate),
     )
