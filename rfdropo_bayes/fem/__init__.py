@@ -8,6 +8,7 @@ from rfdropo_bayes.runtime import configure_jax
 
 configure_jax()
 
+from rfdropo_bayes.fem.balance import energies  # noqa: E402
 from rfdropo_bayes.fem.cables import CableLayout, cable_layout  # noqa: E402
 from rfdropo_bayes.fem.dynamics import (  # noqa: E402
     Material,
@@ -21,7 +22,6 @@ from rfdropo_bayes.fem.dynamics import (  # noqa: E402
     without_cables,
 )
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall  # noqa: E402
-from rfdropo_bayes.fem.energies import energies  # noqa: E402
 from rfdropo_bayes.fem.equilibrium import static_equilibrium  # noqa: E402
 from rfdropo_bayes.fem.layered import (  # noqa: E402
     LayeredBody,

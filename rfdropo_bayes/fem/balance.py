@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import corotational
+from rfdropo_bayes.fem.bending_law import potential
 from rfdropo_bayes.fem.blocktridiagonal import multiply
 from rfdropo_bayes.fem.cables import CableLayout, lengths_and_jacobian
 from rfdropo_bayes.fem.dynamics import (
@@ -29,9 +30,35 @@ from rfdropo_bayes.fem.dynamics import (
     resistance,
 )
 from rfdropo_bayes.fem.effects import BodyEffects, Scalar
-from rfdropo_bayes.fem.energies import Energies, energies
 from rfdropo_bayes.fem.tetrahedra import elastic_energy, element_rotations, lame_constants, nodal_force
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem
+
+
+class Energies(NamedTuple):
+    """Energies of one state [J]."""
+
+    kinetic: Float[Array, "..."]
+    elastic: Float[Array, "..."]
+    gravitational: Float[Array, "..."]  # zero with every node at the origin
+
+    @property
+    def total(self) -> Float[Array, "..."]:
+        """Their sum."""
+        return self.kinetic + self.elastic + self.gravitational
+
+
+def energies(system: System, prepared: Prepared, state: State) -> Energies:
+    """Kinetic energy v'Mv/2, elastic energy d'Kd/2 in the layers' frames with that of a bending law, and gravity's
+    -x'Mg. What a Prony branch, a wall and stretched cables hold is left out, and softening too."""
+    _, local = frames_and_displacements(system, prepared, state.position)
+    elastic = 0.5 * jnp.einsum("li,lij,lj->", local, prepared.stiffness, local)
+    if prepared.effects.bending is not None and prepared.sections is not None:
+        elastic = elastic + potential(prepared.effects.bending, prepared.sections, local)
+    return Energies(
+        kinetic=0.5 * jnp.sum(state.velocity * mass_times(system, prepared, state.velocity)),
+        elastic=elastic,
+        gravitational=-jnp.sum(prepared.weight * state.position),
+    )
 
 
 class Balance(NamedTuple):

@@ -46,6 +46,11 @@ class TetrahedralBody(NamedTuple):
     rest_frame: Float[np.ndarray, "elements 3 3"]  # rows: axes of the element's frame at rest
     frames: str  # one of FRAMES
 
+    @property
+    def nodes(self) -> int:
+        """Nodes of the whole mesh."""
+        return len(self.rest)
+
 
 def tetrahedral_body(
     rest: Float[np.ndarray, "nodes 3"],

@@ -32,8 +32,8 @@ from rfdropo_bayes.simulators.mechanisms import (
     settled,
 )
 from rfdropo_bayes.simulators.parameters import check_names, check_value
-from rfdropo_bayes.simulators.protocol import Observation, Result
-from rfdropo_bayes.simulators.robot_simulator import EQUILIBRIUM_TOLERANCE, Values, Wound
+from rfdropo_bayes.simulators.protocol import Observation
+from rfdropo_bayes.simulators.robot_simulator import Values, Wound, status_of
 
 WHOLE = 1e-6
 """How far a control period may be from a whole number of time steps, in time steps."""
@@ -365,9 +365,7 @@ class Session:
         return self._by_lane(look)
 
     def _observation(self, found: Motion, position: np.ndarray, angle: np.ndarray) -> Observation:
-        cases = found.diverged, found.imbalance > EQUILIBRIUM_TOLERANCE, ~found.converged
-        codes = Result.DIVERGED, Result.NOT_IN_EQUILIBRIUM, self.simulator.unsolved
-        status = np.select(cases, [int(code) for code in codes], int(Result.OK))
+        status = status_of(found, self.simulator.unsolved, np)
         pose = found.pose
         if pose is not None:
             pose = np.concatenate(

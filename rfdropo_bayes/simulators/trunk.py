@@ -86,23 +86,10 @@ class TrunkSimulator(RobotSimulator):
         return self.discretisation.time_step
 
     @property
-    def description(self) -> dict[str, object]:
-        """Engine, precision, discretisation and mechanisms."""
-        return {
-            **self.engine.describe(),
-            "robot": self.robot.name,
-            "time_step_s": self.discretisation.time_step,
-            "nodes_across": self.discretisation.nodes_across,
-            "layers": len(self.assembly.system.body.station) - 1,
-            "mechanisms": [mechanism.name for mechanism in self.mechanisms],
-            "content_sha256": self.content_sha256,
-            **({"object": "cube"} if self.pushes else {}),
-        }
-
-    @property
-    def nodes(self) -> int:
+    def discretised(self) -> dict[str, object]:
         """See `RobotSimulator`."""
-        return self.assembly.system.body.nodes
+        layers = len(self.assembly.system.body.station) - 1
+        return {"nodes_across": self.discretisation.nodes_across, "layers": layers}
 
     def session(self, lanes: int, period: float) -> Session:
         """So many trunks that are commanded one control period [s] at a time; see `Session`."""

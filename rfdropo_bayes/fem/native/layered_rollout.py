@@ -214,10 +214,12 @@ def settle(tables, batch, samples, factors, work, p, schedule, first, token):
 
 
 @kernel
-def begin_step(tables, batch, samples, factors, work, schedule, output, step, first, token):
+def begin_step(tables, batch, samples, factors, work, touch, schedule, output, poses, step, first, token):
     """Record the state that a step starts from, and take the step's commands; returns False after the last step."""
     if step % schedule.stride == 0:
         record_body(tables, work, output, step // schedule.stride, first, batch.count, token)
+        if touch is not None:
+            record_cubes(touch, poses, output.records, step // schedule.stride, first, batch.count, token)
     if step == schedule.steps:
         return False
     step_factors(samples, factors, work, schedule.time_step, token)
@@ -252,18 +254,11 @@ def compile_rollout(sources: str) -> Callable:
             start_slip(body, rubbing, slips, state, token)
         if scene is not None and not schedule.resumed:
             start_cubes(around, addresses(cubes), given.count, meeting, first, token)
+        shown = None if scene is None else addresses(poses)
         step = 0
-        while begin_step(body, given, material, factor, state, schedule, record, step, first, token):
-            if scene is not None and step % schedule.stride == 0:
-                record_cubes(
-                    meeting, addresses(poses), record.records, step // schedule.stride, first, given.count, token
-                )
+        while begin_step(body, given, material, factor, state, meeting, schedule, record, shown, step, first, token):
             constrained_step(body, rubbing, around, material, factor, state, slips, meeting, extra, p, schedule, token)
             step += 1
-        if scene is not None and schedule.steps % schedule.stride == 0:
-            record_cubes(
-                meeting, addresses(poses), record.records, schedule.steps // schedule.stride, first, given.count, token
-            )
         finish_rollouts(state, record, first, given.count, token)
 
     return rollout

@@ -9,8 +9,8 @@ from __future__ import annotations
 from rfdropo_bayes.fem.native.block_cholesky import condense_rows, extend_border
 from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
 from rfdropo_bayes.fem.native.contact_geometry import (
+    add_cube_velocity,
     choose_all,
-    cube_velocity,
     find_candidates,
     kind_of,
     list_contacts,
@@ -181,9 +181,8 @@ def hold_again(pattern, scene, touch, work, rows, p, reached, cables, contacts, 
             slot, i = touch.contact[c], cables + 3 * c
             kind = kind_of(touch, slot)
             u, v, w = trunk_velocity(scene, touch, slot, kind, work.velocity, token)
-            store(p.free, i, u + cube_velocity(touch, slot, kind, 0, touch.after, 0, token))
-            store(p.free, i + 1, v + cube_velocity(touch, slot, kind, 1, touch.after, 0, token))
-            store(p.free, i + 2, w + cube_velocity(touch, slot, kind, 2, touch.after, 0, token))
+            u, v, w = add_cube_velocity(touch, slot, kind, u, v, w, touch.after, 0, token)
+            store(p.free, i, u, v, w)
         if contacts > touch.count[3]:
             _across(pattern, touch, work, rows, p, reached, cables, contacts, free, token)
     for i in range(n):

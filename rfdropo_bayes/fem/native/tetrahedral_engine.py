@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import numpy as np
@@ -20,7 +19,7 @@ from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block
 from rfdropo_bayes.fem.native.compilation import kernel_sources
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
 from rfdropo_bayes.fem.native.contact_records import PushOutput, Touch, cube_rows, pairs_of, scene_tables, touch_storage
-from rfdropo_bayes.fem.native.layered import available_threads
+from rfdropo_bayes.fem.native.layered import available_threads, in_blocks
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
 from rfdropo_bayes.fem.native.tetrahedral import Mesh, Samples, Work
@@ -34,7 +33,6 @@ class TetrahedralEngine:
 
     Args:
         dtype: ``numpy.float64`` or ``numpy.float32``.
-        lanes: samples side by side; by default as many as this machine's vector registers hold.
         threads: lane blocks at a time; results do not depend on it.
         scene: what the body pushes a cube on; None for a body that touches nothing.
     """
@@ -47,13 +45,12 @@ class TetrahedralEngine:
         points: PointMap,
         *,
         dtype: type = np.float64,
-        lanes: int | None = None,
         threads: int | None = None,
         scene: PushScene | None = None,
     ) -> None:
         self.body, self.dtype, self.points = body, np.dtype(dtype), points
         self._kernel = _kernel()  # here, so that threads do not make one each
-        self.lanes = lanes or native_lanes(dtype)
+        self.lanes = native_lanes(dtype)
         self.threads = threads or available_threads()
         self._order, self._number = _numbering(body)
         self._rest = body.rest[self._order].astype(self.dtype).ravel()
@@ -87,14 +84,12 @@ class TetrahedralEngine:
         """
         samples = len(parameters["young_modulus"])
         commands = np.broadcast_to(commands, (samples, *commands.shape[-2:]))
-
         if (cube is None) != (self._scene is None):
             raise InputError("a scene without a cube, or a cube without a scene", where="rollouts")
         cubes = poses = None
         if cube is not None:
             cubes = cube_rows(*cube, samples, self.dtype)
             poses = PushOutput(np.zeros((samples, 1 + commands.shape[1] // stride, 7)))
-        chunks = [np.arange(first, first + self.lanes) for first in range(0, samples, self.lanes)]
         rows, points = commands.shape[1] // stride, len(self._nodes)
         result = Motion(
             np.zeros((samples, 1 + rows, points, 3)),
@@ -106,8 +101,8 @@ class TetrahedralEngine:
         )
         result.position[:, 0] = np.einsum("pk,pki->pi", self.points.weight, self.body.rest[self.points.node])
 
-        def run(chunk: Int[np.ndarray, " lanes"]) -> None:
-            lane, kept = np.minimum(chunk, samples - 1), chunk[chunk < samples]
+        def run(first: int) -> None:
+            lane, kept = np.minimum(np.arange(first, first + self.lanes), samples - 1), slice(first, first + self.lanes)
             inputs = self._samples({name: np.asarray(value)[lane] for name, value in parameters.items()})
             displacement, work, output = self._lanes_last(commands[lane]), self._work(), self._output(rows)
             single = self.dtype.itemsize == 4
@@ -115,16 +110,15 @@ class TetrahedralEngine:
             schedule = kernels.Schedule(float(time_step), stride, *numbers, self._reach, single)
             self._kernel(
                 self._pattern, self._mesh, self._cables, self._scene, self._rest, displacement, cubes, inputs, work,
-                *self._constraints(), schedule, output, poses, int(chunk[0]), samples, lane_token(self.lanes),
+                *self._constraints(), schedule, output, poses, first, samples, lane_token(self.lanes),
             )  # fmt: skip
-            count = len(kept)
+            count = min(self.lanes, samples - first)
             result.position[kept, 1:] = np.moveaxis(output.position, 3, 0)[:count]
             result.tension[kept, 1:] = np.moveaxis(output.tension, 2, 0)[:count]
             result.diverged[kept] = work.lost[0, :count] > 0.0
             result.converged[kept] = ~(work.unsolved[0, :count] > 0.0)
 
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(run, chunks))
+        in_blocks(run, samples, self.lanes, self.threads)
         return result
 
     def _output(self, rows: int) -> kernels.Output:
