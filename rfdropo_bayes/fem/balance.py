@@ -41,11 +41,6 @@ class Energies(NamedTuple):
     elastic: Float[Array, "..."]
     gravitational: Float[Array, "..."]  # zero with every node at the origin
 
-    @property
-    def total(self) -> Float[Array, "..."]:
-        """Their sum."""
-        return self.kinetic + self.elastic + self.gravitational
-
 
 def energies(system: System, prepared: Prepared, state: State) -> Energies:
     """Kinetic energy v'Mv/2, elastic energy d'Kd/2 in the layers' frames with that of a bending law, and gravity's
@@ -209,11 +204,10 @@ def tetrahedral_balance(
     position: Float[Array, "rows nodes 3"],
     tension: Float[Array, "rows cables"],
     time_step: Scalar,
-    velocity: Float[Array, "nodes 3"] | float = 0.0,
 ) -> Balance:
-    """Forces and energies of a rollout of a tetrahedral body; arguments as `layered_balance`."""
+    """Forces and energies of a rollout of a tetrahedral body from rest; arguments as `layered_balance`."""
     body, mass = system.body, material.node_mass[:, None]
-    velocities = _velocities(position, velocity, time_step)
+    velocities = _velocities(position, 0.0, time_step)
     first, shear = lame_constants(material.young_modulus, material.poisson_ratio)
     lame = first * material.stiffness_scale, shear * material.stiffness_scale
     guides = jnp.asarray(system.guides)

@@ -23,8 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem.cable_friction import PRESLIDING
-
-Scalar = Float[Array, ""] | float
+from rfdropo_bayes.fem.effects import Scalar
 
 CABLE_SOFTNESS = 1e-9
 """R of a cable, relative to its entry on the diagonal of W; in single precision, see ``native.constraint_problem``."""

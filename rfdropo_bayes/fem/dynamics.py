@@ -200,11 +200,6 @@ def mass_times(system: System, prepared: Prepared, field: Float[Array, "nodes 3"
     return multiply(prepared.mass, field.reshape(len(system.body.station), -1, 3)).reshape(-1, 3)
 
 
-def _with_axes(mass: BlockTridiagonal) -> BlockTridiagonal:
-    """Scalar mass blocks repeated for the three displacement components."""
-    return BlockTridiagonal(*(jnp.kron(block, jnp.eye(3)) for block in mass))
-
-
 def section_means(system: System, field: Float[Array, "nodes 3"]) -> Float[Array, "stations 3"]:
     """Mean of a nodal field over the nodes of every station."""
     return jnp.mean(field.reshape(len(system.body.station), -1, 3), axis=1)
@@ -331,7 +326,7 @@ def linearised(
     load = prepared.weight + external_force
     right = time_step * (elastic.force + load - elastic.lookahead * strained - dragged)
     inertia, elasticity = 1.0 + time_step * prepared.rayleigh_mass, time_step * elastic.lookahead
-    mass = _with_axes(prepared.mass)
+    mass = [jnp.kron(block, jnp.eye(3)) for block in prepared.mass]  # for the three components
     matrix = BlockTridiagonal(*(inertia * m + elasticity * k for m, k in zip(mass, elastic.tangent, strict=True)))
     taut = _taut(system, prepared, state, elastic, time_step)
     matrix = BlockTridiagonal(*(m + k for m, k in zip(matrix, taut, strict=True)))
@@ -375,7 +370,7 @@ def step(
         share, segment = slipped(system.cables, slip, found.impulses.share, tension)
         memory = memory._replace(slip=share, segment=segment)
     moved = State(state.position + time_step * velocity, velocity, tension, memory, found.cube, found.touch)
-    return accept(system, prepared, state, moved, found.converged)
+    return accept(system, prepared, state, moved, found.impulses.converged)
 
 
 def free_solve(system: System, matrix: BlockTridiagonal) -> Solve:

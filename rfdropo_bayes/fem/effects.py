@@ -56,6 +56,11 @@ class BodyEffects(NamedTuple):
         """Whether any effect is given."""
         return bool(jax.tree.leaves(self))
 
+    @property
+    def rubs(self) -> bool:
+        """Whether cables rub in their guides: it adds rows to the problem of every step, whatever its size."""
+        return self.coulomb_friction is not None or self.capstan_friction is not None
+
 
 class Memory(NamedTuple):
     """What the effects that are present remember from step to step."""

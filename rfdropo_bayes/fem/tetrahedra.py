@@ -179,11 +179,6 @@ def element_tangents(
     return first[scaled] * pairs + shear[scaled] * (jnp.swapaxes(pairs, 3, 4) + dots[..., None, None] * jnp.eye(3))
 
 
-def equal_node_masses(body: TetrahedralBody, mass: Float[Array, ""] | float) -> Float[Array, " nodes"]:
-    """A total mass [kg] in equal parts on all nodes, held ones included (SOFA's UniformMass)."""
-    return jnp.broadcast_to(mass / len(body.rest), (len(body.rest),))
-
-
 def lumped_masses(body: TetrahedralBody, density: Float[Array, ""] | float) -> Float[Array, " nodes"]:
     """A quarter of every element's mass on each of its nodes [kg]."""
     volume = np.zeros(len(body.rest))

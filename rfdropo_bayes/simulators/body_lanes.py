@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import Material, point_positions
 from rfdropo_bayes.fem.dynamics import Prepared, State, remembering, step
-from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.layered import PointMap, joined
 from rfdropo_bayes.fem.native.layered_session import LayeredSession
 from rfdropo_bayes.fem.pushing import PushScene, smallest_gap
 from rfdropo_bayes.fem.rigid_body import Cube
@@ -72,12 +72,7 @@ class LanesBeforeCube:
     def __init__(self, kind: Callable[[Engine, int], BodyLanes], engine: Engine, scene: PushScene, count: int) -> None:
         markers, spheres = engine.body.markers, scene.spheres
         self._shown, self._count = len(markers.node), count
-        width = max(markers.node.shape[1], spheres.node.shape[1])
-        node, weight = (
-            np.concatenate([np.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts])
-            for parts in ((markers.node, spheres.node), (markers.weight, spheres.centre))
-        )
-        body: Any = engine.body._replace(markers=PointMap(node, weight))
+        body: Any = engine.body._replace(markers=joined([markers, PointMap(spheres.node, spheres.centre)]))
         self._bodies = kind(replace(engine, body=body), count)
         self.save, self.restore = self._bodies.save, self._bodies.restore
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 from jaxtyping import Array
 
-Inputs = TypeVar("Inputs")
 Output = TypeVar("Output")
 
 
-def one_callback(roll: Callable[[Inputs, int], Output], shapes: Output, inputs: Inputs, limit: Array) -> Output:
+def one_callback(roll: Callable[[Any, int], Output], shapes: Output, inputs: Any, limit: Array) -> Output:
     """Outputs of rollouts, from a traced program that ``vmap`` may have given any batch axes.
 
     Padding of a batch, and perturbations of what acts after the body, ask for the same rollout again and again: each
@@ -26,7 +25,7 @@ def one_callback(roll: Callable[[Inputs, int], Output], shapes: Output, inputs: 
         limit: steps to compute.
     """
 
-    def on_host(given: Inputs, limits: np.ndarray) -> Output:
+    def on_host(given: Any, limits: np.ndarray) -> Output:
         batch, count = np.shape(limits), np.size(limits)
         flat = jax.tree.map(lambda value: np.asarray(value).reshape(count, *value.shape[len(batch) :]), given)
         chosen, place = distinct(jax.tree.leaves(flat))

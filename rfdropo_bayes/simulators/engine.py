@@ -113,12 +113,6 @@ class Inputs(NamedTuple):
     cube: CubeInputs | None = None
 
 
-def effects_costly(effects: BodyEffects) -> bool:
-    """Whether an effect is present that slows every rollout down, even at its null value: friction of the cables, which
-    adds rows to the problem of every step."""
-    return effects.coulomb_friction is not None or effects.capstan_friction is not None
-
-
 @dataclass(frozen=True)
 class Engine:
     """The motion of a body under given cable displacements, with or without a cube.
@@ -201,15 +195,15 @@ class Engine:
         cube, imbalance = inputs.cube, jnp.zeros(())
         around: dict[str, Any] = {} if cube is None else {"scene": self.scene, "cube": cube.cube}
         place = None if cube is None else cube.start
-        if isinstance(self.body.system, TetrahedralSystem):
-            system: Any = self.body.system
-            state: Any = tetrahedral_dynamics.state_at_rest(system)._replace(cube=place)
-            run: Any = partial(tetrahedral_dynamics.simulate, system, inputs.material)
+        system: Any = self.body.system
+        material: Any = inputs.material
+        if self.layered:
+            prepared, state, imbalance = self.initial(material, inputs.start)
+            run: Any = partial(simulate, system, prepared)
         else:
-            system = self.body.system
-            prepared, state, imbalance = self.initial(inputs.material, inputs.start)  # type: ignore[arg-type]
-            state = state._replace(cube=place)
-            run = partial(simulate, system, prepared)
+            state = tetrahedral_dynamics.state_at_rest(system)  # type: ignore[assignment]
+            run = partial(tetrahedral_dynamics.simulate, system, material)
+        state = state._replace(cube=place)
         rollout = run(state, rows, self.time_step, markers, horizon=steps, **around)
         first = point_positions(markers, state.position)
         pose = None

@@ -17,9 +17,9 @@ from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, animated_on_grid
 from rfdropo_bayes.simulators.engine import Engine
-from rfdropo_bayes.simulators.mechanisms import Mechanism
+from rfdropo_bayes.simulators.mechanisms import Mechanism, Values
 from rfdropo_bayes.simulators.mesh_body import MeshAssembly, TetrahedraTable
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import refined_body
 
 

@@ -23,11 +23,9 @@ from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observ
 from rfdropo_bayes.simulators.cube import cube_at_measured, cube_inputs, push_table, scene_of
 from rfdropo_bayes.simulators.engine import Backend, CubeInputs, Engine
 from rfdropo_bayes.simulators.extended import ExtendedSimulator
-from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms, code_of
+from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, Values, check_mechanisms, code_of
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.protocol import Observation, Result
-
-Values = Mapping[str, Float[Array, ""]]
 
 EQUILIBRIUM_TOLERANCE = 1e-3
 """Static equilibrium counts as found when the unbalanced force is below this share of the largest force."""

@@ -28,12 +28,13 @@ from rfdropo_bayes.simulators.mechanisms import (
     SensingMechanism,
     SteppedMechanism,
     TimedSensingMechanism,
+    Values,
     inside_drive,
     settled,
 )
 from rfdropo_bayes.simulators.parameters import check_names, check_value
 from rfdropo_bayes.simulators.protocol import Observation
-from rfdropo_bayes.simulators.robot_simulator import Values, Wound, status_of
+from rfdropo_bayes.simulators.robot_simulator import Wound, status_of
 
 WHOLE = 1e-6
 """How far a control period may be from a whole number of time steps, in time steps."""
@@ -337,15 +338,12 @@ class Session:
 
         return self._by_lane(of)
 
-    @property
-    def _camera_chain(self) -> list[Any]:
-        return [m for m in self.simulator.mechanisms if isinstance(m, SensingMechanism | TimedSensingMechanism)]
-
     @cached_property
     def _look(self) -> Any:
         """Cameras of all lanes after an observation, and the marker positions [m] that they see; None for the cameras
         before makes it the first."""
-        chain = self._camera_chain
+        cameras = SensingMechanism | TimedSensingMechanism
+        chain: list[Any] = [m for m in self.simulator.mechanisms if isinstance(m, cameras)]
 
         def look(
             values: Values, before: tuple[Any, ...] | None, position: Float[Array, "marker 3"], now: Float[Array, ""]

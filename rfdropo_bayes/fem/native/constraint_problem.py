@@ -442,10 +442,8 @@ def solve_problem(p, cables, runs, contacts, settled, token):
             free = load(p.free, i, token)
             velocity = free + _multiply(p.matrix, p.impulse, i, n, token)
             store(p.velocity, i, velocity)
-            free, own = (
-                magnitude(free, zero),
-                magnitude(load(p.matrix, i * n + i, token) * load(p.impulse, i, token), zero),
-            )
+            free = magnitude(free, zero)
+            own = magnitude(load(p.matrix, i * n + i, token) * load(p.impulse, i, token), zero)
             largest = where_greater(free, largest, free, largest)
             largest = where_greater(own, largest, own, largest)
         rounding = largest * (ROUNDING * settled)

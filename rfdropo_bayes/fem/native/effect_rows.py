@@ -14,11 +14,6 @@ from rfdropo_bayes.fem.layered import LayeredBody
 from rfdropo_bayes.fem.native import layered_effects as at
 
 
-def has_friction(effects: BodyEffects) -> bool:
-    """Whether cables rub in their guides."""
-    return effects.coulomb_friction is not None or effects.capstan_friction is not None
-
-
 def _each(function: Callable[[float], float], values: ArrayLike, count: int) -> Float[np.ndarray, " batch"]:
     """A function of each number on its own: NumPy's own depend in the last bit on where in an array a number stands."""
     return np.array([function(float(value)) for value in np.broadcast_to(values, count)])

@@ -33,7 +33,7 @@ from rfdropo_bayes.fem.native.contact_records import (
     scene_tables,
     touch_storage,
 )
-from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, has_friction, law_rows
+from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, law_rows
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.layered_records import KINDS, Factors, Friction, Samples, Work, friction_storage, runs_of
 from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, compile_rollout, storage
@@ -161,7 +161,7 @@ class NativeLayered:
             InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
         """
         run = self.run_of(material, displacement, start, steps, stride, cube)
-        rubs = has_friction(material.effects)
+        rubs = material.effects.rubs
         in_blocks(
             lambda first: self.run_block(run, self.records(rubs), first), run.batch.count, self.lanes, self.threads
         )

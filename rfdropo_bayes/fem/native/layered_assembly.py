@@ -8,6 +8,7 @@ only, held in ``factors``. ``tables``, ``samples``, ``factors`` and ``work`` are
 
 from __future__ import annotations
 
+from rfdropo_bayes.fem.corotational import POLAR_ITERATIONS
 from rfdropo_bayes.fem.native.fields import clear
 from rfdropo_bayes.fem.native.layered_effects import (
     BENDING,
@@ -20,8 +21,6 @@ from rfdropo_bayes.fem.native.layered_effects import (
 )
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, store
 from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral, resist_twist
-
-POLAR_ITERATIONS = 6
 
 
 @kernel
@@ -120,11 +119,11 @@ def _local_change(change, factor, modes, layer, work, token):
 
 
 @kernel
-def _layer_reaction(row, column, entries, modes, stiffness, first, local, reaction, token):
+def _layer_reaction(tables, stiffness, first, local, reaction, token):
     """``reaction`` = K ``local`` for the layer whose stiffness starts at row ``first``."""
-    clear(reaction, 0, 6 * modes, token)
-    for e in range(entries):
-        i, j = row[e], column[e]
+    clear(reaction, 0, 6 * tables.modes, token)
+    for e in range(tables.entries):
+        i, j = tables.entry_row[e], tables.entry_column[e]
         k = load(stiffness, first + e, token)
         store(reaction, i, fma(k, load(local, j, token), load(reaction, i, token)))
         if i != j:
@@ -134,18 +133,8 @@ def _layer_reaction(row, column, entries, modes, stiffness, first, local, reacti
 @kernel
 def _subtract_reaction(tables, samples, layer, work, field, token):
     """Subtract R K ``local`` from a field; leaves K ``local`` in ``reaction``."""
-    modes, axes, reaction, first = tables.modes, work.axes, work.reaction, layer * tables.entries
-    _layer_reaction(
-        tables.entry_row,
-        tables.entry_column,
-        tables.entries,
-        modes,
-        samples.stiffness,
-        first,
-        work.local,
-        reaction,
-        token,
-    )
+    modes, axes, reaction = tables.modes, work.axes, work.reaction
+    _layer_reaction(tables, samples.stiffness, layer * tables.entries, work.local, reaction, token)
     for k in range(2 * modes):
         x, y, z = load3(reaction, 3 * k, token)
         for i in range(3):

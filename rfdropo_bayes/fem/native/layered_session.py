@@ -18,7 +18,6 @@ from jaxtyping import Float, Int
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import Material
 from rfdropo_bayes.fem.native.contact_records import Cubes
-from rfdropo_bayes.fem.native.effect_rows import has_friction
 from rfdropo_bayes.fem.native.layered import NativeLayered, Records, Run, in_blocks
 from rfdropo_bayes.fem.native.layered_records import Samples
 from rfdropo_bayes.fem.native.simd import aligned_zeros
@@ -107,7 +106,7 @@ class LayeredSession:
         rows = np.asarray(rows, dtype=np.intp)
         still = np.zeros((len(rows), 1, self.engine.tables.cables))
         run = self.engine.run_of(material, still, start, 0, 1, cube)
-        self._admit(run, has_friction(material.effects))
+        self._admit(run, material.effects.rubs)
         settles = run.schedule.static_iterations > 0
         keys = [b"".join(_row(getattr(run.batch, n), row).tobytes() for n in GIVEN) for row in range(len(rows))]
         known = self._equilibria if settles else OrderedDict()

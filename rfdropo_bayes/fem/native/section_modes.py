@@ -92,10 +92,6 @@ def border_panels(cables: int) -> int:
     return (cables + 3) // 3
 
 
-def _both_faces(shape: np.ndarray) -> Float[np.ndarray, "nodes2 modes2"]:
-    return np.kron(np.eye(2), shape)
-
-
 def sparse_points(node: np.ndarray, weight: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points given by nodes as sparse sums of modes: first, place, weight."""
     section = len(shape)
@@ -131,7 +127,7 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
     body = system.body
     shape, parity = section_modes(body.nodes_across)
     modes, layers = len(parity), len(body.station) - 1
-    faces = _both_faces(shape)
+    faces = np.kron(np.eye(2), shape)
     moduli = np.einsum("am,plaibj,bn->plminj", faces, layer_moduli(body), faces, optimize=True)
     mass = np.einsum("am,lab,bn->lmn", faces, layer_volume(body), faces, optimize=True)
     blocks = [(f * modes + m, g * modes + n, parity[m] ^ parity[n]) for f, m, g, n in block_pairs(modes)]

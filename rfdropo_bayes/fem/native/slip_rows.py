@@ -7,7 +7,7 @@ from rfdropo_bayes.fem.native.fields import clear, point
 from rfdropo_bayes.fem.native.layered_effects import CAPSTAN, COULOMB, FRICTION
 from rfdropo_bayes.fem.native.layered_records import KINDS
 from rfdropo_bayes.fem.native.layered_step import pull_guide
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, square_root, store, where_greater
 
 
 @kernel
@@ -70,15 +70,11 @@ def _gather_run(tables, runs, friction, r, kind, border, panels, work, token):
         beyond = before
         if g < runs.last[r]:
             beyond = fma(load(friction.weight, kind * runs.guides + g, token), inverse, before)
-        x, y, z = (
-            before * load(friction.direction, 3 * g, token),
-            before * load(friction.direction, 3 * g + 1, token),
-            before * load(friction.direction, 3 * g + 2, token),
-        )
+        x, y, z = load3(friction.direction, 3 * g, token)
+        x, y, z = before * x, before * y, before * z
         if g < tied:
-            x = x - beyond * load(friction.direction, 3 * g + 3, token)
-            y = y - beyond * load(friction.direction, 3 * g + 4, token)
-            z = z - beyond * load(friction.direction, 3 * g + 5, token)
+            u, v, w = load3(friction.direction, 3 * g + 3, token)
+            x, y, z = x - beyond * u, y - beyond * v, z - beyond * w
         moving = moving + pull_guide(tables, g, border, row, panels, x, y, z, work.velocity, token)
         before = beyond
     return moving

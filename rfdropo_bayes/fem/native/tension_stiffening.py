@@ -75,38 +75,38 @@ def add_dyad(matrix, t, scale, axes, a, i, b, j, token):
 
 
 @kernel
-def stiffen_twist(tables, layer, rate, work, whole, token):
-    """Add T r^2 / L of all cables against the twist of a layer, over ``rate`` squared; see ``fem.tension_stiffening``.
+def _twist_tiles(tables, matrix, t, layer, row_face, column_face, triangle, stiffness, axes, token):
+    """Add a stiffness against the relative twist of a layer's faces to the block of two of them, from ``t`` on.
 
     The twist of a face is half of q_x . e_y / h_x - q_y . e_x / h_y, where q_x and q_y are its modes linear in x and y
     and h their values at rest.
     """
-    modes, across, axes, a = tables.modes, tables.across, work.axes, 9 * layer
-    stiffness = fill(0.0, axes, token)
+    modes, across, frame = tables.modes, tables.across, 9 * layer
+    low, high = 3 * (layer + row_face) * modes, 3 * (layer + column_face) * modes
+    for i in range(2):
+        for j in range(i + 1 if triangle else 2):
+            row, column = (across if i else 1), (across if j else 1)
+            a = 0.5 / tables.rest[low + (3 * across + 1 if i else 3)]
+            b = 0.5 / tables.rest[high + (3 * across + 1 if j else 3)]
+            sign = 1.0 if (row_face == column_face) == (i == j) else -1.0
+            tile, scale = t + 9 * (row * modes + column), sign * (stiffness * a * b)
+            add_dyad(matrix, tile, scale, axes, frame, 1 - i, frame, 1 - j, token)
+
+
+@kernel
+def stiffen_twist(tables, layer, rate, work, whole, token):
+    """Add T r^2 / L of all cables against the twist of a layer, over ``rate`` squared."""
+    axes, block = work.axes, 9 * tables.modes * tables.modes
+    stiffness, upper = fill(0.0, axes, token), (layer + 1) * block
     for c in range(tables.cables):
         arm = fill(tables.twist_arm[layer * tables.cables + c], axes, token)
         stiffness = fma(arm, load(work.tension, c, token), stiffness)
     stiffness = stiffness * fill(1.0 / (rate * rate), axes, token)
     store(work.twist, layer, stiffness)
-    low, high = 3 * layer * modes, 3 * (layer + 1) * modes
-    x0, y0 = 0.5 / tables.rest[low + 3], 0.5 / tables.rest[low + 3 * across + 1]
-    x1, y1 = 0.5 / tables.rest[high + 3], 0.5 / tables.rest[high + 3 * across + 1]
-    size, block = 3 * modes, 9 * modes * modes
-    upper = (layer + 1) * block
-    xx, xy = 3 * (size + 3), 3 * (size + 3 * across)
-    yx, yy = 3 * (across * size + 3), 3 * (across * size + 3 * across)
-    add_dyad(work.pivot, upper + xx, stiffness * x1 * x1, axes, a, 1, a, 1, token)
-    add_dyad(work.pivot, upper + yx, -(stiffness * y1 * x1), axes, a, 0, a, 1, token)
-    add_dyad(work.pivot, upper + yy, stiffness * y1 * y1, axes, a, 0, a, 0, token)
+    _twist_tiles(tables, work.pivot, upper, layer, 1, 1, True, stiffness, axes, token)
     if whole:
-        lower = upper - block
-        add_dyad(work.pivot, lower + xx, stiffness * x0 * x0, axes, a, 1, a, 1, token)
-        add_dyad(work.pivot, lower + yx, -(stiffness * y0 * x0), axes, a, 0, a, 1, token)
-        add_dyad(work.pivot, lower + yy, stiffness * y0 * y0, axes, a, 0, a, 0, token)
-        add_dyad(work.coupling, upper + xx, -(stiffness * x0 * x1), axes, a, 1, a, 1, token)
-        add_dyad(work.coupling, upper + xy, stiffness * x0 * y1, axes, a, 1, a, 0, token)
-        add_dyad(work.coupling, upper + yx, stiffness * y0 * x1, axes, a, 0, a, 1, token)
-        add_dyad(work.coupling, upper + yy, -(stiffness * y0 * y1), axes, a, 0, a, 0, token)
+        _twist_tiles(tables, work.pivot, upper - block, layer, 0, 0, True, stiffness, axes, token)
+        _twist_tiles(tables, work.coupling, upper, layer, 0, 1, False, stiffness, axes, token)
 
 
 @kernel

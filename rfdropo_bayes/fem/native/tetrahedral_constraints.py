@@ -87,7 +87,9 @@ def _condense(pattern, touch, work, rows, p, n, reached, cables, contacts, free,
 
 @kernel
 def _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, time_step, token):
-    """Weights of the border rows by the change of the impulses since ``before``, and the tensions."""
+    """Weights of the border rows by the change of the impulses since ``before``, and the tensions; lanes whose impulses
+    were not found stay marked."""
+    store(work.unsolved, 0, load(work.unsolved, 0, token) + load(p.going, 0, token))
     store(work.weight, 0, fill(1.0, work.weight, token))
     for i in range(cables + 1, 3 * pattern.border):
         store(work.weight, i, fill(0.0, work.weight, token))
@@ -137,17 +139,10 @@ def hold(pattern, scene, samples, touch, work, rows, p, reached, cables, free, s
         add_cube(touch, p, cables, contacts, time_step, token)
     soften(p, cables, 0, contacts, time_step, schedule.softness, token)
     solve_problem(p, cables, 0, contacts, schedule.settled, token)
-    _mark(work, p, token)
     _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, time_step, token)
     if scene is not None:
         stop_cube(touch, p, cables, contacts, token)
     return contacts
-
-
-@kernel
-def _mark(work, p, token):
-    """Lanes whose impulses were not found stay marked."""
-    store(work.unsolved, 0, load(work.unsolved, 0, token) + load(p.going, 0, token))
 
 
 @kernel
@@ -192,7 +187,6 @@ def hold_again(pattern, scene, touch, work, rows, p, reached, cables, contacts, 
         store(p.free, i, value)
         store(p.before, i, load(p.impulse, i, token))
     solve_problem(p, cables, 0, contacts, schedule.settled, token)
-    _mark(work, p, token)
     _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, schedule.time_step, token)
     if scene is not None:
         stop_cube(touch, p, cables, contacts, token)

@@ -104,7 +104,9 @@ class TetrahedralEngine:
         def run(first: int) -> None:
             lane, kept = np.minimum(np.arange(first, first + self.lanes), samples - 1), slice(first, first + self.lanes)
             inputs = self._samples({name: np.asarray(value)[lane] for name, value in parameters.items()})
-            displacement, work, output = self._lanes_last(commands[lane]), self._work(), self._output(rows)
+            displacement, work = self._lanes_last(commands[lane]), self._work()
+            sizes = (rows, points, 3, self.lanes), (rows, commands.shape[2], self.lanes)
+            output = kernels.Output(self._nodes, self._weights, *(aligned_zeros(size, self.dtype) for size in sizes))
             single = self.dtype.itemsize == 4
             numbers = SETTLED[self.dtype.name], SOFTNESS[self.dtype.name]
             schedule = kernels.Schedule(float(time_step), stride, *numbers, self._reach, single)
@@ -120,15 +122,6 @@ class TetrahedralEngine:
 
         in_blocks(run, samples, self.lanes, self.threads)
         return result
-
-    def _output(self, rows: int) -> kernels.Output:
-        """What a lane block records."""
-        return kernels.Output(
-            self._nodes,
-            self._weights,
-            aligned_zeros((rows, len(self._nodes), 3, self.lanes), self.dtype),
-            aligned_zeros((rows, len(self._cables.limit), self.lanes), self.dtype),
-        )
 
     def _constraints(self) -> tuple[Touch | None, Rows, Problem, Int[np.ndarray, " free"]]:
         """Contacts, their rows, the problem of a step, and the nodes that contacts reach, of one lane block."""
