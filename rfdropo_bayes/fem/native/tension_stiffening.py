@@ -75,38 +75,36 @@ def add_dyad(matrix, t, scale, axes, a, i, b, j, token):
 
 
 @kernel
-def _twist_tiles(tables, matrix, t, layer, row_face, column_face, triangle, stiffness, axes, token):
+def _twist_tiles(tables, matrix, t, layer, triangle, sign, stiffness, x0, y0, x1, y1, axes, token):
     """Add a stiffness against the relative twist of a layer's faces to the block of two of them, from ``t`` on.
 
-    The twist of a face is half of q_x . e_y / h_x - q_y . e_x / h_y, where q_x and q_y are its modes linear in x and y
-    and h their values at rest.
+    The twist of a face is q_x . e_y x - q_y . e_x y, where q_x and q_y are its modes linear in x and y.
     """
     modes, across, frame = tables.modes, tables.across, 9 * layer
-    low, high = 3 * (layer + row_face) * modes, 3 * (layer + column_face) * modes
     for i in range(2):
         for j in range(i + 1 if triangle else 2):
-            row, column = (across if i else 1), (across if j else 1)
-            a = 0.5 / tables.rest[low + (3 * across + 1 if i else 3)]
-            b = 0.5 / tables.rest[high + (3 * across + 1 if j else 3)]
-            sign = 1.0 if (row_face == column_face) == (i == j) else -1.0
-            tile, scale = t + 9 * (row * modes + column), sign * (stiffness * a * b)
+            tile = t + 9 * ((across if i else 1) * modes + (across if j else 1))
+            scale = (sign if i == j else -sign) * (stiffness * (y0 if i else x0) * (y1 if j else x1))
             add_dyad(matrix, tile, scale, axes, frame, 1 - i, frame, 1 - j, token)
 
 
 @kernel
 def stiffen_twist(tables, layer, rate, work, whole, token):
     """Add T r^2 / L of all cables against the twist of a layer, over ``rate`` squared."""
-    axes, block = work.axes, 9 * tables.modes * tables.modes
-    stiffness, upper = fill(0.0, axes, token), (layer + 1) * block
+    modes, axes, y = tables.modes, work.axes, 3 * tables.across + 1
+    block, stiffness = 9 * modes * modes, fill(0.0, axes, token)
     for c in range(tables.cables):
         arm = fill(tables.twist_arm[layer * tables.cables + c], axes, token)
         stiffness = fma(arm, load(work.tension, c, token), stiffness)
     stiffness = stiffness * fill(1.0 / (rate * rate), axes, token)
     store(work.twist, layer, stiffness)
-    _twist_tiles(tables, work.pivot, upper, layer, 1, 1, True, stiffness, axes, token)
+    low, high, upper = 3 * layer * modes, 3 * (layer + 1) * modes, (layer + 1) * block
+    x0, y0 = 0.5 / tables.rest[low + 3], 0.5 / tables.rest[low + y]
+    x1, y1 = 0.5 / tables.rest[high + 3], 0.5 / tables.rest[high + y]
+    _twist_tiles(tables, work.pivot, upper, layer, True, 1.0, stiffness, x1, y1, x1, y1, axes, token)
     if whole:
-        _twist_tiles(tables, work.pivot, upper - block, layer, 0, 0, True, stiffness, axes, token)
-        _twist_tiles(tables, work.coupling, upper, layer, 0, 1, False, stiffness, axes, token)
+        _twist_tiles(tables, work.pivot, upper - block, layer, True, 1.0, stiffness, x0, y0, x0, y0, axes, token)
+        _twist_tiles(tables, work.coupling, upper, layer, False, -1.0, stiffness, x0, y0, x1, y1, axes, token)
 
 
 @kernel
