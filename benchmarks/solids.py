@@ -11,7 +11,7 @@ import scipy.sparse as sparse
 from jaxtyping import Float, Int
 from scipy.sparse.linalg import spsolve
 
-from rfdropo_bayes.fem.hexahedron import stiffness
+from rfdropo_bayes.fem.hexahedron import elastic_stiffness, elasticity
 
 
 def bricks(
@@ -36,7 +36,9 @@ def deflection(
     force: Float[np.ndarray, "nodes 3"],
 ) -> Float[np.ndarray, "nodes 3"]:
     """Displacement under nodal forces; ``held`` marks the components that are fixed."""
-    matrices = jax.jit(jax.vmap(lambda x: stiffness(x, young, poisson)))(jnp.asarray(nodes[elements]))
+    matrices = jax.jit(jax.vmap(lambda x: elastic_stiffness(x, elasticity(young, poisson))))(
+        jnp.asarray(nodes[elements])
+    )
     place = (3 * elements[:, :, None] + np.arange(3)).reshape(len(elements), 24)
     rows, columns = np.repeat(place, 24, axis=1).ravel(), np.tile(place, (1, 24)).ravel()
     total = sparse.coo_matrix((np.asarray(matrices).ravel(), (rows, columns)), shape=(nodes.size,) * 2).tocsc()

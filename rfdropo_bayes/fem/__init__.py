@@ -8,23 +8,21 @@ from rfdropo_bayes.runtime import configure_jax
 
 configure_jax()
 
+from rfdropo_bayes.fem.balance import energies  # noqa: E402
 from rfdropo_bayes.fem.cables import CableLayout, cable_layout  # noqa: E402
 from rfdropo_bayes.fem.dynamics import (  # noqa: E402
     Material,
     Prepared,
     State,
-    StepInfo,
     System,
     material,
     prepare,
-    remembering,
     state_at_rest,
     step,
     without_cables,
 )
-from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Memory, Viscoelasticity, Wall  # noqa: E402
-from rfdropo_bayes.fem.energies import Energies, energies  # noqa: E402
-from rfdropo_bayes.fem.equilibrium import EquilibriumInfo, static_equilibrium  # noqa: E402
+from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall  # noqa: E402
+from rfdropo_bayes.fem.equilibrium import static_equilibrium  # noqa: E402
 from rfdropo_bayes.fem.layered import (  # noqa: E402
     LayeredBody,
     PointMap,
@@ -36,22 +34,17 @@ from rfdropo_bayes.fem.layered import (  # noqa: E402
     spread_forces,
     uniform_body,
 )
-from rfdropo_bayes.fem.rollouts import Rollout, simulate  # noqa: E402
+from rfdropo_bayes.fem.rollouts import simulate  # noqa: E402
 
 __all__ = [
     "BendingLaw",
     "BodyEffects",
     "CableLayout",
-    "Energies",
-    "EquilibriumInfo",
     "LayeredBody",
     "Material",
-    "Memory",
     "PointMap",
     "Prepared",
-    "Rollout",
     "State",
-    "StepInfo",
     "System",
     "Viscoelasticity",
     "Wall",
@@ -62,7 +55,6 @@ __all__ = [
     "point_positions",
     "prepare",
     "profile_body",
-    "remembering",
     "rest_positions",
     "simulate",
     "solid_torsion_constant",

@@ -14,7 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import corotational
+from rfdropo_bayes.fem.bending_law import potential
 from rfdropo_bayes.fem.blocktridiagonal import multiply
 from rfdropo_bayes.fem.cables import CableLayout, lengths_and_jacobian
 from rfdropo_bayes.fem.dynamics import (
@@ -28,9 +30,30 @@ from rfdropo_bayes.fem.dynamics import (
     resistance,
 )
 from rfdropo_bayes.fem.effects import BodyEffects, Scalar
-from rfdropo_bayes.fem.energies import Energies, energies
 from rfdropo_bayes.fem.tetrahedra import elastic_energy, element_rotations, lame_constants, nodal_force
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem
+
+
+class Energies(NamedTuple):
+    """Energies of one state [J]."""
+
+    kinetic: Float[Array, "..."]
+    elastic: Float[Array, "..."]
+    gravitational: Float[Array, "..."]  # zero with every node at the origin
+
+
+def energies(system: System, prepared: Prepared, state: State) -> Energies:
+    """Kinetic energy v'Mv/2, elastic energy d'Kd/2 in the layers' frames with that of a bending law, and gravity's
+    -x'Mg. What a Prony branch, a wall and stretched cables hold is left out, and softening too."""
+    _, local = frames_and_displacements(system, prepared, state.position)
+    elastic = 0.5 * jnp.einsum("li,lij,lj->", local, prepared.stiffness, local)
+    if prepared.effects.bending is not None and prepared.sections is not None:
+        elastic = elastic + potential(prepared.effects.bending, prepared.sections, local)
+    return Energies(
+        kinetic=0.5 * jnp.sum(state.velocity * mass_times(system, prepared, state.velocity)),
+        elastic=elastic,
+        gravitational=-jnp.sum(prepared.weight * state.position),
+    )
 
 
 class Balance(NamedTuple):
@@ -75,12 +98,13 @@ class _Step(NamedTuple):
 
 def check_effects(effects: BodyEffects) -> None:
     """Raise InputError for friction of the cables: their pull is then not given by one tension each."""
-    effects.refuse(
-        ("coulomb_friction", "capstan_friction"),
-        "forces and energies are not available with {}",
-        where="balance",
-        remedy="remove the mechanism, or do without them",
-    )
+    for name in ("coulomb_friction", "capstan_friction"):
+        if getattr(effects, name) is not None:
+            raise InputError(
+                f"forces and energies are not available with {name.replace('_', ' ')}",
+                where="balance",
+                remedy="remove the mechanism, or do without them",
+            )
 
 
 def _pull(
@@ -180,11 +204,10 @@ def tetrahedral_balance(
     position: Float[Array, "rows nodes 3"],
     tension: Float[Array, "rows cables"],
     time_step: Scalar,
-    velocity: Float[Array, "nodes 3"] | float = 0.0,
 ) -> Balance:
-    """Forces and energies of a rollout of a tetrahedral body; arguments as `layered_balance`."""
+    """Forces and energies of a rollout of a tetrahedral body from rest; arguments as `layered_balance`."""
     body, mass = system.body, material.node_mass[:, None]
-    velocities = _velocities(position, velocity, time_step)
+    velocities = _velocities(position, 0.0, time_step)
     first, shear = lame_constants(material.young_modulus, material.poisson_ratio)
     lame = first * material.stiffness_scale, shear * material.stiffness_scale
     guides = jnp.asarray(system.guides)

@@ -23,6 +23,12 @@ class BlockTridiagonal(NamedTuple):
     lower: Float[Array, "stations_1 b b"]
 
 
+def at_stations(lower: Float[Array, "layers *b"], upper: Float[Array, "layers *b"]) -> Float[Array, "stations *b"]:
+    """Sums at all stations of what every layer has at its lower and at its upper one."""
+    none = jnp.zeros_like(lower[:1])
+    return jnp.concatenate([lower, none]) + jnp.concatenate([none, upper])
+
+
 class BlockFactor(NamedTuple):
     """Inverse pivots D^-1 and multipliers L of A = (1 + L) D (1 + L)'; ``multiplier[0]`` is zero."""
 

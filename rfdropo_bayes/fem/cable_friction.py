@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rfdropo_bayes.fem.cables import CableLayout
+from rfdropo_bayes.fem.cables import CableLayout, segments
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
 
 RUNS = 4
@@ -53,17 +53,6 @@ def run_members(layout: CableLayout) -> Bool[np.ndarray, "cables cable_runs guid
     return members
 
 
-def directions(
-    layout: CableLayout, guides: Float[Array, "cables guides nodes"], position: Float[Array, "nodes 3"]
-) -> Float[Array, "cables guides 3"]:
-    """Unit vectors from the point before to each guide; zero where unused."""
-    guided = jnp.einsum("cgn,ni->cgi", guides, position)
-    points = jnp.concatenate([jnp.asarray(layout.anchor)[:, None, :], guided], axis=1)
-    used = layout.guide_used[..., None]
-    segment = jnp.where(used, points[:, 1:] - points[:, :-1], np.array([1.0, 0.0, 0.0]))
-    return jnp.where(used, segment / jnp.sqrt(jnp.sum(segment**2, axis=-1, keepdims=True)), 0.0)
-
-
 def wrap_angles(direction: Float[Array, "cables guides 3"]) -> Float[Array, "cables guides"]:
     """Angle [rad] by which a cable turns at each guide; meaningless at its last. 3e-5 short at 60 degrees."""
     following = jnp.concatenate([direction[:, 1:], direction[:, -1:]], axis=1)
@@ -96,7 +85,7 @@ def slip_problem(
     """Friction of a step from the shape at its start, the friction mobilised then, and the tension in front of every
     guide [N]."""
     members = run_members(layout)
-    direction = directions(layout, guides, position)
+    direction = segments(layout, guides, position)[1]
     middle = 0.5 * (segment + jnp.concatenate([segment[:, 1:], segment[:, -1:]], axis=1)) + SLACK
     weights = []
     if effects.coulomb_friction is not None:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.fem.cables import CableLayout
+from rfdropo_bayes.fem.cables import CableLayout, routes
 from rfdropo_bayes.fem.layered import LayeredBody, attach, rest_positions
 
 SHORTEST = 0.02
@@ -26,11 +26,9 @@ SHORTEST = 0.02
 def crossing_weights(body: LayeredBody, layout: CableLayout) -> Float[np.ndarray, "layers cables nodes2"]:
     """Weights of node positions that give the way of every cable through every layer, from the lower section to the
     upper one; zero beyond the cable's end."""
-    rest, nodes = rest_positions(body), body.section_nodes
-    middle = 0.5 * (body.station[1:] + body.station[:-1])
+    nodes, middle = body.section_nodes, 0.5 * (body.station[1:] + body.station[:-1])
     weights = np.zeros((len(middle), len(layout.anchor), 2 * nodes))
-    for cable, (anchor, node, weight, used) in enumerate(zip(*layout, strict=True)):
-        route = np.vstack([anchor, np.einsum("gk,gki->gi", weight, rest[node])[used]])
+    for cable, route in enumerate(routes(layout, rest_positions(body))):
         route = route[np.argsort(route[:, 2], kind="stable")]
         place = [np.interp(body.station, route[:, 2], route[:, i]) for i in (0, 1)]
         points = attach(body, np.stack([*place, body.station], axis=1))

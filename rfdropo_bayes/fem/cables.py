@@ -7,7 +7,8 @@ length may not exceed the commanded one; tension and slack are complementary (Si
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.layered import LayeredBody, attach
+from rfdropo_bayes.fem.layered import LayeredBody, PointMap, attach
 
 
 class CableLayout(NamedTuple):
@@ -30,8 +31,17 @@ class CableLayout(NamedTuple):
 def cable_layout(
     body: LayeredBody, anchors: Float[np.ndarray, "cables 3"], guides: Sequence[Float[np.ndarray, "guides 3"]]
 ) -> CableLayout:
-    """Cables from fixed anchors through guide points on the undeformed body [m]; each may have its own number of
-    guides.
+    """Cables of a layered body; see `routed`."""
+    return routed(partial(attach, body), anchors, guides)
+
+
+def routed(
+    bind: Callable[[Float[np.ndarray, "guides 3"]], PointMap],
+    anchors: Float[np.ndarray, "cables 3"],
+    guides: Sequence[Float[np.ndarray, "guides 3"]],
+) -> CableLayout:
+    """Cables from fixed anchors through guide points of the undeformed body [m]; each may have its own number of
+    guides. ``bind`` ties points to the body's nodes.
 
     Raises:
         InputError: a cable without guides, or with two successive points at the same place.
@@ -49,10 +59,19 @@ def cable_layout(
         steps = np.linalg.norm(np.diff(np.concatenate([anchors[cable : cable + 1], points]), axis=0), axis=1)
         if not np.all(steps > 1e-9):
             raise InputError("two successive points coincide", where=f"cable {cable}", remedy="remove one of them")
-        attached = attach(body, np.concatenate([points, np.repeat(points[-1:], most - len(points), axis=0)]))
-        nodes[cable], weights[cable] = attached
+        nodes[cable], weights[cable] = bind(
+            np.concatenate([points, np.repeat(points[-1:], most - len(points), axis=0)])
+        )
         used[cable, : len(points)] = True
     return CableLayout(anchors, nodes, weights, used)
+
+
+def routes(layout: CableLayout, rest: Float[np.ndarray, "nodes 3"]) -> list[Float[np.ndarray, "points 3"]]:
+    """Anchor and guides of every cable, with the nodes here [m]."""
+    parts = zip(*layout, strict=True)
+    return [
+        np.vstack([anchor, np.einsum("gk,gki->gi", weight, rest[node])[used]]) for anchor, node, weight, used in parts
+    ]
 
 
 def guide_matrix(layout: CableLayout, nodes: int) -> Float[np.ndarray, "cables guides nodes"]:
@@ -64,15 +83,22 @@ def guide_matrix(layout: CableLayout, nodes: int) -> Float[np.ndarray, "cables g
     return matrix
 
 
-def lengths_and_jacobian(
+def segments(
     layout: CableLayout, guides: Float[Array, "cables guides nodes"], position: Float[Array, "nodes 3"]
-) -> tuple[Float[Array, " cables"], Float[Array, "cables nodes 3"]]:
-    """Cable lengths [m] and their derivatives with respect to the node positions."""
+) -> tuple[Float[Array, "cables guides 1"], Float[Array, "cables guides 3"]]:
+    """Distance [m] from the point before to each guide, and the unit vector; zero where unused."""
     guided = jnp.einsum("cgn,ni->cgi", guides, position)
     points = jnp.concatenate([jnp.asarray(layout.anchor)[:, None, :], guided], axis=1)
     used = layout.guide_used[..., None]
     segment = jnp.where(used, points[:, 1:] - points[:, :-1], np.array([1.0, 0.0, 0.0]))
     length = jnp.sqrt(jnp.sum(segment**2, axis=-1, keepdims=True))
-    direction = jnp.where(used, segment / length, 0.0)
+    return jnp.where(used, length, 0.0), jnp.where(used, segment / length, 0.0)
+
+
+def lengths_and_jacobian(
+    layout: CableLayout, guides: Float[Array, "cables guides nodes"], position: Float[Array, "nodes 3"]
+) -> tuple[Float[Array, " cables"], Float[Array, "cables nodes 3"]]:
+    """Cable lengths [m] and their derivatives with respect to the node positions."""
+    length, direction = segments(layout, guides, position)
     pull = direction - jnp.concatenate([direction[:, 1:], jnp.zeros_like(direction[:, :1])], axis=1)
-    return jnp.sum(jnp.where(used, length, 0.0), axis=(1, 2)), jnp.einsum("cgn,cgi->cni", guides, pull)
+    return jnp.sum(length, axis=(1, 2)), jnp.einsum("cgn,cgi->cni", guides, pull)

@@ -6,10 +6,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from rfdropo_bayes.fem.cable_friction import Slip
-from rfdropo_bayes.fem.constraints import Contacts, Impulses, Scalar, Slips, solve_constraints
+from rfdropo_bayes.fem.constraints import Contacts, Impulses, Slips, solve_constraints
+from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.pushing import PushScene, Touch, find_contacts, trunk_rows
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState, free_twist, inverse_inertia, moved
 
@@ -43,11 +44,6 @@ class ConstrainedStep(NamedTuple):
     impulses: Impulses
     cube: CubeState | None
     touch: Float[Array, "pairs 3"] | None  # impulses of all pairs that can touch, in space [N s]
-
-    @property
-    def converged(self) -> Bool[Array, ""]:
-        """Whether all impulses were found."""
-        return self.impulses.converged
 
 
 def meet(

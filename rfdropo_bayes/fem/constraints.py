@@ -23,8 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem.cable_friction import PRESLIDING
-
-Scalar = Float[Array, ""] | float
+from rfdropo_bayes.fem.effects import Scalar
 
 CABLE_SOFTNESS = 1e-9
 """R of a cable, relative to its entry on the diagonal of W; in single precision, see ``native.constraint_problem``."""
@@ -175,16 +174,6 @@ def _iterate(problem: _Problem, start: Float[Array, " n"]) -> tuple[Float[Array,
     return impulse, ~going
 
 
-def no_slips() -> Slips:
-    """Cables without friction."""
-    return Slips(jnp.zeros(0), jnp.zeros(0))
-
-
-def no_contacts() -> Contacts:
-    """A body that touches nothing."""
-    return Contacts(jnp.zeros(0), 0.0, jnp.zeros((0, 3)))
-
-
 def solve_constraints(
     compliance: Float[Array, "n n"],
     free: Float[Array, " n"],
@@ -207,7 +196,8 @@ def solve_constraints(
         time_step: h [s].
         give: of every cable's length per tension, over the time step squared [1/kg].
     """
-    slips, contacts = slips or no_slips(), contacts or no_contacts()
+    slips = slips or Slips(jnp.zeros(0), jnp.zeros(0))
+    contacts = contacts or Contacts(jnp.zeros(0), 0.0, jnp.zeros((0, 3)))
     cables, runs = len(previous), len(slips.impulse)
     if not len(free):
         return Impulses(previous, slips.mobilised, slips.impulse, jnp.zeros((0, 3)), jnp.array(True))

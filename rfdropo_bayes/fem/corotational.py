@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal
+from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, at_stations
 from rfdropo_bayes.fem.hexahedron import cofactor
 
 POLAR_ITERATIONS = 6
@@ -59,8 +59,7 @@ def internal_force(
     """Elastic force [N] on the nodes of every station, from what each layer resists in its own frame."""
     force = -jnp.einsum("lij,lnj->lni", frame, resistance.reshape(len(frame), -1, 3))
     half = force.shape[1] // 2
-    none = jnp.zeros((1, half, 3))
-    return jnp.concatenate([force[:, :half], none]) + jnp.concatenate([none, force[:, half:]])
+    return at_stations(force[:, :half], force[:, half:])
 
 
 def pack(stiffness: Float[Array, "layers dofs dofs"]) -> Float[Array, "layers 9 pairs"]:
@@ -81,6 +80,4 @@ def tangent(packed: Float[Array, "layers 9 pairs"], frame: Float[Array, "layers 
     pairs = jnp.einsum("lij,lhk->lihjk", frame, frame).reshape(layers, 9, 9)
     parts = (pairs @ packed).reshape(layers, 3, 3, 3, section, section)
     blocks = jnp.transpose(parts, (3, 0, 4, 1, 5, 2)).reshape(3, layers, 3 * section, 3 * section)
-    none = jnp.zeros_like(blocks[0, :1])
-    diagonal = jnp.concatenate([blocks[0], none]) + jnp.concatenate([none, blocks[1]])
-    return BlockTridiagonal(diagonal, blocks[2])
+    return BlockTridiagonal(at_stations(blocks[0], blocks[1]), blocks[2])

@@ -25,11 +25,6 @@ class DriveLimits(NamedTuple):
         return jnp.minimum(within, jnp.asarray(self.displacement))
 
 
-def no_limits(cables: int) -> DriveLimits:
-    """Drives that reach every command within the step."""
-    return DriveLimits(np.full(cables, np.inf))
-
-
 def animated_commands(
     command: Float[np.ndarray, "rows cables"], steps: int, time_step: float
 ) -> Float[np.ndarray, "rows steps cables"]:

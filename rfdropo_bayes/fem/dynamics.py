@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.fem import corotational, layered
 from rfdropo_bayes.fem.bending_law import Sections, moments, sections
-from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, multiply, solve
+from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, at_stations, multiply, solve
 from rfdropo_bayes.fem.cable_friction import slip_problem, slipped, start_slip
 from rfdropo_bayes.fem.cable_strings import crossing_weights, string_stiffness
 from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian
@@ -140,12 +140,9 @@ def prepare(system: System, material: Material) -> Prepared:
     stiffness = stiffness * material.stiffness_scale[:, None, None]
     section = body.section_nodes
     layer_mass = layered.layer_mass(body) * material.density
-    none = jnp.zeros((1, section, section))
     lumped = (material.point_mass / section)[:, None, None] * jnp.eye(section)
     mass = BlockTridiagonal(
-        jnp.concatenate([layer_mass[:, :section, :section], none])
-        + jnp.concatenate([none, layer_mass[:, section:, section:]])
-        + lumped,
+        at_stations(layer_mass[:, :section, :section], layer_mass[:, section:, section:]) + lumped,
         layer_mass[:, section:, :section],
     )
     rest = jnp.asarray(layered.rest_positions(body))
@@ -202,11 +199,6 @@ def resistance(
 def mass_times(system: System, prepared: Prepared, field: Float[Array, "nodes 3"]) -> Float[Array, "nodes 3"]:
     """Consistent mass times a nodal field."""
     return multiply(prepared.mass, field.reshape(len(system.body.station), -1, 3)).reshape(-1, 3)
-
-
-def _with_axes(mass: BlockTridiagonal) -> BlockTridiagonal:
-    """Scalar mass blocks repeated for the three displacement components."""
-    return BlockTridiagonal(*(jnp.kron(block, jnp.eye(3)) for block in mass))
 
 
 def section_means(system: System, field: Float[Array, "nodes 3"]) -> Float[Array, "stations 3"]:
@@ -348,7 +340,7 @@ def linearised(
     load = prepared.weight + external_force
     right = time_step * (elastic.force + load - elastic.lookahead * strained - dragged)
     inertia, elasticity = 1.0 + time_step * prepared.rayleigh_mass, time_step * elastic.lookahead
-    mass = _with_axes(prepared.mass)
+    mass = [jnp.kron(block, jnp.eye(3)) for block in prepared.mass]  # for the three components
     matrix = BlockTridiagonal(*(inertia * m + elasticity * k for m, k in zip(mass, elastic.tangent, strict=True)))
     taut = _taut(system, prepared, state, elastic, time_step)
     matrix = BlockTridiagonal(*(m + k for m, k in zip(matrix, taut, strict=True)))
@@ -392,7 +384,7 @@ def step(
         share, segment = slipped(system.cables, slip, found.impulses.share, tension)
         memory = memory._replace(slip=share, segment=segment)
     moved = State(state.position + time_step * velocity, velocity, tension, memory, found.cube, found.touch)
-    return accept(system, prepared, state, moved, found.converged)
+    return accept(system, prepared, state, moved, found.impulses.converged)
 
 
 def free_solve(system: System, matrix: BlockTridiagonal) -> Solve:

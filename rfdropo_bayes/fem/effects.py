@@ -6,13 +6,10 @@ there. An effect that is not given (None) costs nothing: it is no part of the tr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 from jaxtyping import Array, Float
-
-from rfdropo_bayes.errors import InputError
 
 Scalar = Float[Array, ""] | float
 
@@ -59,11 +56,10 @@ class BodyEffects(NamedTuple):
         """Whether any effect is given."""
         return bool(jax.tree.leaves(self))
 
-    def refuse(self, names: Sequence[str], sentence: str, *, where: str, remedy: str) -> None:
-        """Raise InputError with ``sentence``, its ``{}`` filled in, if one of the named effects is given."""
-        for name in names:
-            if getattr(self, name) is not None:
-                raise InputError(sentence.format(name.replace("_", " ")), where=where, remedy=remedy)
+    @property
+    def rubs(self) -> bool:
+        """Whether cables rub in their guides: it adds rows to the problem of every step, whatever its size."""
+        return self.coulomb_friction is not None or self.capstan_friction is not None
 
 
 class Memory(NamedTuple):

@@ -104,7 +104,7 @@ def static_equilibrium(
         pull = Pull(forces.jacobian, slack, current.tension, give)
         still = jnp.zeros_like(current.position)
         found = constrained_step(free_solve(system, forces.tangent), forces.body + load, still, pull, 1.0)
-        increment, tension, converged = found.increment, found.impulses.cable, found.converged
+        increment, tension, converged = found.increment, found.impulses.cable, found.impulses.converged
         now, before = lax.stop_gradient((increment, current.increment))
         along = jnp.sum(now * before)
         opposed = along < -0.3 * jnp.sqrt(jnp.sum(now**2) * jnp.sum(before**2))

@@ -91,13 +91,6 @@ def _stretches(inverse: Float[Array, "3 3"]) -> Float[Array, "3 6"]:
     return jnp.concatenate([normal**2, 2.0 * normal * jnp.roll(normal, -1, axis=1)], axis=1)
 
 
-def stiffness(
-    coordinates: Float[Array, "8 3"], young_modulus: Float[Array, ""], poisson_ratio: Float[Array, ""]
-) -> Float[Array, "24 24"]:
-    """Stiffness [N/m] of one isotropic element; see `elastic_stiffness`."""
-    return elastic_stiffness(coordinates, elasticity(young_modulus, poisson_ratio))
-
-
 def elastic_stiffness(coordinates: Float[Array, "8 3"], moduli: Float[Array, "6 6"]) -> Float[Array, "24 24"]:
     """Stiffness [N/m] of one element, its twelve modes condensed; any non-degenerate coordinates [m]."""
     local = shape_gradients(GAUSS_POINTS)

@@ -13,6 +13,7 @@ true section does not. ``sectional`` bodies leave that coupling out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -277,6 +278,13 @@ def attach(body: LayeredBody, points: Float[np.ndarray, "points 3"]) -> PointMap
     first = layer * section + cell[:, 1] * across + cell[:, 0]
     offsets = np.array([dz * section + dy * across + dx for dz in range(2) for dy in range(2) for dx in range(2)])
     return PointMap(node=first[:, None] + offsets[None], weight=hexahedron.shape_functions(natural))
+
+
+def joined(maps: Sequence[PointMap]) -> PointMap:
+    """The points of all maps, one after the other."""
+    width = max(points.node.shape[1] for points in maps)
+    padded = [[np.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in points] for points in maps]
+    return PointMap(*(np.concatenate(parts) for parts in zip(*padded, strict=True)))
 
 
 def point_positions(points: PointMap, position: Float[Array, "nodes 3"]) -> Float[Array, "points 3"]:

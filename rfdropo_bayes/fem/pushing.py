@@ -15,10 +15,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.layered import LayeredBody, attach, centre_gradient
 from rfdropo_bayes.fem.rigid_body import CORNERS, Cube, CubeState, rotation_matrix
-
-Scalar = Float[Array, ""] | float
 
 NEAREST = 24
 """Spheres that the reference engine looks at, nearest to the cube and to the plate: more than ever come near them."""

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-Scalar = Float[Array, ""] | float
+from rfdropo_bayes.fem.effects import Scalar
 
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 """Corners of the cube of side one about its centre."""
@@ -88,8 +88,3 @@ def moved(state: CubeState, twist: Float[Array, "6"], time_step: Scalar) -> Cube
     )
     orientation = orientation / jnp.linalg.norm(orientation)
     return CubeState(state.position + time_step * velocity, orientation, velocity, spin)
-
-
-def kinetic_energy(cube: Cube, state: CubeState) -> Float[Array, ""]:
-    """Energy of the motion [J]."""
-    return 0.5 * cube.mass * (jnp.sum(state.velocity**2) + cube.gyration_radius**2 * jnp.sum(state.spin**2))

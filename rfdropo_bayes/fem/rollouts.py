@@ -28,6 +28,20 @@ class Rollout(NamedTuple):
     pose: Float[Array, "rows 7"] | None = None  # of the cube: centre [m] and unit quaternion (x, y, z, w)
 
 
+class Motion(NamedTuple):
+    """Recorded motion of a body by any engine, of one rollout or a batch; row 0 is the initial state.
+
+    A diverged rollout stays finite, but its rows from then on mean nothing.
+    """
+
+    position: Float[Any, "*batch row point 3"]  # [m]
+    tension: Float[Any, "*batch row cable"]  # [N]
+    diverged: Bool[Any, "*batch"]
+    imbalance: Float[Any, "*batch"]  # relative unbalanced force of the initial equilibrium; 0 for a start at rest
+    converged: Bool[Any, "*batch"]  # whether the impulses of every step's constraints were found
+    pose: Float[Any, "*batch row 7"] | None = None  # of the cube: centre [m] and unit quaternion (x, y, z, w)
+
+
 class _Progress(NamedTuple):
     state: Any
     info: StepInfo

@@ -1,7 +1,7 @@
 """Geometric stiffness of layers in tension, body and cables together: they hold the axis straight as a string does.
 
 The corotational tangent leaves it out. Without it the iteration for equilibrium of a soft body that hangs in its cables
-or its own weight swings about the answer with growing amplitude, and so do time steps under strongly opposed cables.
+or its own weight swings about the answer with growing amplitude.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal
+from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, at_stations
 from rfdropo_bayes.fem.layered import LayeredBody
 
 
@@ -41,5 +41,4 @@ def lateral_stiffening(
     lateral = jnp.eye(3) - axis[:, :, None] * axis[:, None, :]
     spring = jnp.maximum(tension, 0.0) / np.diff(body.station) / nodes**2
     block = jax.vmap(lambda part: jnp.kron(jnp.ones((nodes, nodes)), part))(lateral * spring[:, None, None])
-    none = jnp.zeros_like(block[:1])
-    return BlockTridiagonal(jnp.concatenate([block, none]) + jnp.concatenate([none, block]), -block)
+    return BlockTridiagonal(at_stations(block, block), -block)

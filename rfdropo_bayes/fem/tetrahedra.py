@@ -17,6 +17,7 @@ that others simulate, not for accuracy at few unknowns.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.cables import CableLayout
+from rfdropo_bayes.fem.cables import CableLayout, routed
 from rfdropo_bayes.fem.corotational import rotation
 from rfdropo_bayes.fem.dynamics import POISSON_LIMIT
 from rfdropo_bayes.fem.layered import PointMap
@@ -44,6 +45,11 @@ class TetrahedralBody(NamedTuple):
     volume: Float[np.ndarray, " elements"]  # [m3]
     rest_frame: Float[np.ndarray, "elements 3 3"]  # rows: axes of the element's frame at rest
     frames: str  # one of FRAMES
+
+    @property
+    def nodes(self) -> int:
+        """Nodes of the whole mesh."""
+        return len(self.rest)
 
 
 def tetrahedral_body(
@@ -173,11 +179,6 @@ def element_tangents(
     return first[scaled] * pairs + shear[scaled] * (jnp.swapaxes(pairs, 3, 4) + dots[..., None, None] * jnp.eye(3))
 
 
-def equal_node_masses(body: TetrahedralBody, mass: Float[Array, ""] | float) -> Float[Array, " nodes"]:
-    """A total mass [kg] in equal parts on all nodes, held ones included (SOFA's UniformMass)."""
-    return jnp.broadcast_to(mass / len(body.rest), (len(body.rest),))
-
-
 def lumped_masses(body: TetrahedralBody, density: Float[Array, ""] | float) -> Float[Array, " nodes"]:
     """A quarter of every element's mass on each of its nodes [kg]."""
     volume = np.zeros(len(body.rest))
@@ -217,18 +218,5 @@ def mean_points(maps: Sequence[PointMap]) -> PointMap:
 def route_cables(
     body: TetrahedralBody, anchors: Float[np.ndarray, "cables 3"], guides: Sequence[Float[np.ndarray, "guides 3"]]
 ) -> CableLayout:
-    """Cables from anchors fixed in space through guide points of the undeformed body [m]."""
-    most = max((len(points) for points in guides), default=1)
-    node = np.zeros((len(guides), most, LARGEST_WEIGHTS), dtype=int)
-    weight = np.zeros((len(guides), most, LARGEST_WEIGHTS))
-    used = np.zeros((len(guides), most), dtype=bool)
-    for cable, points in enumerate(guides):
-        if len(points) == 0:
-            raise InputError(
-                "no guide point", where=f"cable {cable}", remedy="give at least the point where it is tied"
-            )
-        node[cable], weight[cable] = locate(
-            body, np.concatenate([points, np.repeat(points[-1:], most - len(points), axis=0)])
-        )
-        used[cable, : len(points)] = True
-    return CableLayout(np.asarray(anchors, float).reshape(-1, 3), node, weight, used)
+    """Cables of a tetrahedral body; see `fem.cables.routed`."""
+    return routed(partial(locate, body), anchors, guides)

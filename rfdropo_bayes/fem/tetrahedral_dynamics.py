@@ -138,7 +138,7 @@ def step(
     position = state.position + time_step * velocity
     moved = TetrahedralState(position, velocity, tension, shortening, found.cube, found.touch)
     reach = LOST * float(np.ptp(system.body.rest, axis=0).max())
-    return accept_within(reach, moved.position - system.body.rest, state, moved, found.converged)
+    return accept_within(reach, moved.position - system.body.rest, state, moved, found.impulses.converged)
 
 
 def simulate(

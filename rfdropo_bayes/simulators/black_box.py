@@ -16,11 +16,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots.parameter import Parameter
+from rfdropo_bayes.simulators.callbacks import one_callback
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
 from rfdropo_bayes.simulators.differences import LENGTH, with_differences
-from rfdropo_bayes.simulators.engine import distinct, flattened, padded
-from rfdropo_bayes.simulators.extended import ExtendedSimulator, Values
-from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, Mechanism, check_mechanisms, code_of, obstacle
+from rfdropo_bayes.simulators.extended import ExtendedSimulator
+from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, Mechanism, Values, check_mechanisms, code_of, obstacle
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.process import ProcessSimulation
 from rfdropo_bayes.simulators.protocol import Observation, Result
@@ -303,29 +303,17 @@ class BlackBoxSimulator(ExtendedSimulator):
         return with_differences(self._call, size, "float64", difference=self.box.difference)
 
     def _call(self, inputs: tuple[dict[str, Array], Array], limit: Array) -> Moved:
-        """One callback for the whole batch."""
         rows = inputs[1].shape[0]
         shapes = Moved(
             jax.ShapeDtypeStruct((rows, len(self.marker_names), 3), jnp.float64),
             jax.ShapeDtypeStruct((rows, len(self.cable_names)), jnp.float64),
             jax.ShapeDtypeStruct((), jnp.bool_),
         )
-        return jax.pure_callback(self._on_host, shapes, inputs, limit, vmap_method="broadcast_all")
+        return one_callback(self._rolled, shapes, inputs, limit)
 
-    def _on_host(self, inputs: tuple[dict[str, Array], Array], limit: Array) -> Moved:
-        """Flatten whatever batch axes vmap has added, simulate what differs, and restore them."""
-        batch, rows = inputs[1].shape[:-2], inputs[1].shape[-2]
-        count, steps = int(np.prod(batch)), int(np.max(limit))
-        given = jax.tree.map(lambda value: flattened(np.asarray(value), len(batch), count), inputs)
-        chosen, place = distinct(jax.tree.leaves(given))
-        values, command = jax.tree.map(lambda value: value[chosen], given)
-        found = self._rolled(values, command[:, : steps + 1])
-        parts = (np.asarray(part)[place] for part in found)
-        position, tension, failed = (part.reshape((*batch, *part.shape[1:])) for part in parts)
-        return Moved(padded(position, len(batch), rows), padded(tension, len(batch), rows), failed)
-
-    def _rolled(self, values: Batch, command: Float[np.ndarray, "n row channel"]) -> Moved:
+    def _rolled(self, inputs: tuple[Batch, Float[np.ndarray, "n row channel"]], steps: int) -> Moved:
         """Rollouts of a batch; those that failed are zero."""
+        values, command = inputs[0], inputs[1][:, : steps + 1]
         count, rows = command.shape[:2]
         position = np.zeros((count, rows, len(self.marker_names), 3))
         tension, failed = np.zeros((count, rows, len(self.cable_names))), np.zeros(count, dtype=bool)

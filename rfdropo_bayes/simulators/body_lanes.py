@@ -13,48 +13,34 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem import Material, point_positions, prepare, state_at_rest
-from rfdropo_bayes.fem import static_equilibrium as find_equilibrium
+from rfdropo_bayes.fem import Material, point_positions
 from rfdropo_bayes.fem.dynamics import Prepared, State, remembering, step
-from rfdropo_bayes.fem.layered import PointMap
-from rfdropo_bayes.fem.native.layered import NativeRollout
+from rfdropo_bayes.fem.layered import PointMap, joined
 from rfdropo_bayes.fem.native.layered_session import LayeredSession
 from rfdropo_bayes.fem.pushing import PushScene, smallest_gap
 from rfdropo_bayes.fem.rigid_body import Cube
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.simulators.engine import CubeInputs, Engine, cube_arrays
 
 TOUCHING = 0.001
 """[m] A body that overlaps the cube by less starts in contact. The first step then moves the cube by as much."""
 
 
-class LaneMotion(NamedTuple):
-    """Where the bodies of some lanes are."""
+class LaneStart(NamedTuple):
+    """What lanes start from."""
 
-    position: Float[np.ndarray, "lane marker 3"]
-    tension: Float[np.ndarray, "lane cable"]
-    diverged: Bool[np.ndarray, " lane"]  # since the lane was started
-    imbalance: Float[np.ndarray, " lane"]  # relative unbalanced force of its initial equilibrium
-    converged: Bool[np.ndarray, " lane"]  # whether the impulses of all constraints were found since then
-    pose: Float[np.ndarray, "lane 7"] | None  # of the cube: centre [m] and quaternion (x, y, z, w)
+    material: Material
+    start: Float[Any, "*row cable"]  # displacements that the initial state belongs to [m]
+    cube: CubeInputs | None
 
 
 class BodyLanes(Protocol):
-    """The bodies of a session's lanes."""
+    """The bodies of a session's lanes; their `Motion` is where they are, without an axis of rows."""
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of their parameters and state."""
+    def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
+        """Start some lanes anew, with one entry per row; returns the motion of these rows."""
 
-    def reset(
-        self,
-        rows: Int[np.ndarray, " row"],
-        material: Material,
-        start: Float[np.ndarray, "row cable"],
-        cube: CubeInputs | None,
-    ) -> LaneMotion:
-        """Start some lanes anew; material and cube have one entry per row. Returns the motion of these rows."""
-
-    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> LaneMotion:
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> Motion:
         """Take steps to the cable displacements [m] at their ends."""
 
     def save(self) -> Float[np.ndarray, "lane values"]:
@@ -86,12 +72,7 @@ class LanesBeforeCube:
     def __init__(self, kind: Callable[[Engine, int], BodyLanes], engine: Engine, scene: PushScene, count: int) -> None:
         markers, spheres = engine.body.markers, scene.spheres
         self._shown, self._count = len(markers.node), count
-        width = max(markers.node.shape[1], spheres.node.shape[1])
-        node, weight = (
-            np.concatenate([np.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts])
-            for parts in ((markers.node, spheres.node), (markers.weight, spheres.centre))
-        )
-        body: Any = engine.body._replace(markers=PointMap(node, weight))
+        body: Any = engine.body._replace(markers=joined([markers, PointMap(spheres.node, spheres.centre)]))
         self._bodies = kind(replace(engine, body=body), count)
         self.save, self.restore = self._bodies.save, self._bodies.restore
 
@@ -100,31 +81,20 @@ class LanesBeforeCube:
 
         self._gaps = jax.jit(jax.vmap(gap))
 
-    @property
-    def nbytes(self) -> int:
+    def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """See `BodyLanes`."""
-        return self._bodies.nbytes
-
-    def reset(
-        self,
-        rows: Int[np.ndarray, " row"],
-        material: Material,
-        start: Float[np.ndarray, "row cable"],
-        cube: CubeInputs | None,
-    ) -> LaneMotion:
-        """See `BodyLanes`."""
-        found = self._bodies.reset(rows, material, start, cube)
+        found = self._bodies.reset(rows, given)
         spread = np.zeros(self._count, int)  # all lanes are computed, so that one program serves any number of rows
         spread[rows] = np.arange(len(rows))
         spheres = found.position[:, self._shown :]
-        gap = np.asarray(self._gaps(*jax.tree.map(lambda part: np.asarray(part)[spread], (cube, spheres))))[rows]
+        gap = np.asarray(self._gaps(*jax.tree.map(lambda part: np.asarray(part)[spread], (given.cube, spheres))))[rows]
         return self._markers(found._replace(imbalance=np.where(gap < -TOUCHING, np.inf, found.imbalance)))
 
-    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> LaneMotion:
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> Motion:
         """See `BodyLanes`."""
         return self._markers(self._bodies.advance(displacement))
 
-    def _markers(self, found: LaneMotion) -> LaneMotion:
+    def _markers(self, found: Motion) -> Motion:
         return found._replace(position=found.position[:, : self._shown])
 
 
@@ -135,33 +105,21 @@ class CompiledLanes:
         self._session, self._from_equilibrium = LayeredSession(engine.native, count), engine.from_equilibrium
         self.save, self.restore = self._session.save, self._session.restore
 
-    @property
-    def nbytes(self) -> int:
+    def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """See `BodyLanes`."""
-        return self._session.nbytes
+        cube = None if given.cube is None else cube_arrays(given.cube)
+        begin = given.start if self._from_equilibrium else None
+        return _last(self._session.reset(rows, given.material, start=begin, cube=cube))
 
-    def reset(
-        self,
-        rows: Int[np.ndarray, " row"],
-        material: Material,
-        start: Float[np.ndarray, "row cable"],
-        cube: CubeInputs | None,
-    ) -> LaneMotion:
-        """See `BodyLanes`."""
-        solid = None if cube is None else cube_arrays(cube)
-        begin = start if self._from_equilibrium else None
-        return _last(self._session.reset(rows, material, start=begin, cube=solid))
-
-    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> LaneMotion:
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> Motion:
         """See `BodyLanes`."""
         return _last(self._session.advance(displacement, stride=displacement.shape[1]))
 
 
-def _last(found: NativeRollout) -> LaneMotion:
+def _last(found: Motion) -> Motion:
     """The last recorded row."""
     pose = None if found.pose is None else found.pose[:, -1]
-    last = found.position[:, -1], found.tension[:, -1]
-    return LaneMotion(*last, found.diverged, found.residual, found.converged, pose)
+    return found._replace(position=found.position[:, -1], tension=found.tension[:, -1], pose=pose)
 
 
 class _Lane(NamedTuple):
@@ -183,30 +141,19 @@ class ReferenceLanes:
         self._system: Any = engine.body.system
         self._lanes: _Lane | None = None
 
-    @property
-    def nbytes(self) -> int:
-        """See `BodyLanes`."""
-        return sum(leaf.nbytes for leaf in jax.tree.leaves(self._lanes))
-
-    def reset(
-        self,
-        rows: Int[np.ndarray, " row"],
-        material: Material,
-        start: Float[np.ndarray, "row cable"],
-        cube: CubeInputs | None,
-    ) -> LaneMotion:
+    def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """See `BodyLanes`. All lanes are computed, so that one program serves any number of rows."""
         spread = np.zeros(self._count, int)
         spread[rows] = np.arange(len(rows))
-        fresh = self._first(*jax.tree.map(lambda part: jnp.asarray(part)[spread], (material, start, cube)))
+        fresh = self._first(jax.tree.map(lambda part: jnp.asarray(part)[spread], given))
         if self._lanes is None:
             self._lanes = fresh
         elif str(jax.tree.structure(fresh)) != str(jax.tree.structure(self._lanes)):
             raise InputError("a lane whose body has other effects than the lanes before", where="reset")
         self._lanes = jax.tree.map(lambda new, old: old.at[rows].set(new[rows]), fresh, self._lanes)
-        return LaneMotion(*(None if part is None else part[rows] for part in self._shown()))
+        return Motion(*(None if part is None else part[rows] for part in self._shown()))
 
-    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> LaneMotion:
+    def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> Motion:
         """See `BodyLanes`."""
         self._lanes = self._moved(self._lanes, jnp.asarray(displacement))
         return self._shown()
@@ -221,7 +168,7 @@ class ReferenceLanes:
         whole[rows] = state
         self._lanes = lanes_like(self._lanes, whole)
 
-    def _shown(self) -> LaneMotion:
+    def _shown(self) -> Motion:
         assert self._lanes is not None
         lanes, markers = self._lanes, self._engine.body.markers
         position = jax.vmap(lambda nodes: point_positions(markers, nodes))(lanes.state.position)
@@ -230,20 +177,16 @@ class ReferenceLanes:
             pose = np.concatenate([cube.position, cube.orientation], axis=1)
         parts = position, lanes.state.tension, lanes.diverged, lanes.imbalance, lanes.converged
         shown: Any = [*map(np.asarray, parts), pose]
-        return LaneMotion(*shown)
+        return Motion(*shown)
 
     @cached_property
-    def _first(self) -> Callable[[Material, Array, CubeInputs | None], _Lane]:
-        system = self._system
+    def _first(self) -> Callable[[LaneStart], _Lane]:
+        engine = self._engine
 
-        def first(material: Material, start: Float[Array, " cable"], cube: CubeInputs | None) -> _Lane:
-            prepared, imbalance = prepare(system, material), jnp.zeros(())
-            state = state_at_rest(system)
-            if self._engine.from_equilibrium:
-                state, found = find_equilibrium(system, prepared, start)
-                imbalance = found.residual
-            state = remembering(system, prepared, state, self._engine.scene)
-            solid, place = (None, None) if cube is None else cube
+        def first(given: LaneStart) -> _Lane:
+            prepared, state, imbalance = engine.initial(given.material, given.start)
+            state = remembering(self._system, prepared, state, engine.scene)
+            solid, place = (None, None) if given.cube is None else given.cube
             return _Lane(prepared, state._replace(cube=place), jnp.array(False), imbalance, jnp.array(True), solid)
 
         return jax.jit(jax.vmap(first))

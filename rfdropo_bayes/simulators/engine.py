@@ -6,7 +6,6 @@ threads of a CPU with rollouts, one call out of a traced program for a whole bat
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple, Protocol
@@ -14,7 +13,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import (
@@ -31,12 +30,14 @@ from rfdropo_bayes.fem import (
     tetrahedral_dynamics,
 )
 from rfdropo_bayes.fem import static_equilibrium as find_equilibrium
-from rfdropo_bayes.fem.dynamics import System
+from rfdropo_bayes.fem.dynamics import Prepared, State, System
 from rfdropo_bayes.fem.native.layered import NativeLayered
 from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
 from rfdropo_bayes.fem.pushing import PushScene
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem
+from rfdropo_bayes.simulators.callbacks import one_callback
 from rfdropo_bayes.simulators.differences import (
     ACCELERATION,
     LENGTH,
@@ -112,23 +113,6 @@ class Inputs(NamedTuple):
     cube: CubeInputs | None = None
 
 
-class Motion(NamedTuple):
-    """What an engine returns: rows are time steps, row 0 is the initial state."""
-
-    position: Float[Array, "row marker 3"]
-    tension: Float[Array, "row cable"]
-    diverged: Bool[Array, ""]
-    imbalance: Float[Array, ""]  # relative unbalanced force of the initial equilibrium; 0 for a start at rest
-    converged: Bool[Array, ""]  # whether the impulses of every step's constraints were found
-    pose: Float[Array, "row 7"] | None = None  # of the cube: centre [m] and unit quaternion (x, y, z, w)
-
-
-def effects_costly(effects: BodyEffects) -> bool:
-    """Whether an effect is present that slows every rollout down, even at its null value: friction of the cables, which
-    adds rows to the problem of every step."""
-    return effects.coulomb_friction is not None or effects.capstan_friction is not None
-
-
 @dataclass(frozen=True)
 class Engine:
     """The motion of a body under given cable displacements, with or without a cube.
@@ -197,23 +181,29 @@ class Engine:
         limit = jnp.asarray(displacement.shape[0] if steps is None else steps, jnp.float64)
         return self._differentiable(inputs, limit)
 
+    def initial(self, material: Material, start: Float[Array, " cable"]) -> tuple[Prepared, State, Float[Array, ""]]:
+        """A layered body in the reference engine before its first step, and the relative force out of balance."""
+        system: Any = self.body.system
+        prepared, state = prepare(system, material), state_at_rest(system)
+        if not self.from_equilibrium:
+            return prepared, state, jnp.zeros(())
+        state, found = find_equilibrium(system, prepared, start)
+        return prepared, state, found.residual
+
     def _reference(self, inputs: Inputs, steps: Int[Array, ""] | None) -> Motion:
         markers, rows = self.body.markers, inputs.displacement[:, None, :]
         cube, imbalance = inputs.cube, jnp.zeros(())
         around: dict[str, Any] = {} if cube is None else {"scene": self.scene, "cube": cube.cube}
         place = None if cube is None else cube.start
-        if isinstance(self.body.system, TetrahedralSystem):
-            system: Any = self.body.system
-            state: Any = tetrahedral_dynamics.state_at_rest(system)._replace(cube=place)
-            run: Any = partial(tetrahedral_dynamics.simulate, system, inputs.material)
+        system: Any = self.body.system
+        material: Any = inputs.material
+        if self.layered:
+            prepared, state, imbalance = self.initial(material, inputs.start)
+            run: Any = partial(simulate, system, prepared)
         else:
-            system = self.body.system
-            prepared, state = prepare(system, inputs.material), state_at_rest(system)  # type: ignore[arg-type]
-            if self.from_equilibrium:
-                state, found = find_equilibrium(system, prepared, inputs.start)
-                imbalance = found.residual
-            state = state._replace(cube=place)
-            run = partial(simulate, system, prepared)
+            state = tetrahedral_dynamics.state_at_rest(system)  # type: ignore[assignment]
+            run = partial(tetrahedral_dynamics.simulate, system, material)
+        state = state._replace(cube=place)
         rollout = run(state, rows, self.time_step, markers, horizon=steps, **around)
         first = point_positions(markers, state.position)
         pose = None
@@ -245,7 +235,6 @@ class Engine:
         return with_differences(self._call, input_sizes, backend.precision, backend.one_sided, backend.difference)
 
     def _call(self, inputs: Inputs, limit: Array) -> Motion:
-        """One callback for the whole batch."""
         rows, cables = inputs.displacement.shape[0] + 1, inputs.displacement.shape[1]
 
         def numbers(*shape: int) -> jax.ShapeDtypeStruct:
@@ -255,34 +244,16 @@ class Engine:
         pose = None if self.scene is None else numbers(rows, 7)
         markers = len(self.body.markers.node)
         shapes = Motion(numbers(rows, markers, 3), numbers(rows, cables), flag, numbers(), flag, pose)
-        return jax.pure_callback(self._on_host, shapes, inputs, limit, vmap_method="broadcast_all")
+        return one_callback(self._rolled, shapes, inputs, limit)
 
-    def _on_host(self, inputs: Inputs, limit: Array) -> Motion:
-        """Flatten whatever batch axes vmap has added, roll out what differs, and restore them."""
-        batch, rows = inputs.displacement.shape[:-2], inputs.displacement.shape[-2] + 1
-        count = int(np.prod(batch))
-        given = jax.tree.map(lambda value: flattened(np.asarray(value), len(batch), count), inputs)
-        # Padding of a batch, and perturbations of what acts after the body, ask for the same rollout again and again.
-        chosen, place = distinct(jax.tree.leaves(given))
-        found = self._rolled(jax.tree.map(lambda value: value[chosen], given), int(np.max(limit)))
-        restored = (None if part is None else part[place].reshape((*batch, *part.shape[1:])) for part in found)
-        position, tension, diverged, imbalance, converged, pose = restored
-        axis = len(batch)
-        return Motion(
-            padded(position, axis, rows), padded(tension, axis, rows), diverged, imbalance, converged,
-            None if pose is None else padded(pose, axis, rows),
-        )  # fmt: skip
-
-    def _rolled(self, inputs: Inputs, steps: int) -> tuple:
-        """Rollouts of a batch with one axis, in the order of ``Motion``."""
+    def _rolled(self, inputs: Inputs, steps: int) -> Motion:
+        """Rollouts of a batch with one axis."""
         cube = None if inputs.cube is None else cube_arrays(inputs.cube)
         if isinstance(self.body.system, System):
             start = inputs.start if self.from_equilibrium else None
-            found = self.native.rollout(inputs.material, inputs.displacement, start=start, steps=steps, cube=cube)
-        else:
-            commands = inputs.displacement[:, :steps]
-            found = self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
-        return found.position, found.tension, found.diverged, found.residual, found.converged, found.pose
+            return self.native.rollout(inputs.material, inputs.displacement, start=start, steps=steps, cube=cube)
+        commands = inputs.displacement[:, :steps]
+        return self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
 
 
 def cube_arrays(cube: CubeInputs) -> tuple[Float[np.ndarray, "batch 13"], Float[np.ndarray, "batch 4"]]:
@@ -317,24 +288,3 @@ def input_sizes(inputs: Inputs) -> Inputs:
         place = CubeState(*(jnp.broadcast_to(size, v.shape) for size, v in zip(widths, cube.start, strict=True)))
         cube = CubeInputs(solid._replace(friction=jnp.abs(cube.cube.friction) + FRICTION), place)
     return Inputs(magnitudes, jnp.full_like(start, LENGTH), jnp.full_like(displacement, LENGTH), cube)
-
-
-def distinct(arrays: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Which rows differ from all before them, and for every row the place of its like among these."""
-    seen: dict[bytes, int] = {}
-    place = [seen.setdefault(b"".join(a[row].tobytes() for a in arrays), len(seen)) for row in range(len(arrays[0]))]
-    return np.unique(place, return_index=True)[1], np.array(place)
-
-
-def flattened(array: np.ndarray, axes: int, count: int) -> np.ndarray:
-    """One batch axis of ``count`` in place of the first ``axes`` axes."""
-    return array.reshape(count, *array.shape[axes:])
-
-
-def padded(recorded: np.ndarray, axis: int, rows: int) -> np.ndarray:
-    """Zero rows along an axis where fewer steps were computed than there are commands."""
-    if recorded.shape[axis] == rows:
-        return recorded
-    width = [(0, 0)] * recorded.ndim
-    width[axis] = (0, rows - recorded.shape[axis])
-    return np.pad(recorded, width)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -16,12 +16,11 @@ from rfdropo_bayes.simulators.mechanisms import (
     Mechanism,
     SensingMechanism,
     TimedSensingMechanism,
+    Values,
     inside_drive,
     settled,
 )
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
-
-Values = Mapping[str, Float[Array, ""]]
 
 
 class ExtendedSimulator:

@@ -10,10 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.drives import DriveLimits
-from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.layered import PointMap, joined
 from rfdropo_bayes.fem.tetrahedra import (
     TetrahedralBody,
-    equal_node_masses,
     locate,
     lumped_masses,
     mean_points,
@@ -89,13 +88,15 @@ def assemble_mesh(robot: Robot, mesh: TetrahedralMesh, table: TetrahedraTable) -
     limits = DriveLimits(np.full(len(guides), np.inf))
     if table.drives == "sofa":
         limits = DriveLimits(robot.displacement_limits()[:, 1], table.drive_rate or np.inf)
-    share = equal_node_masses(body, 1.0) if table.masses == "equal" else lumped_masses(body, 1.0 / body.volume.sum())
+    share = np.asarray(lumped_masses(body, 1.0 / body.volume.sum()))
+    if table.masses == "equal":
+        share = np.full(body.nodes, 1.0 / body.nodes)
     station = np.asarray(robot.body.station_m)
     layer = np.searchsorted(station, body.rest[body.element, 2].mean(axis=1), side="right") - 1
     return MeshAssembly(
         tetrahedral_system(body, cables, limits),
         _markers(robot, body, dict(zip(robot.cable_names, guides, strict=True)), table.marker_cables),
-        np.asarray(share),
+        share,
         np.clip(layer, 0, len(station) - 2),
         _station_share(body, station),
     )
@@ -126,12 +127,7 @@ def _markers(
                 remedy="name cables whose guides share their heights",
             )
         rows.append(mean_points(found) if found else locate(body, point[None]))
-    width = max(row.node.shape[1] for row in rows)
-    node, weight = (
-        np.concatenate([np.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts])
-        for parts in zip(*rows, strict=True)
-    )
-    return PointMap(node, weight)
+    return joined(rows)
 
 
 def _station_share(body: TetrahedralBody, station: Float[np.ndarray, " stations"]) -> np.ndarray:

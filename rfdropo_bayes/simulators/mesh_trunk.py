@@ -12,13 +12,14 @@ from jaxtyping import Array, Float
 
 from rfdropo_bayes.fem import LayeredBody
 from rfdropo_bayes.fem.balance import Balance, tetrahedral_balance
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, animated_on_grid
-from rfdropo_bayes.simulators.engine import Engine, Motion
-from rfdropo_bayes.simulators.mechanisms import Mechanism
+from rfdropo_bayes.simulators.engine import Engine
+from rfdropo_bayes.simulators.mechanisms import Mechanism, Values
 from rfdropo_bayes.simulators.mesh_body import MeshAssembly, TetrahedraTable
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import refined_body
 
 
@@ -41,26 +42,10 @@ class MeshTrunkSimulator(RobotSimulator):
     mechanisms: Sequence[Mechanism] = field(default_factory=tuple)
 
     @property
-    def description(self) -> dict[str, object]:
-        """Engine, precision, discretisation, options and mechanisms."""
-        body = self.assembly.system.body
-        return {
-            **self.engine.describe(),
-            "robot": self.robot.name,
-            "time_step_s": self.time_step,
-            "body": "tetrahedra",
-            "nodes": len(body.rest),
-            "elements": len(body.element),
-            **{name: value for name, value in self.options.model_dump().items() if name != "unit"},
-            "mechanisms": [mechanism.name for mechanism in self.mechanisms],
-            "content_sha256": self.content_sha256,
-            **({"object": "cube"} if self.pushes else {}),
-        }
-
-    @property
-    def nodes(self) -> int:
-        """See `RobotSimulator`."""
-        return len(self.assembly.system.body.rest)
+    def discretised(self) -> dict[str, object]:
+        """See `RobotSimulator`; with the options."""
+        body, options = self.assembly.system.body, self.options.model_dump(exclude={"unit"})
+        return {"body": "tetrahedra", "nodes": body.nodes, "elements": len(body.element), **options}
 
     def commands(
         self,

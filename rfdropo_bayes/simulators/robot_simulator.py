@@ -17,16 +17,15 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import LayeredBody, Material
 from rfdropo_bayes.fem.balance import Balance
 from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
 from rfdropo_bayes.simulators.cube import cube_at_measured, cube_inputs, push_table, scene_of
-from rfdropo_bayes.simulators.engine import Backend, CubeInputs, Engine, Motion
+from rfdropo_bayes.simulators.engine import Backend, CubeInputs, Engine
 from rfdropo_bayes.simulators.extended import ExtendedSimulator
-from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, check_mechanisms, code_of
+from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, Values, check_mechanisms, code_of
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.protocol import Observation, Result
-
-Values = Mapping[str, Float[Array, ""]]
 
 EQUILIBRIUM_TOLERANCE = 1e-3
 """Static equilibrium counts as found when the unbalanced force is below this share of the largest force."""
@@ -35,6 +34,14 @@ EQUILIBRIUM_TOLERANCE = 1e-3
 def every_node(count: int) -> PointMap:
     """All nodes of a body as recorded points."""
     return PointMap(np.arange(count)[:, None], np.ones((count, 1)))
+
+
+def status_of(motion: Motion, unsolved: Result, arrays: Any = jnp) -> Int[Any, "*batch"]:
+    """How rollouts ended; ``unsolved`` is the code of those whose constraints were not all solved, ``arrays`` NumPy or
+    its likeness in JAX."""
+    cases = motion.diverged, motion.imbalance > EQUILIBRIUM_TOLERANCE, ~motion.converged
+    codes = Result.DIVERGED, Result.NOT_IN_EQUILIBRIUM, unsolved
+    return arrays.select(cases, [int(code) for code in codes], int(Result.OK))
 
 
 class Wound(NamedTuple):
@@ -69,7 +76,20 @@ class RobotSimulator(ExtendedSimulator):
 
     @property
     def description(self) -> dict[str, object]:
-        """Engine, precision and discretisation, for the record."""
+        """Engine, precision, discretisation, options and mechanisms, for the record."""
+        return {
+            **self.engine.describe(),
+            "robot": self.robot.name,
+            "time_step_s": self.time_step,
+            **self.discretised,
+            "mechanisms": [mechanism.name for mechanism in self.mechanisms],
+            "content_sha256": self.content_sha256,
+            **({"object": "cube"} if self.pushes else {}),
+        }
+
+    @property
+    def discretised(self) -> dict[str, object]:
+        """How the body is cut, for the record."""
         raise NotImplementedError
 
     def inputs(self, values: Values, commands: Commands) -> tuple[Any, Array, Array]:
@@ -82,11 +102,6 @@ class RobotSimulator(ExtendedSimulator):
 
     def balance_of(self, material: Any, motion: Motion) -> Balance:
         """Forces and energies of a motion of all nodes, recorded after every step."""
-        raise NotImplementedError
-
-    @property
-    def nodes(self) -> int:
-        """Of the body."""
         raise NotImplementedError
 
     @property
@@ -171,7 +186,7 @@ class RobotSimulator(ExtendedSimulator):
         """
         values = self.complete(parameters)
         inputs = self.inputs(values, commands)
-        engine = self.engine.recording(every_node(self.nodes))
+        engine = self.engine.recording(every_node(self.assembly.system.body.nodes))
         motion = engine.motion(*inputs, cube=self.body_inputs(values)[1])
         return Balance(*(sample(series, commands) for series in self.balance_of(inputs[0], motion)))
 
@@ -219,19 +234,13 @@ class RobotSimulator(ExtendedSimulator):
 
     def observation(self, values: Values, commands: Commands, motion: Motion, unsolved: Result) -> Observation:
         """What a motion shows; ``unsolved`` says how a rollout ended whose constraints were not all solved."""
-        cases = (
-            (motion.diverged, Result.DIVERGED),
-            (motion.imbalance > EQUILIBRIUM_TOLERANCE, Result.NOT_IN_EQUILIBRIUM),
-            (~motion.converged, unsolved),
-        )
-        status = jnp.select([case for case, _ in cases], [int(code) for _, code in cases], int(Result.OK))
         position = self.measured(values, sample(motion.position, commands), observed_at(commands, self.time_step))
         pose = None
         if motion.pose is not None:
             pose = sample(motion.pose, commands)
             pose = pose.at[:, 3:].divide(jnp.linalg.norm(pose[:, 3:], axis=1, keepdims=True))
         angle = self.driven(values, commands, self.time_step)
-        return Observation(position, sample(motion.tension, commands), pose, status, angle)
+        return Observation(position, sample(motion.tension, commands), pose, status_of(motion, unsolved), angle)
 
     @cached_property
     def parameters(self) -> tuple[ParameterSpec, ...]:

@@ -18,23 +18,23 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem import Material
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Travel
-from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneMotion, body_lanes, flat_lanes, lanes_like
+from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneStart, body_lanes, flat_lanes, lanes_like
 from rfdropo_bayes.simulators.commands import carried_out
-from rfdropo_bayes.simulators.engine import CubeInputs
 from rfdropo_bayes.simulators.mechanisms import (
     ActuationMechanism,
     Mechanism,
     SensingMechanism,
     SteppedMechanism,
     TimedSensingMechanism,
+    Values,
     inside_drive,
     settled,
 )
 from rfdropo_bayes.simulators.parameters import check_names, check_value
-from rfdropo_bayes.simulators.protocol import Observation, Result
-from rfdropo_bayes.simulators.robot_simulator import EQUILIBRIUM_TOLERANCE, Values, Wound
+from rfdropo_bayes.simulators.protocol import Observation
+from rfdropo_bayes.simulators.robot_simulator import Wound, status_of
 
 WHOLE = 1e-6
 """How far a control period may be from a whole number of time steps, in time steps."""
@@ -146,7 +146,7 @@ class Session:
         chosen[rows] = True
         self._drives = _chosen(chosen, fresh, self._drives)
         inputs = self._bodies_of(self._values, fresh.wound)
-        found = self.bodies.reset(rows, *jax.tree.map(lambda part: np.asarray(part)[rows], inputs))
+        found = self.bodies.reset(rows, jax.tree.map(lambda part: np.asarray(part)[rows], inputs))
         position = np.zeros((self.lanes, *found.position.shape[1:]))
         position[rows] = found.position
         cameras, seen = self._look(self._values, None, position, np.zeros(self.lanes))
@@ -330,23 +330,20 @@ class Session:
 
     @cached_property
     def _bodies_of(self) -> Any:
-        """Material of all lanes, displacements [m] that their initial states belong to, and cubes."""
+        """What the bodies of all lanes start from."""
 
-        def of(values: Values, wound: Wound) -> tuple[Material, Float[Array, " cable"], CubeInputs | None]:
+        def of(values: Values, wound: Wound) -> LaneStart:
             material, cube = self.simulator.body_inputs(values)
-            return material, wound.level + self.simulator.pretension(values), cube
+            return LaneStart(material, wound.level + self.simulator.pretension(values), cube)
 
         return self._by_lane(of)
-
-    @property
-    def _camera_chain(self) -> list[Any]:
-        return [m for m in self.simulator.mechanisms if isinstance(m, SensingMechanism | TimedSensingMechanism)]
 
     @cached_property
     def _look(self) -> Any:
         """Cameras of all lanes after an observation, and the marker positions [m] that they see; None for the cameras
         before makes it the first."""
-        chain = self._camera_chain
+        cameras = SensingMechanism | TimedSensingMechanism
+        chain: list[Any] = [m for m in self.simulator.mechanisms if isinstance(m, cameras)]
 
         def look(
             values: Values, before: tuple[Any, ...] | None, position: Float[Array, "marker 3"], now: Float[Array, ""]
@@ -365,10 +362,8 @@ class Session:
 
         return self._by_lane(look)
 
-    def _observation(self, found: LaneMotion, position: np.ndarray, angle: np.ndarray) -> Observation:
-        cases = found.diverged, found.imbalance > EQUILIBRIUM_TOLERANCE, ~found.converged
-        codes = Result.DIVERGED, Result.NOT_IN_EQUILIBRIUM, self.simulator.unsolved
-        status = np.select(cases, [int(code) for code in codes], int(Result.OK))
+    def _observation(self, found: Motion, position: np.ndarray, angle: np.ndarray) -> Observation:
+        status = status_of(found, self.simulator.unsolved, np)
         pose = found.pose
         if pose is not None:
             pose = np.concatenate(

@@ -12,11 +12,12 @@ from jaxtyping import Array
 
 from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, cable_layout, prepare, profile_body
 from rfdropo_bayes.fem.balance import Balance, layered_balance
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands
-from rfdropo_bayes.simulators.engine import Engine, Motion
-from rfdropo_bayes.simulators.mechanisms import Mechanism
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator, Values
+from rfdropo_bayes.simulators.engine import Engine
+from rfdropo_bayes.simulators.mechanisms import Mechanism, Values
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.session import Session
 
 
@@ -85,23 +86,10 @@ class TrunkSimulator(RobotSimulator):
         return self.discretisation.time_step
 
     @property
-    def description(self) -> dict[str, object]:
-        """Engine, precision, discretisation and mechanisms."""
-        return {
-            **self.engine.describe(),
-            "robot": self.robot.name,
-            "time_step_s": self.discretisation.time_step,
-            "nodes_across": self.discretisation.nodes_across,
-            "layers": len(self.assembly.system.body.station) - 1,
-            "mechanisms": [mechanism.name for mechanism in self.mechanisms],
-            "content_sha256": self.content_sha256,
-            **({"object": "cube"} if self.pushes else {}),
-        }
-
-    @property
-    def nodes(self) -> int:
+    def discretised(self) -> dict[str, object]:
         """See `RobotSimulator`."""
-        return self.assembly.system.body.nodes
+        layers = len(self.assembly.system.body.station) - 1
+        return {"nodes_across": self.discretisation.nodes_across, "layers": layers}
 
     def session(self, lanes: int, period: float) -> Session:
         """So many trunks that are commanded one control period [s] at a time; see `Session`."""

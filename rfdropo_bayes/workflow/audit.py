@@ -38,7 +38,6 @@ from rfdropo_bayes.report.summary import combined_hash, read_summary
 from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.commands import Commands
-from rfdropo_bayes.simulators.engine import effects_costly
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechanism, obstacle
 from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
@@ -388,7 +387,7 @@ def _costly(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
         return False
     values = simulator.complete({})
     plain = replace(simulator, mechanisms=()).material(values)
-    return effects_costly(mechanism.embody(values, plain, simulator.assembly.system.body).effects)
+    return mechanism.embody(values, plain, simulator.assembly.system.body).effects.rubs
 
 
 def _finer(experiment: Experiment, robot: Robot) -> Experiment:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes import fem
-from rfdropo_bayes.fem.cable_friction import directions, wrap_angles
-from rfdropo_bayes.fem.cables import guide_matrix
+from rfdropo_bayes.fem.cable_friction import wrap_angles
+from rfdropo_bayes.fem.cables import guide_matrix, segments
 from rfdropo_bayes.fem.effects import BodyEffects
 from rfdropo_bayes.fem.surroundings import WALL_SOFTNESS, drag_areas, section_load
 
@@ -201,7 +201,7 @@ def test_coulomb_friction_takes_its_force_at_every_guide_and_holds_it():
 def test_wrap_angles_agree_with_arc_cosines():
     layout = bar().cables
     state = fem.state_at_rest(bar())
-    found = wrap_angles(directions(layout, jnp.asarray(guide_matrix(layout, bar().body.nodes)), state.position))
+    found = wrap_angles(segments(layout, jnp.asarray(guide_matrix(layout, bar().body.nodes)), state.position)[1])
     np.testing.assert_allclose(found[1, :-1], wrap(state.position), rtol=1e-4)
 
 

@@ -14,7 +14,7 @@ from rfdropo_bayes.fem.effects import BodyEffects
 from rfdropo_bayes.fem.native.layered import NativeLayered
 
 STEPS, BATCH, TIME_STEP = 25, 5, 0.01
-AGREEMENT = {"float64": 1e-9, "float32": 3e-5}  # [m]
+AGREEMENT = {"float64": 1e-9, "float32": 1e-6}  # [m]
 
 
 @functools.cache
@@ -101,7 +101,7 @@ def test_agrees_with_the_reference():
         np.testing.assert_allclose(found.position, position, rtol=0.0, atol=tolerance)
         np.testing.assert_allclose(found.tension, tension, rtol=0.0, atol=1e5 * tolerance)
         assert not found.diverged.any()
-        assert found.residual.max() < (1e-9 if precision == "float64" else 1e-3)
+        assert found.imbalance.max() < (1e-9 if precision == "float64" else 1e-3)
     plain = native("float64").rollout(material, displacement, start=start)
     assert np.abs(plain.position - position).max() > 1e-3, "the effects do nothing"
 

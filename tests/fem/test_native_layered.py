@@ -15,7 +15,7 @@ from rfdropo_bayes.fem.native.layered import NativeLayered
 
 TIME_STEP = 0.01
 STEPS = 25
-AGREEMENT = {"float64": 1e-9, "float32": 3e-5}  # [m]
+AGREEMENT = {"float64": 1e-9, "float32": 1e-6}  # [m]
 
 
 @functools.cache
@@ -111,7 +111,7 @@ def test_agrees_with_reference(nodes_across, precision):
     assert not np.any(diverged)
     assert not found.diverged.any()
     assert found.converged.all()
-    assert not found.residual.any()
+    assert not found.imbalance.any()
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])
@@ -127,7 +127,7 @@ def test_settles_like_the_reference(nodes_across, precision):
     assert np.ptp(position, axis=1).max() > 2e-3, "nothing moved"
     np.testing.assert_allclose(found.position, position, rtol=0.0, atol=AGREEMENT[precision])
     np.testing.assert_allclose(found.tension, tension, rtol=0.0, atol=1e5 * AGREEMENT[precision])
-    assert found.residual.max() < (1e-9 if precision == "float64" else 1e-3)
+    assert found.imbalance.max() < (1e-9 if precision == "float64" else 1e-3)
     assert np.max(residual) < 1e-9
 
 
@@ -197,12 +197,12 @@ def test_lost_rollout_leaves_its_neighbours_alone():
     settled = engine(2, "float64").rollout(
         material._replace(young_modulus=modulus), displacement, start=displacement[:, 0]
     )
-    assert settled.residual[2] > 1.0
+    assert settled.imbalance[2] > 1.0
     assert np.all(np.isfinite(settled.position))
 
 
 def test_records_what_was_asked_for():
-    """Strides, prefixes, shared commands and initial states are slices of the same motion."""
+    """Strides, prefixes and shared commands are slices of the same motion."""
     system, _ = body_with_cables(2)
     material, displacement = random_materials(system, 5, 12), random_displacements(system, 5, 13)
     run = engine(2, "float64").rollout
@@ -214,9 +214,6 @@ def test_records_what_was_asked_for():
     np.testing.assert_array_equal(strided.tension, shared.tension[:, ::4])
     prefix = run(material, displacement[0], steps=7)
     np.testing.assert_array_equal(prefix.position, shared.position[:, :8])
-    rest = fem.rest_positions(system.body)
-    placed = run(material, displacement[0], position=np.repeat(rest[None], 5, axis=0), tension=np.zeros(3))
-    np.testing.assert_allclose(placed.position, shared.position, rtol=0.0, atol=1e-13)
 
 
 def test_cables_that_share_a_route():
@@ -271,7 +268,10 @@ def test_bad_settings_are_named():
 
 
 def test_single_precision_while_nearly_incompressible():
-    """A long soft body whose resistance to volume change drowns that to bending in single precision, unless refined."""
+    """A long soft body whose resistance to volume change drowns that to bending in single precision, unless refined.
+
+    It is up to 500 times that to shear, and rounding counts as much more: 2.2e-6 m.
+    """
     layers, batch = 20, 4
     body = fem.uniform_body(0.195, 0.01, 0.01, layers)
     angle = 2.0 * np.pi * np.arange(4) / 4
@@ -288,4 +288,4 @@ def test_single_precision_while_nearly_incompressible():
         for precision in AGREEMENT
     )
     assert np.ptp(double.position, axis=1).max() > 0.03, "nothing moved"
-    np.testing.assert_allclose(single.position, double.position, rtol=0.0, atol=AGREEMENT["float32"])
+    np.testing.assert_allclose(single.position, double.position, rtol=0.0, atol=1e-5)

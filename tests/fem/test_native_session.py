@@ -44,7 +44,7 @@ def test_periods_with_partial_resets_are_whole_rollouts(precision, effects):
         if len(rows):
             first = session.reset(rows, rows_of(material, which[rows]), start=start[which[rows]])
             np.testing.assert_array_equal(first.position[:, 0], whole.position[which[rows], 0])
-            np.testing.assert_array_equal(first.residual, whole.residual[which[rows]])
+            np.testing.assert_array_equal(first.imbalance, whole.imbalance[which[rows]])
         age = PERIOD * np.maximum(period - born, 0)
         moves = np.stack([displacement[w, a : a + PERIOD] for w, a in zip(which, age, strict=True)])
         seen = session.advance(moves)

@@ -9,7 +9,7 @@ import pytest
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.fem.drives import DriveLimits, animated_commands
 from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
-from rfdropo_bayes.fem.tetrahedra import equal_node_masses, locate, mean_points, route_cables, tetrahedral_body
+from rfdropo_bayes.fem.tetrahedra import locate, mean_points, route_cables, tetrahedral_body
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, simulate, state_at_rest, tetrahedral_system
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.runtime import configure_jax
@@ -49,7 +49,7 @@ class Scene:
         self.cables = route_cables(self.body, np.vstack([pull, pull]), long + short)
         self.limits = DriveLimits(np.repeat([0.07, 0.04], 4), rate=1e-3)
         self.points = mean_points([locate(self.body, guides) for guides in long])
-        self.mass = np.asarray(equal_node_masses(self.body, 0.42))
+        self.mass = np.full(self.body.nodes, 0.42 / self.body.nodes)
 
     def fast(self, command: np.ndarray, dtype: type = np.float64) -> np.ndarray:
         values = {name: np.asarray([value], float) for name, value in PARAMETERS.items()} | {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rfdropo_bayes.simulators.engine import distinct
+from rfdropo_bayes.simulators.callbacks import distinct
 
 
 def test_rollouts_that_are_asked_for_twice_are_found():

@@ -13,11 +13,12 @@ import pytest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.constraints import NORMAL_SOFTNESS
 from rfdropo_bayes.fem.pushing import find_contacts, trunk_rows
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators import Result, Simulator
 from rfdropo_bayes.simulators.cube import push_table
-from rfdropo_bayes.simulators.engine import Backend, Engine, Motion
+from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
 from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator

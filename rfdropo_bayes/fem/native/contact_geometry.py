@@ -18,6 +18,7 @@ from rfdropo_bayes.fem.native.simd import (
     fnma,
     kernel,
     load,
+    load3,
     magnitude,
     square_root,
     store,
@@ -33,12 +34,6 @@ HALF_DIAGONAL = 0.5 * math.sqrt(3.0)
 
 
 @kernel
-def _column(array, first, step, token):
-    """Three rows of an array."""
-    return load(array, first, token), load(array, first + step, token), load(array, first + 2 * step, token)
-
-
-@kernel
 def _dot(a, b, c, x, y, z):
     return fma(a, x, fma(b, y, c * z))
 
@@ -46,7 +41,7 @@ def _dot(a, b, c, x, y, z):
 @kernel
 def turn_cube(touch, token):
     """Matrix of the cube's orientation."""
-    x, y, z = _column(touch.cube, 3, 1, token)
+    x, y, z = load3(touch.cube, 3, token)
     w, one = load(touch.cube, 6, token), fill(1.0, touch.cube, token)
     store(touch.turn, 0, one - 2.0 * fma(y, y, z * z), 2.0 * fma(x, y, -z * w), 2.0 * fma(x, z, y * w))
     store(touch.turn, 3, 2.0 * fma(x, y, z * w), one - 2.0 * fma(x, x, z * z), 2.0 * fma(y, z, -x * w))
@@ -86,11 +81,19 @@ def _place_frame(touch, slot, x, y, z, token):
 
 
 @kernel
-def _list(touch, slot, pair, gap, x, y, z, token):
-    """Write a candidate: its gap, and its place from the cube's centre."""
+def _list(touch, slot, pair, gap, x, y, z, nx, ny, nz, token):
+    """Write a candidate: its gap, its place from the cube's centre, and its normal."""
     touch.pair[slot] = pair
     store(touch.gap, slot, gap)
     store(touch.arm, 3 * slot, x, y, z)
+    _place_frame(touch, slot, nx, ny, nz, token)
+
+
+@kernel
+def _upward(scene, touch, token):
+    """Normal of the plate."""
+    zero = fill(0.0, touch.cube, token)
+    return zero + scene.up[0], zero + scene.up[1], zero + scene.up[2]
 
 
 @kernel
@@ -118,30 +121,29 @@ def _place_spheres(scene, touch, position, velocity, time_step, token):
 @kernel
 def _cube_reach(touch, time_step, token):
     """How far any point of the cube moves in two steps."""
-    x, y, z = _column(touch.cube, 7, 1, token)
-    u, v, w = _column(touch.cube, 10, 1, token)
+    x, y, z = load3(touch.cube, 7, token)
+    u, v, w = load3(touch.cube, 10, token)
     return 2.0 * time_step * fma(load(touch.values, 1, token), _length(u, v, w), _length(x, y, z))
 
 
 @kernel
 def _list_corners(scene, touch, reach, token):
     """The cube's corners that are near the plate in any lane; returns how many."""
-    zero = fill(0.0, touch.cube, token)
+    nx, ny, nz = _upward(scene, touch, token)
     half, slot, reach = 0.5 * load(touch.values, 1, token), 0, reach + ALARM
-    cx, cy, cz = _column(touch.cube, 0, 1, token)
+    cx, cy, cz = load3(touch.cube, 0, token)
     level = _height(scene, cx, cy, cz) - scene.distance
     for corner in range(CORNERS):
         x = half * (-1.0 if corner // 4 == 0 else 1.0)
         y = half * (-1.0 if corner // 2 % 2 == 0 else 1.0)
         z = half * (-1.0 if corner % 2 == 0 else 1.0)
-        ax, bx, dx = _column(touch.turn, 0, 1, token)
-        ay, by, dy = _column(touch.turn, 3, 1, token)
-        az, bz, dz = _column(touch.turn, 6, 1, token)
+        ax, bx, dx = load3(touch.turn, 0, token)
+        ay, by, dy = load3(touch.turn, 3, token)
+        az, bz, dz = load3(touch.turn, 6, token)
         ax, ay, az = _dot(ax, bx, dx, x, y, z), _dot(ay, by, dy, x, y, z), _dot(az, bz, dz, x, y, z)
         gap = level + fma(ax, scene.up[0], fma(ay, scene.up[1], az * scene.up[2]))
         if any_greater(reach, gap):
-            _list(touch, slot, corner, _within(gap, reach, token), ax, ay, az, token)
-            _place_frame(touch, slot, zero + scene.up[0], zero + scene.up[1], zero + scene.up[2], token)
+            _list(touch, slot, corner, _within(gap, reach, token), ax, ay, az, nx, ny, nz, token)
             slot += 1
     return slot
 
@@ -153,7 +155,7 @@ def _box_distance(touch, x, y, z, token):
     half, square, deepest = 0.5 * load(touch.values, 1, token), zero, zero - APART
     nx, ny, nz, mx, my, mz = zero, zero, zero, zero, zero, zero
     for j in range(3):
-        ux, uy, uz = _column(touch.turn, j, 3, token)
+        ux, uy, uz = load(touch.turn, j, token), load(touch.turn, j + 3, token), load(touch.turn, j + 6, token)
         local = _dot(x, y, z, ux, uy, uz)
         sign = where_greater(zero, local, -one, one)
         beyond = fma(sign, local, -half)
@@ -179,14 +181,14 @@ def _place_offset(scene, touch, slot, sphere, position, token):
     zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
     a, b, c, d, e, f, g, h, i = zero, zero, zero, zero, zero, zero, zero, zero, zero
     for k in range(scene.first[sphere], scene.first[sphere + 1]):
-        x, y, z = _column(position, scene.place[k], 1, token)
+        x, y, z = load3(position, scene.place[k], token)
         u, v, w = scene.gradient[3 * k], scene.gradient[3 * k + 1], scene.gradient[3 * k + 2]
         a, b, c = fma(x, u, a), fma(x, v, b), fma(x, w, c)
         d, e, f = fma(y, u, d), fma(y, v, e), fma(y, w, f)
         g, h, i = fma(z, u, g), fma(z, v, h), fma(z, w, i)
     ca, cb, cc = fnma(f, h, e * i), fnma(d, i, f * g), fnma(e, g, d * h)
     scale = (-scene.radius[sphere] * one) / _dot(a, b, c, ca, cb, cc)
-    x, y, z = _column(touch.frame, 9 * slot, 1, token)
+    x, y, z = load3(touch.frame, 9 * slot, token)
     store(touch.offset, 3 * slot, scale * _dot(ca, fnma(b, i, c * h), fnma(c, e, b * f), x, y, z))
     store(touch.offset, 3 * slot + 1, scale * _dot(cb, fnma(c, g, a * i), fnma(a, f, c * d), x, y, z))
     store(touch.offset, 3 * slot + 2, scale * _dot(cc, fnma(a, h, b * g), fnma(b, d, a * e), x, y, z))
@@ -195,9 +197,9 @@ def _place_offset(scene, touch, slot, sphere, position, token):
 @kernel
 def _list_pushing(scene, touch, position, slot, reach, token):
     """The spheres that are near the cube in any lane; returns the next free slot."""
-    (cx, cy, cz), outer = _column(touch.cube, 0, 1, token), HALF_DIAGONAL * load(touch.values, 1, token)
+    (cx, cy, cz), outer = load3(touch.cube, 0, token), HALF_DIAGONAL * load(touch.values, 1, token)
     for sphere in range(scene.spheres):
-        x, y, z = _column(touch.middle, 3 * sphere, 1, token)
+        x, y, z = load3(touch.middle, 3 * sphere, token)
         x, y, z, near = x - cx, y - cy, z - cz, reach + load(touch.reach, sphere, token)
         far = outer + near + (scene.radius[sphere] + scene.distance)
         if not any_greater(far * far, _dot(x, y, z, x, y, z)):
@@ -207,8 +209,7 @@ def _list_pushing(scene, touch, position, slot, reach, token):
         if any_greater(near, gap):
             # The contact lies on the cube, below the sphere's centre.
             x, y, z = fnma(distance, nx, x), fnma(distance, ny, y), fnma(distance, nz, z)
-            _list(touch, slot, CORNERS + sphere, _within(gap, near, token), x, y, z, token)
-            _place_frame(touch, slot, nx, ny, nz, token)
+            _list(touch, slot, CORNERS + sphere, _within(gap, near, token), x, y, z, nx, ny, nz, token)
             _place_offset(scene, touch, slot, sphere, position, token)
             slot += 1
     return slot
@@ -217,14 +218,14 @@ def _list_pushing(scene, touch, position, slot, reach, token):
 @kernel
 def _list_lying(scene, touch, position, slot, token):
     """The spheres that are near the plate in any lane; returns the next free slot."""
-    zero = fill(0.0, touch.cube, token)
+    zero, (nx, ny, nz) = fill(0.0, touch.cube, token), _upward(scene, touch, token)
     for sphere in range(scene.spheres):
-        x, y, z = _column(touch.middle, 3 * sphere, 1, token)
+        x, y, z = load3(touch.middle, 3 * sphere, token)
         near = load(touch.reach, sphere, token)
         gap = _height(scene, x, y, z) - (scene.radius[sphere] + scene.distance)
         if any_greater(near, gap):
-            _list(touch, slot, CORNERS + scene.spheres + sphere, _within(gap, near, token), zero, zero, zero, token)
-            _place_frame(touch, slot, zero + scene.up[0], zero + scene.up[1], zero + scene.up[2], token)
+            pair, gap = CORNERS + scene.spheres + sphere, _within(gap, near, token)
+            _list(touch, slot, pair, gap, zero, zero, zero, nx, ny, nz, token)
             _place_offset(scene, touch, slot, sphere, position, token)
             slot += 1
     return slot
@@ -240,7 +241,7 @@ def sphere_of(scene, pair):
 def weights(scene, touch, slot, k, token):
     """Weights of a sphere's entry in the normal row of a candidate and in its tangents."""
     centre, one = scene.centre[k], fill(1.0, touch.cube, token)
-    x, y, z = _column(touch.offset, 3 * slot, 1, token)
+    x, y, z = load3(touch.offset, 3 * slot, token)
     around = fma(x, scene.gradient[3 * k], fma(y, scene.gradient[3 * k + 1], z * scene.gradient[3 * k + 2]))
     return centre * one, around + centre
 
@@ -249,8 +250,8 @@ def weights(scene, touch, slot, k, token):
 def cube_row(touch, slot, r, kind, token):
     """Derivative of a candidate's relative velocity along row r by the cube's twist; zero between trunk and plate."""
     sign = 1.0 if kind == 0 else -1.0 if kind == 1 else 0.0
-    x, y, z = _column(touch.frame, 9 * slot + 3 * r, 1, token)
-    ax, ay, az = _column(touch.arm, 3 * slot, 1, token)
+    x, y, z = load3(touch.frame, 9 * slot + 3 * r, token)
+    ax, ay, az = load3(touch.arm, 3 * slot, token)
     x, y, z = sign * x, sign * y, sign * z
     return x, y, z, fnma(az, y, ay * z), fnma(ax, z, az * x), fnma(ay, x, ax * y)
 
@@ -271,22 +272,30 @@ def trunk_velocity(scene, touch, slot, kind, field, token):
     sphere = sphere_of(scene, touch.pair[slot])
     for k in range(scene.first[sphere], scene.first[sphere + 1]):
         centre, around = weights(scene, touch, slot, k, token)
-        a, b, c = _column(field, scene.place[k], 1, token)
+        a, b, c = load3(field, scene.place[k], token)
         u, v, w = fma(a, centre, u), fma(b, centre, v), fma(c, centre, w)
         x, y, z = fma(a, around, x), fma(b, around, y), fma(c, around, z)
-    nx, ny, nz = _column(touch.frame, 9 * slot, 1, token)
-    sx, sy, sz = _column(touch.frame, 9 * slot + 3, 1, token)
-    tx, ty, tz = _column(touch.frame, 9 * slot + 6, 1, token)
+    nx, ny, nz = load3(touch.frame, 9 * slot, token)
+    sx, sy, sz = load3(touch.frame, 9 * slot + 3, token)
+    tx, ty, tz = load3(touch.frame, 9 * slot + 6, token)
     return _dot(nx, ny, nz, u, v, w), _dot(sx, sy, sz, x, y, z), _dot(tx, ty, tz, x, y, z)
 
 
 @kernel
-def cube_velocity(touch, slot, kind, r, twist, first, token):
+def _cube_rate(touch, slot, kind, r, twist, first, token):
     """What the cube's twist, at rows from ``first`` on, adds to a candidate's relative velocity along row r."""
     a, b, c, d, e, f = cube_row(touch, slot, r, kind, token)
-    x, y, z = _column(twist, first, 1, token)
-    u, v, w = _column(twist, first + 3, 1, token)
+    x, y, z = load3(twist, first, token)
+    u, v, w = load3(twist, first + 3, token)
     return _dot(a, b, c, x, y, z) + _dot(d, e, f, u, v, w)
+
+
+@kernel
+def add_cube_velocity(touch, slot, kind, u, v, w, twist, first, token):
+    """A candidate's relative velocity with what the cube's twist, at rows from ``first`` on, adds to it."""
+    u = u + _cube_rate(touch, slot, kind, 0, twist, first, token)
+    v = v + _cube_rate(touch, slot, kind, 1, twist, first, token)
+    return u, v, w + _cube_rate(touch, slot, kind, 2, twist, first, token)
 
 
 @kernel
@@ -319,12 +328,10 @@ def find_candidates(scene, position, velocity, gravity, drag, touch, time_step, 
         kind = kind_of(touch, slot)
         u, v, w = trunk_velocity(scene, touch, slot, kind, velocity, token)
         store(touch.rate, 3 * slot, u, v, w)
-        u = u + cube_velocity(touch, slot, kind, 0, touch.cube, 7, token)
-        v = v + cube_velocity(touch, slot, kind, 1, touch.cube, 7, token)
-        w = w + cube_velocity(touch, slot, kind, 2, touch.cube, 7, token)
+        u, v, w = add_cube_velocity(touch, slot, kind, u, v, w, touch.cube, 7, token)
         closing = where_greater(_closing(touch, slot, u, v, w, time_step, token), -EAGER * one, one, zero)
         # What touched before may hold on by its friction.
-        x, y, z = _column(touch.memory, 3 * touch.pair[slot], 1, token)
+        x, y, z = load3(touch.memory, 3 * touch.pair[slot], token)
         closing = where_greater(_dot(x, y, z, x, y, z), zero, one, closing)
         store(touch.chosen, slot, _near(touch, slot, closing, token))
 
@@ -360,11 +367,9 @@ def add_missed(scene, touch, increment, time_step, missed, token):
         near = _near(touch, slot, one - chosen, token)
         if not any_greater(near, zero):
             continue
-        u, v, w = _column(touch.rate, 3 * slot, 1, token)
+        u, v, w = load3(touch.rate, 3 * slot, token)
         x, y, z = trunk_velocity(scene, touch, slot, kind, increment, token)
-        u = u + x + cube_velocity(touch, slot, kind, 0, touch.after, 0, token)
-        v = v + y + cube_velocity(touch, slot, kind, 1, touch.after, 0, token)
-        w = w + z + cube_velocity(touch, slot, kind, 2, touch.after, 0, token)
+        u, v, w = add_cube_velocity(touch, slot, kind, u + x, v + y, w + z, touch.after, 0, token)
         near = where_greater(_closing(touch, slot, u, v, w, time_step, token), missed * one, near, zero)
         if any_greater(near, zero):
             found = True

@@ -73,7 +73,6 @@ class Touch(NamedTuple):
     offset: Float[np.ndarray, "pairs3 lanes"]  # from the sphere's centre to its surface, in the body at rest [m]
     chosen: Float[np.ndarray, "pairs lanes"]  # 1 for a lane's contacts
     on_cube: Float[np.ndarray, "pairs18 lanes"]  # of a contact: relative velocity by the cube's twist
-    failed: Float[np.ndarray, "1 lanes"]  # 1 once the impulses of a step were not found
     pair: Int[np.ndarray, " pairs"]  # that a candidate is
     contact: Int[np.ndarray, " pairs"]  # candidate that a contact is
     count: Int[np.ndarray, "4"]  # candidates of the three kinds; contacts without the trunk
@@ -91,7 +90,7 @@ def touch_storage(spheres: int, lanes: int, dtype: type) -> Touch:
         "cube": CUBE_STATE, "values": CUBE_VALUES, "memory": 3 * pairs, "turn": 9, "twist": 6, "after": 6,
         "middle": 3 * spheres, "reach": spheres, "rate": 3 * pairs, "gap": pairs, "frame": 9 * pairs,
         "arm": 3 * pairs, "offset": 3 * pairs,
-        "chosen": pairs, "on_cube": 18 * pairs, "failed": 1,
+        "chosen": pairs, "on_cube": 18 * pairs,
     }  # fmt: skip
     arrays = {name: aligned_zeros((size, lanes), dtype) for name, size in sizes.items()}
     numbers = np.zeros(pairs, dtype=np.int64), np.zeros(pairs, dtype=np.int64), np.zeros(4, dtype=np.int64)

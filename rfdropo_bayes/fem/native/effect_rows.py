@@ -11,31 +11,7 @@ from jaxtyping import ArrayLike, Float, Int
 from rfdropo_bayes.fem.bending_law import relative_curvature, section_areas
 from rfdropo_bayes.fem.effects import BodyEffects
 from rfdropo_bayes.fem.layered import LayeredBody
-from rfdropo_bayes.fem.native.layered_effects import (
-    BENDING,
-    BRANCH,
-    CAPSTAN,
-    COULOMB,
-    DECAY,
-    DISTANCE,
-    DRAG,
-    EFFECTS,
-    FLAGS,
-    FRICTION,
-    GAIN,
-    GIVE,
-    LAW,
-    NORMAL_X,
-    NORMAL_Y,
-    SHARE,
-    SURROUNDED,
-    WALL,
-)
-
-
-def has_friction(effects: BodyEffects) -> bool:
-    """Whether cables rub in their guides."""
-    return effects.coulomb_friction is not None or effects.capstan_friction is not None
+from rfdropo_bayes.fem.native import layered_effects as at
 
 
 def _each(function: Callable[[float], float], values: ArrayLike, count: int) -> Float[np.ndarray, " batch"]:
@@ -45,26 +21,26 @@ def _each(function: Callable[[float], float], values: ArrayLike, count: int) -> 
 
 def effect_rows(effects: BodyEffects, count: int, time_step: float) -> Float[np.ndarray, "batch rows"]:
     """Numbers of the effects beside the bending law, null where there are none."""
-    rows = np.zeros((count, EFFECTS))
-    rows[:, DECAY] = 1.0
+    rows = np.zeros((count, at.EFFECTS))
+    rows[:, at.DECAY] = 1.0
     if effects.viscoelasticity is not None:
         fraction, time = (np.asarray(value, float) for value in effects.viscoelasticity)
-        rows[:, SHARE] = time_step / (time + time_step)
-        rows[:, GAIN] = fraction * (1.0 - rows[:, SHARE])
+        rows[:, at.SHARE] = time_step / (time + time_step)
+        rows[:, at.GAIN] = fraction * (1.0 - rows[:, at.SHARE])
     if effects.softening_rate is not None:
-        rows[:, DECAY] = _each(lambda rate: math.exp(-rate * time_step), effects.softening_rate, count)
+        rows[:, at.DECAY] = _each(lambda rate: math.exp(-rate * time_step), effects.softening_rate, count)
     if effects.drag is not None:
-        rows[:, DRAG] = effects.drag
+        rows[:, at.DRAG] = effects.drag
     if effects.wall is not None:
-        rows[:, WALL], rows[:, DISTANCE] = effects.wall.stiffness, effects.wall.distance
-        rows[:, NORMAL_X] = _each(math.cos, effects.wall.azimuth, count)
-        rows[:, NORMAL_Y] = _each(math.sin, effects.wall.azimuth, count)
+        rows[:, at.WALL], rows[:, at.DISTANCE] = effects.wall.stiffness, effects.wall.distance
+        rows[:, at.NORMAL_X] = _each(math.cos, effects.wall.azimuth, count)
+        rows[:, at.NORMAL_Y] = _each(math.sin, effects.wall.azimuth, count)
     if effects.cable_compliance is not None:
-        rows[:, GIVE] = effects.cable_compliance
+        rows[:, at.GIVE] = effects.cable_compliance
     if effects.coulomb_friction is not None:
-        rows[:, COULOMB] = effects.coulomb_friction
+        rows[:, at.COULOMB] = effects.coulomb_friction
     if effects.capstan_friction is not None:
-        rows[:, CAPSTAN] = effects.capstan_friction
+        rows[:, at.CAPSTAN] = effects.capstan_friction
     return rows
 
 
@@ -77,7 +53,7 @@ def law_rows(
 ) -> Float[np.ndarray, "batch layer_rows"]:
     """The bending law of every layer; see ``fem.bending_law.moments``."""
     law = effects.bending
-    rows = np.zeros((*layer_scale.shape, LAW))
+    rows = np.zeros((*layer_scale.shape, at.LAW))
     if law is None:
         return rows.reshape(len(rows), -1)
     modulus = np.stack([young_modulus, young_modulus, shear_modulus], axis=1)
@@ -95,10 +71,10 @@ def law_rows(
 
 def effect_flags(effects: BodyEffects) -> Int[np.ndarray, " flags"]:
     """Which effects a batch has, as far as they are skipped where it has not."""
-    flags = np.zeros(FLAGS, dtype=np.int64)
-    flags[BENDING] = effects.bending is not None
-    flags[BRANCH] = effects.viscoelasticity is not None
-    flags[SURROUNDED] = effects.drag is not None or effects.wall is not None
-    flags[FRICTION] = effects.coulomb_friction is not None
-    flags[FRICTION + 1] = effects.capstan_friction is not None
+    flags = np.zeros(at.FLAGS, dtype=np.int64)
+    flags[at.BENDING] = effects.bending is not None
+    flags[at.BRANCH] = effects.viscoelasticity is not None
+    flags[at.SURROUNDED] = effects.drag is not None or effects.wall is not None
+    flags[at.FRICTION] = effects.coulomb_friction is not None
+    flags[at.FRICTION + 1] = effects.capstan_friction is not None
     return flags

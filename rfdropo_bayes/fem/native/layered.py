@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import count as counting
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
 from rfdropo_bayes.fem.equilibrium import ITERATIONS
 from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.native.compilation import kernel_sources
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
 from rfdropo_bayes.fem.native.contact_records import (
     MISSED,
@@ -32,15 +33,14 @@ from rfdropo_bayes.fem.native.contact_records import (
     scene_tables,
     touch_storage,
 )
-from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, has_friction, law_rows
-from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
+from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, law_rows
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
-from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
+from rfdropo_bayes.fem.native.layered_records import KINDS, Factors, Friction, Samples, Work, friction_storage, runs_of
 from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, compile_rollout, storage
 from rfdropo_bayes.fem.native.section_modes import border_panels, layered_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
-from rfdropo_bayes.fem.native.slip_records import KINDS, Friction, friction_storage, runs_of
 from rfdropo_bayes.fem.pushing import PushScene
+from rfdropo_bayes.fem.rollouts import Motion
 
 Precision = Literal["float64", "float32"]
 # When a step's impulses are found and what counts as a missed contact, as far as the precision resolves them;
@@ -48,29 +48,6 @@ Precision = Literal["float64", "float32"]
 _NUMERICS = {
     name: (SETTLED[name], SOFTNESS[name], MISSED[name], number) for name, number in (("float64", 0), ("float32", 1))
 }
-
-
-class NativeRollout(NamedTuple):
-    """Recorded motion of a batch; row 0 is the initial state.
-
-    A diverged rollout stays finite, but its rows from then on mean nothing.
-    """
-
-    position: Float[np.ndarray, "batch rows points 3"]  # [m]
-    tension: Float[np.ndarray, "batch rows cables"]  # [N]
-    diverged: Bool[np.ndarray, " batch"]
-    converged: Bool[np.ndarray, " batch"]  # whether the impulses of every step's constraints were found
-    residual: Float[np.ndarray, " batch"]  # relative force out of balance in the initial equilibrium; 0 without one
-    pose: Float[np.ndarray, "batch rows 7"] | None = None  # of the cube: centre [m], unit quaternion (x, y, z, w)
-
-    @classmethod
-    def of(cls, run: Run) -> NativeRollout:
-        """What a run has recorded."""
-        output = run.output
-        assert output is not None
-        codes = output.diverged.view(bool), output.converged.view(bool)
-        pose = None if run.poses is None else run.poses.pose
-        return cls(output.position, output.tension, *codes, output.residual, pose)
 
 
 class Run(NamedTuple):
@@ -81,6 +58,15 @@ class Run(NamedTuple):
     schedule: Schedule
     output: Output | None = None
     poses: PushOutput | None = None
+
+    @property
+    def motion(self) -> Motion:
+        """What has been recorded."""
+        output = self.output
+        assert output is not None
+        pose = None if self.poses is None else self.poses.pose
+        codes = output.diverged.view(bool), output.imbalance, output.converged.view(bool)
+        return Motion(output.position, output.tension, *codes, pose)
 
 
 class Records(NamedTuple):
@@ -155,22 +141,17 @@ class NativeLayered:
         displacement: Float[np.ndarray, "*batch steps cables"],
         *,
         start: Float[np.ndarray, "*batch cables"] | None = None,
-        position: Float[np.ndarray, "*batch nodes 3"] | None = None,
-        tension: Float[np.ndarray, "*batch cables"] | None = None,
         steps: int | None = None,
         stride: int = 1,
         cube: tuple[Float[np.ndarray, "*batch 13"], Float[np.ndarray, "*batch 4"]] | None = None,
-    ) -> NativeRollout:
+    ) -> Motion:
         """Roll out a batch.
 
         Args:
             material: fields with a leading batch axis, or without one to serve the whole batch.
             displacement: cable displacements [m] at the end of every step, one sequence for all or one per rollout.
             start: cable displacements [m] whose static equilibrium is the initial state, as in
-                ``fem.static_equilibrium``; None leaves that out.
-            position: node positions [m] of the initial state, not moving; None is the undeformed body. Equilibrium is
-                sought from here.
-            tension: initial cable tensions [N], where the first tension problem is started; None means zero.
+                ``fem.static_equilibrium``; None starts undeformed.
             steps: compute only so many steps.
             stride: record every so many steps.
             cube: of an engine with a scene: centre [m], unit quaternion (x, y, z, w), velocity [m/s] and spin [rad/s]
@@ -179,13 +160,12 @@ class NativeLayered:
         Raises:
             InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
         """
-        state = {"start": start, "position": position, "tension": tension}
-        run = self.run_of(material, displacement, state, steps, stride, cube)
-        rubs = has_friction(material.effects)
+        run = self.run_of(material, displacement, start, steps, stride, cube)
+        rubs = material.effects.rubs
         in_blocks(
             lambda first: self.run_block(run, self.records(rubs), first), run.batch.count, self.lanes, self.threads
         )
-        return NativeRollout.of(run)
+        return run.motion
 
     def records(self, rubs: bool) -> Records:
         """What a block works on in the calling thread; ``rubs``: with friction of the cables."""
@@ -214,28 +194,26 @@ class NativeLayered:
         self,
         material: Material,
         displacement: np.ndarray,
-        given: Mapping[str, np.ndarray | None],
+        start: np.ndarray | None,
         steps: int | None,
         stride: int,
         cube: tuple[np.ndarray, np.ndarray] | None,
     ) -> Run:
-        """What the kernels read and write; ``given`` holds the states that `rollout` takes, by name."""
+        """What the kernels read and write; arguments as `rollout`."""
         displacement = np.asarray(displacement, dtype=float)
         cables = self.tables.cables
         if displacement.ndim not in (2, 3) or displacement.shape[-1] != cables:
             raise InputError(f"displacement has shape {displacement.shape} for {cables} cables", where="rollout")
-        state = {
-            "position": self._modes(given["position"]),
-            "tension": _cable_rows(given["tension"], cables, "tension"),
-            "start": _cable_rows(given["start"], cables, "start"),
-            "displacement": displacement.reshape(-1, displacement.shape[-2] * cables),
-        }
-        batch = self._batch(material, state)
+        begin = np.zeros(cables) if start is None else np.asarray(start, dtype=float)
+        if begin.ndim not in (1, 2) or begin.shape[-1] != cables:
+            raise InputError(f"start has shape {begin.shape} for {cables} cables", where="rollout")
+        moves = displacement.reshape(-1, displacement.shape[-2] * cables)
+        batch = self._batch(material, {"start": begin.reshape(-1, cables), "displacement": moves})
         steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
         if (cube is None) != (self._scene is None):
             raise InputError("a scene without a cube, or a cube without a scene", where="rollout")
         cubes = None if cube is None else cube_rows(*cube, batch.count, self.dtype)
-        settling = 0 if given["start"] is None else ITERATIONS
+        settling = 0 if start is None else ITERATIONS
         schedule = Schedule(self.time_step, steps, int(stride), settling, *_NUMERICS[self.precision])
         return self.with_output(Run(batch, cubes, schedule))
 
@@ -253,23 +231,15 @@ class NativeLayered:
         poses = None if self._scene is None else PushOutput(np.zeros((count, records, 7)))
         return run._replace(output=output, poses=poses)
 
-    def _modes(self, position: np.ndarray | None) -> np.ndarray:
-        """Node positions as section modes, one row a rollout."""
-        if position is None:
-            return self.tables.rest[None]
-        shape = self.tables.shape
-        nodes = np.asarray(position, dtype=float).reshape(-1, len(self.system.body.station), len(shape), 3)
-        return np.einsum("mn,bsni->bsmi", self.tables.inverse, nodes).reshape(len(nodes), -1)
-
-    def _batch(self, material: Material, state: dict[str, np.ndarray]) -> Batch:
-        """Parameters, initial states and commands in the precision of the kernels."""
+    def _batch(self, material: Material, commands: dict[str, np.ndarray]) -> Batch:
+        """Parameters and commands in the precision of the kernels."""
         layers = self.tables.stations - 1
         width = {"gravity": (3,), "stiffness_scale": (layers,), "point_mass": (layers + 1,)}
         given, effects = material._asdict(), material.effects
         del given["effects"]
         values = {name: np.asarray(value, dtype=float) for name, value in given.items()}
         sizes = {len(value) for name, value in values.items() if value.ndim > len(width.get(name, ()))}
-        sizes |= {len(value) for value in state.values()}
+        sizes |= {len(value) for value in commands.values()}
         count = max(sizes)
         if sizes - {1, count}:
             raise InputError(f"batch axes of lengths {sorted(sizes)}", where="rollout")
@@ -292,10 +262,10 @@ class NativeLayered:
             "point_mass": rows["point_mass"],
             "law": law_rows(effects, self.system.body, modulus, shear, rows["stiffness_scale"]),
             "effects": effect_rows(effects, count, self.time_step),
-            **state,
+            **commands,
         }
         arrays = {name: np.ascontiguousarray(array, dtype=self.dtype) for name, array in arrays.items()}
-        pitches = {f"{name}_pitch": value.shape[1] if len(value) > 1 else 0 for name, value in state.items()}
+        pitches = {f"{name}_pitch": value.shape[1] if len(value) > 1 else 0 for name, value in commands.items()}
         return Batch(**arrays, present=effect_flags(effects), count=count, **pitches)
 
 
@@ -318,11 +288,3 @@ def in_blocks(block: Callable[[int], None], count: int, lanes: int, threads: int
     work()
     for other in waiting:
         other.result()
-
-
-def _cable_rows(values: np.ndarray | None, cables: int, name: str) -> Float[np.ndarray, "rows cables"]:
-    """One row for each rollout, or one for all; zero where nothing is given."""
-    rows = np.zeros(cables) if values is None else np.asarray(values, dtype=float)
-    if rows.ndim not in (1, 2) or rows.shape[-1] != cables:
-        raise InputError(f"{name} has shape {rows.shape} for {cables} cables", where="rollout")
-    return rows.reshape(-1, cables)

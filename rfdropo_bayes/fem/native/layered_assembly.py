@@ -8,6 +8,7 @@ only, held in ``factors``. ``tables``, ``samples``, ``factors`` and ``work`` are
 
 from __future__ import annotations
 
+from rfdropo_bayes.fem.corotational import POLAR_ITERATIONS
 from rfdropo_bayes.fem.native.cable_strings import add_string_reaction, add_strings, measure_strings
 from rfdropo_bayes.fem.native.fields import clear
 from rfdropo_bayes.fem.native.layered_effects import (
@@ -15,15 +16,12 @@ from rfdropo_bayes.fem.native.layered_effects import (
     BRANCH,
     SURROUNDED,
     add_bending_law,
-    add_branch,
     add_law_tangent,
     subtract_law_product,
     subtract_surroundings_product,
 )
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, store
 from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral
-
-POLAR_ITERATIONS = 6
 
 
 @kernel
@@ -93,6 +91,25 @@ def _local_field(rest, modes, layer, factors, work, token):
 
 
 @kernel
+def add_branch(tables, factors, layer, work, token):
+    """Let the dashpot of a layer's Prony branch follow, and add to ``local`` what the branch makes of its strain."""
+    modes, rest, frame = tables.modes, tables.rest, 9 * layer
+    share, gain = load(factors.share, 0, token), load(factors.branch, 0, token)
+    base = 3 * layer * modes
+    for k in range(2 * modes):
+        row = base + 3 * k
+        constant = k == 0 or k == modes
+        x, y, z = _relative(work.position, row, base, constant, token)
+        for i in range(3):
+            still = rest[row + i] - rest[base + i] if constant else rest[row + i]
+            strain, t = _turned(work.axes, frame, x, y, z, i, token) - still, 2 * base + 3 * k + i
+            behind = load(work.branch, t, token)
+            behind = fma(share, strain - behind, behind)
+            store(work.branch, t, behind)
+            store(work.local, 3 * k + i, fma(gain, strain - behind, load(work.local, 3 * k + i, token)))
+
+
+@kernel
 def _local_change(change, factor, modes, layer, work, token):
     """``local`` = factor * R' change, relative to the lower section."""
     base = 3 * layer * modes
@@ -103,23 +120,15 @@ def _local_change(change, factor, modes, layer, work, token):
 
 
 @kernel
-def _layer_reaction(row, column, entries, modes, stiffness, first, local, reaction, token):
+def _layer_reaction(tables, stiffness, first, local, reaction, token):
     """``reaction`` = K ``local`` for the layer whose stiffness starts at row ``first``."""
-    clear(reaction, 0, 6 * modes, token)
-    for e in range(entries):
-        i, j = row[e], column[e]
+    clear(reaction, 0, 6 * tables.modes, token)
+    for e in range(tables.entries):
+        i, j = tables.entry_row[e], tables.entry_column[e]
         k = load(stiffness, first + e, token)
         store(reaction, i, fma(k, load(local, j, token), load(reaction, i, token)))
         if i != j:
             store(reaction, j, fma(k, load(local, i, token), load(reaction, j, token)))
-
-
-@kernel
-def _react(tables, samples, layer, work, token):
-    """K ``local`` into ``reaction``."""
-    rows, columns, first = tables.entry_row, tables.entry_column, layer * tables.entries
-    stiffness, local, reaction = samples.stiffness, work.local, work.reaction
-    _layer_reaction(rows, columns, tables.entries, tables.modes, stiffness, first, local, reaction, token)
 
 
 @kernel
@@ -209,23 +218,11 @@ def _layer_tangent(parity, modes, stiffness, first, layer, whole, factors, work,
 
 
 @kernel
-def add_station_mass(parity, modes, target, t, mass, entry, inertia, token):
-    """Add the inertia of a station to its pivot, whose tiles start at ``t``."""
+def add_mass(parity, modes, target, t, mass, entry, inertia, triangle, token):
+    """Add the inertia of a station, a ``triangle``, or that which couples the stations of a layer, to tiles from ``t``
+    on."""
     for m in range(modes):
-        for n in range(m + 1):
-            if parity[m] == parity[n]:
-                value = inertia * load(mass, entry, token)
-                tile = t + 9 * (m * modes + n)
-                for i in range(3):
-                    store(target, tile + 4 * i, load(target, tile + 4 * i, token) + value)
-                entry += 1
-
-
-@kernel
-def add_layer_mass(parity, modes, target, t, mass, entry, inertia, token):
-    """Add the inertia that couples the stations of a layer, in tiles from ``t`` on."""
-    for m in range(modes):
-        for n in range(modes):
+        for n in range(m + 1 if triangle else modes):
             if parity[m] == parity[n]:
                 value = inertia * load(mass, entry, token)
                 tile = t + 9 * (m * modes + n)
@@ -250,7 +247,7 @@ def add_layer_force(tables, samples, factors, layer, work, strings, token):
         add_branch(tables, factors, layer, work, token)
     if samples.present[BENDING]:
         add_bending_law(tables, samples, factors, layer, work, token)
-    _react(tables, samples, layer, work, token)
+    _layer_reaction(tables, samples.stiffness, layer * tables.entries, work.local, work.reaction, token)
     store(work.held, layer, load(work.reaction, 3 * tables.modes + 2, token))
     if strings:
         one = fill(1.0, work.local, token)
@@ -266,7 +263,7 @@ def subtract_tangent_product(tables, samples, factors, change, field, work, toke
     inverse = fill(1.0, elasticity, token) / elasticity
     for layer in range(tables.stations - 1):
         _local_change(change, elasticity, tables.modes, layer, work, token)
-        _react(tables, samples, layer, work, token)
+        _layer_reaction(tables, samples.stiffness, layer * tables.entries, work.local, work.reaction, token)
         add_string_reaction(tables, layer, inverse, work, token)
         _subtract_reaction(tables, layer, work, field, token)
         resist_lateral(tables, layer, change, field, work, token)

@@ -155,31 +155,6 @@ def add_law_tangent(tables, factors, layer, work, whole, token):
 
 
 @kernel
-def add_branch(tables, factors, layer, work, token):
-    """Let the dashpot of a layer's Prony branch follow, and add to ``local`` what the branch makes of its strain."""
-    modes, axes, frame = tables.modes, work.axes, 9 * layer
-    share, gain = load(factors.share, 0, token), load(factors.branch, 0, token)
-    base, first = 3 * layer * modes, 6 * layer * modes
-    for k in range(2 * modes):
-        row = base + 3 * k
-        constant = k == 0 or k == modes
-        x, y = load(work.position, row, token), load(work.position, row + 1, token)
-        z = load(work.position, row + 2, token)
-        if constant:
-            x, y = x - load(work.position, base, token), y - load(work.position, base + 1, token)
-            z = z - load(work.position, base + 2, token)
-        for i in range(3):
-            still = tables.rest[row + i] - tables.rest[base + i] if constant else tables.rest[row + i]
-            strain = fma(load(axes, frame + 3 + i, token), y, load(axes, frame + 6 + i, token) * z)
-            strain = fma(load(axes, frame + i, token), x, strain) - still
-            t = first + 3 * k + i
-            behind = load(work.branch, t, token)
-            behind = fma(share, strain - behind, behind)
-            store(work.branch, t, behind)
-            store(work.local, 3 * k + i, fma(gain, strain - behind, load(work.local, 3 * k + i, token)))
-
-
-@kernel
 def add_surroundings(tables, samples, factors, station, work, token):
     """Add the wall and the fluid of a station to ``field`` and to its pivot; keeps their part of the matrix."""
     zero, row = fill(0.0, work.field, token), 3 * station * tables.modes

@@ -10,9 +10,9 @@ from jaxtyping import Float, Int, UInt8
 
 from rfdropo_bayes.fem.native.cube_motion import record_cubes, start_cubes
 from rfdropo_bayes.fem.native.fields import clear, fill_lanes, point
-from rfdropo_bayes.fem.native.layered_assembly import layer_frame
+from rfdropo_bayes.fem.native.layered_assembly import add_branch, layer_frame
 from rfdropo_bayes.fem.native.layered_constraints import constrained_step
-from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, GAIN, GIVE, LAW, SHARE, add_branch
+from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, GAIN, GIVE, LAW, SHARE
 from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
 from rfdropo_bayes.fem.native.layered_step import solve_increment
@@ -34,14 +34,10 @@ class Batch(NamedTuple):
     law: Float[np.ndarray, "batch layer_rows"]
     effects: Float[np.ndarray, "batch rows"]
     present: Int[np.ndarray, " flags"]
-    position: Float[np.ndarray, "rows values"]  # initial, in section modes
-    tension: Float[np.ndarray, "rows cables"]  # initial
     start: Float[np.ndarray, "rows cables"]  # displacements of the initial equilibrium
     displacement: Float[np.ndarray, "rows steps cables"]
     count: int
-    position_pitch: int  # from one row to the next, 0 where one serves all
-    tension_pitch: int
-    start_pitch: int
+    start_pitch: int  # from one row to the next, 0 where one serves all
     displacement_pitch: int
 
 
@@ -52,7 +48,7 @@ class Output(NamedTuple):
     tension: Float[np.ndarray, "batch records cables"]
     diverged: UInt8[np.ndarray, " batch"]
     converged: UInt8[np.ndarray, " batch"]  # 0 where the impulses of a step were not found
-    residual: Float[np.ndarray, " batch"]
+    imbalance: Float[np.ndarray, " batch"]  # relative force out of balance in the initial equilibrium
     records: int
 
 
@@ -121,7 +117,7 @@ def _prepare(tables, samples, token):
 
 @kernel
 def start_rollouts(tables, batch, samples, work, first, token):
-    """Parameters and initial state of a block's rollouts, not moving."""
+    """Parameters of a block's rollouts; at rest, without tension."""
     count, values = batch.count, 3 * tables.modes * tables.stations
     fill_lanes(batch.moduli, 3, 0, 3, first, count, samples.moduli, token)
     fill_lanes(batch.density, 1, 0, 1, first, count, samples.density, token)
@@ -134,9 +130,10 @@ def start_rollouts(tables, batch, samples, work, first, token):
     fill_lanes(batch.effects, EFFECTS, 0, EFFECTS, first, count, samples.effects, token)
     for flag in range(FLAGS):
         samples.present[flag] = batch.present[flag]
-    fill_lanes(batch.position, batch.position_pitch, 0, values, first, count, work.position, token)
-    fill_lanes(batch.tension, batch.tension_pitch, 0, tables.cables, first, count, work.tension, token)
     _prepare(tables, samples, token)
+    for row in range(values):
+        store(work.position, row, fill(tables.rest[row], work.position, token))
+    clear(work.tension, 0, tables.cables, token)
     clear(work.velocity, 0, values, token)
     clear(work.branch, 0, 6 * tables.modes * layers, token)
     clear(work.solution, 0, values, token)
@@ -198,7 +195,7 @@ def finish_rollouts(work, output, first, count, token):
     for lane in range(min(len(token), count - first)):
         output.diverged[first + lane] = 1 if work.lost[lane] > 0.0 else 0
         output.converged[first + lane] = 0 if work.failed[lane] > 0.0 else 1
-        output.residual[first + lane] = work.imbalance[lane]
+        output.imbalance[first + lane] = work.imbalance[lane]
 
 
 @kernel
@@ -218,10 +215,12 @@ def settle(tables, batch, samples, factors, work, p, schedule, first, token):
 
 
 @kernel
-def begin_step(tables, batch, samples, factors, work, schedule, output, step, first, token):
+def begin_step(tables, batch, samples, factors, work, touch, schedule, output, poses, step, first, token):
     """Record the state that a step starts from, and take the step's commands; returns False after the last step."""
     if step % schedule.stride == 0:
         record_body(tables, work, output, step // schedule.stride, first, batch.count, token)
+        if touch is not None:
+            record_cubes(touch, poses, output.records, step // schedule.stride, first, batch.count, token)
     if step == schedule.steps:
         return False
     step_factors(samples, factors, work, schedule.time_step, token)
@@ -256,18 +255,11 @@ def compile_rollout(sources: str) -> Callable:
             start_slip(body, rubbing, slips, state, token)
         if scene is not None and not schedule.resumed:
             start_cubes(around, addresses(cubes), given.count, meeting, first, token)
+        shown = None if scene is None else addresses(poses)
         step = 0
-        while begin_step(body, given, material, factor, state, schedule, record, step, first, token):
-            if scene is not None and step % schedule.stride == 0:
-                record_cubes(
-                    meeting, addresses(poses), record.records, step // schedule.stride, first, given.count, token
-                )
+        while begin_step(body, given, material, factor, state, meeting, schedule, record, shown, step, first, token):
             constrained_step(body, rubbing, around, material, factor, state, slips, meeting, extra, p, schedule, token)
             step += 1
-        if scene is not None and schedule.steps % schedule.stride == 0:
-            record_cubes(
-                meeting, addresses(poses), record.records, schedule.steps // schedule.stride, first, given.count, token
-            )
         finish_rollouts(state, record, first, given.count, token)
 
     return rollout

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from operator import itemgetter
 from typing import NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import Material
 from rfdropo_bayes.fem.native.contact_records import Cubes
-from rfdropo_bayes.fem.native.effect_rows import has_friction
-from rfdropo_bayes.fem.native.layered import NativeLayered, NativeRollout, Records, Run, in_blocks
+from rfdropo_bayes.fem.native.layered import NativeLayered, Records, Run, in_blocks
 from rfdropo_bayes.fem.native.layered_records import Samples
 from rfdropo_bayes.fem.native.simd import aligned_zeros
+from rfdropo_bayes.fem.rollouts import Motion
 
 KEPT = {
     "samples": tuple(name for name in Samples._fields if name != "present"),
@@ -78,11 +80,6 @@ class LayeredSession:
         self._local = threading.local()
         self._equilibria: OrderedDict[bytes, _Lane] = OrderedDict()
 
-    @property
-    def nbytes(self) -> int:
-        """Memory of parameters and state of all lanes; scratch, one block a thread, is not counted."""
-        return self.memory.nbytes
-
     def reset(
         self,
         rows: Int[np.ndarray, " row"],
@@ -90,7 +87,7 @@ class LayeredSession:
         *,
         start: Float[np.ndarray, "row cables"] | None = None,
         cube: tuple[Float[np.ndarray, "row 13"], Float[np.ndarray, "row 4"]] | None = None,
-    ) -> NativeRollout:
+    ) -> Motion:
         """Start some lanes anew; the others do not notice.
 
         Args:
@@ -108,24 +105,24 @@ class LayeredSession:
         """
         rows = np.asarray(rows, dtype=np.intp)
         still = np.zeros((len(rows), 1, self.engine.tables.cables))
-        run = self.engine.run_of(material, still, {"start": start, "position": None, "tension": None}, 0, 1, cube)
-        self._admit(run, has_friction(material.effects))
+        run = self.engine.run_of(material, still, start, 0, 1, cube)
+        self._admit(run, material.effects.rubs)
         settles = run.schedule.static_iterations > 0
         keys = [b"".join(_row(getattr(run.batch, n), row).tobytes() for n in GIVEN) for row in range(len(rows))]
         known = self._equilibria if settles else OrderedDict()
         first = {key: row for row, key in reversed(list(enumerate(keys))) if key not in known}
         fresh = self._settled(_taken(run, list(first.values())))
         found = {key: known[key] for key in keys if key in known}
-        found |= {key: _Lane(*(part[row] for part in fresh)) for row, key in enumerate(first)}
+        found |= {key: jax.tree.map(itemgetter(row), fresh) for row, key in enumerate(first)}
         self._remember(known, found)
-        lanes = _Lane(*(np.stack(parts) for parts in zip(*(found[key] for key in keys), strict=True)))
+        lanes = jax.tree.map(lambda *parts: np.stack(parts), *(found[key] for key in keys))
         pose = None
         if run.cubes is not None:
             lanes, pose = self._with_cubes(lanes, run.cubes), np.asarray(run.cubes.state[:, None, :7], float)
         self.memory[rows // self.engine.lanes, :, rows % self.engine.lanes] = lanes.state
-        return NativeRollout(*lanes[1:], pose)
+        return lanes.motion._replace(pose=pose)
 
-    def advance(self, displacement: Float[np.ndarray, "lane steps cables"], *, stride: int = 1) -> NativeRollout:
+    def advance(self, displacement: Float[np.ndarray, "lane steps cables"], *, stride: int = 1) -> Motion:
         """Take steps to the cable displacements [m] at their ends; recorded before the first, and every ``stride``.
 
         Raises:
@@ -146,7 +143,7 @@ class LayeredSession:
             engine.run_block(run, self._records(first // engine.lanes), first)
 
         in_blocks(block, self.count, engine.lanes, engine.threads)
-        return NativeRollout.of(run)
+        return run.motion
 
     def save(self) -> Float[np.ndarray, "lane values"]:
         """A copy of parameters and state, one row a lane."""
@@ -195,7 +192,7 @@ class LayeredSession:
                 there[:, place.first : place.last] = part.T[: len(there)]
 
         in_blocks(block, count, engine.lanes, engine.threads)
-        return _Lane(state, *NativeRollout.of(run)[:5])
+        return _Lane(state, run.motion._replace(pose=None))
 
     def _with_cubes(self, lanes: _Lane, cubes: Cubes) -> _Lane:
         """Lanes with cubes at the start: those of a body that was settled before may have been others."""
@@ -232,14 +229,10 @@ class LayeredSession:
 
 
 class _Lane(NamedTuple):
-    """State of a lane, or of several, and what it shows of it, in the order of `NativeRollout`."""
+    """State of a lane, or of several, and what it shows of its body."""
 
     state: Float[np.ndarray, "*lane values"]
-    position: Float[np.ndarray, "*lane 1 points 3"]
-    tension: Float[np.ndarray, "*lane 1 cables"]
-    diverged: Bool[np.ndarray, "*lane"]
-    converged: Bool[np.ndarray, "*lane"]
-    residual: Float[np.ndarray, "*lane"]
+    motion: Motion
 
 
 def _row(values: np.ndarray, row: int) -> np.ndarray:

@@ -14,6 +14,16 @@ UNBOUNDED = 1e30
 
 
 @kernel
+def _weighted_modes(modes, field, station, i, weights, first, step, token):
+    """Sum of component i of a station's modes, with every so manyth weight from ``first`` on."""
+    value = fill(0.0, field, token)
+    for m in range(modes):
+        weight = fill(weights[first + m * step], field, token)
+        value = fma(load(field, 3 * (station * modes + m) + i, token), weight, value)
+    return value
+
+
+@kernel
 def _farthest(tables, field, token):
     """Largest component of a field at any node."""
     modes, zero = tables.modes, fill(0.0, field, token)
@@ -21,10 +31,7 @@ def _farthest(tables, field, token):
     for station in range(tables.stations):
         for node in range(modes):
             for i in range(3):
-                value = zero
-                for m in range(modes):
-                    row = 3 * (station * modes + m) + i
-                    value = fma(load(field, row, token), fill(tables.shape[node * modes + m], field, token), value)
+                value = _weighted_modes(modes, field, station, i, tables.shape, node * modes, 1, token)
                 value = magnitude(value, zero)
                 largest = where_greater(value, largest, value, largest)
     return largest
@@ -32,13 +39,9 @@ def _farthest(tables, field, token):
 
 @kernel
 def _node_force(tables, field, station, node, i, token):
-    """Component i of the force on a node."""
-    modes = tables.modes
-    value = fill(0.0, field, token)
-    for m in range(modes):
-        row = 3 * (station * modes + m) + i
-        value = fma(load(field, row, token), fill(tables.inverse[m * modes + node], field, token), value)
-    return value
+    """Component i of the force on a node, in magnitude."""
+    value = _weighted_modes(tables.modes, field, station, i, tables.inverse, node, tables.modes, token)
+    return magnitude(value, fill(0.0, field, token))
 
 
 @kernel
@@ -90,7 +93,7 @@ def _imbalance(tables, samples, factors, work, token):
     for station in range(tables.stations):
         for node in range(modes):
             for i in range(3):
-                loads = loads + magnitude(_node_force(tables, work.field, station, node, i, token), zero)
+                loads = loads + _node_force(tables, work.field, station, node, i, token)
     for c in range(tables.cables):
         loads = loads + load(work.tension, c, token)
     if samples.present[SURROUNDED]:
@@ -103,7 +106,7 @@ def _imbalance(tables, samples, factors, work, token):
     for station in range(tables.held, tables.stations):
         for node in range(modes):
             for i in range(3):
-                force = magnitude(_node_force(tables, work.field, station, node, i, token), zero)
+                force = _node_force(tables, work.field, station, node, i, token)
                 largest = where_greater(largest, force, largest, force)
     tiny = fill(1e-30, zero, token)
     return largest / where_greater(loads, tiny, loads, tiny)

@@ -6,8 +6,7 @@ from rfdropo_bayes.fem.native.chain_cholesky import combine_border, eliminate, s
 from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
 from rfdropo_bayes.fem.native.fields import clear, point
 from rfdropo_bayes.fem.native.layered_assembly import (
-    add_layer_mass,
-    add_station_mass,
+    add_mass,
     assemble_layer,
     start_loads,
     subtract_tangent_product,
@@ -21,26 +20,30 @@ LARGEST = 1e30
 
 
 @kernel
-def _pull(tables, g, offset, work, x, y, z, token):
-    """Add a pull on guide g to the border row at ``offset`` of every station; returns it times the guide's velocity."""
-    border, velocity = work.border, work.velocity
-    growth = fill(0.0, border, token)
-    store(work.pull, 3 * g, x, y, z)
+def pull_guide(tables, g, border, row, panels, x, y, z, velocity, token):
+    """Add a pull on a guide to a row of a border of so many panels; returns it times the guide's velocity."""
+    size, moving = 3 * tables.modes, fill(0.0, border, token)
+    first = row // 3 * 3 * size + row % 3
     for k in range(tables.guide_first[g], tables.guide_first[g + 1]):
-        row, w = tables.guide_place[k], fill(tables.guide_weight[k], border, token)
-        t = tables.guide_slot[k] + offset
-        store(border, t, fma(x, w, load(border, t, token)))
-        store(border, t + 3, fma(y, w, load(border, t + 3, token)))
-        store(border, t + 6, fma(z, w, load(border, t + 6, token)))
-        moved = fma(
-            x, load(velocity, row, token), fma(y, load(velocity, row + 1, token), z * load(velocity, row + 2, token))
-        )
-        growth = fma(w, moved, growth)
-    return growth
+        place, weight = tables.guide_place[k], fill(tables.guide_weight[k], border, token)
+        t = first + 3 * (tables.guide_station[k] * (panels - 1) * size + place)
+        store(border, t, fma(x, weight, load(border, t, token)))
+        store(border, t + 3, fma(y, weight, load(border, t + 3, token)))
+        store(border, t + 6, fma(z, weight, load(border, t + 6, token)))
+        along = fma(y, load(velocity, place + 1, token), z * load(velocity, place + 2, token))
+        moving = fma(weight, fma(x, load(velocity, place, token), along), moving)
+    return moving
 
 
 @kernel
-def _gather_cable(tables, c, offset, work, token):
+def _pull_cable(tables, g, c, work, x, y, z, token):
+    """As `pull_guide`, by cable c; the pull is kept."""
+    store(work.pull, 3 * g, x, y, z)
+    return pull_guide(tables, g, work.border, c + 1, (tables.cables + 3) // 3, x, y, z, work.velocity, token)
+
+
+@kernel
+def _gather_cable(tables, c, work, token):
     """Border row dl/dx of a cable; returns how much shorter than at rest it is, and dl/dt."""
     x, one = work.position, fill(1.0, work.position, token)
     px, py, pz = (
@@ -59,18 +62,16 @@ def _gather_cable(tables, c, offset, work, token):
         scale = one / segment
         dx, dy, dz = dx * scale, dy * scale, dz * scale
         if g > first:
-            growth = growth + _pull(tables, g - 1, offset, work, bx - dx, by - dy, bz - dz, token)
+            growth = growth + _pull_cable(tables, g - 1, c, work, bx - dx, by - dy, bz - dz, token)
         px, py, pz, bx, by, bz = gx, gy, gz, dx, dy, dz
-    return shorter, growth + _pull(tables, last - 1, offset, work, bx, by, bz, token)
+    return shorter, growth + _pull_cable(tables, last - 1, c, work, bx, by, bz, token)
 
 
 @kernel
 def gather_cables(tables, work, rate, token):
     """Border rows dl/dx of all cables; ``slack`` = rate * (commanded length - length) - dl/dt."""
     for c in range(tables.cables):
-        row = c + 1
-        offset = row // 3 * 9 * tables.modes + row % 3
-        shorter, growth = _gather_cable(tables, c, offset, work, token)
+        shorter, growth = _gather_cable(tables, c, work, token)
         store(work.slack, c, (shorter - load(work.commanded, c, token)) * rate - growth)
 
 
@@ -133,10 +134,10 @@ def condense_increment(tables, samples, factors, work, rate, token):
             stiffen(tables, station - 1, rate, work, not last, token)
             resist_lateral(tables, station - 1, work.velocity, work.field, work, token)
         entry, t = station * tables.pairs, station * block
-        add_station_mass(tables.parity, tiles, work.pivot, t, samples.station_mass, entry, inertia, token)
+        add_mass(tables.parity, tiles, work.pivot, t, samples.station_mass, entry, inertia, True, token)
         if not last:
             entry = (station - 1) * tables.coupled
-            add_layer_mass(tables.parity, tiles, work.coupling, t, samples.layer_mass, entry, inertia, token)
+            add_mass(tables.parity, tiles, work.coupling, t, samples.layer_mass, entry, inertia, False, token)
         if samples.present[SURROUNDED]:
             add_surroundings(tables, samples, factors, station, work, token)
         for k in range(size):

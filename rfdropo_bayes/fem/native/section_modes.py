@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.fem.cable_strings import crossing_weights
-from rfdropo_bayes.fem.cables import CableLayout
+from rfdropo_bayes.fem.cables import CableLayout, routes
 from rfdropo_bayes.fem.dynamics import LOST, System
 from rfdropo_bayes.fem.layered import PointMap, centre_gradient, rest_positions
 from rfdropo_bayes.fem.native.layer_moduli import layer_moduli, layer_volume
@@ -50,7 +50,7 @@ class LayeredTables(NamedTuple):
     guide_first: Int[np.ndarray, " guides_1"]
     guide_place: Int[np.ndarray, " entries"]
     guide_weight: Float[np.ndarray, " entries"]
-    guide_slot: Int[np.ndarray, " entries"]  # of border row 0
+    guide_station: Int[np.ndarray, " entries"]
     anchor: Float[np.ndarray, "cables 3"]
     rest_length: Float[np.ndarray, " cables"]
     crossing: Float[np.ndarray, "layers cables 2 modes"]  # way of every cable through every layer
@@ -92,10 +92,6 @@ def border_panels(cables: int) -> int:
     return (cables + 3) // 3
 
 
-def _both_faces(shape: np.ndarray) -> Float[np.ndarray, "nodes2 modes2"]:
-    return np.kron(np.eye(2), shape)
-
-
 def sparse_points(node: np.ndarray, weight: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points given by nodes as sparse sums of modes: first, place, weight."""
     section = len(shape)
@@ -114,24 +110,16 @@ def sparse_points(node: np.ndarray, weight: np.ndarray, shape: np.ndarray) -> tu
 
 
 def _guides(layout: CableLayout, shape: np.ndarray) -> dict[str, np.ndarray]:
-    used, size = layout.guide_used, 3 * len(shape)
+    used = layout.guide_used
     first, place, weight = sparse_points(layout.guide_node[used], layout.guide_weight[used], shape)
     return {
         "cable_first": np.concatenate([[0], np.cumsum(used.sum(axis=1))]).astype(np.int64),
         "guide_first": first,
         "guide_place": place,
         "guide_weight": weight,
-        "guide_slot": place // size * border_panels(len(used)) * 3 * size + 3 * (place % size),
+        "guide_station": place // (3 * len(shape)),
         "anchor": np.asarray(layout.anchor, dtype=float).reshape(-1, 3),
     }
-
-
-def _rest_lengths(layout: CableLayout, rest: np.ndarray) -> Float[np.ndarray, " cables"]:
-    lengths = []
-    for anchor, node, weight, used in zip(*layout, strict=True):
-        points = np.vstack([anchor, np.einsum("gk,gki->gi", weight, rest[node])[used]])
-        lengths.append(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-    return np.array(lengths, dtype=float)
 
 
 def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTables:
@@ -139,7 +127,7 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
     body = system.body
     shape, parity = section_modes(body.nodes_across)
     modes, layers = len(parity), len(body.station) - 1
-    faces = _both_faces(shape)
+    faces = np.kron(np.eye(2), shape)
     moduli = np.einsum("am,plaibj,bn->plminj", faces, layer_moduli(body), faces, optimize=True)
     mass = np.einsum("am,lab,bn->lmn", faces, layer_volume(body), faces, optimize=True)
     blocks = [(f * modes + m, g * modes + n, parity[m] ^ parity[n]) for f, m, g, n in block_pairs(modes)]
@@ -169,7 +157,7 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
         gradient=slopes,
         rest=np.linalg.solve(shape, rest.reshape(layers + 1, modes, 3)).ravel(),
         **_guides(system.cables, shape),
-        rest_length=_rest_lengths(system.cables, rest),
+        rest_length=np.array([np.linalg.norm(np.diff(r, axis=0), axis=1).sum() for r in routes(system.cables, rest)]),
         crossing=crossing_weights(body, system.cables) @ faces,
         section_length=tributary_lengths(body),
         section_area=drag_areas(body),

@@ -120,15 +120,21 @@ def _pointer(context, builder, array_type, array, row, simd: SimdType):
     return builder.bitcast(builder.gep(data, [offset]), vector_type(simd).as_pointer())
 
 
+def _loaded(context, builder, sig, arguments, simd: SimdType, count: int) -> list:
+    """Rows of an array from a row on."""
+    first = context.cast(builder, arguments[1], sig.args[1], types.intp)
+    rows = [first, *(builder.add(first, ir.Constant(first.type, k)) for k in range(1, count))]
+    pointers = [_pointer(context, builder, sig.args[0], arguments[0], row, simd) for row in rows]
+    return [builder.load(pointer, align=simd.dtype.bitwidth // 8) for pointer in pointers]
+
+
 @intrinsic
 def load(typing_context, array, row, token):
     """Row ``row`` of an array ``(n, lanes)`` as a `Simd` value."""
     simd = SimdType(array.dtype, len(token))
 
     def generate(context, builder, sig, arguments):
-        index = context.cast(builder, arguments[1], sig.args[1], types.intp)
-        pointer = _pointer(context, builder, sig.args[0], arguments[0], index, simd)
-        return builder.load(pointer, align=simd.dtype.bitwidth // 8)
+        return _loaded(context, builder, sig, arguments, simd, 1)[0]
 
     return simd(array, row, token), generate
 
@@ -139,11 +145,7 @@ def load3(typing_context, array, row, token):
     simd = SimdType(array.dtype, len(token))
 
     def generate(context, builder, sig, arguments):
-        first = context.cast(builder, arguments[1], sig.args[1], types.intp)
-        rows = [builder.add(first, ir.Constant(first.type, k)) for k in range(3)]
-        pointers = [_pointer(context, builder, sig.args[0], arguments[0], row, simd) for row in rows]
-        values = [builder.load(pointer, align=simd.dtype.bitwidth // 8) for pointer in pointers]
-        return context.make_tuple(builder, sig.return_type, values)
+        return context.make_tuple(builder, sig.return_type, _loaded(context, builder, sig, arguments, simd, 3))
 
     return types.UniTuple(simd, 3)(array, row, token), generate
 
@@ -208,16 +210,16 @@ def fill(typing_context, number, array, token):
     return simd(number, array, token), generate
 
 
-def _binary(name: str) -> Callable:
-    def generate(context, builder, sig, arguments):
-        simd = sig.return_type
-        left, right = (
-            value if isinstance(kind, SimdType) else _splat(context, builder, value, kind, simd)
-            for value, kind in zip(arguments, sig.args, strict=True)
-        )
-        return getattr(builder, name)(left, right)
+def _vectors(context, builder, sig, arguments) -> list:
+    """Arguments of which those that are numbers fill all lanes."""
+    return [
+        value if isinstance(kind, SimdType) else _splat(context, builder, value, kind, sig.return_type)
+        for value, kind in zip(arguments, sig.args, strict=True)
+    ]
 
-    return generate
+
+def _binary(name: str) -> Callable:
+    return lambda context, builder, sig, arguments: getattr(builder, name)(*_vectors(context, builder, sig, arguments))
 
 
 for _operator, _name in (
@@ -255,17 +257,17 @@ class _NegateTemplate(AbstractTemplate):
         return signature(args[0], args[0]) if isinstance(args[0], SimdType) else None
 
 
+def _lanewise(builder, name: str, simd: SimdType, arguments: list):
+    """Call of LLVM's own function of vectors."""
+    kind = vector_type(simd)
+    signed, name = ir.FunctionType(kind, [kind] * len(arguments)), f"llvm.{name}.v{simd.lanes}f{simd.dtype.bitwidth}"
+    return builder.call(cgutils.get_or_insert_function(builder.module, signed, name), arguments)
+
+
 def _fused(negative: bool) -> Callable:
     def generate(context, builder, sig, arguments):
-        simd = sig.return_type
-        first, second, third = (
-            value if isinstance(kind, SimdType) else _splat(context, builder, value, kind, simd)
-            for value, kind in zip(arguments, sig.args, strict=True)
-        )
-        kind = vector_type(simd)
-        name = f"llvm.fma.v{simd.lanes}f{simd.dtype.bitwidth}"
-        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * 3), name)
-        return builder.call(function, [builder.fneg(first) if negative else first, second, third])
+        first, second, third = _vectors(context, builder, sig, arguments)
+        return _lanewise(builder, "fma", sig.return_type, [builder.fneg(first) if negative else first, second, third])
 
     return generate
 
@@ -289,10 +291,7 @@ def square_root(typing_context, value):
         return None
 
     def generate(context, builder, sig, arguments):
-        kind = vector_type(sig.args[0])
-        name = f"llvm.sqrt.v{value.lanes}f{value.dtype.bitwidth}"
-        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind]), name)
-        return builder.call(function, arguments)
+        return _lanewise(builder, "sqrt", value, arguments)
 
     return value(value), generate
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from rfdropo_bayes.fem.cable_friction import FADING, PRESLIDING, SLACK, STRAIGHT
 from rfdropo_bayes.fem.native.fields import clear, point
 from rfdropo_bayes.fem.native.layered_effects import CAPSTAN, COULOMB, FRICTION
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, square_root, store, where_greater
-from rfdropo_bayes.fem.native.slip_records import KINDS
+from rfdropo_bayes.fem.native.layered_records import KINDS
+from rfdropo_bayes.fem.native.layered_step import pull_guide
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, square_root, store, where_greater
 
 
 @kernel
@@ -56,21 +57,6 @@ def _weigh_guides(runs, friction, kinds, kind, token):
 
 
 @kernel
-def _pull_guide(tables, g, border, row, panels, x, y, z, work, token):
-    """Add a pull on a guide to a border row; returns it times the guide's velocity."""
-    size, moving = 3 * tables.modes, fill(0.0, border, token)
-    for k in range(tables.guide_first[g], tables.guide_first[g + 1]):
-        place, weight = tables.guide_place[k], fill(tables.guide_weight[k], border, token)
-        t = ((place // size * panels + row // 3) * size + place % size) * 3 + row % 3
-        store(border, t, fma(x, weight, load(border, t, token)))
-        store(border, t + 3, fma(y, weight, load(border, t + 3, token)))
-        store(border, t + 6, fma(z, weight, load(border, t + 6, token)))
-        along = fma(y, load(work.velocity, place + 1, token), z * load(work.velocity, place + 2, token))
-        moving = fma(weight, fma(x, load(work.velocity, place, token), along), moving)
-    return moving
-
-
-@kernel
 def _gather_run(tables, runs, friction, r, kind, border, panels, work, token):
     """Border row of a run; returns how fast the guides move along it."""
     zero, one = fill(0.0, border, token), fill(1.0, border, token)
@@ -84,16 +70,12 @@ def _gather_run(tables, runs, friction, r, kind, border, panels, work, token):
         beyond = before
         if g < runs.last[r]:
             beyond = fma(load(friction.weight, kind * runs.guides + g, token), inverse, before)
-        x, y, z = (
-            before * load(friction.direction, 3 * g, token),
-            before * load(friction.direction, 3 * g + 1, token),
-            before * load(friction.direction, 3 * g + 2, token),
-        )
+        x, y, z = load3(friction.direction, 3 * g, token)
+        x, y, z = before * x, before * y, before * z
         if g < tied:
-            x = x - beyond * load(friction.direction, 3 * g + 3, token)
-            y = y - beyond * load(friction.direction, 3 * g + 4, token)
-            z = z - beyond * load(friction.direction, 3 * g + 5, token)
-        moving = moving + _pull_guide(tables, g, border, row, panels, x, y, z, work, token)
+            u, v, w = load3(friction.direction, 3 * g + 3, token)
+            x, y, z = x - beyond * u, y - beyond * v, z - beyond * w
+        moving = moving + pull_guide(tables, g, border, row, panels, x, y, z, work.velocity, token)
         before = beyond
     return moving
 

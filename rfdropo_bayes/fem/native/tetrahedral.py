@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from rfdropo_bayes.fem.corotational import POLAR_ITERATIONS
 from rfdropo_bayes.fem.native.simd import (
     fill,
     fma,
@@ -24,8 +25,6 @@ from rfdropo_bayes.fem.native.simd import (
     square_root,
     store,
 )
-
-POLAR_ITERATIONS = 6
 
 
 class Mesh(NamedTuple):
@@ -122,6 +121,16 @@ def _polar_frame(mesh, e, x, axes, token):
 
 
 @mesh_pasted
+def _rotate(axes, x, y, z, token):
+    """From space to the element's frame."""
+    return (
+        fma(load(axes, 0, token), x, fma(load(axes, 1, token), y, load(axes, 2, token) * z)),
+        fma(load(axes, 3, token), x, fma(load(axes, 4, token), y, load(axes, 5, token) * z)),
+        fma(load(axes, 6, token), x, fma(load(axes, 7, token), y, load(axes, 8, token) * z)),
+    )
+
+
+@mesh_pasted
 def _rotate_back(axes, x, y, z, token):
     """From the element's frame to space."""
     return (
@@ -147,18 +156,8 @@ def _element_force(mesh, e, work, lame, shear, lookahead, token):
         dx = fma(lookahead, load(v, n, token), load(x, n, token)) - ox
         dy = fma(lookahead, load(v, n + 1, token), load(x, n + 1, token)) - oy
         dz = fma(lookahead, load(v, n + 2, token), load(x, n + 2, token)) - oz
-        u = (
-            fma(load(axes, 0, token), dx, fma(load(axes, 1, token), dy, load(axes, 2, token) * dz))
-            - mesh.edge[e, a - 1, 0]
-        )
-        w = (
-            fma(load(axes, 3, token), dx, fma(load(axes, 4, token), dy, load(axes, 5, token) * dz))
-            - mesh.edge[e, a - 1, 1]
-        )
-        t = (
-            fma(load(axes, 6, token), dx, fma(load(axes, 7, token), dy, load(axes, 8, token) * dz))
-            - mesh.edge[e, a - 1, 2]
-        )
+        u, w, t = _rotate(axes, dx, dy, dz, token)
+        u, w, t = u - mesh.edge[e, a - 1, 0], w - mesh.edge[e, a - 1, 1], t - mesh.edge[e, a - 1, 2]
         gx, gy, gz = mesh.gradient[e, a, 0], mesh.gradient[e, a, 1], mesh.gradient[e, a, 2]
         h00, h01, h02 = fma(u, gx, h00), fma(u, gy, h01), fma(u, gz, h02)
         h10, h11, h12 = fma(w, gx, h10), fma(w, gy, h11), fma(w, gz, h12)

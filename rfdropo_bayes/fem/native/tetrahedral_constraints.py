@@ -9,8 +9,8 @@ from __future__ import annotations
 from rfdropo_bayes.fem.native.block_cholesky import condense_rows, extend_border
 from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
 from rfdropo_bayes.fem.native.contact_geometry import (
+    add_cube_velocity,
     choose_all,
-    cube_velocity,
     find_candidates,
     kind_of,
     list_contacts,
@@ -87,7 +87,9 @@ def _condense(pattern, touch, work, rows, p, n, reached, cables, contacts, free,
 
 @kernel
 def _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, time_step, token):
-    """Weights of the border rows by the change of the impulses since ``before``, and the tensions."""
+    """Weights of the border rows by the change of the impulses since ``before``, and the tensions; lanes whose impulses
+    were not found stay marked."""
+    store(work.unsolved, 0, load(work.unsolved, 0, token) + load(p.going, 0, token))
     store(work.weight, 0, fill(1.0, work.weight, token))
     for i in range(cables + 1, 3 * pattern.border):
         store(work.weight, i, fill(0.0, work.weight, token))
@@ -137,17 +139,10 @@ def hold(pattern, scene, samples, touch, work, rows, p, reached, cables, free, s
         add_cube(touch, p, cables, contacts, time_step, token)
     soften(p, cables, 0, contacts, time_step, schedule.softness, token)
     solve_problem(p, cables, 0, contacts, schedule.settled, token)
-    _mark(work, p, token)
     _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, time_step, token)
     if scene is not None:
         stop_cube(touch, p, cables, contacts, token)
     return contacts
-
-
-@kernel
-def _mark(work, p, token):
-    """Lanes whose impulses were not found stay marked."""
-    store(work.unsolved, 0, load(work.unsolved, 0, token) + load(p.going, 0, token))
 
 
 @kernel
@@ -181,9 +176,8 @@ def hold_again(pattern, scene, touch, work, rows, p, reached, cables, contacts, 
             slot, i = touch.contact[c], cables + 3 * c
             kind = kind_of(touch, slot)
             u, v, w = trunk_velocity(scene, touch, slot, kind, work.velocity, token)
-            store(p.free, i, u + cube_velocity(touch, slot, kind, 0, touch.after, 0, token))
-            store(p.free, i + 1, v + cube_velocity(touch, slot, kind, 1, touch.after, 0, token))
-            store(p.free, i + 2, w + cube_velocity(touch, slot, kind, 2, touch.after, 0, token))
+            u, v, w = add_cube_velocity(touch, slot, kind, u, v, w, touch.after, 0, token)
+            store(p.free, i, u, v, w)
         if contacts > touch.count[3]:
             _across(pattern, touch, work, rows, p, reached, cables, contacts, free, token)
     for i in range(n):
@@ -193,7 +187,6 @@ def hold_again(pattern, scene, touch, work, rows, p, reached, cables, contacts, 
         store(p.free, i, value)
         store(p.before, i, load(p.impulse, i, token))
     solve_problem(p, cables, 0, contacts, schedule.settled, token)
-    _mark(work, p, token)
     _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, schedule.time_step, token)
     if scene is not None:
         stop_cube(touch, p, cables, contacts, token)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import numpy as np
@@ -11,20 +10,21 @@ import scipy.sparse as sparse
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.cables import CableLayout
+from rfdropo_bayes.fem.cables import CableLayout, routes
 from rfdropo_bayes.fem.drives import DriveLimits
 from rfdropo_bayes.fem.dynamics import LOST, POISSON_LIMIT
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
+from rfdropo_bayes.fem.native.compilation import kernel_sources
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
 from rfdropo_bayes.fem.native.contact_records import PushOutput, Touch, cube_rows, pairs_of, scene_tables, touch_storage
-from rfdropo_bayes.fem.native.kernel_sources import kernel_sources
-from rfdropo_bayes.fem.native.layered import NativeRollout, available_threads
+from rfdropo_bayes.fem.native.layered import available_threads, in_blocks
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
 from rfdropo_bayes.fem.native.tetrahedral import Mesh, Samples, Work
 from rfdropo_bayes.fem.pushing import PushScene
+from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
 
 
@@ -33,7 +33,6 @@ class TetrahedralEngine:
 
     Args:
         dtype: ``numpy.float64`` or ``numpy.float32``.
-        lanes: samples side by side; by default as many as this machine's vector registers hold.
         threads: lane blocks at a time; results do not depend on it.
         scene: what the body pushes a cube on; None for a body that touches nothing.
     """
@@ -46,13 +45,12 @@ class TetrahedralEngine:
         points: PointMap,
         *,
         dtype: type = np.float64,
-        lanes: int | None = None,
         threads: int | None = None,
         scene: PushScene | None = None,
     ) -> None:
         self.body, self.dtype, self.points = body, np.dtype(dtype), points
         self._kernel = _kernel()  # here, so that threads do not make one each
-        self.lanes = lanes or native_lanes(dtype)
+        self.lanes = native_lanes(dtype)
         self.threads = threads or available_threads()
         self._order, self._number = _numbering(body)
         self._rest = body.rest[self._order].astype(self.dtype).ravel()
@@ -74,7 +72,7 @@ class TetrahedralEngine:
         time_step: float,
         stride: int = 1,
         cube: tuple[Float[np.ndarray, "*samples 13"], Float[np.ndarray, "*samples 4"]] | None = None,
-    ) -> NativeRollout:
+    ) -> Motion:
         """Rollouts from rest through the commanded displacements [m] of every step, recorded every ``stride`` steps.
 
         ``parameters`` holds, with a leading axis of samples: ``young_modulus`` [Pa], ``poisson_ratio``, ``node_mass``
@@ -86,54 +84,44 @@ class TetrahedralEngine:
         """
         samples = len(parameters["young_modulus"])
         commands = np.broadcast_to(commands, (samples, *commands.shape[-2:]))
-
         if (cube is None) != (self._scene is None):
             raise InputError("a scene without a cube, or a cube without a scene", where="rollouts")
         cubes = poses = None
         if cube is not None:
             cubes = cube_rows(*cube, samples, self.dtype)
             poses = PushOutput(np.zeros((samples, 1 + commands.shape[1] // stride, 7)))
-        chunks = [np.arange(first, first + self.lanes) for first in range(0, samples, self.lanes)]
         rows, points = commands.shape[1] // stride, len(self._nodes)
-        result = NativeRollout(
+        result = Motion(
             np.zeros((samples, 1 + rows, points, 3)),
             np.zeros((samples, 1 + rows, commands.shape[2])),
             np.zeros(samples, dtype=bool),
-            np.ones(samples, dtype=bool),
             np.zeros(samples),
+            np.ones(samples, dtype=bool),
             None if poses is None else poses.pose,
         )
         result.position[:, 0] = np.einsum("pk,pki->pi", self.points.weight, self.body.rest[self.points.node])
 
-        def run(chunk: Int[np.ndarray, " lanes"]) -> None:
-            lane, kept = np.minimum(chunk, samples - 1), chunk[chunk < samples]
+        def run(first: int) -> None:
+            lane, kept = np.minimum(np.arange(first, first + self.lanes), samples - 1), slice(first, first + self.lanes)
             inputs = self._samples({name: np.asarray(value)[lane] for name, value in parameters.items()})
-            displacement, work, output = self._lanes_last(commands[lane]), self._work(), self._output(rows)
+            displacement, work = self._lanes_last(commands[lane]), self._work()
+            sizes = (rows, points, 3, self.lanes), (rows, commands.shape[2], self.lanes)
+            output = kernels.Output(self._nodes, self._weights, *(aligned_zeros(size, self.dtype) for size in sizes))
             single = self.dtype.itemsize == 4
             numbers = SETTLED[self.dtype.name], SOFTNESS[self.dtype.name]
             schedule = kernels.Schedule(float(time_step), stride, *numbers, self._reach, single)
             self._kernel(
                 self._pattern, self._mesh, self._cables, self._scene, self._rest, displacement, cubes, inputs, work,
-                *self._constraints(), schedule, output, poses, int(chunk[0]), samples, lane_token(self.lanes),
+                *self._constraints(), schedule, output, poses, first, samples, lane_token(self.lanes),
             )  # fmt: skip
-            count = len(kept)
+            count = min(self.lanes, samples - first)
             result.position[kept, 1:] = np.moveaxis(output.position, 3, 0)[:count]
             result.tension[kept, 1:] = np.moveaxis(output.tension, 2, 0)[:count]
             result.diverged[kept] = work.lost[0, :count] > 0.0
             result.converged[kept] = ~(work.unsolved[0, :count] > 0.0)
 
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(run, chunks))
+        in_blocks(run, samples, self.lanes, self.threads)
         return result
-
-    def _output(self, rows: int) -> kernels.Output:
-        """What a lane block records."""
-        return kernels.Output(
-            self._nodes,
-            self._weights,
-            aligned_zeros((rows, len(self._nodes), 3, self.lanes), self.dtype),
-            aligned_zeros((rows, len(self._cables.limit), self.lanes), self.dtype),
-        )
 
     def _constraints(self) -> tuple[Touch | None, Rows, Problem, Int[np.ndarray, " free"]]:
         """Contacts, their rows, the problem of a step, and the nodes that contacts reach, of one lane block."""
@@ -245,15 +233,14 @@ def _mesh(
 def _cables(
     layout: CableLayout, limits: DriveLimits, body: TetrahedralBody, number: np.ndarray, dtype: np.dtype
 ) -> kernels.Cables:
-    first, node, weight, segment = [0], [], [], [np.zeros(0)]
+    first, node, weight = [0], [], []
+    legs = [np.linalg.norm(np.diff(route, axis=0), axis=1) for route in routes(layout, body.rest)]
+    segment = [np.concatenate([[0.0], lengths]) for lengths in legs]
     for cable, used in enumerate(layout.guide_used):
         guides = layout.guide_node[cable, used], layout.guide_weight[cable, used]
         node.append(np.concatenate([guides[0][:1] * 0, guides[0]]))
         weight.append(np.concatenate([guides[1][:1] * 0.0, guides[1]]))
         first.append(first[-1] + len(node[-1]))
-        place = np.einsum("gk,gki->gi", guides[1], body.rest[guides[0]])
-        route = np.concatenate([layout.anchor[cable : cable + 1], place])
-        segment.append(np.concatenate([[0.0], np.linalg.norm(np.diff(route, axis=0), axis=1)]))
     width = max([int(np.max(np.nonzero(w)[1])) + 1 for w in weight if np.any(w)], default=1)
     shape = (0, layout.guide_node.shape[2])
     return kernels.Cables(
@@ -261,7 +248,7 @@ def _cables(
         np.ascontiguousarray(number[np.concatenate([np.zeros(shape, dtype=int), *node])][:, :width], dtype=np.int32),
         np.ascontiguousarray(np.concatenate([np.zeros(shape), *weight])[:, :width], dtype=dtype),
         layout.anchor.astype(dtype),
-        np.concatenate(segment).astype(dtype),
+        np.concatenate([np.zeros(0), *segment]).astype(dtype),
         np.asarray(limits.displacement, dtype=dtype),
         float(limits.rate),
     )

@@ -1,0 +1,49 @@
+"""Rollouts that no traced program can hold: one call out of it for a whole batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+Output = TypeVar("Output")
+
+
+def one_callback(roll: Callable[[Any, int], Output], shapes: Output, inputs: Any, limit: Array) -> Output:
+    """Outputs of rollouts, from a traced program that ``vmap`` may have given any batch axes.
+
+    Padding of a batch, and perturbations of what acts after the body, ask for the same rollout again and again: each
+    is computed once.
+
+    Args:
+        roll: rollouts of inputs with one batch axis, up to so many steps; it may leave out rows after the last one.
+        shapes: of one rollout's outputs; those with axes have one of rows first. Rows left out are zero.
+        inputs: of one rollout.
+        limit: steps to compute.
+    """
+
+    def on_host(given: Any, limits: np.ndarray) -> Output:
+        batch, count = np.shape(limits), np.size(limits)
+        flat = jax.tree.map(lambda value: np.asarray(value).reshape(count, *value.shape[len(batch) :]), given)
+        chosen, place = distinct(jax.tree.leaves(flat))
+        found = roll(jax.tree.map(lambda value: value[chosen], flat), int(np.max(limits)))
+
+        def restored(shape: jax.ShapeDtypeStruct, part: np.ndarray) -> np.ndarray:
+            part = part[place]
+            if shape.shape and part.shape[1] < shape.shape[0]:
+                part = np.pad(part, [(0, 0), (0, shape.shape[0] - part.shape[1]), *[(0, 0)] * (part.ndim - 2)])
+            return part.reshape((*batch, *shape.shape))
+
+        return jax.tree.map(restored, shapes, found)
+
+    return jax.pure_callback(on_host, shapes, inputs, limit, vmap_method="broadcast_all")
+
+
+def distinct(arrays: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Which rows differ from all before them, and for every row the place of its like among these."""
+    seen: dict[bytes, int] = {}
+    place = [seen.setdefault(b"".join(a[row].tobytes() for a in arrays), len(seen)) for row in range(len(arrays[0]))]
+    return np.unique(place, return_index=True)[1], np.array(place)
