@@ -328,7 +328,7 @@ def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it(
     whole = climb(target, base.x, with_play)
     assert early.log_evidence < whole.log_evidence - 100.0  # what it is about
     both = climb(target, whole.x, np.array([*with_play, *creep.indices], dtype=int))
-    step = Step("creep", ("creep",), replace(look, fit=early), both, both.log_evidence - early.log_evidence, {})
+    step = Step("creep", ("creep",), replace(look, fit=early), both, both.log_evidence - early.log_evidence, {}, target)
     again = inquiry._climbed_again(step, ["play"])
     assert again is not None
     assert again.log_evidence == pytest.approx(whole.log_evidence, abs=0.1)
@@ -439,7 +439,7 @@ def test_the_smallest_p_value_of_a_bootstrap_is_a_bound():
     assert p_value(0.012) == "0.012"
 
 
-GAIN = Gain(2.0, 1.0, 50.0, 5.0, 0.02, {}, 0.5, (0.3, 0.7), 0.5, 6)
+GAIN = Gain(2.0, 1.0, 50.0, 5.0, 0.02, {}, 0.5, (0.3, 0.7), 0.5, 6, 0.0)
 
 
 @pytest.mark.parametrize(
