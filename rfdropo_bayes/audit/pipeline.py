@@ -24,7 +24,7 @@ from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Look, look
-from rfdropo_bayes.audit.search import better_nearby, search, with_usable_differences
+from rfdropo_bayes.audit.search import WITHIN, better_nearby, search, with_usable_differences
 from rfdropo_bayes.audit.verdict import NO_VERDICT, PARTLY, UNEXPLAINED, decide
 from rfdropo_bayes.bayes.channels import ObjectPose, Series
 from rfdropo_bayes.bayes.model import TrajectoryModel
@@ -346,8 +346,8 @@ def _base_fit(
     target, fit = judged(target, first, free)
     for _ in range(AGAIN):
         better = better_nearby(target, fit)
-        if better is None:
-            return target, fit
+        if better is None:  # of a motion that bends, as where cables go slack, slopes promise what is not there
+            return target, replace(fit, promise=0.0) if fit.promise < WITHIN else fit
         report(f"base model: sum of squares {fit.residual @ fit.residual:.0f}, and better beside it")
         fit = climb(target, better, free)
     return target, fit if better_nearby(target, fit) is None else replace(fit, promise=np.inf)
