@@ -192,7 +192,7 @@ class Inquiry:
                 return found
             better = None
             if len(steps) not in renewed:
-                with suppress(OutOfTime):
+                with self.target.forward.deadline.stage("refits"), suppress(OutOfTime):
                     better = self._climbed_again(step, named)
             if better is not None:
                 renewed.add(len(steps))

@@ -454,6 +454,7 @@ GAIN = Gain(2.0, 1.0, 50.0, 5.0, 0.02, {}, 0.5, (0.3, 0.7), 0.5, 6, 0.0)
         ({"elpd_p": 0.06}, False, False),  # perhaps chance
         ({"elpd_difference": -1.0, "elpd_p": None}, False, False),
         ({"elpd_difference": 1.0, "elpd_p": None}, False, True),  # too few recordings to tell from chance
+        ({"elpd_p": None, "elpd_least": -4.0}, False, False),  # one of these few speaks against it
     ],
 )
 def test_a_verdict_agrees_with_the_errors(changes, worse, clear):
