@@ -91,11 +91,15 @@ class Gain:
         return self.rmse_extended > self.rmse_base or self.interval[1] < 0.0
 
     @property
+    def opposed(self) -> bool:
+        """Whether one of a few trajectories speaks clearly against the extension, though all together favour it."""
+        return self.elpd_p is None and self.elpd_difference > 0.0 and self.elpd_least <= -UNLIKELIER
+
+    @property
     def clear(self) -> bool:
         """Whether unseen trajectories clearly support the extension: it surely takes a part of the discrepancy away,
         their error does not grow, and they are clearly likelier: of few, none is clearly less likely."""
-        surely = self.elpd_least > -UNLIKELIER if self.elpd_p is None else self.elpd_p <= CHANCE
-        likelier = self.elpd_difference > 0.0 and surely
+        likelier = self.elpd_difference > 0.0 and (self.elpd_p is None or self.elpd_p <= CHANCE) and not self.opposed
         return self.interval[0] > 0.0 and likelier and not self.worse
 
 
