@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.score import project_out
-from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED
+from rfdropo_bayes.bayes.noise.autoregression import MISFIT, RESIDUALS, STATED
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 
 
@@ -39,7 +39,7 @@ def null_residuals(
         drawn = _fitted(measurements, noise, base, drawn)
     for row, single in enumerate(drawn):
         estimated = noise
-        if noise.source != STATED:
+        if noise.source not in (STATED, MISFIT):
             estimated = measurements.noise(single, parameters, noise)
         found[row, : measurements.count.size] = measurements.whiten(measurements.mean_of(single), estimated)
     weighed = measurements.size - measurements.count.size  # whose errors are known

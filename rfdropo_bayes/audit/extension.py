@@ -22,6 +22,8 @@ from rfdropo_bayes.audit.candidates import (
 from rfdropo_bayes.audit.deadline import OutOfTime, about
 from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb, climb_rollouts, heights
 from rfdropo_bayes.audit.forward import Forward
+from rfdropo_bayes.audit.inadequacy import as_measured, far_off, judged
+from rfdropo_bayes.audit.omnibus import Omnibus
 from rfdropo_bayes.audit.score import joint_statistic, likeness, span
 from rfdropo_bayes.audit.screen import Look, Row, look
 
@@ -29,7 +31,6 @@ DISCRETISATION = "discretisation"
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])
 TOLD_APART = 10.0  # nats: a candidate that is so much worse, once refitted, is excluded, and of no class with the best
 PAIRS = 3  # that are refitted
-POOR = 2.0  # squared residual per value from which on a climb may have ended far from where it should
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Rules:
         family: probability that the screen names anything where nothing is wrong.
         class_cosine: signatures more alike than this are one class.
         classes: leading classes that are refitted; members: candidates refitted in all.
-        effects: most mechanisms that are added.
+        effects: most mechanisms that are added to a model that is not far off.
         evidence: log Bayes factor a mechanism must bring to be added; one after the first must bring the logarithm of
             the number of candidates more, since with so many to choose from a few together imitate most things.
         bootstraps: simulated data sets behind every p-value.
@@ -74,6 +75,7 @@ class Step:
         fit: of the model with it.
         log_bayes_factor: of the model with against that without it, by Laplace.
         refits: log Bayes factors of all candidates that were refitted at this step.
+        judge: the target under which the fit was found, see `inadequacy`.
     """
 
     name: str
@@ -82,6 +84,7 @@ class Step:
     fit: Fit
     log_bayes_factor: float
     refits: dict[str, float]
+    judge: Target
 
 
 @dataclass
@@ -89,7 +92,8 @@ class Inquiry:
     """The question put to a data set: which of the candidates does the base model lack?
 
     Attributes:
-        target: data, noise and simulator; every candidate is in the simulator, at its null value.
+        target: data, noise and simulator; every candidate is in the simulator, at its null value. Its noise
+            is that under which the present model is judged, see `inadequacy`.
         candidates: that may be named.
         rules: see `Rules`.
         seed: of all bootstraps.
@@ -132,9 +136,17 @@ class Inquiry:
             names.append(DISCRETISATION)
         with clock.stage("joint test"):
             found = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer)
+            if self.target.known is not None:  # whether anything is wrong, the noise of the measurement says
+                return replace(found, omnibus=self._tested(fit, len(without)), finer=None), probes
         if found.finer is not None and found.row(DISCRETISATION).adjusted_p > self.rules.family:
             found = replace(found, omnibus=max(found.omnibus, found.finer, key=lambda test: test.p))
         return found, probes
+
+    def _tested(self, fit: Fit, number: int) -> Omnibus:
+        """The joint test of a fit under the noise of the measurement."""
+        known = self.target.measured
+        measured = as_measured(self.target, fit)
+        return look(known, measured, [], [], [self.seed, number], self.rules.bootstraps).omnibus
 
     def name_causes(self, base: Fit) -> tuple[Fit, list[Step], Look]:
         """Forward-stepwise extension: the base model, the steps taken, and the look at the final model.
@@ -148,6 +160,7 @@ class Inquiry:
         except OutOfTime:
             fit = steps[-1].fit if steps else bases[-1]
             found = look(self.target, fit, [], [], [self.seed, len(steps)], self.rules.bootstraps)
+            found = replace(found, omnibus=self._tested(fit, len(steps)))
         return bases[-1], steps, found
 
     def _name_causes(self, bases: list[Fit], steps: list[Step]) -> Look:
@@ -156,18 +169,21 @@ class Inquiry:
         renewed: set[int] = set()  # numbers of steps at which the model was climbed again: once at each
         while True:
             named = [step.name for step in steps]
+            if steps and DISCRETISATION not in named:
+                self.target, fit = judged(self.target.measured, fit.x, fit.free)
+                steps[-1] = replace(steps[-1], fit=fit, judge=self.target)
             found, _ = self.look_at(fit, named)
             if not steps and found.omnibus.p > self.rules.base_passes:
                 return found
             p = p_in_words(found.omnibus.p, self.rules.bootstraps)
             self.report(f"joint test p {p}; first: {found.rows[0].name if found.rows else 'none'}")
-            if len(steps) >= self.rules.effects or found.omnibus.p > self.rules.extended_passes:
+            if self._room(steps) < 1 or found.omnibus.p > self.rules.extended_passes:
                 return found
             with self.target.forward.deadline.stage("refits"):
                 step = self._extend(found, named)
                 pair = list[Step]()
                 with suppress(OutOfTime):
-                    pair = self._pair(found, named, step)
+                    pair = self._pair(found, named, step) if self._room(steps) > 1 else []
             if pair:
                 steps += pair
                 fit = pair[-1].fit
@@ -176,7 +192,7 @@ class Inquiry:
                 return found
             better = None
             if len(steps) not in renewed:
-                with suppress(OutOfTime):
+                with self.target.forward.deadline.stage("refits"), suppress(OutOfTime):
                     better = self._climbed_again(step, named)
             if better is not None:
                 renewed.add(len(steps))
@@ -194,6 +210,11 @@ class Inquiry:
                 with self.target.forward.deadline.stage("refits"):
                     steps[:] = self._reconsider(bases[-1], steps)
                 fit = steps[-1].fit
+
+    def _room(self, steps: Sequence[Step]) -> int:
+        """How many mechanisms may still be added: a model that is far off lacks more than a few, and rows that count
+        as few keep out what only imitates them."""
+        return len(self.candidates) if self.target.known is not None else self.rules.effects - len(steps)
 
     def _extend(self, found: Look, named: Sequence[str]) -> Step | None:
         """Refit the leading classes and add the best of them, if it is worth it."""
@@ -224,7 +245,7 @@ class Inquiry:
         # What looks the same near null may be another thing at the size that it has.
         able = [row for row in able if refits.get(row.name, np.inf) > refits[best] - TOLD_APART]
         members = self._class_of(found.row(best), able)
-        return Step(best, members, found, fits[best], refits[best], refits)
+        return Step(best, members, found, fits[best], refits[best], refits, self.target)
 
     def _pair(self, found: Look, named: Sequence[str], single: Step | None) -> list[Step]:
         """Two mechanisms at once, where the best one leaves most of a large misfit; none where they do not pay.
@@ -232,9 +253,9 @@ class Inquiry:
         Of compliance and pretension of cables neither does much without the other. Pairs are ranked by what the linear
         model says of them, and the leading ones are refitted.
         """
-        fit, left = found.fit, (single.fit if single else found.fit).residual
-        taken = float(fit.residual @ fit.residual - left @ left)
-        if left @ left <= POOR * np.count_nonzero(left) or len(named) + 2 > self.rules.effects:
+        fit, last = found.fit, single.fit if single else found.fit
+        taken = float(fit.residual @ fit.residual - last.residual @ last.residual)
+        if not far_off(self.target, last.x):
             return []
         rows = {row.name: row for row in found.rows if row.probe is not None and row.name != DISCRETISATION}
         heads = sorted(rows.values(), key=lambda row: -row.lm)[: self.rules.members]
@@ -261,8 +282,8 @@ class Inquiry:
         between, _ = self.look_at(alone[first], [*named, first])
         gains = [alone[first].log_evidence - fit.log_evidence, fits[best].log_evidence - alone[first].log_evidence]
         return [
-            Step(first, (first,), found, alone[first], gains[0], single.refits if single else {}),
-            Step(second, (second,), between, fits[best], gains[1], {}),
+            Step(first, (first,), found, alone[first], gains[0], single.refits if single else {}, self.target),
+            Step(second, (second,), between, fits[best], gains[1], {}, self.target),
         ]
 
     def _refit_pair(self, fit: Fit, rows: Sequence[Row]) -> Fit:
@@ -304,7 +325,7 @@ class Inquiry:
         """The best candidates of the leading classes, and further members of these while there is room; those that
         cannot bring what a mechanism must are left out."""
         able = [row for row in significant if drops[row.name] > 2.0 * self.rules.evidence]
-        able.sort(key=lambda row: row.rank * np.log(len(fit.residual)) - drops[row.name])
+        able.sort(key=lambda row: row.rank * np.log(fit.counted) - drops[row.name])
         heads: list[Row] = []
         rest: list[Row] = []
         for row in able:
@@ -351,8 +372,7 @@ class Inquiry:
         """A fit with one amplitude that leaves most of a large misfit, or a better one from elsewhere: the base model's
         optimum, where it has made up for the effect, may be in another valley than that of both together."""
         candidate = next((c for c in self.candidates if c.name == name), None)
-        poor = fit.residual @ fit.residual > POOR * np.count_nonzero(fit.residual)
-        if candidate is None or len(candidate.indices) != 1 or not poor:
+        if candidate is None or len(candidate.indices) != 1 or not far_off(self.target, fit.x):
             return fit
         coordinates, (index,) = self.target.forward.coordinates, candidate.indices
         signs = (coordinates.one_sided[index],) if coordinates.one_sided[index] else (-1, 1)
@@ -377,13 +397,11 @@ class Inquiry:
         candidate = next(c for c in self.candidates if c.name == last.name)
         indices = np.array([*base.free, *candidate.indices], dtype=int)
         # With the first one gone, its place in the fit may be far from the best: the base model's is another start.
-        emptied, plain = last.fit.x.copy(), base.x.copy()
+        emptied, bare = last.fit.x.copy(), base.x.copy()
         others = np.setdiff1d(last.fit.free, indices)
         emptied[others] = self.target.forward.coordinates.null[others]
-        plain[list(candidate.indices)] = last.fit.x[list(candidate.indices)]
-        alone = max(
-            (climb(self.target, start, indices) for start in (emptied, plain)), key=lambda fit: fit.log_evidence
-        )
+        bare[list(candidate.indices)] = last.fit.x[list(candidate.indices)]
+        alone = max((climb(self.target, start, indices) for start in (emptied, bare)), key=lambda fit: fit.log_evidence)
         found, _ = self.look_at(alone, [last.name])
         again = self._extend(found, [last.name])
         if again is None or again.name in (first.name, *first.members) or again.name == DISCRETISATION:
@@ -391,5 +409,7 @@ class Inquiry:
         if again.fit.log_evidence < last.fit.log_evidence + 1.0:
             return steps
         self.report(f"with {last.name} in the model, {again.name} takes the place of {first.name}")
-        renewed = replace(last, before=first.before, fit=alone, log_bayes_factor=alone.log_evidence - base.log_evidence)
+        plain = climb(self.target, base.x, base.free)
+        gained = alone.log_evidence - plain.log_evidence
+        renewed = replace(last, before=first.before, fit=alone, log_bayes_factor=gained)
         return [renewed, again]

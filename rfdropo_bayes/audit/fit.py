@@ -57,6 +57,11 @@ class Fit:
         """Whether no step promises more than a nat, or more than what the accuracy of a large misfit allows."""
         return self.promise < 1.0 + CLOSE * float(self.residual @ self.residual)
 
+    @property
+    def counted(self) -> float:
+        """How many independent values the residuals amount to, where rows that last count as fewer."""
+        return max(min(float(self.residual @ self.residual), len(self.residual)), np.e)
+
     def draws(self, rng: np.random.Generator, count: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Draws of all coordinates, folded back at the bounds."""
         values, vectors = np.linalg.eigh(self.covariance)
@@ -69,12 +74,22 @@ class Fit:
 
 @dataclass(frozen=True)
 class Target:
-    """What is fitted: measurements under a noise, by a simulator; ``journal`` keeps what was computed."""
+    """What is fitted: measurements under a noise, by a simulator; ``journal`` keeps what was computed.
+
+    Where the noise is that of a model that is far off (see `inadequacy`), ``known`` is the same under the noise of the
+    measurement.
+    """
 
     forward: Forward
     measurements: Measurements
     noise: Stacked
     journal: Journal = field(default_factory=Journal)
+    known: Target | None = None
+
+    @property
+    def measured(self) -> Target:
+        """The same under the noise of the measurement."""
+        return self if self.known is None else self.known
 
     @cached_property
     def identity(self) -> str:

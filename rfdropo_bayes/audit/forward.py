@@ -292,7 +292,8 @@ class Forward:
         every = self.commands.step.shape[1]
         steps = None if rows is None else min(int(self.commands.sample_step[:, :rows].max()) + 1, every)
         found, status = self.lanes.roll(flat[once], start[once], commands.of(once), self.deadline.check, steps)
-        self.pace = (time.monotonic() - began) / len(status)
+        lanes = -(-len(status) // self.lanes.width) * self.lanes.width  # of a call that is not full, all run
+        self.pace = (time.monotonic() - began) / lanes
         self.rollouts += len(status)
         status, found = status[again], {name: part[again] for name, part in found.items()}
         fine = status == Result.OK

@@ -17,6 +17,7 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 
 DIFFERENCE_FROM = 6  # trajectories below which an ELPD difference has no standard error worth stating
 CHANCE = 0.05  # probability that unseen trajectories seem to support an extension that is worth nothing
+UNLIKELIER = 3.0  # nats: of a few trajectories, none may speak so clearly against an extension
 FLIPS = 4095  # draws of the signs of more differences than can all be gone through
 RESAMPLES = 2000
 BANDS = 12
@@ -69,6 +70,7 @@ class Gain:
         explained: share of the base model's discrepancy that the extension takes away; interval: its 90 % interval.
         floor: the noise's root mean square distance of a marker [m].
         trajectories: how many.
+        elpd_least: the smallest difference of any of them.
     """
 
     rmse_base: float
@@ -81,6 +83,7 @@ class Gain:
     interval: tuple[float, float]
     floor: float
     trajectories: int
+    elpd_least: float
 
     @property
     def worse(self) -> bool:
@@ -88,10 +91,15 @@ class Gain:
         return self.rmse_extended > self.rmse_base or self.interval[1] < 0.0
 
     @property
+    def opposed(self) -> bool:
+        """Whether one of a few trajectories speaks clearly against the extension, though all together favour it."""
+        return self.elpd_p is None and self.elpd_difference > 0.0 and self.elpd_least <= -UNLIKELIER
+
+    @property
     def clear(self) -> bool:
         """Whether unseen trajectories clearly support the extension: it surely takes a part of the discrepancy away,
-        their error does not grow, and they are clearly likelier."""
-        likelier = self.elpd_difference > 0.0 and (self.elpd_p is None or self.elpd_p <= CHANCE)
+        their error does not grow, and they are clearly likelier: of few, none is clearly less likely."""
+        likelier = self.elpd_difference > 0.0 and (self.elpd_p is None or self.elpd_p <= CHANCE) and not self.opposed
         return self.interval[0] > 0.0 and likelier and not self.worse
 
 
@@ -102,6 +110,9 @@ def measure_gain(
     noise: Stacked,
     pattern: Float[np.ndarray, "group time column"],
     rng: np.random.Generator,
+    *,
+    judge: Stacked | None = None,
+    spread: Float[np.ndarray, " column"] | None = None,
 ) -> Gain:
     """Compare two models.
 
@@ -111,10 +122,14 @@ def measure_gain(
         noise: of the measurements.
         pattern: what the base model leaves where it was fitted, whitened: it says where to look for the discrepancy,
             in frequency and over the columns.
+        rng: of the interval.
+        judge: noise under which the base model is judged, and densities are compared; that of the measurements by
+            default.
+        spread: deviation of the extended model's errors, for its bands; that of the measurements' noise by default.
     """
     first, second = (np.where(unseen.valid, p.mean, 0.0) for p in (base, extended))
     markers = max(unseen.valid[..., : unseen.markers].sum() / 3.0, 1.0)
-    own = [_elpd(unseen, p, noise) for p in (base, extended)]
+    own = [_elpd(unseen, p, judge or noise) for p in (base, extended)]
     difference = own[1] - own[0]
     count = len(difference)
     explained, interval = explained_fraction(unseen, first, second, noise, pattern, rng)
@@ -125,11 +140,12 @@ def measure_gain(
         elpd_difference=float(difference.sum()),
         elpd_difference_se=float(np.sqrt(count) * difference.std(ddof=1)) if count >= DIFFERENCE_FROM else None,
         elpd_p=sign_flip_p(difference, rng) if count >= DIFFERENCE_FROM else None,
-        coverage=_coverage(unseen, extended, noise),
+        coverage=_coverage(unseen, extended, noise.scale if spread is None else spread),
         explained=explained,
         interval=interval,
         floor=noise_distance(noise.first),
         trajectories=count,
+        elpd_least=float(difference.min()),
     )
 
 
@@ -161,9 +177,9 @@ def _elpd(unseen: Unseen, prediction: Prediction, noise: Stacked) -> Float[np.nd
     return logsumexp(-0.5 * np.sum(white**2, axis=(-2, -1)), axis=0) - np.log(len(residual))
 
 
-def _coverage(unseen: Unseen, prediction: Prediction, noise: Stacked) -> dict[float, float]:
-    spread = np.sqrt(prediction.errors.var(axis=0) + noise.scale**2)
-    z = (np.abs(prediction.mean) / spread)[unseen.valid]
+def _coverage(unseen: Unseen, prediction: Prediction, spread: Float[np.ndarray, " column"]) -> dict[float, float]:
+    whole = np.sqrt(prediction.errors.var(axis=0) + spread**2)
+    z = (np.abs(prediction.mean) / whole)[unseen.valid]
     return {level: float(np.mean(z < norm.ppf(0.5 + level / 2))) for level in LEVELS}
 
 

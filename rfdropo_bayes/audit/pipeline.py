@@ -18,12 +18,13 @@ from rfdropo_bayes.audit.differences import Groups
 from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step
 from rfdropo_bayes.audit.fit import Fit, Target, climb, climb_rollouts, widened
 from rfdropo_bayes.audit.forward import Forward, Lanes
-from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
+from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain, noise_distance
+from rfdropo_bayes.audit.inadequacy import as_measured, judged, spread
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Look, look
-from rfdropo_bayes.audit.search import better_nearby, search, with_usable_differences
+from rfdropo_bayes.audit.search import WITHIN, better_nearby, search, with_usable_differences
 from rfdropo_bayes.audit.verdict import NO_VERDICT, PARTLY, UNEXPLAINED, decide
 from rfdropo_bayes.bayes.channels import ObjectPose, Series
 from rfdropo_bayes.bayes.model import TrajectoryModel
@@ -149,14 +150,16 @@ def audit(
     with deadline.stage("base model"):
         target, base = base_model(question, question.seed, journal, report, deadline)
     question = _with_differences_of(question, target)
-    noise = target.noise.first
+    noise = target.measured.noise.first
     shared = "" if noise.correlation is None else ", shared between coordinates"
-    report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}")
+    report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}{_far_off(target)}")
     finer = None if question.finer is None else _forward(question, True, target.measurements, deadline)
-    inquiry = Inquiry(target, question.candidates, question.rules, question.seed, finer, report)
+    judge, inquiry = target, Inquiry(target, question.candidates, question.rules, question.seed, finer, report)
     inquiry, base, steps, last = _inquired(inquiry, base)
-    target = inquiry.target
-    held_out = _held_out(question, target, inquiry, base, steps)
+    target = inquiry.target.measured
+    judge = judge if judge.known is not None else target
+    held_out = _held_out(question, [judge, *(step.judge for step in steps)], inquiry, base, steps)
+    base, steps = as_measured(judge, base), [replace(s, fit=as_measured(s.judge, s.fit)) for s in steps]
     kept = held_out.supported() if held_out else 0
     unsupported = [step.name for step in steps[kept:]] if kept else []
     if unsupported:
@@ -198,12 +201,20 @@ def audit(
     )
 
 
+def _far_off(target: Target) -> str:
+    """What a line of words says of a model that is far off."""
+    if target.known is None:
+        return ""
+    size = 1e3 * noise_distance(target.noise.first)
+    return f"; it is far off, and judged under white noise of {size:.2g} mm, rows that last counted as fewer"
+
+
 def _judged(
     inquiry: Inquiry, base: Fit, steps: Sequence[Step], looks: Sequence[Look], gain: Gain | None, deadline: Deadline
 ) -> tuple[str, Stacked | None]:
     """The verdict, and the noise under which the base model would pass where something is left unexplained."""
     rules, last = inquiry.rules, looks[-1].omnibus.p
-    members, noise = [len(step.members) for step in steps], inquiry.target.noise
+    members, noise = [len(step.members) for step in steps], inquiry.target.measured.noise
     verdict = decide(rules, looks[0].omnibus.p, last if steps else None, members, gain, noise.doubtful)
     if not base.converged or (verdict == UNEXPLAINED and deadline.reached):
         verdict = NO_VERDICT
@@ -332,11 +343,11 @@ def _base_fit(
     usual, target = target.forward.lanes.difference, with_usable_differences(target, first)
     if target.forward.lanes.difference != usual:
         report(f"motion is rough: derivatives over relative steps of {target.forward.lanes.difference:g}")
-    fit = climb(target, first, free)
+    target, fit = judged(target, first, free)
     for _ in range(AGAIN):
         better = better_nearby(target, fit)
-        if better is None:
-            return target, fit
+        if better is None:  # of a motion that bends, as where cables go slack, slopes promise what is not there
+            return target, replace(fit, promise=0.0) if fit.promise < WITHIN else fit
         report(f"base model: sum of squares {fit.residual @ fit.residual:.0f}, and better beside it")
         fit = climb(target, better, free)
     return target, fit if better_nearby(target, fit) is None else replace(fit, promise=np.inf)
@@ -380,9 +391,10 @@ def _final_look(inquiry: Inquiry, extended: Fit, steps: Sequence[Step]) -> Look:
 
 def _suspected(inquiry: Inquiry, base: Fit) -> Stacked | None:
     """Noise fitted to what the base model leaves, where it passes under that, though not under the noise stated."""
-    if inquiry.target.noise.source != STATED:
+    known = inquiry.target.measured
+    if known.noise.source != STATED:
         return None
-    target, fit = _under_residual_noise(inquiry.target, base)
+    target, fit = _under_residual_noise(known, base)
     found, _ = replace(inquiry, target=target).look_at(fit)
     passes = found.omnibus.p > inquiry.rules.base_passes and not target.noise.doubtful
     return target.noise if passes else None
@@ -409,6 +421,8 @@ class HeldOut:
         predictions: of the base model, then after each step.
         patterns: what each of these models leaves where it was fitted, see `measure_gain`.
         noise: of the measurements.
+        judges: the noise under which each of the models is judged, see `inadequacy`.
+        spreads: deviation of what each of them leaves, by column.
         seed: of the gain's interval.
     """
 
@@ -417,12 +431,15 @@ class HeldOut:
     predictions: list[Prediction]
     patterns: list[np.ndarray]
     noise: Stacked
+    judges: list[Stacked]
+    spreads: list[np.ndarray]
     seed: int
 
     def gain(self, before: int, after: int) -> Gain:
         """What the model after some steps is worth beside that after fewer."""
         first, second, rng = self.predictions[before], self.predictions[after], np.random.default_rng([self.seed, 4])
-        return measure_gain(self.unseen, first, second, self.noise, self.patterns[before], rng)
+        judge, spread, pattern = self.judges[before], self.spreads[after], self.patterns[before]
+        return measure_gain(self.unseen, first, second, self.noise, pattern, rng, judge=judge, spread=spread)
 
     def supported(self) -> int:
         """Number of steps that the unseen recordings clearly support, each beside the last one that they do."""
@@ -433,18 +450,23 @@ class HeldOut:
         return last
 
 
-def _held_out(question: Question, target: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step]) -> HeldOut | None:
+def _held_out(
+    question: Question, judges: Sequence[Target], inquiry: Inquiry, base: Fit, steps: Sequence[Step]
+) -> HeldOut | None:
     """The test recordings, or fitted ones that are left out in turn; None where the model was not extended, or the time
     was up."""
     if not steps:
         return None
     inquiry.report("measuring the gain on recordings that no fit has seen")
-    with target.forward.deadline.stage("gain"), suppress(OutOfTime):
-        return _predicted(question, target, inquiry, base, steps)
+    with inquiry.target.forward.deadline.stage("gain"), suppress(OutOfTime):
+        return _predicted(question, judges, inquiry, base, steps)
     return None
 
 
-def _predicted(question: Question, target: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step]) -> HeldOut:
+def _predicted(
+    question: Question, judges: Sequence[Target], inquiry: Inquiry, base: Fit, steps: Sequence[Step]
+) -> HeldOut:
+    target = inquiry.target.measured
     count, every = len(question.trajectories), len(question.model.recordings.names)
     fits = [base, *(step.fit for step in steps)]
     names = ["", *(step.name for step in steps)]
@@ -457,9 +479,11 @@ def _predicted(question: Question, target: Target, inquiry: Inquiry, base: Fit, 
             forward = simulated(question, DISCRETISATION in names[: i + 1], tested, range(count, every))
             predictions.append(_predict(replace(target, forward=forward, measurements=tested), fit, [question.seed, 3]))
     else:
-        which, unseen, predictions = _left_out(question, target, inquiry, fits, names)
-    patterns = [target.measurements.series(fit.residual) for fit in fits]
-    return HeldOut(which, unseen, predictions, patterns, target.noise, question.seed)
+        which, unseen, predictions = _left_out(question, judges, inquiry, fits, names)
+    seen = list(zip(judges, fits, strict=True))
+    patterns = [target.measurements.series(as_measured(judge, fit).residual) for judge, fit in seen]
+    spreads, noises = [spread(judge, fit) for judge, fit in seen], [judge.noise for judge in judges]
+    return HeldOut(which, unseen, predictions, patterns, target.noise, noises, spreads, question.seed)
 
 
 def _unseen(tested: Measurements, valid: np.ndarray) -> Unseen:
@@ -468,10 +492,11 @@ def _unseen(tested: Measurements, valid: np.ndarray) -> Unseen:
 
 
 def _left_out(
-    question: Question, target: Target, inquiry: Inquiry, fits: Sequence[Fit], names: Sequence[str]
+    question: Question, judges: Sequence[Target], inquiry: Inquiry, fits: Sequence[Fit], names: Sequence[str]
 ) -> tuple[str, Unseen, list[Prediction]]:
     """Predict each group of repeats from the others; where one has parameters that no other tells (a single one has),
     the later rows of all from the earlier ones."""
+    target = inquiry.target.measured
     measured = target.measurements
     groups = len(measured.members)
     kinds = [tuple(slots) for slots in target.forward.slots]
@@ -486,12 +511,12 @@ def _left_out(
     parts: list[list[np.ndarray]] = [[] for _ in fits]
     for mask in masks:
         mask = np.broadcast_to(mask, measured.count.shape)
-        kept = replace(measured, count=np.where(mask, 0.0, measured.count))
-        for i, fit in enumerate(fits):
+        for i, (judge, fit) in enumerate(zip(judges, fits, strict=True)):
             forward = target.forward
             if DISCRETISATION in names[: i + 1] and inquiry.finer is not None:
                 forward = inquiry.finer
-            refitted = climb(replace(target, forward=forward, measurements=kept), fit.x, fit.free, evaluations=15)
+            kept = replace(judge.measurements, count=np.where(mask, 0.0, judge.measurements.count))
+            refitted = climb(replace(judge, forward=forward, measurements=kept), fit.x, fit.free, evaluations=15)
             own = replace(target, forward=forward)
             parts[i].append(_predict(own, refitted, [question.seed, 3]).errors)
     draws = min(len(part) for row in parts for part in row)

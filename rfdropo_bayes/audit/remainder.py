@@ -12,7 +12,7 @@ from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.bayes.noise.autoregression import Autoregression
 
 MOST_ROWS = 300
-AMPLITUDES = np.concatenate([[0.0], np.geomspace(0.02, 50.0, 28)])  # in deviations of the noise
+SMALLEST, LARGEST, AMPLITUDES = 0.02, 50.0, 28  # of the amplitudes that are tried, in deviations of the noise
 LENGTHS = (1.5, 3.0, 6.0, 12.0, 25.0, 50.0, 100.0)  # in rows
 
 
@@ -50,11 +50,13 @@ def describe_remainder(measurements: Measurements, white: Float[np.ndarray, " n"
     every = np.ones((len(rows), 1), dtype=bool)
     unit = Autoregression(np.ones(1), noise.autocorrelation, noise.source, noise.freedom)
     whitener = unit.whiten(np.eye(len(rows))[:, :, None], np.broadcast_to(every, (len(rows), len(rows), 1)))[..., 0].T
+    most = max(LARGEST, 3.0 * float(np.sqrt(np.mean(data**2))))  # a stated noise may be a thousandth of what is left
+    amplitudes = np.concatenate([[0.0], np.geomspace(SMALLEST, most, AMPLITUDES)])
     best = (0.0, 0.0, LENGTHS[0])
     for length in LENGTHS:
         values, vectors = np.linalg.eigh(whitener @ _matern(rows, length) @ whitener.T)
         power = np.einsum("rk,grc->gkc", vectors, data) ** 2
-        for amplitude in AMPLITUDES:
+        for amplitude in amplitudes:
             spread = 1.0 + (amplitude * weight[:, None]) ** 2 * np.maximum(values, 0.0)
             gain = -0.5 * np.sum(power / spread[:, :, None] - power) - 0.5 * data.shape[2] * np.sum(np.log(spread))
             if gain > best[0] + 1e-9:

@@ -30,7 +30,7 @@ class Row:
         lm: score statistic of that probe; rank: its degrees of freedom.
         p: of that probe alone.
         adjusted_p: probability that, were the model right, any probe of any candidate surprised as much.
-        score: LM - rank log n, by which candidates are ranked.
+        score: LM - rank log n, n being the values that count, by which candidates are ranked.
     """
 
     name: str
@@ -113,7 +113,7 @@ def _row(name: str, seen: Sequence[Probe], surprises: np.ndarray, most: np.ndarr
     best = max(own, key=lambda i: surprises[i])
     probe = seen[best]
     lm = float(statistic(probe.mark, fit.residual)[0])
-    score = lm - probe.mark.rank * np.log(len(fit.residual))
+    score = lm - probe.mark.rank * np.log(fit.counted)
     return Row(name, probe, lm, probe.mark.rank, _p_value(surprises[best]), tail(surprises[best], most), score)
 
 

@@ -23,6 +23,8 @@ from rfdropo_bayes.simulators.differences import usable_difference
 
 CLIMBED = 0.1  # nats that a step of these climbs promises at their end; the audit's own climb goes on from there
 POLLED = (0.3, 0.03, 0.003)  # prior deviations to each side of a summit that are tried
+ALONG = (4.0, 2.0, 1.0, 0.3)  # deviations of the posterior along its principal axes, likewise
+WITHIN = 0.5 * max(ALONG) ** 2  # nats that a step of slopes promises which is no longer than those tried
 
 
 @dataclass(frozen=True)
@@ -146,12 +148,13 @@ def search(target: Target, key: PRNGKeyArray) -> Float[np.ndarray, " d"]:
 def with_usable_differences(target: Target, x: Float[np.ndarray, " d"]) -> Target:
     """The target with derivatives over steps on whose scale its motion is smooth around a point.
 
-    Slopes over the steps of a ladder are compared, of all base parameters at once; rollouts say which steps agree.
+    Slopes over the steps of a ladder, in prior deviations, are compared, of all base parameters at once; rollouts say
+    which steps agree.
     """
     usual, coordinates = target.forward.lanes.difference, target.forward.coordinates
     if usual is None:
         return target
-    directions = np.eye(len(x))[: coordinates.base]
+    directions = np.diag(coordinates.prior_sd)[: coordinates.base]
 
     def slope(step: float) -> np.ndarray:
         points = np.clip(np.concatenate([x + step * directions, x - step * directions]), *coordinates.bounds)
@@ -169,14 +172,14 @@ def better_nearby(target: Target, fit: Fit) -> Float[np.ndarray, " d"] | None:
     Derivatives cannot tell: of a motion that is rough on the scale of their steps they are noise, and promise nothing.
     """
     coordinates = target.forward.coordinates
-    points = []
-    for index in fit.free:
-        for step in POLLED:
-            for sign in (-1.0, 1.0):
-                point = fit.x.copy()
-                point[index] += sign * step * coordinates.prior_sd[index]
-                points.append(point)
-    tried = np.clip(np.stack([fit.x, *points]), *coordinates.bounds)
+    own = coordinates.prior_sd[fit.free]
+    values, vectors = np.linalg.eigh(fit.covariance / np.outer(own, own))
+    axes = (vectors * np.sqrt(np.maximum(values, 0.0))).T * own
+    moves = [step * np.diag(own) for step in POLLED] + [step * axes for step in ALONG]
+    moved = np.concatenate([sign * move for move in moves for sign in (-1.0, 1.0)])
+    points = np.repeat(fit.x[None], 1 + len(moved), axis=0)
+    points[1:, fit.free] += moved
+    tried = np.clip(points, *coordinates.bounds)
     height = heights(target, tried, "poll")
     best = int(np.argmax(height))
     return tried[best] if height[best] > height[0] + 1.0 + CLOSE * float(fit.residual @ fit.residual) else None

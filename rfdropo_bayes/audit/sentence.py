@@ -150,6 +150,11 @@ def _p(answer: Answer) -> str:
 
 def _adoption(answer: Answer) -> str:
     """What of the findings joins the model for good."""
+    if not answer.adopted and answer.gain is not None and answer.gain.opposed and not answer.gain.worse:
+        return (
+            " One of the unseen recordings is clearly less likely with this: extended.toml keeps the base model. "
+            "Compare groups of recordings with --between."
+        )
     if not answer.adopted:
         return " Unseen recordings do not clearly support this: extended.toml keeps the base model."
     if answer.unsupported:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.modes.climb import LevenbergState as LevenbergState
     from rfdropo_bayes.inference.modes.climb import maximise as maximise
     from rfdropo_bayes.inference.modes.climb import normal_at as normal_at
+    from rfdropo_bayes.inference.modes.lasting import lasting_series as lasting_series
     from rfdropo_bayes.inference.modes.search import LaplaceConfig as LaplaceConfig
     from rfdropo_bayes.inference.modes.search import find_modes as find_modes
     from rfdropo_bayes.inference.nested import NestedConfig as NestedConfig
@@ -50,6 +51,7 @@ PUBLIC = {
     "LevenbergState": "modes.climb",
     "maximise": "modes.climb",
     "normal_at": "modes.climb",
+    "lasting_series": "modes.lasting",
     "LaplaceConfig": "modes.search",
     "find_modes": "modes.search",
     "NestedConfig": "nested",

@@ -68,19 +68,25 @@ def with_differences(
 
 LADDER = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 AGREE = 0.5  # share by which slopes over two successive steps of the ladder may differ
+# Slopes of a motion that bends, as where a cable goes slack, differ between steps and stay of one size (on the paper's
+# trunk within a tenth of it); those of a motion that jitters grow as steps shrink.
+JITTER = 3.0
 
 
 def usable_difference(slope: Callable[[float], Float[np.ndarray, "..."]]) -> float:
     """Smallest step of `LADDER` from which on slopes agree; the largest one where none do.
 
     A motion can be rough: smooth on the smallest scales, with slopes there that are thousands of times those of the
-    changes that matter (a body of tetrahedra that jitters). Rounding is rough, too.
+    changes that matter (a body of tetrahedra that jitters). Rounding is rough, too. A motion that bends is not: where
+    slopes over the smallest step are no larger than others, they are right.
 
     Args:
         slope: secant over one step to each side, of all outputs along all directions of interest.
     """
     chosen = LADDER[-1]
     larger = slope(chosen)
+    if np.linalg.norm(slope(LADDER[0])) < JITTER * np.linalg.norm(larger):
+        return LADDER[0]
     for step in LADDER[-2::-1]:
         smaller = slope(step)
         if np.linalg.norm(smaller - larger) > AGREE * np.linalg.norm(larger):

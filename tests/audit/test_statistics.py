@@ -213,7 +213,7 @@ def test_coordinates_are_those_of_the_prior_s_own_transform(prior, low, high):
 
 
 def gain(explained: float, low: float) -> Gain:
-    return Gain(2e-3, 1e-3, 10.0, 2.0, 0.02, {}, explained, (low, 1.0), 9e-4, 6)
+    return Gain(2e-3, 1e-3, 10.0, 2.0, 0.02, {}, explained, (low, 1.0), 9e-4, 6, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from rfdropo_bayes.bayes.noise.shared import half_log_determinant, mixed, shrunk
 MAX_ORDER = 3
 LEAST_SHARE = 0.05  # of the mean deviation that a column has at least: a marker that never moves is no certainty
 REPEATS, STATED, RESIDUALS = "repeats", "stated", "residuals"
+MISFIT = "misfit"  # white, of the size of what a model that is far off leaves
 SLOW = 0.9  # share that the rows before predict, from which on a model's residuals are not taken for noise alone
 
 
