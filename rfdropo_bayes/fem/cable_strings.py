@@ -65,7 +65,7 @@ def string_stiffness(
     length = jnp.where(square > least**2, jnp.sqrt(jnp.maximum(square, least**2)), least)
     stretch = jnp.einsum("lni,lni->li", turned, gradient)
     lever = length / (0.5 * (stretch[:, 0] + stretch[:, 1]) + stretch[:, 2])[:, None]
-    spring = tension / length
+    spring = np.any(weights != 0.0, axis=-1) * tension / length
     relative = weights - lever[..., None] * gradient[:, None, :, 2]
     straight = jnp.einsum("lc,lcn,lcm->lnm", spring, relative, relative)
     mixed = jnp.einsum("lc,lcn,lma->lnma", spring * lever, relative, gradient[..., :2])

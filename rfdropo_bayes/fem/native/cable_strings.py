@@ -38,7 +38,8 @@ def measure_strings(tables, layer, rate, work, token):
             dx, dy, dz = fma(weight, x, dx), fma(weight, y, dy), fma(weight, z, dz)
         length = square_root(fma(dx, dx, fma(dy, dy, dz * dz)))
         length = where_greater(length, least, length, least)
-        spring = load(work.tension, c, token) / (length * fill(rate * rate, axes, token))
+        reached = abs(tables.crossing[(layer * cables + c) * 2 * modes])  # one, or zero beyond the cable's end
+        spring = fill(reached, axes, token) * load(work.tension, c, token) / (length * fill(rate * rate, axes, token))
         store(work.string, 2 * (layer * cables + c), spring, length / stretch)
 
 
