@@ -84,8 +84,8 @@ class ModelTable(Table):
     )
     object_pose: bool = Field(
         default=False,
-        description="the recordings' poses of the pushed body are data, with object_noise, object_turn_noise and "
-        "object_correlation_time; it starts at the first of them",
+        description="the recordings' poses of the pushed body are data, with object_noise, object_turn_noise and, "
+        "unless noise is white, object_correlation_time; it starts at the first of them",
     )
     weighed: list[WeighedTable] = Field(
         default_factory=list,

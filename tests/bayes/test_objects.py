@@ -109,6 +109,22 @@ def problem(trajectory: Trajectory, *, poses: bool = True, lost: tuple[int, ...]
     return CalibrationProblem(TrajectoryModel(simulator, space, {}, recordings, tuple(channels)))
 
 
+def test_white_noise_of_poses_has_no_memory_and_the_density_of_independent_errors():
+    """Against a sum of normal log densities; a body that goes 1 mm too far along x in every row but the first."""
+    white = ObjectPose.gather(Finger(), [recording()], 30, lasting=False)
+    assert [spec.name for spec in white.noise_specs] == ["object_noise", "object_turn_noise"]
+    assert white.independent
+    assert not ObjectPose.gather(Finger(), [recording()], 30).independent
+    about = white.readings.copy()
+    about[:, 1:, 0] -= 1e-3
+    sizes = {"object_noise": 2e-3, "object_turn_noise": 0.05}
+    residual, scale = white.whiten(white.deviation(white.readings, about), sizes)
+    np.testing.assert_allclose(
+        np.asarray(residual)[0, 1:], [0.5, 0.0, 0.0, 0.0, 0.0, 0.0] * np.ones((29, 1)), atol=1e-6
+    )
+    np.testing.assert_allclose(np.asarray(scale)[0, 1:], np.log(np.repeat([2e-3, 0.05], 3)) * np.ones((29, 1)))
+
+
 def test_the_density_of_the_poses_is_that_of_an_ornstein_uhlenbeck_process_about_the_simulated_ones():
     read = recording()
     chosen, plain = problem(read, lost=(7, 8)), problem(read, poses=False)
