@@ -60,15 +60,17 @@ class Drive:
         motor: what it drives.
         eds: path of its electronic data sheet.
         offset: counts at length zero.
+        answer: how long it has to answer an SDO request [s].
     """
 
-    def __init__(self, network: LoggedNetwork, motor: Motor, eds: str, offset: float) -> None:
+    def __init__(self, network: LoggedNetwork, motor: Motor, eds: str, offset: float, answer: float = 0.3) -> None:
         self.motor, self.offset = motor, offset
         self.network = network
         try:
             self.node = canopen.RemoteNode(motor.node, eds)
         except Exception as error:  # configparser and canopen raise many types on damaged data sheets
             raise InputError(f"is no readable data sheet ({error})", where=eds, remedy=_EDS_REMEDY) from None
+        self.node.sdo.RESPONSE_TIMEOUT = answer
         network.add_node(self.node)
         self._sdo = threading.Lock()
         self.controlword, self.target = int(Command.DISABLE_VOLTAGE), 0

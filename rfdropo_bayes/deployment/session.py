@@ -174,7 +174,7 @@ class _Session:
         bus_table, identity = settings.bus, settings.drives
         if self.simulated:
             sensor = sensor or SimulatedMarkers(len(self.robot.marker_names))
-            identity = DrivesTable(product=0x52464401)
+            identity = DrivesTable(product=0x52464401, answer_s=identity.answer_s)
             if bus is None:
                 bus_table = self._stack.enter_context(simulated_drives(self._simulation(sensor)))
         self.sensor = sensor if sensor is not None else open_sensor(sensor_table, self.robot)
@@ -188,7 +188,8 @@ class _Session:
         guards = settings.safety.guards()
         motors = self._motors()
         drives = [
-            Drive(self.network, motor, identity.eds, offset) for motor, offset in zip(motors, self.offsets, strict=True)
+            Drive(self.network, motor, identity.eds, offset, identity.answer_s)
+            for motor, offset in zip(motors, self.offsets, strict=True)
         ]
         self.drives = Drives(self.network, drives, guards)
         for drive in drives:

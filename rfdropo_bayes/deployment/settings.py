@@ -30,6 +30,7 @@ class DrivesTable(_Table):
         serial: channel -> serial number.
         check_eds: whether vendor and product in the data sheet must be those that the drive says; some makers leave
             them out of step.
+        answer_s: a drive has this long to answer an SDO request; more for drives that write to slow memory.
     """
 
     eds: str = str(SIMULATED_EDS)
@@ -38,6 +39,7 @@ class DrivesTable(_Table):
     revision: int | None = None
     serial: dict[str, int] = {}
     check_eds: bool = True
+    answer_s: float = Field(default=0.3, gt=0.0)
 
     def identity(self, channel: str) -> Identity:
         """What the drive of a channel must say of itself."""

@@ -190,9 +190,9 @@ def serve(table: SimulationTable, ready: Path | None = None) -> None:
             plant = PlantHere(build_plant(table.plant, robot, table.settings))
         drives = SimulatedDrives(robot, table, bus, plant)
         schedule_fifo()
-        if ready is not None:
-            ready.write_text(bus_table.channel, encoding="utf-8")
         stack.enter_context(steady_interpreter())
+        if ready is not None:  # last of all: making the interpreter steady takes longer than an SDO client waits
+            ready.write_text(bus_table.channel, encoding="utf-8")
         with contextlib.suppress(can.CanError):  # the bus has gone, and the drives with it
             drives.run(stop)
 

@@ -39,9 +39,11 @@ class Rig:
         with contextlib.suppress(can.CanError):
             self.simulated.run(self._stop)
 
-    def drives(self, guards: Guards | None = None, eds: str = str(objects.SIMULATED_EDS)) -> Drives:
+    def drives(
+        self, guards: Guards | None = None, eds: str = str(objects.SIMULATED_EDS), answer: float = 1.0
+    ) -> Drives:
         """The master's side."""
-        made = [Drive(self.network, motor, eds, motor.offset_counts) for motor in self.robot.motors]
+        made = [Drive(self.network, motor, eds, motor.offset_counts, answer) for motor in self.robot.motors]
         return Drives(self.network, made, guards or Guards())
 
     def close(self) -> None:

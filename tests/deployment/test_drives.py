@@ -164,6 +164,19 @@ def test_no_data_sheet_and_no_answer_are_told_apart(rig, tmp_path: Path) -> None
         rig.drives().all[2].check(Identity())
 
 
+@pytest.mark.parametrize(("answer", "heard"), [(0.05, False), (2.0, True)])
+def test_a_slow_drive_is_waited_for_as_long_as_said(rig, monkeypatch, answer: float, heard: bool) -> None:
+    slow = rig.simulated.drives[0]
+    receive = slow.receive
+    monkeypatch.setattr(slow, "receive", lambda *frame: (time.sleep(0.2), receive(*frame)))
+    drive = rig.drives(answer=answer).all[0]
+    if heard:
+        assert drive.read(Object.DEVICE_TYPE) & 0xFFFF == 402
+    else:
+        with pytest.raises(InputError, match="No SDO response"):
+            drive.read(Object.DEVICE_TYPE)
+
+
 def test_a_torque_that_would_falsify_tensions_is_refused(rig) -> None:
     rig.simulated.drives[0].local.data_store[Object.RATED_TORQUE][0] = (500).to_bytes(4, "little")
     with pytest.raises(InputError, match="rated torque is 500"):

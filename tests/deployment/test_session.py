@@ -22,6 +22,7 @@ from rfdropo_bayes.deployment.sensors import SimulatedMarkers
 from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import (
     Deployment,
+    DrivesTable,
     HomingTable,
     PolicyTable,
     SafetyTable,
@@ -38,6 +39,7 @@ from .policies import linear_policy
 PATIENT = SafetyTable(
     settle_s=0.1, misses=50, stale_cycles=30, heartbeat_s=1.0, hold_s=0.2, following_error_m=0.02, start_rate_m_s=0.02
 )
+SLOW = DrivesTable(answer_s=2.0)
 
 
 def turning(path: Path, robot: Robot, gain: float = 0.004) -> Path:
@@ -55,7 +57,7 @@ def dry_run(tmp_path_factory) -> tuple[Path, Deployment]:
     folder = tmp_path_factory.mktemp("dry")
     policy = turning(folder / "policy.onnx", load_robot("motor_arm"))
     settings = Deployment(
-        robot="motor_arm", duration_s=2.0, policy=PolicyTable(file=str(policy)), safety=PATIENT,
+        robot="motor_arm", duration_s=2.0, policy=PolicyTable(file=str(policy)), drives=SLOW, safety=PATIENT,
         simulation=SimulationSettings(settings={"stiffness": 300.0, "pretension": 3.0}),
     )  # fmt: skip
     outcome = rb.deploy(settings, "dry-run", folder / "session")
@@ -158,7 +160,7 @@ def test_homing_finds_the_tension_and_keeps_it(tmp_path: Path) -> None:
         "motor_arm", bus, settings={"stiffness": 400.0, "pretension": 2.0}, encoder_offset=4711, start_length_m=0.002
     )
     with simulated_drives(table) as found:
-        settings = Deployment(robot="motor_arm", bus=found, homing=homing, safety=PATIENT)
+        settings = Deployment(robot="motor_arm", bus=found, homing=homing, drives=SLOW, safety=PATIENT)
         outcome = deploy(settings, "home", tmp_path / "s", sensor=sensor)
         assert outcome.cause is Cause.FINISHED, outcome.detail
     result = load_homing(tmp_path / "home.json", robot, 1.0)
@@ -171,7 +173,7 @@ def test_homing_finds_the_tension_and_keeps_it(tmp_path: Path) -> None:
 def test_a_cable_that_is_off_ends_the_homing(tmp_path: Path) -> None:
     homing = HomingTable(rate_m_s=0.02, travel_m=0.01, rounds=1)
     simulation = SimulationSettings(settings={"stiffness": 0.0, "pretension": 0.0})
-    settings = Deployment(robot="motor_arm", homing=homing, simulation=simulation, safety=PATIENT)
+    settings = Deployment(robot="motor_arm", homing=homing, simulation=simulation, drives=SLOW, safety=PATIENT)
     outcome = deploy(settings, "home", tmp_path / "s", simulated=True)
     assert outcome.cause is Cause.HOMING_FAILED
     assert "is its cable off?" in outcome.detail
