@@ -17,7 +17,9 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 
 DIFFERENCE_FROM = 6  # trajectories below which an ELPD difference has no standard error worth stating
 CHANCE = 0.05  # probability that unseen trajectories seem to support an extension that is worth nothing
-UNLIKELIER = 3.0  # nats: of a few trajectories, none may speak so clearly against an extension
+# Nats by which densities of a few trajectories must differ to say anything: were the less likely model right, so large
+# a difference would come up in at most `CHANCE` of cases (Markov's inequality: the mean of the ratio is one).
+TELLING = -float(np.log(CHANCE))
 FLIPS = 4095  # draws of the signs of more differences than can all be gone through
 RESAMPLES = 2000
 BANDS = 12
@@ -93,13 +95,16 @@ class Gain:
     @property
     def opposed(self) -> bool:
         """Whether one of a few trajectories speaks clearly against the extension, though all together favour it."""
-        return self.elpd_p is None and self.elpd_difference > 0.0 and self.elpd_least <= -UNLIKELIER
+        return self.elpd_p is None and self.elpd_difference > 0.0 and self.elpd_least <= -TELLING
 
     @property
     def clear(self) -> bool:
         """Whether unseen trajectories clearly support the extension: it surely takes a part of the discrepancy away,
-        their error does not grow, and they are clearly likelier: of few, none is clearly less likely."""
-        likelier = self.elpd_difference > 0.0 and (self.elpd_p is None or self.elpd_p <= CHANCE) and not self.opposed
+        their error does not grow, and they are clearly likelier: few by `TELLING`, and none clearly less likely."""
+        if self.elpd_p is None:
+            likelier = self.elpd_difference >= TELLING and not self.opposed
+        else:
+            likelier = self.elpd_difference > 0.0 and self.elpd_p <= CHANCE
         return self.interval[0] > 0.0 and likelier and not self.worse
 
 

@@ -158,13 +158,17 @@ def audit(
     inquiry, base, steps, last = _inquired(inquiry, base)
     target = inquiry.target.measured
     judge = judge if judge.known is not None else target
-    held_out = _held_out(question, [judge, *(step.judge for step in steps)], inquiry, base, steps)
+    asked = [step.name for step in steps]
+    held_out = _held_out(question, judge, inquiry, base, steps)
+    if held_out is not None and (kept := held_out.supported()):
+        steps, last = steps[:kept], steps[kept].before if kept < len(steps) else last
+        steps, held_out = _without_carried(question, judge, inquiry, base, steps, held_out.after(kept))
+        if len(steps) < kept:
+            last = inquiry.tested(steps[-1].fit, len(steps))
     base, steps = as_measured(judge, base), [replace(s, fit=as_measured(s.judge, s.fit)) for s in steps]
-    kept = held_out.supported() if held_out else 0
-    unsupported = [step.name for step in steps[kept:]] if kept else []
+    unsupported = [name for name in asked if name not in [step.name for step in steps]]
     if unsupported:
         report(f"unseen recordings do not support {' and '.join(unsupported)}")
-        steps, last = steps[:kept], steps[kept].before
     extended = steps[-1].fit if steps else base
     if steps and target.noise.source == RESIDUALS:
         with suppress(OutOfTime):
@@ -437,9 +441,18 @@ class HeldOut:
 
     def gain(self, before: int, after: int) -> Gain:
         """What the model after some steps is worth beside that after fewer."""
-        first, second, rng = self.predictions[before], self.predictions[after], np.random.default_rng([self.seed, 4])
-        judge, spread, pattern = self.judges[before], self.spreads[after], self.patterns[before]
+        return self.after(after).beside(self.after(before))
+
+    def beside(self, other: HeldOut) -> Gain:
+        """What the last model is worth beside the last one of another sequence of steps."""
+        rng, judge, pattern = np.random.default_rng([self.seed, 4]), other.judges[-1], other.patterns[-1]
+        first, second, spread = other.predictions[-1], self.predictions[-1], self.spreads[-1]
         return measure_gain(self.unseen, first, second, self.noise, pattern, rng, judge=judge, spread=spread)
+
+    def after(self, steps: int) -> HeldOut:
+        """The same of no more than so many steps."""
+        parts = ("predictions", "patterns", "judges", "spreads")
+        return replace(self, **{name: getattr(self, name)[: steps + 1] for name in parts})
 
     def supported(self) -> int:
         """Number of steps that the unseen recordings clearly support, each beside the last one that they do."""
@@ -450,23 +463,45 @@ class HeldOut:
         return last
 
 
-def _held_out(
-    question: Question, judges: Sequence[Target], inquiry: Inquiry, base: Fit, steps: Sequence[Step]
-) -> HeldOut | None:
+def _without_carried(
+    question: Question, judge: Target, inquiry: Inquiry, base: Fit, steps: list[Step], held_out: HeldOut
+) -> tuple[list[Step], HeldOut]:
+    """Steps less those that were supported beside a later one only, and without which that one does as well.
+
+    Two mechanisms may pay only together. Whether they do is seen by taking the first one out: the model with it, as if
+    it were the last step, must clearly predict unseen recordings better than the model without it. Where the time is
+    up, the steps stay that were supported together.
+    """
+    index, clock = 0, inquiry.target.forward.deadline
+    with clock.stage("gain"), clock.reserve(), suppress(OutOfTime):
+        while index < len(steps) - 1:
+            if held_out.gain(index, index + 1).clear or DISCRETISATION in [step.name for step in steps]:
+                index += 1
+                continue
+            inquiry.report(f"is {steps[index].name} needed? The model without it")
+            fewer = inquiry.without(steps, index, base)
+            other = _predicted(question, judge, inquiry, base, fewer)
+            if held_out.beside(other).clear:
+                index += 1
+            else:
+                steps, held_out, index = fewer, other, 0
+    return steps, held_out
+
+
+def _held_out(question: Question, judge: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step]) -> HeldOut | None:
     """The test recordings, or fitted ones that are left out in turn; None where the model was not extended, or the time
     was up."""
     if not steps:
         return None
     inquiry.report("measuring the gain on recordings that no fit has seen")
     with inquiry.target.forward.deadline.stage("gain"), suppress(OutOfTime):
-        return _predicted(question, judges, inquiry, base, steps)
+        return _predicted(question, judge, inquiry, base, steps)
     return None
 
 
-def _predicted(
-    question: Question, judges: Sequence[Target], inquiry: Inquiry, base: Fit, steps: Sequence[Step]
-) -> HeldOut:
-    target = inquiry.target.measured
+def _predicted(question: Question, judge: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step]) -> HeldOut:
+    """Predictions of the base model, fitted under ``judge``, and of the model after each step."""
+    target, judges = inquiry.target.measured, [judge, *(step.judge for step in steps)]
     count, every = len(question.trajectories), len(question.model.recordings.names)
     fits = [base, *(step.fit for step in steps)]
     names = ["", *(step.name for step in steps)]

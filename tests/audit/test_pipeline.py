@@ -426,6 +426,45 @@ def test_what_only_the_fitted_recordings_have_is_not_adopted_beside_what_all_hav
     assert content["gain"]["rmse_extended_mm"] < content["gain"]["rmse_base_mm"]
 
 
+def test_a_step_that_a_later_one_carries_is_not_adopted():
+    """An inquiry that named a useless step first, then play: only play is left, refitted, with the size that it has."""
+    asked = unrepeated({"play": 3.0}, 7)
+    target, base = base_model(asked, asked.seed)
+    inquiry = Inquiry(target, asked.candidates, asked.rules, asked.seed)
+    look, _ = inquiry.look_at(base)
+    useless, play = (next(c for c in asked.candidates if c.name == name) for name in ("creep", "play"))
+    first = climb(target, base.x, np.array([*base.free, *useless.indices]))
+    both = climb(target, first.x, np.array([*first.free, *play.indices]))
+    steps = [
+        Step("creep", ("creep",), look, first, 0.0, {}, target),
+        Step("play", ("play",), look, both, 9.0, {}, target),
+    ]
+    held_out = pipeline._held_out(asked, target, inquiry, base, steps)
+    assert held_out.supported() == 2
+    assert not held_out.gain(0, 1).clear
+    kept, measured = pipeline._without_carried(asked, target, inquiry, base, steps, held_out)
+    assert [step.name for step in kept] == ["play"]
+    assert set(kept[0].fit.free) == {*base.free, *play.indices}
+    assert measured.gain(0, 1).clear
+    # Where the first of the two is needed beside the second, both stay.
+    swapped = [replace(steps[0], name="play", fit=climb(target, base.x, np.array([*base.free, *play.indices])))]
+    pair = [*swapped, replace(steps[1], name="creep")]
+    always = replace(held_out, predictions=[held_out.predictions[k] for k in (0, 0, 2)])
+    stayed, _ = pipeline._without_carried(asked, target, inquiry, base, pair, always)
+    assert [step.name for step in stayed] == ["play", "creep"]
+
+
+def test_a_family_takes_the_place_of_a_cause_only_if_it_wins_under_wider_priors_too():
+    """Ten parameters more must bring 3 nats and ten times log 2; as many or fewer parameters, 3 nats."""
+    asked = question(TRUTH, 1)
+    target, old = base_model(asked, 0)
+    inquiry = Inquiry(target, asked.candidates, asked.rules, 0)
+    family = np.arange(len(old.free) + 10)
+    for free, gain, wins in ((old.free, 2.9, False), (old.free, 3.1, True), (family, 9.8, False), (family, 10.0, True)):
+        new = replace(old, free=free, log_evidence=old.log_evidence + gain)
+        assert inquiry._surpasses(new, old, asked.rules.evidence) == wins
+
+
 def test_what_unseen_recordings_clearly_support_is_adopted_and_no_p_value_is_zero():
     content = found({"play": 1.0}, 1)
     assert content["adopted"] == ["play"]
@@ -453,7 +492,8 @@ GAIN = Gain(2.0, 1.0, 50.0, 5.0, 0.02, {}, 0.5, (0.3, 0.7), 0.5, 6, 0.0)
         ({"interval": (-0.1, 0.7)}, False, False),  # perhaps nothing
         ({"elpd_p": 0.06}, False, False),  # perhaps chance
         ({"elpd_difference": -1.0, "elpd_p": None}, False, False),
-        ({"elpd_difference": 1.0, "elpd_p": None}, False, True),  # too few recordings to tell from chance
+        ({"elpd_difference": 4.0, "elpd_p": None}, False, True),  # too few recordings to tell from chance
+        ({"elpd_difference": 2.0, "elpd_p": None}, False, False),  # of few, a twentieth of a chance is allowed
         ({"elpd_p": None, "elpd_least": -4.0}, False, False),  # one of these few speaks against it
     ],
 )
