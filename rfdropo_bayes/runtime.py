@@ -7,6 +7,9 @@ import hashlib
 import os
 from pathlib import Path
 
+# The rollout of a value and those of a central difference call out of a program at once; one thread is left to copy.
+CALLBACK_THREADS = 4
+
 
 def limit_blas_threads() -> None:
     """Keep BLAS on one thread, unless the user chose otherwise.
@@ -24,8 +27,16 @@ def configure_jax() -> None:
     Stiff finite-element solves lose their answer in float32. Operations that run ahead of a callback into the compiled
     engines can take the threads that the callback waits for: on two processors a rollout outside ``jax.jit`` then
     hangs for ever.
+
+    A callback waits, in a thread of XLA's pool, for a copy of its arguments by another thread of it. The pool has one
+    thread for each processor: on one processor two callbacks of one program wait for ever. So the pool never has fewer
+    than `CALLBACK_THREADS`.
     """
     import jax
+
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if usable < CALLBACK_THREADS:
+        os.environ.setdefault("PJRT_NPROC", str(CALLBACK_THREADS))  # read when JAX first uses the processor
 
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_cpu_enable_async_dispatch", False)

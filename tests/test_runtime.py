@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rfdropo_bayes.runtime import keep_compilations
+from rfdropo_bayes.runtime import CALLBACK_THREADS, configure_jax, keep_compilations
 
 VARIABLES = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
 
@@ -35,3 +35,19 @@ def test_a_folder_that_the_user_chose_stays(unset: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/somewhere")
     keep_compilations()
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "/somewhere"
+
+
+@pytest.mark.parametrize(
+    ("processors", "given", "threads"), [(1, None, CALLBACK_THREADS), (1, "2", "2"), (16, None, None)]
+)
+def test_callbacks_have_the_threads_that_they_wait_for(
+    processors, given, threads, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """XLA reads the variable when it makes its pool; a number that the user chose stays, and so does that of many
+    processors."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(processors)), raising=False)
+    monkeypatch.setenv("PJRT_NPROC", given or "")
+    if given is None:
+        monkeypatch.delenv("PJRT_NPROC")
+    configure_jax()
+    assert os.environ.get("PJRT_NPROC") == (None if threads is None else str(threads))

@@ -159,12 +159,7 @@ def audit(
     target = inquiry.target.measured
     judge = judge if judge.known is not None else target
     asked = [step.name for step in steps]
-    held_out = _held_out(question, judge, inquiry, base, steps)
-    if held_out is not None and (kept := held_out.supported()):
-        steps, last = steps[:kept], steps[kept].before if kept < len(steps) else last
-        steps, held_out = _without_carried(question, judge, inquiry, base, steps, held_out.after(kept))
-        if len(steps) < kept:
-            last = inquiry.tested(steps[-1].fit, len(steps))
+    steps, last, held_out = _supported(question, judge, inquiry, base, steps, last)
     base, steps = as_measured(judge, base), [replace(s, fit=as_measured(s.judge, s.fit)) for s in steps]
     unsupported = [name for name in asked if name not in [step.name for step in steps]]
     if unsupported:
@@ -203,6 +198,19 @@ def audit(
         target.forward.rollouts + (finer.rollouts if finer else 0),
         deadline.profile,
     )
+
+
+def _supported(
+    question: Question, judge: Target, inquiry: Inquiry, base: Fit, steps: list[Step], last: Look
+) -> tuple[list[Step], Look, HeldOut | None]:
+    """The steps that recordings which no fit has seen support, all of them where these support none; the look at the
+    model with them; and the predictions of these recordings."""
+    held_out = _held_out(question, judge, inquiry, base, steps)
+    if held_out is None or not (kept := held_out.supported()):
+        return steps, last, held_out
+    last = steps[kept].before if kept < len(steps) else last
+    steps, held_out = _without_carried(question, judge, inquiry, base, steps[:kept], held_out.after(kept))
+    return steps, last if len(steps) == kept else inquiry.tested(steps[-1].fit, len(steps)), held_out
 
 
 def _far_off(target: Target) -> str:
