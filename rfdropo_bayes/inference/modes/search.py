@@ -8,6 +8,7 @@
 2. Each climb is a Levenberg-Marquardt search at growing horizons. Short prefixes come first, because a long recording
    has many local optima.
 3. From one horizon to the next goes one climb of each optimum, the better half of them, and every rival of the best.
+   They begin anew, at draws from the normal distributions around these optima, see `begun_anew`.
 4. Around each optimum stands a normal distribution (Laplace's approximation), whose integral estimates its evidence.
 """
 
@@ -28,7 +29,15 @@ from rfdropo_bayes.bayes.problem import Hierarchy, Problem, ResidualProblem, Val
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.modes.climb import Climbable, Laplace, LevenbergState, climb_cost, laplace, maximise
+from rfdropo_bayes.inference.modes.climb import (
+    Climbable,
+    Laplace,
+    LevenbergState,
+    climb_cost,
+    laplace,
+    maximise,
+    normal_at,
+)
 from rfdropo_bayes.inference.modes.lasting import CountedProblem, Lasting, lasting_cautions, lasting_residuals
 from rfdropo_bayes.inference.modes.mixture import MIXTURES, draw_mixture, mixture_weights, rivals
 from rfdropo_bayes.inference.modes.scales import integrate_scales
@@ -181,7 +190,11 @@ def find_modes(
         state, steps = maximise(target, climbs.positions[climbs.done], max_steps=allowed, tolerance=config.tolerance)
         climbs = _record(climbs, state, len(steps), horizon, target)
         if climbs.done == len(climbs.positions):
-            climbs, target = _go_on(climbs, horizon), None
+            climbs = _go_on(climbs, horizon)
+            if climbs.level < len(horizons):
+                longer, level_key = horizons[climbs.level], jax.random.fold_in(key, climbs.level)
+                climbs = begun_anew(problem, target, climbs, longer, config.screen, level_key)
+            target = None
         climbs = climbs._replace(seconds=climbs.seconds + time.monotonic() - began)
         checkpoint.save(*_pack(climbs))
         share = (climbs.level + climbs.done / len(climbs.positions)) / len(horizons)
@@ -416,7 +429,7 @@ def _go_on(climbs: Climbs, horizon: int) -> Climbs:
     for index in np.argsort(-density, kind="stable"):
         if all(np.max(np.abs(positions[index] - positions[other])) > SAME for other in kept):
             kept.append(int(index))
-    order = np.array(kept)
+    order = np.array([index for index in kept if np.isfinite(density[index])])
     order = order[(2 * np.arange(len(order)) < len(order)) | (density[order] > density[order[0]] - RIVAL)]
     return climbs._replace(
         positions=positions[order],
@@ -425,6 +438,35 @@ def _go_on(climbs: Climbs, horizon: int) -> Climbs:
         level=climbs.level + 1,
         done=0,
     )
+
+
+def begun_anew(
+    problem: Problem, target: Climbable, climbs: Climbs, horizon: int, screen: int, key: PRNGKeyArray
+) -> Climbs:
+    """The climbs at their starts for a longer prefix of the data.
+
+    Of what a prefix does not tell, every optimum has the prior's middle: the mass of a cube before the robot touches
+    it. Climbs from there to a longer prefix would all begin at one such value. So starts are chosen among the optima
+    and as many draws as a screening takes from the normal distributions around them, which keep the prior's spread.
+
+    Args:
+        problem: to be climbed.
+        target: the posterior of the prefix that the climbs have ended at.
+        climbs: one of each optimum.
+        horizon: of the longer prefix, at which draws are judged.
+        screen: number of draws.
+        key: random key.
+
+    Raises:
+        NoLikelihoodError: neither an optimum nor a draw has a positive likelihood.
+    """
+    ends = zip(climbs.positions, climbs.log_density, climbs.converged, strict=True)
+    modes = [normal_at(target, LevenbergState(u, float(density), 0.0, bool(done))) for u, density, done in ends]
+    drawn = draw_mixture(modes, mixture_weights("equal", [mode.log_evidence for mode in modes]), screen, key)
+    u = np.concatenate([climbs.positions, drawn])
+    density = _heights(problem, u, horizon, climbs.ledger)
+    order = _spread(u, density, len(modes))
+    return climbs._replace(positions=u[order], log_density=density[order], converged=np.zeros(len(order), dtype=bool))
 
 
 def _pack(climbs: Climbs) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
