@@ -87,8 +87,9 @@ class Answer:
     the looks at the base model and after each step; ``stages`` the explained fraction after each step; ``sizes`` is the
     last model's fit under priors that do not pull, and ``draws`` are from it; ``suspected`` is a noise under which the
     base model would pass, where a stated one leaves a discrepancy that is not explained; ``shift`` is the distance by
-    which constants tell repeats apart [m]; ``stopped`` says that the time was up before all was done; ``profile`` are
-    the seconds of each stage.
+    which constants tell repeats apart [m]; ``numerical`` is how far half the time step and a finer mesh
+    move the markers of the last model [m], None where that is not known or the finer one is the model; ``stopped``
+    says that the time was up before all was done; ``profile`` are the seconds of each stage.
     """
 
     verdict: str
@@ -108,6 +109,7 @@ class Answer:
     draws: Float[np.ndarray, "draw d"]
     suspected: Stacked | None
     shift: float | None
+    numerical: float | None
     stopped: bool
     rollouts: int
     profile: dict[str, float]
@@ -194,6 +196,7 @@ def audit(
         sizes.draws(np.random.default_rng([question.seed, 5]), 1000, low, high),
         suspected,
         target.measurements.shift,
+        None if DISCRETISATION in asked else _numerical(target, finer, extended),
         stopped,
         target.forward.rollouts + (finer.rollouts if finer else 0),
         deadline.profile,
@@ -211,6 +214,19 @@ def _supported(
     last = steps[kept].before if kept < len(steps) else last
     steps, held_out = _without_carried(question, judge, inquiry, base, steps[:kept], held_out.after(kept))
     return steps, last if len(steps) == kept else inquiry.tested(steps[-1].fit, len(steps)), held_out
+
+
+def _numerical(target: Target, finer: Forward | None, fit: Fit) -> float | None:
+    """Root mean square distance [m] by which a finer mesh and time step move the markers where they are measured; None
+    where there is no finer simulator, or its rollouts do not end well."""
+    if finer is None:
+        return None
+    seen, fine = finer.observe(fit.x[None])
+    if not fine[0]:
+        return None
+    moved = target.forward.observe_one(fit.x)["position"] - seen["position"][0]
+    measured = target.measurements.channels[0].valid
+    return float(np.sqrt(3.0 * np.mean(moved.reshape(measured.shape)[measured] ** 2)))
 
 
 def _far_off(target: Target) -> str:

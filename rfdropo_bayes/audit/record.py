@@ -60,6 +60,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         },
         "coverage": {} if gain is None else {f"{level:g}": gain.coverage[level] for level in LEVELS},
         "noise_floor_mm": MILLIMETRES * noise_distance(noise) if noise.source == REPEATS else None,
+        "numerical_error_mm": None if answer.numerical is None else MILLIMETRES * answer.numerical,
         "noise": _noise(answer),
         "channels": list(answer.target.measurements.names_of_channels),
         "residual_in_noise_deviations": base_rms,

@@ -26,6 +26,7 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         + _compared(answer, findings)
         + _suspicion(answer)
         + _shifted(answer)
+        + _numerical(answer)
         + _left_out(answer)
         + _stopped(answer)
     )
@@ -80,6 +81,17 @@ def _shifted(answer: Answer) -> str:
     return (
         f" Repeats differ by constants of {1e3 * answer.shift:.2g} mm, which pass for noise here: a frame or a start "
         "that was not the same each time? Let camera_offset differ in [model.per_recording]."
+    )
+
+
+def _numerical(answer: Answer) -> str:
+    """What is said of a simulation that half the time step changes by more than the noise."""
+    error, noise = answer.numerical, noise_distance(answer.target.noise.first)
+    if error is None or error <= noise:
+        return ""
+    return (
+        f" Half the time step and a finer mesh move the last model's markers by {1e3 * error:.2g} mm, the noise by "
+        f"{1e3 * noise:.2g} mm: what is found may stand for an error of the simulation; shorten [simulator] time_step."
     )
 
 

@@ -132,8 +132,16 @@ def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(family, named):
     assert [step.name for step in answer.steps] == named
     assert answer.verdict == ("explained" if named else "no_discrepancy")
     assert answer.looks[0].refined is not bool(named)
-    if not named:
-        assert "twice as fine" in record(answer, versions={}, data_sha256="", next_experiment=None)["sentence"]
+    content = record(answer, versions={}, data_sha256="", next_experiment=None)
+    if named:  # the finer simulator is the model now
+        assert content["numerical_error_mm"] is None
+        return
+    assert "twice as fine" in content["sentence"]
+    coarse = answer.target.forward.observe_one(answer.extended.x)["position"]
+    moved = coarse - (np.sqrt(1.0 + 12.0 * coarse) - 1.0) / 6.0  # the finer position p solves p (1 + 3 p) = coarse
+    assert content["numerical_error_mm"] == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(moved**2, axis=-1))), rel=1e-4)
+    larger = content["numerical_error_mm"] > content["noise_floor_mm"]
+    assert ("shorten [simulator] time_step" in content["sentence"]) == larger
 
 
 def test_the_same_seed_gives_the_same_audit():

@@ -129,6 +129,29 @@ class Decay:
         return (self.data[:horizon] - amplitude * kind.exp(-rate * self.time[:horizon])) / noise
 
 
+class Touched(LinearGaussian):
+    """y = x0 in the first half of the rows, y = x0 + x1^3 - 3 x1 later: a body that is touched halfway.
+
+    Least squares that begin at x1 = 0, its prior's middle, end at x1 = -1; the truth is 2.2.
+    """
+
+    def __init__(self, n_rows: int = 20) -> None:
+        super().__init__(n_rows=n_rows, d=2)
+        self.mean, self.sd, self.noise = np.zeros(2), np.full(2, 1.5), np.full(n_rows, 0.1)
+        self.later = (np.arange(n_rows) >= n_rows // 2).astype(float)
+        self.data = np.asarray(self.fit(jnp.array([0.7, 2.2]), n_rows))
+
+    def fit(self, u, horizon):
+        return u[..., :1] + (u[..., 1:] ** 3 - 3.0 * u[..., 1:]) * self.later[:horizon]
+
+    def _row_density(self, u, horizon):
+        return jax.scipy.stats.norm.logpdf(self.data[:horizon], self.fit(u, horizon), self.noise[:horizon])
+
+    def residuals(self, values, horizon):
+        u = jnp.stack([values[name] for name in self.names])
+        return (self.data[:horizon] - self.fit(u, horizon)) / self.noise[:horizon]
+
+
 class TwoModes(LinearGaussian):
     """One row y = |x| + noise in ``d`` dimensions (the rest observed directly): two modes of unequal prior mass."""
 

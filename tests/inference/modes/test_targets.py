@@ -18,7 +18,7 @@ from rfdropo_bayes.inference.smc import bridge, sampler
 from rfdropo_bayes.inference.smc.bridge import BridgeConfig
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
 
-from ..toys import Decay, LinearGaussian, Spring, TwoModes
+from ..toys import Decay, LinearGaussian, Spring, Touched, TwoModes
 
 KEY = jax.random.key(4)
 
@@ -35,7 +35,15 @@ def test_a_linear_model_has_its_closed_form_posterior_and_evidence():
     # 2000 independent draws: 5 standard errors of a mean are 0.11 sd, of a deviation 8 %.
     np.testing.assert_array_less(np.abs(draws.mean(axis=0) - mean), 0.11 * sd)
     np.testing.assert_allclose(draws.std(axis=0), sd, rtol=0.08)
-    assert result.rollouts < 200
+    assert result.rollouts < 64 * 1.5 + 150  # two screenings, and the climbs
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_a_prefix_does_not_tell_keeps_its_prior_spread(seed: int):
+    """64 draws miss the basin of the truth, 11 % of them each, less than once in a thousand times."""
+    found = laplace.run(Touched(), LaplaceConfig(blocks=2), jax.random.key(seed))
+    assert found.optimum["x1"] == pytest.approx(2.2, abs=0.02)
+    assert found.optimum["x0"] == pytest.approx(0.7, abs=0.1)
 
 
 @pytest.mark.parametrize("traceable", [True, False])
