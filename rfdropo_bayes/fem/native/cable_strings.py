@@ -3,26 +3,50 @@
 In the frame of a layer a cable resists s_x, s_y and s_z with its spring T / L, where s_i = sum over modes k of p_k u_ki
 + lever g_ki u_kz; the last term is missing in s_z. Of mode k, w_k is the weight in the way of the cable through the
 layer, and g_k that in the mean gradient along the axis that its parity says; p_k is w_k, less lever g_k where that axis
-is z.
+is z. Cables that are slack in all lanes, or end before the layer, are left out: they add exact zeros.
 """
 
 from __future__ import annotations
 
 from rfdropo_bayes.fem.cable_strings import SHORTEST
+from rfdropo_bayes.fem.native.chain_cholesky import subtract_product
 from rfdropo_bayes.fem.native.fields import clear
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, square_root, store, where_greater
+from rfdropo_bayes.fem.native.simd import (
+    any_greater,
+    fill,
+    fma,
+    fnma,
+    kernel,
+    load,
+    load3,
+    square_root,
+    store,
+    where_greater,
+)
+
+
+@kernel
+def _way(tables, layer, c, field, token):
+    """Way of a cable through a layer, of the modes' values in a field."""
+    x, y, z = fill(0.0, field, token), fill(0.0, field, token), fill(0.0, field, token)
+    first = (layer * tables.cables + c) * 2 * tables.modes
+    for k in range(2 * tables.modes):
+        weight = fill(tables.crossing[first + k], field, token)
+        u, v, w = load3(field, 3 * k, token)
+        x, y, z = fma(weight, u, x), fma(weight, v, y), fma(weight, w, z)
+    return x, y, z
 
 
 @kernel
 def measure_strings(tables, layer, rate, work, token):
     """Spring, over ``rate`` squared, and lever of every cable in a layer, whose frame is known."""
     modes, cables, axes, a = tables.modes, tables.cables, work.axes, 9 * layer
-    half, base, first = fill(0.5, axes, token), 3 * layer * modes, 2 * modes * layer
+    zero, one, half = fill(0.0, axes, token), fill(1.0, axes, token), fill(0.5, axes, token)
+    base, first, stretch = 3 * layer * modes, 2 * modes * layer, zero
     least = fill(SHORTEST * (tables.rest[base + 3 * modes + 2] - tables.rest[base + 2]), axes, token)
-    stretch = fill(0.0, axes, token)
     for k in range(2 * modes):
-        kind, slope = tables.parity[k % modes], fill(tables.gradient[first + k], axes, token)
-        axis, along = (2 if kind == 0 else kind - 1), fill(0.0, axes, token)
+        kind, slope = tables.parity[k], fill(tables.gradient[first + k], axes, token)
+        axis, along = (2 if kind == 0 else kind - 1), zero
         for i in range(3):
             x = load(work.position, base + 3 * k + i, token)
             if k == 0 or k == modes:
@@ -30,75 +54,86 @@ def measure_strings(tables, layer, rate, work, token):
             store(work.local, 3 * k + i, x)
             along = fma(load(axes, a + 3 * i + axis, token), x, along)
         stretch = fma(slope, along if kind == 0 else half * along, stretch)
+    shrink, slower = one / stretch, 1.0 / (rate * rate)
     for c in range(cables):
-        dx, dy, dz = fill(0.0, axes, token), fill(0.0, axes, token), fill(0.0, axes, token)
-        for k in range(2 * modes):
-            weight = fill(tables.crossing[(layer * cables + c) * 2 * modes + k], axes, token)
-            x, y, z = load3(work.local, 3 * k, token)
-            dx, dy, dz = fma(weight, x, dx), fma(weight, y, dy), fma(weight, z, dz)
-        length = square_root(fma(dx, dx, fma(dy, dy, dz * dz)))
+        tension, string = load(work.tension, c, token), 2 * (layer * cables + c)
+        if tables.crossing[string * modes] == 0.0 or not any_greater(tension, zero):
+            store(work.string, string, zero, zero)
+            continue
+        x, y, z = _way(tables, layer, c, work.local, token)
+        length = square_root(fma(x, x, fma(y, y, z * z)))
         length = where_greater(length, least, length, least)
-        reached = abs(tables.crossing[(layer * cables + c) * 2 * modes])  # one, or zero beyond the cable's end
-        spring = fill(reached, axes, token) * load(work.tension, c, token) / (length * fill(rate * rate, axes, token))
-        store(work.string, 2 * (layer * cables + c), spring, length / stretch)
-
-
-@kernel
-def _relative(tables, layer, c, k, lever, token):
-    """p_k of a cable."""
-    weight = fill(tables.crossing[(layer * tables.cables + c) * 2 * tables.modes + k], lever, token)
-    if tables.parity[k % tables.modes] == 0:
-        return fnma(lever, fill(tables.gradient[2 * tables.modes * layer + k], lever, token), weight)
-    return weight
+        store(work.string, string, slower * tension / length, length * shrink)
 
 
 @kernel
 def _sum_strings(tables, layer, work, token):
-    """Sums over the cables of spring times p_k p_l, k >= l, of spring lever p_k and of spring lever^2 into ``web``."""
-    size, cables = 2 * tables.modes, tables.cables
-    mixed = size * (size + 1) // 2
-    clear(work.web, 0, mixed + size + 1, token)
+    """Sums over the cables of spring times r_k r_l into ``web``, in tiles, where r is p and then the lever; returns
+    False where no cable pulls."""
+    modes, cables, ways, pulled, web = tables.modes, tables.cables, work.ways, work.pulled, work.web
+    size, zero, taut = 2 * modes, fill(0.0, work.string, token), 0
+    panels = size // 3 + 1
     for c in range(cables):
-        spring = load(work.string, 2 * (layer * cables + c), token)
-        lever = load(work.string, 2 * (layer * cables + c) + 1, token)
-        for k in range(size):
-            store(work.local, k, _relative(tables, layer, c, k, lever, token))
-        entry = 0
-        for k in range(size):
-            pulled = spring * load(work.local, k, token)
-            for n in range(k + 1):
-                store(work.web, entry, fma(pulled, load(work.local, n, token), load(work.web, entry, token)))
-                entry += 1
-            store(work.web, mixed + k, fma(pulled, lever, load(work.web, mixed + k, token)))
-        last = mixed + size
-        store(work.web, last, fma(spring * lever, lever, load(work.web, last, token)))
+        string = 2 * (layer * cables + c)
+        spring, lever = load(work.string, string, token), load(work.string, string + 1, token)
+        if not any_greater(spring, zero):
+            continue
+        for k in range(size + 1):
+            t, way = 3 * (k // 3 * cables + taut) + k % 3, lever
+            if k < size:
+                way = fill(tables.crossing[string * modes + k], lever, token)
+                if tables.parity[k] == 0:
+                    way = fnma(lever, fill(tables.gradient[size * layer + k], lever, token), way)
+            store(ways, t, way)
+            store(pulled, t, -(spring * way))
+        taut += 1
+    clear(web, 0, 9 * panels * panels if taut > 0 else 0, token)
+    for i in range(panels if taut > 0 else 0):
+        for j in range(i + 1):
+            subtract_product(web, 9 * (i * panels + j), pulled, 3 * i * cables, ways, 3 * j * cables, taut, token)
+    return taut > 0
+
+
+@kernel
+def _sum_of(k, n, panels, work, token):
+    """Entry k >= n of ``web``."""
+    return load(work.web, 9 * (k // 3 * panels + n // 3) + 3 * (n % 3) + k % 3, token)
 
 
 @kernel
 def _string_tile(tables, target, t, layer, k, n, work, token):
     """Add the part of modes k and n of a layer to the tile at ``t``."""
-    modes, axes, a = tables.modes, work.axes, 9 * layer
-    size, first = 2 * modes, 2 * modes * layer
-    mixed = size * (size + 1) // 2
-    high, low = max(k, n), min(k, n)
-    straight = load(work.web, high * (high + 1) // 2 + low, token)
-    row_kind, column_kind = tables.parity[k % modes], tables.parity[n % modes]
-    row_slope, column_slope = tables.gradient[first + k], tables.gradient[first + n]
-    tilted = fill(0.0, axes, token)
-    if row_kind == column_kind and (row_kind == 1 or row_kind == 2):
-        tilted = load(work.web, mixed + size, token) * fill(row_slope * column_slope, axes, token)
-    into = load(work.web, mixed + k, token) * fill(column_slope, axes, token)
-    out = load(work.web, mixed + n, token) * fill(row_slope, axes, token)
-    for c in range(3):
-        z = load(axes, a + 3 * c + 2, token)
-        side = tilted * z
-        if row_kind == 1 or row_kind == 2:
-            side = fma(out, load(axes, a + 3 * c + row_kind - 1, token), side)
-        for r in range(3):
-            value = fma(load(axes, a + 3 * r + 2, token), side, load(target, t + 3 * c + r, token))
-            if column_kind == 1 or column_kind == 2:
-                value = fma(into * load(axes, a + 3 * r + column_kind - 1, token), z, value)
-            store(target, t + 3 * c + r, value + straight if r == c else value)
+    size, axes, a, parity, slope = 2 * tables.modes, work.axes, 9 * layer, tables.parity, tables.gradient
+    first, panels = size * layer, size // 3 + 1
+    straight, row_kind, column_kind = _sum_of(max(k, n), min(k, n), panels, work, token), parity[k], parity[n]
+    row_tilts, column_tilts = row_kind == 1 or row_kind == 2, column_kind == 1 or column_kind == 2
+    if not (row_tilts or column_tilts):
+        for i in range(3):
+            store(target, t + 4 * i, load(target, t + 4 * i, token) + straight)
+        return
+    zero = fill(0.0, axes, token)
+    into, out, tilted = zero, zero, zero
+    if column_tilts:
+        into = _sum_of(size, k, panels, work, token) * slope[first + n]
+    if row_tilts:
+        out = _sum_of(size, n, panels, work, token) * slope[first + k]
+        if row_kind == column_kind:
+            tilted = _sum_of(size, size, panels, work, token) * (slope[first + k] * slope[first + n])
+    row, column = a + (row_kind - 1 if row_tilts else 0), a + (column_kind - 1 if column_tilts else 0)
+    z0, z1, z2 = load(axes, a + 2, token), load(axes, a + 5, token), load(axes, a + 8, token)
+    x0, x1 = into * load(axes, column, token), into * load(axes, column + 3, token)
+    x2 = into * load(axes, column + 6, token)
+    y0, y1 = fma(out, load(axes, row, token), tilted * z0), fma(out, load(axes, row + 3, token), tilted * z1)
+    y2 = fma(out, load(axes, row + 6, token), tilted * z2)
+    c0, c1, c2 = load3(target, t, token)
+    c3, c4, c5 = load3(target, t + 3, token)
+    c6, c7, c8 = load3(target, t + 6, token)
+    c0, c1, c2 = fma(z0, y0, c0) + straight, fma(z1, y0, c1), fma(z2, y0, c2)
+    c3, c4, c5 = fma(z0, y1, c3), fma(z1, y1, c4) + straight, fma(z2, y1, c5)
+    c6, c7, c8 = fma(z0, y2, c6), fma(z1, y2, c7), fma(z2, y2, c8) + straight
+    store(target, t, fma(x0, z0, c0), fma(x1, z0, c1), fma(x2, z0, c2))
+    store(target, t + 3, fma(x0, z1, c3), fma(x1, z1, c4), fma(x2, z1, c5))
+    store(target, t + 6, fma(x0, z2, c6), fma(x1, z2, c7), fma(x2, z2, c8))
 
 
 @kernel
@@ -107,7 +142,8 @@ def add_strings(tables, layer, work, whole, token):
     modes = tables.modes
     block = 9 * modes * modes
     upper = (layer + 1) * block
-    _sum_strings(tables, layer, work, token)
+    if not _sum_strings(tables, layer, work, token):
+        return
     for m in range(modes):
         for n in range(modes):
             tile = 9 * (m * modes + n)
@@ -124,27 +160,35 @@ def add_string_reaction(tables, layer, scale, work, token):
     """Add to ``reaction`` what the strings put against ``local``, a change in the layer's frame, times a scale."""
     modes, cables, local, reaction = tables.modes, tables.cables, work.local, work.reaction
     size, first, zero = 2 * modes, 2 * modes * layer, fill(0.0, work.local, token)
-    tilt_x, tilt_y = zero, zero
+    tx, ty, tz = zero, zero, zero  # what a lever adds to a cable's way
     for k in range(size):
-        slope, z = fill(tables.gradient[first + k], zero, token), load(local, 3 * k + 2, token)
-        if tables.parity[k % modes] == 1:
-            tilt_x = fma(slope, z, tilt_x)
-        elif tables.parity[k % modes] == 2:
-            tilt_y = fma(slope, z, tilt_y)
+        kind, slope = tables.parity[k], fill(tables.gradient[first + k], zero, token)
+        u, v, w = load3(local, 3 * k, token)
+        if kind == 0:
+            tx, ty, tz = fnma(slope, u, tx), fnma(slope, v, ty), fnma(slope, w, tz)
+        elif kind == 1:
+            tx = fma(slope, w, tx)
+        elif kind == 2:
+            ty = fma(slope, w, ty)
+    mx, my, mz = zero, zero, zero  # what pulls at the levers
     for c in range(cables):
-        spring = load(work.string, 2 * (layer * cables + c), token)
-        lever = load(work.string, 2 * (layer * cables + c) + 1, token)
-        x, y, z = lever * tilt_x, lever * tilt_y, zero
+        string = 2 * (layer * cables + c)
+        spring, lever = load(work.string, string, token), load(work.string, string + 1, token)
+        if not any_greater(spring, zero):
+            continue
+        x, y, z = _way(tables, layer, c, local, token)
+        pull = spring * scale
+        x, y, z = pull * fma(lever, tx, x), pull * fma(lever, ty, y), pull * fma(lever, tz, z)
+        mx, my, mz = fma(lever, x, mx), fma(lever, y, my), fma(lever, z, mz)
         for k in range(size):
-            weight = _relative(tables, layer, c, k, lever, token)
-            dx, dy, dz = load3(local, 3 * k, token)
-            x, y, z = fma(weight, dx, x), fma(weight, dy, y), fma(weight, dz, z)
-        x, y, z = spring * scale * x, spring * scale * y, spring * scale * z
-        for k in range(size):
-            weight = _relative(tables, layer, c, k, lever, token)
+            weight = fill(tables.crossing[string * modes + k], zero, token)
             fx, fy, fz = load3(reaction, 3 * k, token)
-            fx, fy, fz = fma(weight, x, fx), fma(weight, y, fy), fma(weight, z, fz)
-            kind = tables.parity[k % modes]
-            if kind == 1 or kind == 2:
-                fz = fma(lever * fill(tables.gradient[first + k], zero, token), x if kind == 1 else y, fz)
-            store(reaction, 3 * k, fx, fy, fz)
+            store(reaction, 3 * k, fma(weight, x, fx), fma(weight, y, fy), fma(weight, z, fz))
+    for k in range(size):
+        kind, slope = tables.parity[k], fill(tables.gradient[first + k], zero, token)
+        fx, fy, fz = load3(reaction, 3 * k, token)
+        if kind == 0:
+            fx, fy, fz = fnma(slope, mx, fx), fnma(slope, my, fy), fnma(slope, mz, fz)
+        elif kind != 3:
+            fz = fma(slope, mx if kind == 1 else my, fz)
+        store(reaction, 3 * k, fx, fy, fz)

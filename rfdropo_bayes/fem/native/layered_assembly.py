@@ -29,7 +29,7 @@ def _deformation(parity, slope, modes, layer, position, axes, token):
     """Mean deformation gradient of a layer into its ``axes``, row-major."""
     clear(axes, 9 * layer, 9 * layer + 9, token)
     for k in range(2 * modes):
-        kind = parity[k % modes]
+        kind = parity[k]
         if kind == 3:
             continue
         column = (kind + 2) % 3

@@ -82,7 +82,9 @@ class Work(NamedTuple):
         np.ndarray, "layers lanes"
     ]  # of layers in tension against lateral motion, in the matrix; first their force
     string: Float[np.ndarray, "layers_cables_2 lanes"]  # spring of every cable, in the matrix, and its lever [m]
-    web: Float[np.ndarray, "sums lanes"]  # sums over the strings of a layer
+    ways: Float[np.ndarray, "panel_cables lanes"]  # of the strings of a layer; panels as in ``chain_cholesky``
+    pulled: Float[np.ndarray, "panel_cables lanes"]  # these times minus their springs
+    web: Float[np.ndarray, "tiles lanes"]  # sums over the strings of a layer
     softness: Float[np.ndarray, "1 lanes"]  # what time has left of the moduli
     branch: Float[np.ndarray, "layer_values lanes"]  # strain of the dashpots, as displacements
     slope: Float[np.ndarray, "layers6 lanes"]  # derivatives of the bending law's moments

@@ -75,7 +75,7 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> tuple[Samples, Fa
         return {name: aligned_zeros((max(count, 1), lanes), dtype) for name, count in sizes.items()}
 
     values, section = stations * size, 2 * size
-    web = modes * (2 * modes + 1) + 2 * modes + 1
+    web = 2 * modes // 3 + 1  # panels of the modes of a layer and of a lever
     samples = rows(
         moduli=3, density=1, layer_scale=layers, point_mass=stations, stiffness=layers * tables.entries,
         station_mass=tables.station_mass.size, layer_mass=tables.layer_mass.size, gravity=3, damping=2,
@@ -86,7 +86,8 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> tuple[Samples, Fa
         condensed=9 * panels * panels, solution=values, field=values, correction=values, weight=3 * panels,
         axes=9 * layers, dyads=54, local=section, reaction=section, pull=3 * (len(tables.guide_first) - 1),
         slack=cables, tension=cables, commanded=cables, points=3 * tables.points, before=values, beyond=3 * layers,
-        held=layers, string=2 * layers * cables, web=web, branch=layers * section, slope=6 * layers,
+        held=layers, string=2 * layers * cables, ways=3 * web * cables,
+        pulled=3 * web * cables, web=9 * web**2, branch=layers * section, slope=6 * layers,
         around=2 * stations, unsolved=1, accepted=1, lost=1, failed=1, relaxation=1, imbalance=1, softness=1,
     )  # fmt: skip
     factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))

@@ -34,7 +34,7 @@ class LayeredTables(NamedTuple):
     ``first[p]:first[p + 1]``.
     """
 
-    parity: Int[np.ndarray, " modes"]
+    parity: Int[np.ndarray, " modes2"]  # of the modes of both sections of a layer
     shape: Float[np.ndarray, "nodes modes"]  # value of every mode at the nodes of a section
     inverse: Float[np.ndarray, "modes nodes"]
     square: Float[np.ndarray, " modes"]  # sum over the nodes
@@ -144,7 +144,7 @@ def layered_tables(system: System, points: PointMap, dtype: type) -> LayeredTabl
     axis = np.array([2, 0, 1, 2])[parity]
     slopes = gradient[:, :, np.arange(modes), axis] * (parity != 3)
     tables = LayeredTables(
-        parity=parity,
+        parity=np.tile(parity, 2),
         shape=shape,
         inverse=np.linalg.inv(shape),
         square=np.sum(shape**2, axis=0),
