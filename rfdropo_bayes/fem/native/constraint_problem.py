@@ -209,16 +209,17 @@ def _linearise_contact(p, c, lines, token):
 
 
 @kernel
-def _linearise_line(p, i, cables, first, token):
-    """As `_linearise_contact`, of a line; in the first iteration cables that pulled before still pull."""
+def _linearise_line(p, i, cables, first, rounding, token):
+    """As `_linearise_contact`, of a line; cables that pulled still pull in the first iteration, and where
+    rounding hides their velocity."""
     zero, one = fill(0.0, p.free, token), fill(1.0, p.free, token)
     velocity, impulse, firm = load(p.velocity, i, token), load(p.impulse, i, token), load(p.firmness, i, token)
     root = square_root(magnitude(firm, zero))
     answer = _line(p, i, cables, velocity, token)
     if i < cables:
         active = where_greater(zero, velocity, one, zero)
-        if first:
-            active = where_greater(impulse, zero, one, active)
+        hidden = one if first else where_greater(magnitude(velocity, zero), rounding, zero, one)
+        active = where_greater(impulse, zero, where_greater(active, hidden, active, hidden), active)
         answer = -firm * velocity
     else:
         bound = load(p.limit, i, token) * load(p.sign, i, token)
@@ -234,12 +235,12 @@ def _linearise_line(p, i, cables, first, token):
 
 
 @kernel
-def _linearise(p, cables, lines, contacts, first, token):
+def _linearise(p, cables, lines, contacts, first, rounding, token):
     """Columns L at ``velocity``, ``aim`` and ``left``: what the impulses are to change by, in L and beside it. Returns
     how many columns act."""
     zero, n = fill(0.0, p.free, token), lines + 3 * contacts
     for i in range(lines):
-        _linearise_line(p, i, cables, first, token)
+        _linearise_line(p, i, cables, first, rounding, token)
     for c in range(contacts):
         _linearise_contact(p, c, lines, token)
     m = 0
@@ -437,7 +438,8 @@ def solve_problem(p, cables, runs, contacts, settled, token):
             own = magnitude(load(p.matrix, i * n + i, token) * load(p.impulse, i, token), zero)
             largest = where_greater(free, largest, free, largest)
             largest = where_greater(own, largest, own, largest)
-        m = _linearise(p, cables, lines, contacts, iteration == 0, token)
+        rounding = largest * (ROUNDING * settled)
+        m = _linearise(p, cables, lines, contacts, iteration == 0, rounding, token)
         going = where_greater(_residual(p, lines, n, token), settled * largest, going, zero)
         if not any_greater(going, zero):
             break
@@ -445,7 +447,7 @@ def solve_problem(p, cables, runs, contacts, settled, token):
         doubt = zero
         for i in range(n):
             doubt = fma(magnitude(load(p.moving, i, token), zero), _firmness(p, i, lines, token), doubt)
-        doubt = doubt * (largest * (ROUNDING * settled))
+        doubt = doubt * rounding
         share = _search_share(p, cables, lines, contacts, going, doubt, token)
         for i in range(n):
             impulse = fma(share, load(p.left, i, token), load(p.impulse, i, token))
