@@ -270,7 +270,7 @@ def test_bad_settings_are_named():
 def test_single_precision_while_nearly_incompressible():
     """A long soft body whose resistance to volume change drowns that to bending in single precision, unless refined.
 
-    It is up to 500 times that to shear, and rounding counts as much more: 2.2e-6 m.
+    It is up to 500 times that to shear, and rounding counts as much more: 5.0e-6 m.
     """
     layers, batch = 20, 4
     body = fem.uniform_body(0.195, 0.01, 0.01, layers)
