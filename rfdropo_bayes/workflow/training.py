@@ -173,7 +173,8 @@ def evaluate_policies(
     Args:
         model: that is simulated.
         posterior: whose draws the episodes' parameters are, or its folder.
-        policies: policy.onnx, or folders that hold one; named after their folders.
+        policies: policy.onnx, or folders that hold one; named after their folders, with those above
+            where two folders are called the same.
         out: folder to write to: evaluation.json, evaluation.md, episodes.csv, success.png, and a GIF of each policy's
             median episode.
         episodes: of each policy.
@@ -188,14 +189,15 @@ def evaluate_policies(
         the content of evaluation.json.
 
     Raises:
-        InputError: bad input, or a policy for another layout.
+        InputError: bad input, a policy for another layout, or one that is given twice.
     """
     experiment, folder = _with_training(model, options), model.folder
     if tables is None:
         tables = Model.of_experiment(experiment, folder).tables()
     table, task, simulator = _training(experiment, folder)
     randomisation = _randomisation(table, experiment, simulator, folder, posterior)
-    loaded = {_name(p): ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies}
+    opened = [ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies]
+    loaded = dict(zip(_names(policies), opened, strict=True))
     chosen = {"episodes": episodes, "seed": seed}
     record: dict[str, Any] = {"tables": tables, "folder": folder, "options": chosen, "texts": model.texts()}
     with run_folder(Path(out), "evaluate", **record, overwrite=overwrite) as out:
@@ -310,8 +312,14 @@ def _episodes_for(
     return batch
 
 
-def _name(path: Path) -> str:
-    return path.name if path.is_dir() else (path.parent.name if path.stem == "policy" else path.stem)
+def _names(policies: Sequence[Path]) -> list[str]:
+    """Names of policies: of their folders, with as many folders above as it takes to tell them apart."""
+    places = [p if p.is_dir() else (p.parent if p.stem == "policy" else p.with_suffix("")) for p in policies]
+    parts = [place.resolve().parts for place in places]
+    if len(set(parts)) < len(parts):
+        raise InputError("a policy is given twice", where="--policy", remedy="name each once")
+    depth = next(d for d in range(1, 1 + max(map(len, parts))) if len({own[-d:] for own in parts}) == len(parts))
+    return ["_".join(part.strip("/") for part in own[-depth:]) for own in parts]
 
 
 def _check_parity(policy: ExportedPolicy, trained: Trained) -> None:

@@ -126,3 +126,14 @@ def test_same_seed_same_curve_from_python(tmp_path) -> None:
     found = rb.evaluate(model, twins, tmp_path / "test", episodes=4, film=False, **ranges)["policies"]
     assert found["first"] == found["again"]
     assert (tmp_path / "test" / "episodes.csv").exists()
+
+
+def test_policies_whose_folders_are_called_the_same_are_told_apart(tmp_path) -> None:
+    for day in ("monday", "tuesday"):
+        (tmp_path / day / "reach").mkdir(parents=True)
+        (tmp_path / day / "reach" / "policy.onnx").write_bytes((COMMITTED / "policy.onnx").read_bytes())
+    policies = [tmp_path / "monday" / "reach", tmp_path / "tuesday" / "reach" / "policy.onnx"]
+    found = run_evaluation(REACH, policies, tmp_path / "test", episodes=2, lanes=2, film=False)
+    assert set(found["policies"]) == {"monday_reach", "tuesday_reach"}
+    with pytest.raises(InputError, match="given twice"):
+        run_evaluation(REACH, [COMMITTED, COMMITTED], tmp_path / "twice", episodes=2)

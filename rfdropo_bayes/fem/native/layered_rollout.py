@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from rfdropo_bayes.fem.native.compilation import named_by
 from rfdropo_bayes.fem.native.cube_motion import record_cubes, start_cubes
 from rfdropo_bayes.fem.native.fields import clear, fill_lanes, point
 from rfdropo_bayes.fem.native.layered_assembly import add_branch, layer_frame
@@ -231,19 +232,18 @@ def begin_step(tables, batch, samples, factors, work, touch, schedule, output, p
 
 
 def compile_rollout(sources: str) -> Callable:
-    """The kernel of one lane block; ``sources``, a digest of the kernels' sources, is part of the key it is cached
-    under.
+    """The kernel of one lane block; ``sources``, a digest of the kernels' sources, names its cache.
 
     ``runs`` with ``friction``, and ``scene`` with ``cubes``, ``touch`` and ``poses``, are None where cables do not rub
     and where there is no cube: what is None is no part of the kernel that is compiled.
     """
 
     @whole
+    @named_by(sources)
     def rollout(
         tables, runs, scene, batch, cubes, samples, factors, work, friction, touch, rows, problem, schedule, output,
         poses, first, token,
     ):  # fmt: skip
-        _ = sources
         body, given, record = addresses(tables), addresses(batch), addresses(output)
         material, factor, state = addresses(samples), addresses(factors), addresses(work)
         extra, p = addresses(rows), addresses(problem)

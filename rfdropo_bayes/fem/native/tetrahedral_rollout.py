@@ -19,6 +19,7 @@ from rfdropo_bayes.fem.native.block_cholesky import (
     factor,
     forward_substitute,
 )
+from rfdropo_bayes.fem.native.compilation import named_by
 from rfdropo_bayes.fem.native.cube_motion import record_cubes, remember_impulses, start_cubes, take_cube_step
 from rfdropo_bayes.fem.native.simd import (
     addresses,
@@ -229,19 +230,18 @@ def record_body(work, output, row, token):
 
 
 def compile_rollout(sources: str) -> Callable:
-    """The kernel of one lane block; ``sources``, a digest of the kernels' sources, is part of the key it is cached
-    under.
+    """The kernel of one lane block; ``sources``, a digest of the kernels' sources, names its cache.
 
     It steps through ``commands`` (steps, cables, lanes) and records after every ``schedule.stride`` steps; ``rest`` are
     the nodes' coordinates at rest. ``scene``, ``cubes``, ``touch`` and ``poses`` are None where there is no cube.
     """
 
     @whole
+    @named_by(sources)
     def rollout(
         pattern, mesh, cables, scene, rest, commands, cubes, samples, work, touch, rows, problem, reached, schedule,
         output, poses, first, count, token,
     ):  # fmt: skip
-        _ = sources
         bare, bare_pattern, bare_samples = addresses(work), addresses(pattern), addresses(samples)
         extra, p, contacts = addresses(rows), addresses(problem), 0
         around = None if scene is None else addresses(scene)
