@@ -32,8 +32,8 @@ from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.simulators.session import Session
 
 REDRAWS = 200
-"""Times that a lane whose initial state was not found is given other parameters. Of the ranges that uniform randomisation
-fits to the virtual trunk, one draw in eight hangs clear of the cube: one reset in 10^11 is then given up."""
+"""Times that a lane whose initial state was not found is given other parameters. Of the ranges that uniform
+randomisation fits to the virtual trunk, one draw in eight hangs clear of the cube: one reset in 10^11 is given up."""
 
 
 class Step(NamedTuple):

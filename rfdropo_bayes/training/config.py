@@ -54,7 +54,10 @@ class TrainingTable(BaseModel):
     goals: tuple[tuple[float, float, float], tuple[float, float, float]] | None = Field(
         default=None, description="corners of the box that goals are drawn from [m]; the task's own by default"
     )
-    normalise: bool = Field(default=True, description="scale observations and rewards by their running moments")
+    normalise: bool = Field(
+        default=True,
+        description="scale observations and rewards by their running moments (deviations plus 0.01 in quadrature)",
+    )
     evaluate_every: int = Field(
         default=100_000,
         ge=1,

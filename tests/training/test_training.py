@@ -54,6 +54,22 @@ def test_the_policy_gets_better_and_the_log_says_so(trained) -> None:
     assert np.median([e.distance for e in found]) < 0.3 * np.median([e.distance for e in idle])
 
 
+class OneGoal(Points):
+    """Points whose goal never varies."""
+
+    def _start(self, lane, options):
+        return super()._start(lane, {"goal": [0.5], **options})
+
+
+def test_an_observation_that_never_varied_is_not_blown_up(tmp_path) -> None:
+    """Another millimetre of it on the robot must not be an input that no training has seen."""
+    found = train(OneGoal, TABLE.model_copy(update={"steps": 3200}), tmp_path, seed=3, gamma=0.9)
+    seen = np.array([[0.2, 0.5], [0.2, 0.501]], dtype=np.float32)
+    one, other = found.normalisation.normalize_obs(seen)
+    assert abs(other[1] - one[1]) <= 0.11
+    assert np.abs(found.act(seen)[1] - found.act(seen)[0]).max() < 0.1
+
+
 def test_same_seed_same_curve_and_another_seed_another(trained, tmp_path) -> None:
     _, policy = trained
     again = train(Points, TABLE, tmp_path / "again", seed=3, gamma=0.9)
