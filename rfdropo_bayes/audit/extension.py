@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import (
@@ -192,7 +193,9 @@ class Inquiry:
                     pair = self._pair(found, named, step) if self._room(steps) > 1 else []
             if pair:
                 steps += pair
-                fit = pair[-1].fit
+                with self.target.forward.deadline.stage("refits"):
+                    steps[:] = self._without_needless(bases[-1], steps)
+                fit = steps[-1].fit
                 continue
             if step is None:
                 return found
@@ -214,7 +217,7 @@ class Inquiry:
             fit = step.fit
             if len(steps) > 1:
                 with self.target.forward.deadline.stage("refits"):
-                    steps[:] = self._reconsider(bases[-1], steps)
+                    steps[:] = self._without_needless(bases[-1], self._reconsider(bases[-1], steps))
                 fit = steps[-1].fit
 
     def _room(self, steps: Sequence[Step]) -> int:
@@ -417,6 +420,24 @@ class Inquiry:
             found.append(replace(step, fit=fit, log_bayes_factor=fit.log_evidence - under.log_evidence))
         return found
 
+    def _without_needless(self, base: Fit, steps: list[Step]) -> list[Step]:
+        """Steps less those that later ones have made needless: without its parameters the last model has as much
+        evidence. Of a lag found first, and a delay and another lag found later, the first may come down to nothing."""
+        last = steps[-1]
+        if DISCRETISATION in [step.name for step in steps]:
+            return steps
+        for index in range(len(steps) - 1):
+            before = steps[index - 1].fit if index else base
+            gone = np.setdiff1d(steps[index].fit.free, before.free)
+            emptied = last.fit.x.copy()
+            emptied[gone] = self.target.forward.coordinates.null[gone]
+            if _nats_to(last.fit, emptied, gone) > TOLD_APART:
+                continue
+            if climb(last.judge, emptied, np.setdiff1d(last.fit.free, gone)).log_evidence >= last.fit.log_evidence:
+                self.report(f"{steps[index].name} is no longer needed")
+                return self._without_needless(base, self.without(steps, index, base))
+        return steps
+
     def _reconsider(self, base: Fit, steps: list[Step]) -> list[Step]:
         """With the last mechanism in the model, was the first one named rightly? Take it out and ask again."""
         first, last = steps[0], steps[-1]
@@ -441,3 +462,10 @@ class Inquiry:
         gained = alone.log_evidence - plain.log_evidence
         renewed = replace(last, before=first.before, fit=alone, log_bayes_factor=gained)
         return [renewed, again]
+
+
+def _nats_to(fit: Fit, point: Float[np.ndarray, " d"], moved: Int[np.ndarray, " moved"]) -> float:
+    """What a fit's normal approximation says that a model loses at best where some coordinates are held at a point."""
+    place = [int(np.flatnonzero(fit.free == index)[0]) for index in moved]
+    apart = fit.x[moved] - point[moved]
+    return 0.5 * float(apart @ np.linalg.solve(fit.covariance[np.ix_(place, place)], apart))

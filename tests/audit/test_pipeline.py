@@ -462,6 +462,24 @@ def test_a_step_that_a_later_one_carries_is_not_adopted():
     assert [step.name for step in stayed] == ["play", "creep"]
 
 
+def test_a_step_that_a_later_one_makes_needless_is_taken_out():
+    """A useless delay before play goes; play before a delay stays."""
+    asked = unrepeated({"play": 3.0}, 7)
+    target, base = base_model(asked, asked.seed)
+    inquiry = Inquiry(target, asked.candidates, asked.rules, asked.seed)
+    look, _ = inquiry.look_at(base)
+    delay, play = (next(c for c in asked.candidates if c.name == name) for name in ("delay", "play"))
+    order = {"delay": delay, "play": play}
+    for first, second, left in (("delay", "play", ["play"]), ("play", "delay", ["play", "delay"])):
+        one = climb(target, base.x, np.array([*base.free, *order[first].indices]))
+        both = climb(target, one.x, np.array([*one.free, *order[second].indices]))
+        steps = [Step(first, (first,), look, one, 1.0, {}, target), Step(second, (second,), look, both, 1.0, {}, target)]
+        kept = inquiry._without_needless(base, steps)
+        assert [step.name for step in kept] == left
+        assert set(kept[-1].fit.free) == {*base.free, *(index for name in left for index in order[name].indices)}
+        assert kept[-1].fit.log_evidence >= both.log_evidence
+
+
 def test_a_family_takes_the_place_of_a_cause_only_if_it_wins_under_wider_priors_too():
     """Ten parameters more must bring 3 nats and ten times log 2; as many or fewer parameters, 3 nats."""
     asked = question(TRUTH, 1)
