@@ -473,7 +473,8 @@ def test_a_step_that_a_later_one_makes_needless_is_taken_out():
     for first, second, left in (("delay", "play", ["play"]), ("play", "delay", ["play", "delay"])):
         one = climb(target, base.x, np.array([*base.free, *order[first].indices]))
         both = climb(target, one.x, np.array([*one.free, *order[second].indices]))
-        steps = [Step(first, (first,), look, one, 1.0, {}, target), Step(second, (second,), look, both, 1.0, {}, target)]
+        fits = {first: one, second: both}
+        steps = [Step(name, (name,), look, fit, 1.0, {}, target) for name, fit in fits.items()]
         kept = inquiry._without_needless(base, steps)
         assert [step.name for step in kept] == left
         assert set(kept[-1].fit.free) == {*base.free, *(index for name in left for index in order[name].indices)}
