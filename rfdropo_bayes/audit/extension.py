@@ -79,7 +79,8 @@ class Step:
         fit: of the model with it.
         log_bayes_factor: of the model with against that without it, by Laplace.
         refits: log Bayes factors of all candidates that were refitted at this step.
-        judge: the target under which the fit was found, see `inadequacy`.
+        judge: the target under which the fit was found, see `inadequacy`. From the step `DISCRETISATION` on it has the
+            finer simulator.
     """
 
     name: str
@@ -97,7 +98,7 @@ class Inquiry:
 
     Attributes:
         target: data, noise and simulator; every candidate is in the simulator, at its null value. Its noise
-            is that under which the present model is judged, see `inadequacy`.
+            is that under which the present model is judged, see `inadequacy`; its simulator that of the present model.
         candidates: that may be named.
         rules: see `Rules`.
         seed: of all bootstraps.
@@ -176,7 +177,7 @@ class Inquiry:
         renewed: set[int] = set()  # numbers of steps at which the model was climbed again: once at each
         while True:
             named = [step.name for step in steps]
-            if steps and DISCRETISATION not in named:
+            if steps:
                 self.target, fit = judged(self.target.measured, fit.x, fit.free)
                 steps[-1] = replace(steps[-1], fit=fit, judge=self.target)
             found, _ = self.look_at(fit, named)
@@ -202,7 +203,7 @@ class Inquiry:
             better = None
             if len(steps) not in renewed:
                 with self.target.forward.deadline.stage("refits"), suppress(OutOfTime):
-                    better = self._climbed_again(step, named)
+                    better = self._climbed_again(step)
             if better is not None:
                 renewed.add(len(steps))
                 self.report(f"without {step.name}, a better optimum than before: the question once more")
@@ -214,7 +215,7 @@ class Inquiry:
                 fit = better
                 continue
             steps.append(step)
-            fit = step.fit
+            self.target, fit = step.judge, step.fit
             if len(steps) > 1:
                 with self.target.forward.deadline.stage("refits"):
                     steps[:] = self._without_needless(bases[-1], self._reconsider(bases[-1], steps))
@@ -255,7 +256,8 @@ class Inquiry:
         # What looks the same near null may be another thing at the size that it has.
         able = [row for row in able if refits.get(row.name, np.inf) > refits[best] - TOLD_APART]
         members = self._class_of(found.row(best), able)
-        return Step(best, members, found, fits[best], refits[best], refits, self.target)
+        judge = self.target.on(self.finer) if best == DISCRETISATION and self.finer else self.target
+        return Step(best, members, found, fits[best], refits[best], refits, judge)
 
     def _pair(self, found: Look, named: Sequence[str], single: Step | None) -> list[Step]:
         """Two mechanisms at once, where the best one leaves most of a large misfit; none where they do not pay.
@@ -265,7 +267,7 @@ class Inquiry:
         """
         fit, last = found.fit, single.fit if single else found.fit
         taken = float(fit.residual @ fit.residual - last.residual @ last.residual)
-        if not far_off(self.target, last.x):
+        if not far_off(single.judge if single else self.target, last.x):
             return []
         rows = {row.name: row for row in found.rows if row.probe is not None and row.name != DISCRETISATION}
         heads = sorted(rows.values(), key=lambda row: -row.lm)[: self.rules.members]
@@ -306,12 +308,10 @@ class Inquiry:
         start = best_between(self.target, fit.x, start_together(fit, probes), held, SHARES)
         return climb(self.target, start, np.array([*fit.free, *np.setdiff1d(np.concatenate(chosen), fit.free)]))
 
-    def _climbed_again(self, step: Step, named: Sequence[str]) -> Fit | None:
+    def _climbed_again(self, step: Step) -> Fit | None:
         """The model before a step, climbed from where the step led: a candidate must not be named for having moved a
         climb on that had stopped early. None where that is no better."""
         before = step.before.fit
-        if any(other == DISCRETISATION for other in named):  # its fits are of another simulator
-            return None
         free, added = step.fit.free, np.setdiff1d(step.fit.free, before.free)
         emptied = step.fit.x.copy()
         emptied[added] = before.x[added]
@@ -370,7 +370,7 @@ class Inquiry:
     def _refit(self, fit: Fit, row: Row, start: np.ndarray) -> Fit:
         if row.name == DISCRETISATION:
             assert self.finer is not None
-            return climb(replace(self.target, forward=self.finer), start, fit.free)
+            return climb(self.target.on(self.finer), start, fit.free)
         assert row.probe is not None
         candidate = next(c for c in self.candidates if c.name == row.name)
         free = np.array([*fit.free, *np.setdiff1d(candidate.indices, fit.free)], dtype=int)
@@ -408,15 +408,16 @@ class Inquiry:
         return new.log_evidence > old.log_evidence + worth + WIDER * further
 
     def without(self, steps: Sequence[Step], index: int, base: Fit) -> list[Step]:
-        """Steps less one of them, the later ones refitted without it."""
+        """Steps less one of them that has parameters, the later ones refitted without it."""
         candidate = next(c for c in self.candidates if c.name == steps[index].name)
         gone = np.setdiff1d(candidate.indices, steps[index - 1].fit.free if index else base.free)
-        found = list(steps[:index])
+        found, judges = list(steps[:index]), [step.judge for step in steps[: index + 1]]
         for step in steps[index + 1 :]:
             before, start = found[-1].fit if found else base, step.fit.x.copy()
             start[gone] = self.target.forward.coordinates.null[gone]
             fit = climb(step.judge, start, np.setdiff1d(step.fit.free, gone))
-            under = climb(step.judge, before.x, before.free)
+            under = climb(step.judge.on(judges[-1].forward), before.x, before.free)
+            judges.append(step.judge)
             found.append(replace(step, fit=fit, log_bayes_factor=fit.log_evidence - under.log_evidence))
         return found
 
@@ -424,9 +425,9 @@ class Inquiry:
         """Steps less those that later ones have made needless: without its parameters the last model has as much
         evidence. Of a lag found first, and a delay and another lag found later, the first may come down to nothing."""
         last = steps[-1]
-        if DISCRETISATION in [step.name for step in steps]:
-            return steps
         for index in range(len(steps) - 1):
+            if steps[index].name == DISCRETISATION:
+                continue
             before = steps[index - 1].fit if index else base
             gone = np.setdiff1d(steps[index].fit.free, before.free)
             emptied = last.fit.x.copy()

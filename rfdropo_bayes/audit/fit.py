@@ -91,6 +91,11 @@ class Target:
         """The same under the noise of the measurement."""
         return self if self.known is None else self.known
 
+    def on(self, forward: Forward) -> Target:
+        """The same with another simulator."""
+        known = None if self.known is None else replace(self.known, forward=forward)
+        return replace(self, forward=forward, known=known)
+
     @cached_property
     def identity(self) -> str:
         """Digest of everything that a residual depends on beside the parameters."""

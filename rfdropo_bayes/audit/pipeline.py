@@ -158,22 +158,21 @@ def audit(
     finer = None if question.finer is None else _forward(question, True, target.measurements, deadline)
     judge, inquiry = target, Inquiry(target, question.candidates, question.rules, question.seed, finer, report)
     inquiry, base, steps, last = _inquired(inquiry, base)
-    target = inquiry.target.measured
-    judge = judge if judge.known is not None else target
+    judge = judge if judge.known is not None else inquiry.target.on(judge.forward)
     asked = [step.name for step in steps]
     steps, last, held_out = _supported(question, judge, inquiry, base, steps, last)
     base, steps = as_measured(judge, base), [replace(s, fit=as_measured(s.judge, s.fit)) for s in steps]
     unsupported = [name for name in asked if name not in [step.name for step in steps]]
     if unsupported:
         report(f"unseen recordings do not support {' and '.join(unsupported)}")
-    extended = steps[-1].fit if steps else base
+    extended, target = steps[-1].fit if steps else base, judge.measured
     if steps and target.noise.source == RESIDUALS:
         with suppress(OutOfTime):
-            last = _final_look(inquiry, extended, steps)
+            last = _final_look(replace(inquiry, target=steps[-1].judge), extended, steps)
     looks = [*(step.before for step in steps), last]
     stages = [held_out.gain(0, k) for k in range(1, len(steps) + 1)] if held_out else []
     gain = stages[-1] if stages else None
-    verdict, suspected = _judged(inquiry, base, steps, looks, gain, deadline)
+    verdict, suspected = _judged(replace(inquiry, target=judge), base, steps, looks, gain, deadline)
     stopped = deadline.reached
     deadline.lift()  # what is left are single rollouts, for the report
     sizes = widened(extended, question.coordinates)
@@ -198,7 +197,7 @@ def audit(
         target.measurements.shift,
         None if DISCRETISATION in asked else _numerical(target, finer, extended),
         stopped,
-        target.forward.rollouts + (finer.rollouts if finer else 0),
+        judge.forward.rollouts + (finer.rollouts if finer else 0),
         deadline.profile,
     )
 
@@ -261,10 +260,11 @@ def _inquired(inquiry: Inquiry, base: Fit) -> tuple[Inquiry, Fit, list[Step], Lo
     """
     if not base.converged:
         return inquiry, base, [], look(inquiry.target, base, [], [], [inquiry.seed, 0], inquiry.rules.bootstraps)
+    own = inquiry.target.forward
     base, steps, last = inquiry.name_causes(base)
     if steps and inquiry.target.noise.source == RESIDUALS:
         with suppress(OutOfTime):
-            again, renewed = _asked_again(inquiry, base, steps[-1].fit)
+            again, renewed = _asked_again(inquiry, own, base, steps[-1].fit)
             found = again.name_causes(renewed)
             if not inquiry.target.forward.deadline.reached:
                 return again, *found
@@ -399,10 +399,10 @@ def residual_noise(target: Target, fit: Fit) -> Stacked:
     return measured.noise(np.where(measured.single_valid, left, 0.0), len(fit.free))
 
 
-def _asked_again(inquiry: Inquiry, base: Fit, extended: Fit) -> tuple[Inquiry, Fit]:
-    """The inquiry with the noise of what a first extension leaves: that of the base model holds the discrepancy itself,
-    and whitens away what would tell its causes apart."""
-    target = replace(inquiry.target, noise=residual_noise(inquiry.target, extended))
+def _asked_again(inquiry: Inquiry, own: Forward, base: Fit, extended: Fit) -> tuple[Inquiry, Fit]:
+    """The inquiry, on the base model's own simulator, with the noise of what a first extension leaves: that of the base
+    model holds the discrepancy itself, and whitens away what would tell its causes apart."""
+    target = replace(inquiry.target, noise=residual_noise(inquiry.target, extended)).on(own)
     inquiry.report(f"once more with the noise that the extended model leaves, AR({target.noise.first.order})")
     return replace(inquiry, target=target), climb(target, base.x, base.free)
 
@@ -499,7 +499,7 @@ def _without_carried(
     index, clock = 0, inquiry.target.forward.deadline
     with clock.stage("gain"), clock.reserve(), suppress(OutOfTime):
         while index < len(steps) - 1:
-            if held_out.gain(index, index + 1).clear or DISCRETISATION in [step.name for step in steps]:
+            if held_out.gain(index, index + 1).clear or steps[index].name == DISCRETISATION:
                 index += 1
                 continue
             inquiry.report(f"is {steps[index].name} needed? The model without it")
@@ -538,7 +538,7 @@ def _predicted(question: Question, judge: Target, inquiry: Inquiry, base: Fit, s
             forward = simulated(question, DISCRETISATION in names[: i + 1], tested, range(count, every))
             predictions.append(_predict(replace(target, forward=forward, measurements=tested), fit, [question.seed, 3]))
     else:
-        which, unseen, predictions = _left_out(question, judges, inquiry, fits, names)
+        which, unseen, predictions = _left_out(question, judges, inquiry, fits)
     seen = list(zip(judges, fits, strict=True))
     patterns = [target.measurements.series(as_measured(judge, fit).residual) for judge, fit in seen]
     spreads, noises = [spread(judge, fit) for judge, fit in seen], [judge.noise for judge in judges]
@@ -551,7 +551,7 @@ def _unseen(tested: Measurements, valid: np.ndarray) -> Unseen:
 
 
 def _left_out(
-    question: Question, judges: Sequence[Target], inquiry: Inquiry, fits: Sequence[Fit], names: Sequence[str]
+    question: Question, judges: Sequence[Target], inquiry: Inquiry, fits: Sequence[Fit]
 ) -> tuple[str, Unseen, list[Prediction]]:
     """Predict each group of repeats from the others; where one has parameters that no other tells (a single one has),
     the later rows of all from the earlier ones."""
@@ -571,13 +571,9 @@ def _left_out(
     for mask in masks:
         mask = np.broadcast_to(mask, measured.count.shape)
         for i, (judge, fit) in enumerate(zip(judges, fits, strict=True)):
-            forward = target.forward
-            if DISCRETISATION in names[: i + 1] and inquiry.finer is not None:
-                forward = inquiry.finer
             kept = replace(judge.measurements, count=np.where(mask, 0.0, judge.measurements.count))
-            refitted = climb(replace(judge, forward=forward, measurements=kept), fit.x, fit.free, evaluations=15)
-            own = replace(target, forward=forward)
-            parts[i].append(_predict(own, refitted, [question.seed, 3]).errors)
+            refitted = climb(replace(judge, measurements=kept), fit.x, fit.free, evaluations=15)
+            parts[i].append(_predict(target.on(judge.forward), refitted, [question.seed, 3]).errors)
     draws = min(len(part) for row in parts for part in row)
     predictions = []
     for row in parts:

@@ -116,19 +116,36 @@ def test_a_cause_outside_the_library_is_not_called_explained_and_a_gain_is_invis
     assert {c["mechanism"] for c in content["candidates"]} == set(CANDIDATES) - {"play"}
 
 
+class Coarse(Toy):
+    """An error of the audit's own simulator, which a finer one lacks."""
+
+    def rollout(self, parameters, commands, steps=None):
+        found = super().rollout(parameters, commands, steps)
+        return found._replace(position=found.position * (1.0 + 3.0 * found.position))
+
+
+def on_a_coarse_mesh(asked):
+    """A question whose simulator is the finer one of a coarse one."""
+    finer = (asked.lanes, asked.model.recordings.commands)
+    return replace(asked, lanes=Lanes(Coarse(), np.arange(4)), finer=finer)
+
+
+def test_what_an_error_of_the_mesh_hides_is_found_on_the_finer_one():
+    """Once the finer simulator is the model, candidates are refitted, and recordings predicted, with it."""
+    answer = audit(on_a_coarse_mesh(question({**TRUTH, "play": 0.15}, 102)))
+    assert [step.name for step in answer.steps] == ["discretisation", "play"]
+    assert answer.verdict == "explained"
+    assert answer.steps[1].judge.forward is answer.steps[0].judge.forward is not answer.target.forward
+    index = answer.question.coordinates.names.index("play")
+    sizes = answer.question.coordinates.values(answer.draws)[:, index]
+    assert abs(sizes.mean() - 0.15) < 4 * sizes.std()
+
+
 @pytest.mark.parametrize(("family", "named"), [(0.02, ["discretisation"]), (0.0, [])])
 def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(family, named):
-    """An error of the audit's own simulator, which a finer one lacks; where nothing may be named, it is let pass."""
-
-    class Coarse(Toy):
-        def rollout(self, parameters, commands, steps=None):
-            found = super().rollout(parameters, commands, steps)
-            return found._replace(position=found.position * (1.0 + 3.0 * found.position))
-
-    asked = question(TRUTH, 102)
-    finer = (asked.lanes, asked.model.recordings.commands)
-    rules = replace(asked.rules, family=family)
-    answer = audit(replace(asked, lanes=Lanes(Coarse(), np.arange(4)), finer=finer, rules=rules))
+    """Where nothing may be named, an error of the mesh is let pass."""
+    asked = on_a_coarse_mesh(question(TRUTH, 102))
+    answer = audit(replace(asked, rules=replace(asked.rules, family=family)))
     assert [step.name for step in answer.steps] == named
     assert answer.verdict == ("explained" if named else "no_discrepancy")
     assert answer.looks[0].refined is not bool(named)
