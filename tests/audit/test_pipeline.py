@@ -356,10 +356,10 @@ def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it(
     assert early.log_evidence < whole.log_evidence - 100.0  # what it is about
     both = climb(target, whole.x, np.array([*with_play, *creep.indices], dtype=int))
     step = Step("creep", ("creep",), replace(look, fit=early), both, both.log_evidence - early.log_evidence, {}, target)
-    again = inquiry._climbed_again(step, ["play"])
+    again = inquiry._climbed_again(step)
     assert again is not None
     assert again.log_evidence == pytest.approx(whole.log_evidence, abs=0.1)
-    assert inquiry._climbed_again(replace(step, before=replace(look, fit=whole)), ["play"]) is None
+    assert inquiry._climbed_again(replace(step, before=replace(look, fit=whole))) is None
 
 
 def test_repeats_whose_clocks_differ_are_not_joined_and_named():
