@@ -61,6 +61,7 @@ class TrainingTable(BaseModel):
     evaluate_every: int = Field(
         default=100_000,
         ge=1,
-        description="environment steps between evaluations; a run that was killed goes on from the last",
+        description="environment steps between evaluations, of which the best has the policy that is kept; a run that "
+        "was killed goes on from the last",
     )
     evaluation_episodes: int = Field(default=64, ge=1, description="episodes of an evaluation during training")

@@ -26,6 +26,7 @@ from rfdropo_bayes.training.evaluation import Case, Episode, draw_cases, play
 
 EVALUATION_SEED = 1_000_003  # cases of an evaluation are none of the episodes that training begins with
 CHECKPOINT, EPISODES = "checkpoints", "episodes.jsonl"
+LAST, BEST = "", "best_"  # what files of a checkpoint begin with
 
 LEAST_SPREAD = 0.01
 """Added to the deviations by which observations are divided, in quadrature [m; quaternions: 1]. In training the cube's
@@ -35,7 +36,7 @@ in reports/table2/README.md."""
 
 @dataclass(frozen=True)
 class Trained:
-    """A trained policy.
+    """The policy of the evaluation with the highest reward: learning goes up and down until its end.
 
     Attributes:
         model: of Stable-Baselines3.
@@ -52,6 +53,11 @@ class Trained:
     diverged: int
     seconds: float
     redrawn: int = 0
+
+    @property
+    def best(self) -> dict[str, float]:
+        """The row of the curve that the policy is of."""
+        return self.curve[_best_row(self.curve)]
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """The policy's most likely action for observations as the environments give them."""
@@ -106,6 +112,8 @@ def train(
             state = _leg(model, normalisation, venv, cases, table, state, seed, Path(out) / EPISODES)
             _save(model, normalisation, folder, state)
             progress.stage(model.num_timesteps / table.steps, **state["curve"][-1])
+    if _best_row(state["curve"]) < len(state["curve"]) - 1:
+        model, normalisation = _load(maker, venv, table, folder, BEST)
     return Trained(model, normalisation, state["curve"], state["diverged"], state["seconds"], state["redrawn"])
 
 
@@ -135,11 +143,25 @@ def _begin(
             **options,
         )
         return model, normalisation
-    normalisation = VecNormalize.load(str(folder / "normalisation.pkl"), venv) if table.normalise else None
-    model = maker.load(folder / "model.zip", env=normalisation or venv, device="cpu", tensorboard_log=tensorboard)
+    model, normalisation = _load(maker, venv, table, folder, LAST, tensorboard)
     if (folder / "replay.pkl").exists():
         model.load_replay_buffer(folder / "replay.pkl")
     return model, normalisation
+
+
+def _load(
+    maker: Any, venv: Any, table: TrainingTable, folder: Path, which: str, tensorboard: str | None = None
+) -> tuple[Any, Any]:
+    """The last or the best model of a checkpoint, and its normalisation."""
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    normalisation = VecNormalize.load(str(folder / f"{which}normalisation.pkl"), venv) if table.normalise else None
+    path = folder / f"{which}model.zip"
+    return maker.load(path, env=normalisation or venv, device="cpu", tensorboard_log=tensorboard), normalisation
+
+
+def _best_row(curve: Sequence[Mapping[str, float]]) -> int:
+    return int(np.argmax([row["reward"] for row in curve]))
 
 
 def _leg(
@@ -218,9 +240,14 @@ def _save(model: Any, normalisation: Any, folder: Path, state: Mapping[str, Any]
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
-        model.save(partial / "model.zip")
-        if normalisation is not None:
-            normalisation.save(str(partial / "normalisation.pkl"))
+        is_best = _best_row(state["curve"]) == len(state["curve"]) - 1
+        for which in (LAST, BEST) if is_best else (LAST,):
+            model.save(partial / f"{which}model.zip")
+            if normalisation is not None:
+                normalisation.save(str(partial / f"{which}normalisation.pkl"))
+        if not is_best:
+            for path in folder.glob(f"{BEST}*"):
+                shutil.copy2(path, partial)
         if getattr(model, "replay_buffer", None) is not None:
             model.save_replay_buffer(partial / "replay.pkl")
         (partial / "state.json").write_text(json.dumps(state), encoding="utf-8")

@@ -342,7 +342,7 @@ def _summary(table: TrainingTable, found: Trained, policy: ExportedPolicy, facts
         "seconds": found.seconds,
         "diverged_episodes": found.diverged,
         "redrawn_parameters": found.redrawn,
-        "evaluation": {key: value for key, value in found.curve[-1].items() if key not in ("steps", "seconds")},
+        "evaluation": {key: value for key, value in found.best.items() if key != "seconds"},
         "curve": found.curve,
         "latency": latency(policy),
         "layout_sha256": policy.layout.sha256,
@@ -356,7 +356,8 @@ def _summary(table: TrainingTable, found: Trained, policy: ExportedPolicy, facts
 
 def policy_card(summary: Mapping[str, Any], layout: PolicyLayout) -> str:
     """What somebody needs to know before using a policy, as Markdown."""
-    last, times, seed = summary["evaluation"], summary["latency"], summary["seed"]
+    episodes = summary["settings"]["evaluation_episodes"]
+    best, times, seed = summary["evaluation"], summary["latency"], summary["seed"]
     parts = "\n".join(f"| {part.name} | {part.size} | {part.unit} |" for part in layout.observation)
     what = (
         f"one of {len(layout.moves)} moves of a channel by {np.max(layout.moves):g} {layout.unit}"
@@ -368,8 +369,8 @@ def policy_card(summary: Mapping[str, Any], layout: PolicyLayout) -> str:
 Trained in simulation by {summary["algorithm"]}: {summary["steps"]} steps in {summary["seconds"]:.0f} s, seed {seed}.
 Parameters of every episode: {summary["randomisation"]}, SHA-256 {summary["posterior_sha256"][:16]}.
 
-In its last evaluation half of {summary["settings"]["evaluation_episodes"]} episodes end within
-{1e3 * last["distance_median"]:.2f} mm of the goal, 95 % within {1e3 * last["distance_q95"]:.2f} mm.
+This is the policy after {best["steps"]} steps, the best evaluated: half of {episodes} episodes end within
+{1e3 * best["distance_median"]:.2f} mm of the goal, 95 % within {1e3 * best["distance_q95"]:.2f} mm.
 One decision takes {1e3 * times["median_s"]:.3f} ms, {1e3 * times["p99_s"]:.3f} ms at the 99th percentile.
 
 | Observation | Numbers | Unit |

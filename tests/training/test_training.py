@@ -25,9 +25,10 @@ from rfdropo_bayes.training.evaluation import (
     success,
 )
 from rfdropo_bayes.training.export import ExportedPolicy, export_policy, latency
-from rfdropo_bayes.training.run import train
+from rfdropo_bayes.training.run import EVALUATION_SEED, train
 from tests.training.toys import STEP, Points, layout
 
+SEED = 3
 OPTIONS = {"n_steps": 20, "batch_size": 160, "n_epochs": 5, "learning_rate": 3e-3, "net_arch": [32]}
 TABLE = TrainingTable(
     options=OPTIONS, steps=6400, environments=16, evaluate_every=3200, evaluation_episodes=20, actions="continuous"
@@ -79,6 +80,23 @@ def test_same_seed_same_curve_and_another_seed_another(trained, tmp_path) -> Non
         return [{k: v for k, v in row.items() if k != "seconds"} for row in run.curve]
 
     assert curve(again) == curve(policy) != curve(other)
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_the_policy_is_that_of_the_best_evaluation(tmp_path, interrupted) -> None:
+    """With this learning rate the last of four evaluations is worse than one before it."""
+    table = TABLE.model_copy(update={"options": OPTIONS | {"learning_rate": 0.1}, "evaluate_every": 1600})
+    if interrupted:
+        train(Points, table.model_copy(update={"steps": 4800}), tmp_path, seed=SEED, gamma=0.9)
+    found = train(Points, table, tmp_path, seed=SEED, gamma=0.9, resume=interrupted)
+    rewards = [row["reward"] for row in found.curve]
+    assert len(rewards) == 4
+    assert max(rewards[:3]) > rewards[3] + 0.1
+    found.normalisation.training = False
+    venv = Points(16)
+    cases = draw_cases(venv, table.evaluation_episodes, EVALUATION_SEED + SEED)
+    assert np.mean([e.total for e in play(found.act, venv, cases)]) == pytest.approx(max(rewards), rel=1e-6)
+    assert found.best["reward"] == max(rewards)
 
 
 def test_a_run_that_was_killed_goes_on_as_if_it_had_not_been(trained, tmp_path) -> None:
