@@ -23,9 +23,9 @@ from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.differences import DIFFERENCE, FORWARD
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
-# Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. Processors take
-# four lanes each.
-WIDTH = max(8, 4 * (os.cpu_count() or 1))
+# Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. A processor takes
+# eight, as many as a vector register of 512 bits holds: with fewer, the native engine's other threads have no work.
+WIDTH = 8 * (os.cpu_count() or 1)
 
 Thetas = Float[np.ndarray, "lane physical"]
 Points = Float[np.ndarray, "n d"]
