@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.envs.randomisation import Randomisation, fitting
 from rfdropo_bayes.envs.tasks import (
@@ -34,6 +35,8 @@ from rfdropo_bayes.simulators.session import Session
 REDRAWS = 200
 """Times that a lane whose initial state was not found is given other parameters. Of the ranges that uniform
 randomisation fits to the virtual trunk, one draw in eight hangs clear of the cube: one reset in 10^11 is given up."""
+LEVER = 0.0175
+"""Half a side of the paper's cube [m]: where motion capture sees the points that tell how the cube is turned."""
 
 
 class Step(NamedTuple):
@@ -53,7 +56,8 @@ class Settings:
 
     Attributes:
         actions, observed, period, step: see `layout_of`.
-        noise: standard deviation of white noise on what is seen of the markers [m].
+        noise: standard deviation of white noise on what is seen of the markers and of points of the cube [m]. What a
+            marker has moved is the difference of two sightings, as on a robot.
         near: an episode ends within this distance of the goal [m]; None lets it go on, which keeps the reward of
             staying there.
     """
@@ -96,17 +100,18 @@ class Episodes:
         self.randomisation = fitting(randomisation, simulator.parameters)
         self.session = Session(simulator, lanes, settings.period)
         self.redrawn = 0
-        self.generators = [np.random.default_rng(lane) for lane in range(lanes)]
+        self.generators = [np.random.default_rng(child) for child in np.random.SeedSequence().spawn(lanes)]
         self.parameters: list[dict[str, float]] = [{} for _ in range(lanes)]
         markers = len(self.robot.marker_names)
         self.goal, self.commands = np.zeros((lanes, 3)), np.zeros((lanes, len(self.layout.channels)))
         self.age = np.zeros(lanes, dtype=int)
         self.first = np.ones(lanes)
-        self.marker, self.before = np.zeros((lanes, markers, 3)), np.zeros((lanes, markers, 3))
+        self.marker = np.zeros((lanes, markers, 3))
         self.pose = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (lanes, 1)) if task.push else None
+        self.seen, self.seen_before, self.seen_pose = self.marker, self.marker, self.pose
 
     def seed(self, lane: int, seed: int | np.random.SeedSequence) -> None:
-        """Let a lane draw from a generator with this seed from now on."""
+        """Let a lane draw from a generator with this seed from now on; without, no two episodes are alike."""
         self.generators[lane] = np.random.default_rng(seed)
 
     def reset(
@@ -168,13 +173,14 @@ class Episodes:
             )
         change = self.layout.change(actions.reshape(self.lanes, *actions.shape[1:]))
         self.commands = np.clip(self.commands + change, self.layout.low, self.layout.high)
-        self.before = self.marker
         found = self.session.act(self.commands)
         good = (np.asarray(found.status) == int(Result.OK)) & np.isfinite(found.position).all(axis=(1, 2))
-        self.marker = np.where(good[:, None, None], found.position, self.before)
+        self.marker = np.where(good[:, None, None], found.position, self.marker)
         if self.pose is not None:
             self.pose = np.where(good[:, None], np.asarray(found.object_pose), self.pose)
         self.age += 1
+        self.seen_before = self.seen
+        self._look(np.arange(self.lanes))
         distance = self.distance()
         gained = np.where(good, reward(distance, self.first), FLOOR * (EPISODE - self.age + 1))
         ended = ~good if self.settings.near is None else ~good | (distance <= self.settings.near)
@@ -215,23 +221,38 @@ class Episodes:
         """Let lanes be where an observation shows them, at the start of an episode."""
         if not len(rows):
             return
-        self.marker, self.before = self.marker.copy(), self.before.copy()
-        self.marker[rows] = self.before[rows] = found.position
+        self.marker = self.marker.copy()
+        self.marker[rows] = found.position
         if self.pose is not None:
             self.pose = self.pose.copy()
             self.pose[rows] = found.object_pose
         self.commands[rows], self.age[rows] = 0.0, 0
         self.first[rows] = self.distance()[rows]
+        self._look(rows)
+        self.seen_before = self.seen_before.copy()
+        self.seen_before[rows] = self.seen[rows]
+
+    def _look(self, rows: Int[np.ndarray, " row"]) -> None:
+        """Let some lanes be seen, with the errors of motion capture."""
+        noise, count = self.settings.noise, self.marker[0].size
+        if not noise:
+            self.seen, self.seen_pose = self.marker, self.pose
+            return
+        own = [self.generators[row] for row in rows]
+        errors = noise * np.stack([rng.normal(size=count + (0 if self.pose is None else 6)) for rng in own])
+        self.seen = self.seen.copy()
+        self.seen[rows] = self.marker[rows] + errors[:, :count].reshape(-1, *self.marker.shape[1:])
+        if self.pose is not None:
+            assert self.seen_pose is not None
+            turn = Rotation.from_rotvec(errors[:, count + 3 :] / LEVER) * Rotation.from_quat(self.pose[rows, 3:])
+            place = self.pose[rows, :3] + errors[:, count : count + 3]
+            self.seen_pose = self.seen_pose.copy()
+            self.seen_pose[rows] = np.concatenate([place, turn.as_quat()], axis=1)
 
     def _observe(self, rows: Int[np.ndarray, " row"]) -> Float[np.ndarray, "row size"]:
-        marker = self.marker[rows]
-        if self.settings.noise:
-            shape = marker.shape[1:]
-            marker = marker + self.settings.noise * np.stack([self.generators[r].normal(size=shape) for r in rows])
-        pose = None if self.pose is None else self.pose[rows]
-        parts = parts_seen(
-            self.layout, self.robot, marker, self.before[rows], self.goal[rows], self.commands[rows], pose
-        )
+        seen, before = self.seen[rows], self.seen_before[rows]
+        pose = None if self.seen_pose is None else self.seen_pose[rows]
+        parts = parts_seen(self.layout, self.robot, seen, before, self.goal[rows], self.commands[rows], pose)
         return self.layout.assemble(parts)
 
 

@@ -12,8 +12,7 @@ from gymnasium.vector.utils import batch_space
 from rfdropo_bayes.envs.building import make_episodes
 from rfdropo_bayes.envs.rendering import picture
 from rfdropo_bayes.envs.spaces import spaces_of
-
-FRAMES_PER_SECOND = 20
+from rfdropo_bayes.envs.tasks import PERIOD
 
 
 class TrunkEnv(gymnasium.Env):
@@ -27,12 +26,13 @@ class TrunkEnv(gymnasium.Env):
     ``reset`` takes the options ``parameters`` and ``goal``; its info holds what the episode began with.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": round(1.0 / PERIOD)}  # noqa: RUF012
 
     def __init__(self, task: str, render_mode: str | None = None, **options: Any) -> None:
         self.episodes = make_episodes(task, 1, **options)
         self.layout = self.episodes.layout
         self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.layout.period_s)}
         self.observation_space, self.action_space = spaces_of(self.layout)
 
     def reset(
@@ -71,6 +71,7 @@ class TrunkVectorEnv(VectorEnv):
         self.episodes = make_episodes(task, num_envs, **options)
         self.layout = self.episodes.layout
         self.num_envs, self.render_mode = num_envs, render_mode
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.layout.period_s)}
         self.single_observation_space, self.single_action_space = spaces_of(self.layout)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -85,14 +86,17 @@ class TrunkVectorEnv(VectorEnv):
             if own is not None:
                 self.episodes.seed(lane, own)
         seen = self.episodes.reset(np.arange(self.num_envs), [options or {}] * self.num_envs)
-        begun = [self.episodes.begun_with(lane) for lane in range(self.num_envs)]
-        return seen, {
-            "parameters": np.array([entry["parameters"] for entry in begun], dtype=object),
-            "goal": self.episodes.goal.copy(),
-        }
+        return seen, self._begun()
+
+    def _begun(self) -> dict[str, np.ndarray]:
+        """What the episodes of all lanes began with."""
+        parameters = np.empty(self.num_envs, dtype=object)
+        parameters[:] = [dict(values) for values in self.episodes.parameters]
+        return {"parameters": parameters, "goal": self.episodes.goal.copy()}
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One action in every lane."""
+        """One action in every lane. Where episodes end, ``final_obs`` and ``final_info`` tell of them, and
+        ``parameters`` and ``goal`` of those that begin."""
         step = self.episodes.act(np.asarray(actions))
         info: dict[str, Any] = {"distance": step.distance, "diverged": step.diverged}
         seen = step.observation
@@ -101,9 +105,16 @@ class TrunkVectorEnv(VectorEnv):
             final = np.full(self.num_envs, None, dtype=object)
             for lane in ended:
                 final[lane] = seen[lane].copy()
-            info |= {"final_obs": final, "_final_obs": step.terminated | step.truncated}
+            done = step.terminated | step.truncated
+            info |= {
+                "final_obs": final,
+                "_final_obs": done,
+                "final_info": {**info, **self._begun()},
+                "_final_info": done,
+            }
             seen = seen.copy()
             seen[ended] = self.episodes.reset(ended)
+            info |= {**self._begun(), "_parameters": done, "_goal": done}
         return seen, step.reward, step.terminated, step.truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:

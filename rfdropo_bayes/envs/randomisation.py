@@ -14,7 +14,9 @@ from jaxtyping import Float
 from scipy.stats import truncnorm
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
 
 POSTERIOR, PHI = "posterior.nc", "summary.json"
@@ -203,31 +205,37 @@ def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Ran
     return randomisation
 
 
-def read_posterior(path: Path, specs: Sequence[ParameterSpec]) -> tuple[Draws, tuple[str, ...]]:
-    """Draws of a saved posterior, and the names in it that are no parameters of the simulator (such as its noise).
+def read_posterior(path: Path, specs: Sequence[ParameterSpec], robot: Robot | None = None) -> Draws:
+    """Draws of a saved posterior, of the parameters that the simulator has: noise is none, nor what belongs to one
+    recording.
 
     Args:
         path: posterior.nc, or the run folder that holds it.
         specs: parameters of the simulator.
+        robot: that is simulated, for which mechanisms have their parameters.
 
     Raises:
-        InputError: no such file, no posterior of ours, or one that shares no parameter with the simulator.
+        InputError: no such file, no posterior of ours, one that shares no parameter with the simulator, or one with a
+            mechanism that the simulator lacks.
     """
     path = Path(path)
     file = path / POSTERIOR if path.is_dir() else path
     record = PosteriorRecord.load(file)
-    drawn = drawn_rows(record, specs, where=str(file))
+    drawn = drawn_rows(record, specs, where=str(file), robot=robot)
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
-    return replace(drawn, sha256=digest), tuple(info.name for info in record.free if info.name not in drawn.names)
+    return replace(drawn, sha256=digest)
 
 
-def drawn_rows(record: PosteriorRecord, specs: Sequence[ParameterSpec], *, where: str = "posterior") -> Draws:
+def drawn_rows(
+    record: PosteriorRecord, specs: Sequence[ParameterSpec], *, where: str = "posterior", robot: Robot | None = None
+) -> Draws:
     """Rows of a posterior, of the parameters that the simulator has.
 
     Raises:
-        InputError: it shares no parameter with the simulator.
+        InputError: it shares no parameter with the simulator, or has a mechanism that the simulator lacks.
     """
     known = {spec.name for spec in specs}
+    _require_mechanisms([info.name for info in record.free if info.name not in known], robot, where)
     names = tuple(info.name for info in record.free if info.name in known)
     if not names:
         raise InputError(
@@ -237,11 +245,11 @@ def drawn_rows(record: PosteriorRecord, specs: Sequence[ParameterSpec], *, where
     return Draws(names, rows, hashlib.sha256(np.ascontiguousarray(rows).tobytes()).hexdigest())
 
 
-def read_phi(path: Path, specs: Sequence[ParameterSpec]) -> Phi:
+def read_phi(path: Path, specs: Sequence[ParameterSpec], robot: Robot | None = None) -> Phi:
     """RF-DROPO's distribution from a run folder.
 
     Raises:
-        InputError: no summary there, or one of a method that has no phi.
+        InputError: no summary there, one of a method that has no phi, or a phi that does not fit the simulator.
     """
     path = Path(path)
     file = path / PHI if path.is_dir() else path
@@ -256,4 +264,21 @@ def read_phi(path: Path, specs: Sequence[ParameterSpec]) -> Phi:
             remedy='calibrate with method = "rfdropo", or randomise over the posterior',
         )
     known = {spec.name for spec in specs}
-    return Phi({name: normal for name, normal in found["phi"].items() if name in known})
+    _require_mechanisms([name for name in found["phi"] if name not in known], robot, str(file))
+    shared = {name: normal for name, normal in found["phi"].items() if name in known}
+    if not shared:
+        raise InputError("phi shares no parameter with the simulator", where=str(file), remedy="use one of this robot")
+    return Phi(shared)
+
+
+def _require_mechanisms(missing: Sequence[str], robot: Robot | None, where: str) -> None:
+    """Raise an InputError where a parameter that the simulator lacks is one of a mechanism of the library."""
+    for name in REGISTRY:
+        (mechanism,) = mechanisms_named([name], robot)
+        own = [spec.name for spec in mechanism.parameters if spec.name in missing]
+        if own:
+            raise InputError(
+                f"has {own[0]}, of the mechanism {name!r}, which the simulator lacks",
+                where=where,
+                remedy=f'add "{name}" to [model] mechanisms',
+            )

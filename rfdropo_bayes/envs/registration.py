@@ -1,4 +1,4 @@
-"""Environments by their names in Gymnasium; called when Gymnasium looks for plugins, so it imports nothing else."""
+"""Environments by their names in Gymnasium."""
 
 from __future__ import annotations
 

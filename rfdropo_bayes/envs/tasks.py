@@ -83,10 +83,13 @@ def reward(
 
     It is -0.05 at the first distance and near 0.95 within a millimetre of the goal.
     """
-    beginning = potential(first_distance)
+    beginning = potential(np.maximum(first_distance, NEAREST))
     return (beginning - potential(distance)) / beginning - 0.05
 
 
+NEAREST = 0.005
+"""Of episodes that begin nearer than this to their goal [m], rewards are those of one that began there: the potential
+goes through zero at a millimetre."""
 FLOOR = -1.05
 """Reward for each action that a failed simulation leaves undone: that of being about twice as far off as at first."""
 

@@ -24,8 +24,8 @@ class TrunkVecEnv(VecEnv):
             begun again with that as an option of a reset.
 
     The info of every step holds ``distance`` [m] and ``diverged``; at the end of an episode also
-    ``terminal_observation``, ``TimeLimit.truncated`` and ``episode`` (r: sum of rewards, l: actions). ``reset_infos``
-    holds what each lane began with: ``parameters`` and ``goal``.
+    ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (r: sum of rewards, l: actions), and what it began
+    with: ``parameters`` and ``goal``. ``reset_infos`` holds what the present episode of each lane began with.
     """
 
     def __init__(self, episodes: Episodes, log: Path | None = None) -> None:
@@ -86,6 +86,7 @@ class TrunkVecEnv(VecEnv):
                 "terminal_observation": step.observation[lane],
                 "TimeLimit.truncated": bool(step.truncated[lane]),
                 "episode": {"r": total, "l": length},
+                **self.reset_infos[lane],
             }
             ending = {"distance": infos[lane]["distance"], "diverged": infos[lane]["diverged"], "reward": total}
             lines.append(json.dumps({"lane": int(lane), **self.reset_infos[lane], **ending, "actions": length}))

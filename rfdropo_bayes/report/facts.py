@@ -15,6 +15,8 @@ from rfdropo_bayes.report.object_scores import ObjectScore
 from rfdropo_bayes.report.residuals import ResidualCheck
 
 PACKAGES = ("rfdropo_bayes", "jax", "numpyro", "blackjax", "arviz", "numpy", "scipy", "numba")
+LEARNING = ("torch", "stable_baselines3", "gymnasium", "onnx", "onnxruntime")
+"""Packages that policies are made with."""
 
 
 @dataclass(frozen=True)
@@ -118,10 +120,11 @@ class RunFacts:
     outline: Mapping[str, Any] | None = None
 
 
-def software_versions() -> dict[str, str]:
-    """Versions of Python and of the packages that numbers depend on; those not installed are left out."""
+def software_versions(further: Sequence[str] = ()) -> dict[str, str]:
+    """Versions of Python and of the packages that numbers depend on, ``further`` ones among them; those not installed
+    are left out."""
     versions = {"python": python_version()}
-    for name in PACKAGES:
+    for name in (*PACKAGES, *further):
         try:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

@@ -96,10 +96,21 @@ class PolicyLayout:
     def change(
         self, action: Int[np.ndarray, "*lane"] | Float[np.ndarray, "*lane channel"]
     ) -> Float[np.ndarray, "*lane channel"]:
-        """What an action adds to the commands [unit]; continuous actions beyond -1 and 1 count as these."""
+        """What an action adds to the commands [unit]; continuous actions beyond -1 and 1 count as these.
+
+        Raises:
+            InputError: a discrete action that is no whole number from 0 on, or too large a one.
+        """
         moves = np.asarray(self.moves)
         if self.kind == "discrete":
-            return moves[np.asarray(action)]
+            chosen = np.asarray(action)
+            if not np.issubdtype(chosen.dtype, np.integer) or chosen.min() < 0 or chosen.max() >= len(moves):
+                raise InputError(
+                    f"{_brief(chosen)} is no action",
+                    where=self.task,
+                    remedy=f"use whole numbers from 0 to {len(moves) - 1}",
+                )
+            return moves[chosen]
         return moves[0] * np.clip(action, -1.0, 1.0)
 
     def to_json(self) -> str:

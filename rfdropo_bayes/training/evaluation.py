@@ -55,10 +55,10 @@ class Episode:
 
 
 def draw_cases(venv: Any, count: int, seed: int) -> list[Case]:
-    """Cases from the distribution that an environment's resets draw from."""
+    """Cases from the distribution that an environment's resets draw from; other seeds have other cases."""
     cases: list[Case] = []
     for turn in range(-(-count // venv.num_envs)):
-        venv.seed(seed + turn * venv.num_envs)
+        venv.seed(_first_seed(seed) + turn * venv.num_envs)
         venv.reset()
         cases += [
             Case({name: float(value) for name, value in info["parameters"].items()}, tuple(map(float, info["goal"])))
@@ -67,14 +67,20 @@ def draw_cases(venv: Any, count: int, seed: int) -> list[Case]:
     return cases[:count]
 
 
-def play(act: Act, venv: Any, cases: Sequence[Case], longest: int = 10_000) -> list[Episode]:
-    """Play every case once.
+def _first_seed(seed: int, *stream: int) -> int:
+    """Seeds of lanes count up from here: far from those of another seed or stream."""
+    return int(np.random.SeedSequence([seed, *stream]).generate_state(1)[0])
+
+
+def play(act: Act, venv: Any, cases: Sequence[Case], seed: int = 0, longest: int = 10_000) -> list[Episode]:
+    """Play every case once, with the same noise whatever the policy and however many cases are played at once.
 
     Args:
         act: the policy; it sees observations as the environments give them.
         venv: environments that take ``parameters`` and ``goal`` as reset options and report ``distance`` and
             ``diverged`` in their info.
         cases: what to start from.
+        seed: of the noise.
         longest: no episode has more actions.
 
     Returns:
@@ -84,6 +90,7 @@ def play(act: Act, venv: Any, cases: Sequence[Case], longest: int = 10_000) -> l
     for first in range(0, len(cases), venv.num_envs):
         chunk = list(cases[first : first + venv.num_envs])
         lanes = chunk + [chunk[-1]] * (venv.num_envs - len(chunk))
+        venv.seed(_first_seed(seed, 1) + first)
         venv.set_options([{"parameters": dict(case.parameters), "goal": list(case.goal)} for case in lanes])
         episodes += _play_lanes(act, venv, len(chunk), first, longest)
     return episodes
@@ -137,6 +144,8 @@ def interquartile_mean(
         return trim_mean(np.concatenate(parts, axis=axis), 0.25, axis=axis)
 
     found = float(middle(*distances))
+    if not np.isfinite(found):  # a quarter and more of the simulations failed
+        return found, found, found
     # Strata are resampled apart: each argument of `bootstrap` is one.
     interval = bootstrap(
         distances,

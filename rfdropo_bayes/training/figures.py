@@ -15,7 +15,6 @@ from rfdropo_bayes.report.style import CYCLE, WIDTH, styled
 from rfdropo_bayes.training.evaluation import Episode
 
 MILLIMETRES = 1e3
-FRAMES_PER_SECOND = 20
 
 
 @styled
@@ -53,8 +52,8 @@ def success_figure(policies: Mapping[str, Sequence[Episode]], thresholds: Sequen
     return figure
 
 
-def save_animation(frames: Sequence[np.ndarray], path: Path) -> Path:
-    """Write pictures as a GIF in real time."""
+def save_animation(frames: Sequence[np.ndarray], path: Path, period: float) -> Path:
+    """Write pictures, one every ``period`` [s], as a GIF in real time."""
     pictures: list[Any] = [Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE) for frame in frames]
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=1000 // FRAMES_PER_SECOND, loop=0)
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(1e3 * period), loop=0)
     return path

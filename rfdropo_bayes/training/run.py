@@ -106,10 +106,13 @@ def train(
     state = _load_state(folder, known) if resume else None
     model, normalisation = _begin(maker, options, venv, table, folder, state, out, seed)
     cases = draw_cases(venv, table.evaluation_episodes, EVALUATION_SEED + seed)
-    state = state or {"known": known, "leg": 0, "seconds": 0.0, "diverged": 0, "redrawn": 0, "curve": []}
+    state = state or {"known": known, "leg": 0, "seconds": 0.0, "diverged": 0, "redrawn": 0, "curve": [], "logged": 0}
+    log = Path(out) / EPISODES
+    if log.exists():  # episodes of a leg that a kill has cut short come again
+        os.truncate(log, state["logged"])
     with Progress(f"{table.algorithm} {table.task}", show=show, log=Path(out) / "log.jsonl") as progress:
         while model.num_timesteps < table.steps:
-            state = _leg(model, normalisation, venv, cases, table, state, seed, Path(out) / EPISODES)
+            state = _leg(model, normalisation, venv, cases, table, state, seed, log)
             _save(model, normalisation, folder, state)
             progress.stage(model.num_timesteps / table.steps, **state["curve"][-1])
     if _best_row(state["curve"]) < len(state["curve"]) - 1:
@@ -180,23 +183,26 @@ def _leg(
     model.set_random_seed(int(np.random.SeedSequence([seed, leg]).generate_state(1)[0] % 2**31))
     model.set_env(normalisation or venv, force_reset=True)
     venv.set_attr("log", log)
-    count = _Failures()
+    count = _failures(table.steps)
     left = table.steps - model.num_timesteps
     if table.anneal:
         # Stable-Baselines3's own schedules count from the start of a leg.
         rate = model.learning_rate * left / table.steps
         model.lr_schedule = lambda _: rate
     steps = min(table.evaluate_every, left)
-    model.learn(steps, callback=count.callback(), reset_num_timesteps=False, tb_log_name="run", log_interval=None)
+    model.learn(steps, callback=count, reset_num_timesteps=False, tb_log_name="run", log_interval=1)
     venv.set_attr("log", None)
     policy = Trained(model, normalisation, [], 0, 0.0)
     if normalisation is not None:
         normalisation.training = False
-    episodes = play(policy.act, venv, cases)
+    episodes = play(policy.act, venv, cases, EVALUATION_SEED + seed)
     if normalisation is not None:
         normalisation.training = True
     seconds = state["seconds"] + time.monotonic() - began
     row = {"steps": int(model.num_timesteps), "seconds": seconds, **_summary(episodes)}
+    for name, value in row.items():
+        model.logger.record(f"evaluation/{name}", value)
+    model.logger.dump(model.num_timesteps)
     return {
         **state,
         "leg": leg,
@@ -204,23 +210,28 @@ def _leg(
         "diverged": state["diverged"] + count.failed,
         "redrawn": state["redrawn"] + venv.get_attr("redrawn")[0] - redrawn,
         "curve": [*state["curve"], row],
+        "logged": log.stat().st_size if log.exists() else 0,
     }
 
 
-class _Failures:
-    """Counts training episodes that ended because the simulation failed."""
+def _failures(steps: int) -> Any:
+    """A callback that counts training episodes whose simulation failed, and has schedules count the whole run's steps.
 
-    def __init__(self) -> None:
-        self.failed = 0
+    Stable-Baselines3 imports are heavy, so that the class is made here.
+    """
+    from stable_baselines3.common.callbacks import BaseCallback
 
-    def callback(self) -> Any:
-        """As a callback of Stable-Baselines3."""
+    class Failures(BaseCallback):
+        failed = 0
 
-        def count(known: dict[str, Any], _: dict[str, Any]) -> bool:
-            self.failed += sum(bool(info.get("diverged", False)) for info in known["infos"])
+        def _on_training_start(self) -> None:
+            self.model._total_timesteps = steps  # of a leg, otherwise: exploration of DQN would end with the first
+
+        def _on_step(self) -> bool:
+            self.failed += sum(bool(info.get("diverged", False)) for info in self.locals["infos"])
             return True
 
-        return count
+    return Failures()
 
 
 def _summary(episodes: Sequence[Episode]) -> dict[str, float]:

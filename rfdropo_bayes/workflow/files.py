@@ -184,7 +184,11 @@ def check_folder(out: Path, command: str, *, resume: bool = False, overwrite: bo
             where=str(out),
             remedy="choose another folder with --out, or replace it with --overwrite",
         )
-    if earlier is not None and (out / CHECKPOINTS).is_dir() and any((out / CHECKPOINTS).rglob("*.npz")):
+    if (
+        earlier is not None
+        and (out / CHECKPOINTS).is_dir()
+        and any(path.is_file() for path in (out / CHECKPOINTS).rglob("*"))
+    ):
         remedy = "go on with --resume, or start anew with --overwrite"
         if ran != command:
             remedy = "choose another folder with --out, or replace it with --overwrite"

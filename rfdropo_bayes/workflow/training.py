@@ -17,6 +17,7 @@ from rfdropo_bayes.envs.vec_env import TrunkVecEnv
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_json, write_text
 from rfdropo_bayes.report import software_versions
+from rfdropo_bayes.report.facts import LEARNING
 from rfdropo_bayes.robots import OBJECT
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -207,15 +208,15 @@ def evaluate_policies(
             batch = _episodes_for(policy.layout, simulator, task, min(lanes, episodes), randomisation, table, name)
             venv = TrunkVecEnv(batch)
             cases = cases or draw_cases(venv, episodes, EVALUATION_SEED + seed)
-            found[name] = play(policy.act, venv, cases)
+            found[name] = play(policy.act, venv, cases, seed)
             if film:
                 _film(batch, found[name], cases, out / f"{name}.gif")
-        content = _judged(found, cases, experiment.seed)
+        content = _judged(found, cases, seed)
         with whole(out / CSV) as partial:
             episode_table(found, cases).to_csv(partial, index=False)
         success_figure(found, THRESHOLDS).savefig(out / FIGURE, dpi=150)
         write_text(out / TABLE, evaluation_table(content))
-        write_json(out / EVALUATION, content)
+        write_json(out / EVALUATION, content, finite=True)
     return content
 
 
@@ -259,9 +260,9 @@ def _randomisation(
     known = {spec.name for spec in simulator.parameters}
     parts: list[Randomisation] = [Point({name: value for name, value in fixed.items() if name in known})]
     if isinstance(posterior, Calibration):
-        parts.append(drawn_rows(posterior.record, simulator.parameters))
+        parts.append(drawn_rows(posterior.record, simulator.parameters, robot=simulator.robot))
     elif posterior is not None:
-        parts.append(read_posterior(Path(posterior), simulator.parameters)[0])
+        parts.append(read_posterior(Path(posterior), simulator.parameters, simulator.robot))
     elif table.randomisation != "none":
         parts.append(_randomised(table, simulator, folder))
     kind = parts[-1].kind
@@ -286,8 +287,8 @@ def _randomised(table: TrainingTable, simulator: RobotSimulator, folder: Path) -
     beside = folder / table.source
     source = beside if beside.exists() else Path(table.source)
     if table.randomisation == "phi":
-        return read_phi(source, simulator.parameters)
-    return read_posterior(source, simulator.parameters)[0]
+        return read_phi(source, simulator.parameters, simulator.robot)
+    return read_posterior(source, simulator.parameters, simulator.robot)
 
 
 def _episodes_for(
@@ -348,7 +349,7 @@ def _summary(table: TrainingTable, found: Trained, policy: ExportedPolicy, facts
         "layout_sha256": policy.layout.sha256,
         "settings": table.model_dump(mode="json"),
         **facts,
-        "versions": software_versions(),
+        "versions": software_versions(LEARNING),
         "status": "done",
         "schema_version": SCHEMA_VERSION,
     }
@@ -364,6 +365,7 @@ def policy_card(summary: Mapping[str, Any], layout: PolicyLayout) -> str:
         if layout.kind == "discrete"
         else f"change of each of {len(layout.channels)} commands, up to {np.max(layout.moves):g} {layout.unit}"
     )
+    versions = ", ".join(f"{name} {version}" for name, version in summary["versions"].items())
     return f"""# A policy for {summary["task"]}
 
 Trained in simulation by {summary["algorithm"]}: {summary["steps"]} steps in {summary["seconds"]:.0f} s, seed {seed}.
@@ -380,6 +382,7 @@ One decision takes {1e3 * times["median_s"]:.3f} ms, {1e3 * times["p99_s"]:.3f} 
 Action, every {layout.period_s:g} s: {what}. Layout SHA-256 {summary["layout_sha256"][:16]}.
 
 It has seen a simulator only. `rfdropo evaluate` says how it does on others; summary.json says what made it.
+Made with {versions}.
 """
 
 
@@ -393,7 +396,7 @@ def _film(batch: Episodes, episodes: Sequence[Episode], cases: Sequence[Case], p
     for action in episode.actions:
         batch.act(np.repeat(np.asarray(action)[None], batch.lanes, axis=0))
         frames.append(picture(batch, 0))
-    save_animation(frames, path)
+    save_animation(frames, path, batch.layout.period_s)
 
 
 def _judged(found: Mapping[str, Sequence[Episode]], cases: Sequence[Case], seed: int) -> dict[str, Any]:
@@ -403,11 +406,20 @@ def _judged(found: Mapping[str, Sequence[Episode]], cases: Sequence[Case], seed:
         rates = {f"{1e3 * t:g}": success(episodes, t) for t in THRESHOLDS}
         policies[name] = {
             "success_mm": {key: {"share": s, "low": low, "high": high} for key, (s, low, high) in rates.items()},
-            "interquartile_mean_mm": dict(zip(("value", "low", "high"), (1e3 * m for m in middle), strict=True)),
-            "median_mm": 1e3 * float(np.median([episode.distance for episode in episodes])),
+            "interquartile_mean_mm": dict(zip(("value", "low", "high"), map(_millimetres, middle), strict=True)),
+            "median_mm": _millimetres(float(np.median([episode.distance for episode in episodes]))),
             "diverged": int(np.sum([episode.diverged for episode in episodes])),
         }
     return {"episodes": len(cases), "policies": policies, "seed": seed, "schema_version": SCHEMA_VERSION}
+
+
+def _millimetres(distance: float) -> float | None:
+    """None where simulations failed, which is no distance."""
+    return 1e3 * distance if np.isfinite(distance) else None
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
 
 
 def evaluation_table(content: Mapping[str, Any]) -> str:
@@ -427,8 +439,8 @@ def evaluation_table(content: Mapping[str, Any]) -> str:
         ]
         middle = row["interquartile_mean_mm"]
         cells += [
-            f"{row['median_mm']:.2f}",
-            f"{middle['value']:.2f} [{middle['low']:.2f}, {middle['high']:.2f}]",
+            _shown(row["median_mm"]),
+            f"{_shown(middle['value'])} [{_shown(middle['low'])}, {_shown(middle['high'])}]",
             str(row["diverged"]),
         ]
         lines.append(f"| {name} | {' | '.join(cells)} |")
