@@ -24,8 +24,8 @@ from rfdropo_bayes.simulators.differences import DIFFERENCE, FORWARD
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
 # Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. A compiled engine
-# computes what many lanes have in common once, be it padding or the value beside its slopes: of 16, 32, 48 and 64 lanes,
-# 48 took the least time for the Jacobians of both real robots, two thirds of that of 16.
+# computes what many lanes have in common once, be it padding or the value beside its slopes: of 16, 32, 48 and 64
+# lanes, 48 took the least time for the Jacobians of both real robots, two thirds of that of 16.
 WIDTH = 48
 NARROW = 8 * (os.cpu_count() or 1)  # of the JAX engine, which computes every lane
 

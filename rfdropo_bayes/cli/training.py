@@ -74,7 +74,7 @@ def table2(
     steps: Annotated[int, typer.Option(help="environment steps of a training")] = 1_000_000,
     episodes: Annotated[int, typer.Option(help="of an evaluation, the same for all policies")] = 200,
     budget: Annotated[int, typer.Option(help="rollouts of a fit")] = 10_000,
-    minutes: Annotated[float, typer.Option(help="bound of the audit")] = 30.0,
+    minutes: Annotated[float, typer.Option(help="bound of the audit")] = 65.0,
     exact_oracle: Annotated[
         bool, typer.Option("--exact-oracle", help="train the oracle on the target's own mesh and time step; slower")
     ] = False,
@@ -101,4 +101,8 @@ def table2(
     )
     for claim in content["claims"]:
         typer.echo(f"{'holds' if claim['holds'] else 'FAILS'}: {claim['task']}, {claim['claim']}: {claim['value']:.2f}")
+    for cell, why in content["failed"].items():
+        typer.echo(f"failed: {cell}: {why}")
+    if content["not_done"]:
+        typer.echo(f"{content['not_done']} cells are not done: go on with --resume")
     typer.echo(f"table: {out / 'table2.md'}")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Bool
 from scipy.stats import binomtest
 
 from rfdropo_bayes.audit.verdict import NO_VERDICT
@@ -29,13 +31,16 @@ from rfdropo_bayes.workflow.audit import run_audit
 from rfdropo_bayes.workflow.audited import AUDIT, EXTENDED
 from rfdropo_bayes.workflow.calibration import run_calibration
 from rfdropo_bayes.workflow.experiment_file import describe, read_tables, self_contained
-from rfdropo_bayes.workflow.files import LOG, run_ended, run_folder
+from rfdropo_bayes.workflow.files import CHECKPOINTS, LOG, run_ended, run_folder
 from rfdropo_bayes.workflow.training import CSV, POLICY, run_evaluation, run_training
 
 THRESHOLDS = (0.01525, 0.02157, 0.030)  # m, those of the paper's Table II
 PAPER = {"15.25": 0.32, "21.57": 0.56, "30": 0.60}  # RF-DROPO, TrunkPush on hardware
 CLAIMED = "15.25"
 ALMOST = 0.9  # of the oracle's success
+RESAMPLES = 4000
+ASKED = "asked.toml"
+"""What a finished part of the study was made from."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,7 @@ class Row:
         method: of inference; empty where nothing is fitted.
         options: of the method, beside the budget.
         randomisation: that the policy is trained under.
+        each: every seed has a fit of its own, as chance chooses what is fitted.
         extended: the model has what the audit found missing.
         on_target: trained on the target itself.
     """
@@ -53,13 +59,14 @@ class Row:
     method: str = ""
     options: Mapping[str, Any] = field(default_factory=dict)
     randomisation: str = "none"
+    each: bool = False
     extended: bool = False
     on_target: bool = False
 
 
 ROWS = {
     "no randomisation": Row(),
-    "UDR": Row("udr", {}, "posterior"),
+    "UDR": Row("udr", {}, "posterior", each=True),
     "BayesSim": Row("bayessim", {}, "posterior"),
     "NPDR": Row("npdr", {"rounds": 10}, "posterior"),
     "RF-DROPO as published": Row("rfdropo", {"mended": False}, "phi"),
@@ -90,7 +97,7 @@ class Size:
     steps: int = 1_000_000
     episodes: int = 200
     budget: int = 10_000
-    minutes: float = 30.0
+    minutes: float = 65.0
     exact_oracle: bool = False
 
     def __post_init__(self) -> None:
@@ -135,6 +142,7 @@ def run_table2(
             The tables hold all that is done.
         resume: keep what an interrupted study has done.
         only_done: tables of the cells that are done; nothing is computed.
+        overwrite: start anew; the folder's fits, policies and evaluations go.
         command: for the record.
 
     Returns:
@@ -150,6 +158,8 @@ def run_table2(
     going_on = resume or only_done
     with run_folder(out, "benchmark table2", options=options, resume=going_on, overwrite=overwrite) as out:
         study = Study({path.stem: path for path in experiments}, target, audit, out, size)
+        if overwrite:
+            _clear(study)
         jobs = list_jobs(study, rows)
         failed: dict[str, str] = {}
         if not only_done:
@@ -191,6 +201,21 @@ def list_jobs(study: Study, rows: Sequence[str] = ()) -> list[tuple[str, str, in
     return jobs
 
 
+def _clear(study: Study) -> None:
+    """Remove all that an earlier study has left."""
+    kinds = ("experiments", "fits", "policies", "evaluations")
+    for place in [study.out / "audit", *(study.out / task / kind for task in study.experiments for kind in kinds)]:
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def _ran(out: Path, asked: str) -> bool:
+    """Whether a part of the study has come to its end, made from what is asked now."""
+    try:
+        return run_ended(out) and (out / ASKED).read_text(encoding="utf-8") == asked
+    except OSError:
+        return False
+
+
 def has_cube(tables: Mapping[str, Any]) -> bool:
     """Whether an experiment's task pushes a cube."""
     return bool(tables.get("simulator", {}).get("push", False))
@@ -206,7 +231,8 @@ def _do(study: Study, task: str, row: str, seed: int) -> None:
     tables = _on_target(study, _tables(study, task))
     path = _written(tables, study.out / task / "experiments" / "target.toml")
     run_evaluation(path, [policy], out, episodes=study.size.episodes, film=False, overwrite=True)
-    write_json(out / "policy.json", {"sha256": _digest(policy / POLICY), **_learning(policy)})
+    made = {"sha256": _digest(policy / POLICY), **_learning(policy), **_judged_on(study, row)}
+    write_json(out / "policy.json", made)
 
 
 def _trained(study: Study, task: str, row: str, seed: int) -> Path:
@@ -216,7 +242,7 @@ def _trained(study: Study, task: str, row: str, seed: int) -> Path:
     training = tables["training"] | {"steps": study.size.steps, "randomisation": chosen.randomisation}
     training.pop("source", None)
     if chosen.method:
-        fit, model = _fitted(study, task, row)
+        fit, model = _fitted(study, task, row, seed if chosen.each else None)
         training["source"] = str(fit)
         tables = model
     if chosen.on_target:
@@ -227,14 +253,15 @@ def _trained(study: Study, task: str, row: str, seed: int) -> Path:
     tables["simulator"] = {**tables.get("simulator", {}), "precision": "float32"}
     tables.pop("data", None)
     path = _written(tables, study.out / task / "experiments" / f"{_slug(row)}_{seed}.toml")
-    out = _place(study, task, "policies", row, seed)
-    if not (run_ended(out) and _learning(out)["steps"] >= study.size.steps):
-        run_training(path, out, resume=(out / "checkpoints").exists())
+    out, asked = _place(study, task, "policies", row, seed), path.read_text(encoding="utf-8")
+    if not _ran(out, asked):
+        run_training(path, out, resume=(out / CHECKPOINTS).exists())
+        write_text(out / ASKED, asked)
     return out
 
 
-def _fitted(study: Study, task: str, row: str) -> tuple[Path, dict[str, Any]]:
-    """Folder of a row's fit, and the tables of the model that was fitted."""
+def _fitted(study: Study, task: str, row: str, seed: int | None) -> tuple[Path, dict[str, Any]]:
+    """Folder of a row's fit, or of the one of a seed, and the tables of the model that was fitted."""
     chosen, tables = ROWS[row], _tables(study, task)
     if chosen.extended:
         tables = _with_causes(study, tables)
@@ -243,19 +270,24 @@ def _fitted(study: Study, task: str, row: str) -> tuple[Path, dict[str, Any]]:
     own = {"parameters": list(search), "search": search} if chosen.method == "rfdropo" else {}
     budget = {} if chosen.method == "udr" else {"rollouts": study.size.budget}
     tables["inference"] = {"method": chosen.method, **chosen.options, **own, **budget}
-    out = _place(study, task, "fits", row)
-    path = _written(tables, study.out / task / "experiments" / f"{_slug(row)}.toml")
-    if not run_ended(out):
-        run_calibration(path, out, resume=(out / "checkpoints").exists())
+    if seed is not None:
+        tables["seed"] = int(tables.get("seed", 0)) + seed
+    out = _place(study, task, "fits", row, seed)
+    path = _written(tables, study.out / task / "experiments" / f"fit_{out.name}.toml")
+    asked = path.read_text(encoding="utf-8")
+    if not _ran(out, asked):
+        run_calibration(path, out, resume=(out / CHECKPOINTS).exists())
+        write_text(out / ASKED, asked)
     return out, tables
 
 
 def _with_causes(study: Study, tables: dict[str, Any]) -> dict[str, Any]:
     """The model with the mechanisms that the audit adopted, and their priors."""
-    out = study.out / "audit"
-    if not run_ended(out):
-        minutes = f"audit.minutes={study.size.minutes}"
-        run_audit(study.audit, out, overrides=[minutes], resume=(out / "checkpoints").exists())
+    out, minutes = study.out / "audit", f"audit.minutes={study.size.minutes}"
+    asked = f"# {minutes}\n{study.audit.read_text(encoding='utf-8')}"
+    if not _ran(out, asked):
+        run_audit(study.audit, out, overrides=[minutes], resume=(out / CHECKPOINTS).exists())
+        write_text(out / ASKED, asked)
     found = json.loads((out / AUDIT).read_text(encoding="utf-8"))
     if found["verdict"] == NO_VERDICT:
         raise InputError(found["sentence"], where=str(out), remedy="mend the audit's file, then remove this folder")
@@ -302,13 +334,19 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def _judged_on(study: Study, row: str) -> dict[str, Any]:
+    """What an evaluation is of, beside its policy."""
+    exact = {"exact_oracle": study.size.exact_oracle} if ROWS[row].on_target else {}
+    return {"target_sha256": _digest(study.target), **exact}
+
+
 def _learning(policy: Path) -> dict[str, float]:
     found = json.loads((policy / "summary.json").read_text(encoding="utf-8"))
     return {"steps": found["steps"], "seconds": found["seconds"], "diverged": found["diverged_episodes"]}
 
 
 def _cell(study: Study, task: str, row: str, seed: int) -> dict[str, Any] | None:
-    """What a cell's evaluation found; None if there is none, or it is of another policy or size."""
+    """What a cell's evaluation found; None if there is none, or it is of another policy, target or size."""
     out = _place(study, task, "evaluations", row, seed)
     policy = _place(study, task, "policies", row, seed) / POLICY
     try:
@@ -316,7 +354,8 @@ def _cell(study: Study, task: str, row: str, seed: int) -> dict[str, Any] | None
         episodes = pd.read_csv(out / CSV)
     except (OSError, ValueError):
         return None
-    if len(episodes) != study.size.episodes or (policy.exists() and _digest(policy) != known["sha256"]):
+    same = all(known.get(name) == value for name, value in _judged_on(study, row).items())
+    if len(episodes) != study.size.episodes or not same or (policy.exists() and _digest(policy) != known["sha256"]):
         return None
     distance = episodes["distance"].to_numpy(dtype=float)
     return {
@@ -333,25 +372,43 @@ def _cell(study: Study, task: str, row: str, seed: int) -> dict[str, Any] | None
 
 
 def summarise(task: str, row: str, cells: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Success of a row's policies together, with 95 % Wilson intervals, and of each seed."""
+    """Success of a row's policies together and of each seed, with 95 % intervals that know chance in both the episodes
+    and the trainings, see `share_of`."""
     own = [cell for cell in cells if (cell["task"], cell["row"]) == (task, row)]
-    count = sum(cell["episodes"] for cell in own)
-    success = {}
-    for name in own[0]["hits"]:
-        hits = sum(cell["hits"][name] for cell in own)
-        interval = binomtest(hits, count).proportion_ci(0.95, method="wilson")
-        success[name] = {"share": hits / count, "low": float(interval.low), "high": float(interval.high)}
+    distance = np.array([cell["distance_mm"] for cell in own])
+    success = {name: share_of(distance <= float(name)) for name in own[0]["hits"]}
     return {
         "task": task,
         "row": row,
         "seeds": len(own),
-        "episodes": count,
+        "episodes": distance.size,
         "steps": min(cell["steps"] for cell in own),
         "training_seconds": float(np.mean([cell["seconds"] for cell in own])),
         "success": success,
         "by_seed": [cell["hits"][CLAIMED] / cell["episodes"] for cell in own],
-        "median_mm": float(np.median([value for cell in own for value in cell["distance_mm"]])),
+        "median_mm": float(np.median(distance)),
     }
+
+
+def share_of(hit: Bool[np.ndarray, "seed episode"]) -> dict[str, float]:
+    """Share of hits, with a 95 % interval: Wilson's for one seed; for more the wider of Wilson's over all episodes and
+    a bootstrap over seeds and, within them, over the episodes that all seeds share.
+
+    Episodes of one policy succeed or fail together, so that those of all seeds are no independent trials.
+    """
+    seeds, episodes = hit.shape
+    interval = binomtest(int(hit.sum()), hit.size).proportion_ci(0.95, method="wilson")
+    low, high = float(interval.low), float(interval.high)
+    if seeds > 1:
+        rng = np.random.default_rng(0)
+        chosen, played = (
+            rng.integers(seeds, size=(RESAMPLES, seeds)),
+            rng.integers(episodes, size=(RESAMPLES, episodes)),
+        )
+        shares = [hit[np.ix_(a, b)].mean() for a, b in zip(chosen, played, strict=True)]
+        ends = np.quantile(shares, [0.025, 0.975])
+        low, high = min(low, float(ends[0])), max(high, float(ends[1]))
+    return {"share": float(hit.mean()), "low": low, "high": high}
 
 
 def claims(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -19,8 +19,8 @@ def as_markdown(content: Mapping[str, Any]) -> str:
         "",
         f"`{content['command']}`",
         "",
-        f"Share of episodes that end within a distance of the goal, with 95 % Wilson intervals over the episodes of "
-        f"all seeds; {size['episodes']} episodes of each policy, the same for all.",
+        f"Share of episodes that end within a distance of the goal, {size['episodes']} of each policy, the same for "
+        "all. The 95 % intervals know chance in episodes and, where a row has several seeds, in trainings.",
         "",
     ]
     for task in dict.fromkeys(row["task"] for row in content["rows"]):
