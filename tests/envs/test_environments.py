@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 
 import gymnasium
@@ -13,8 +15,7 @@ from stable_baselines3.common.env_checker import check_env as check_sb3
 
 from rfdropo_bayes.envs.building import make_episodes
 from rfdropo_bayes.envs.gym_env import TrunkEnv, TrunkVectorEnv
-from rfdropo_bayes.envs.randomisation import Draws, Phi, Point, Uniform, fitting, read_posterior
-from rfdropo_bayes.envs.registration import register
+from rfdropo_bayes.envs.randomisation import Draws, Phi, Point, Uniform, fitting, read_phi, read_posterior
 from rfdropo_bayes.envs.tasks import FLOOR, TASKS, command_limits, layout_of, potential, reward, tracked_markers
 from rfdropo_bayes.envs.vec_env import TrunkVecEnv
 from rfdropo_bayes.errors import InputError
@@ -79,16 +80,89 @@ def test_gymnasium_and_sb3_accept_the_environment(actions, observed) -> None:
     assert frame.std() > 10.0  # something is drawn
 
 
+def test_gymnasium_finds_the_tasks_in_a_fresh_process() -> None:
+    """By the module that the name begins with, and by the bare name once that is imported."""
+    code = f"""if True:
+        import gymnasium
+        print(gymnasium.make("rfdropo_bayes.envs:{REACH}").spec.name, gymnasium.spec("{REACH}").name)
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["TrunkReach", "TrunkReach"]
+
+
 def test_gymnasium_makes_the_tasks_by_name() -> None:
-    register()
     env = gymnasium.make(REACH, actions="continuous")
     seen, info = env.reset(seed=3, options={"goal": [0.0, -0.02, 0.13]})
     assert info["goal"] == [0.0, -0.02, 0.13]
     assert seen.shape == (66,)
     vector = gymnasium.make_vec(REACH, num_envs=2)
     assert isinstance(vector.unwrapped, TrunkVectorEnv)
-    seen, _ = vector.reset(seed=1)
+    seen, begun = vector.reset(seed=1)
     assert seen.shape == (2, 66)
+    for _ in range(100):
+        seen, _, _, truncated, info = vector.step(np.zeros(2, dtype=int))
+    assert truncated.all()
+    assert np.array_equal(info["final_info"]["goal"], begun["goal"])
+    assert not np.array_equal(info["goal"], begun["goal"])  # that of the episode that has begun
+    assert np.array_equal(seen[:, 63:66], info["goal"].astype(np.float32))
+
+
+def test_an_episode_is_recorded_as_a_video(tmp_path) -> None:
+    pytest.importorskip("moviepy", reason="an extra that RecordVideo needs")
+    env = gymnasium.make(REACH, actions="continuous", render_mode="rgb_array", period=0.1)
+    assert env.unwrapped.metadata["render_fps"] == 10
+    filmed = gymnasium.wrappers.RecordVideo(env, str(tmp_path))
+    filmed.reset(seed=0)
+    for _ in range(3):
+        filmed.step(np.zeros(8, dtype=np.float32))
+    filmed.close()
+    assert next(tmp_path.glob("*.mp4")).stat().st_size > 5000
+
+
+def test_episodes_without_a_seed_differ() -> None:
+    goals = [make_episodes(REACH, 1) for _ in range(2)]
+    for one in goals:
+        one.reset([0])
+    assert not np.array_equal(goals[0].goal, goals[1].goal)
+
+
+@pytest.mark.parametrize("task", [REACH, "TrunkPush-v0"])
+def test_what_a_marker_has_moved_is_the_difference_of_two_sightings(task) -> None:
+    """Else a policy could take the noise of motion capture off again. A fresh episode has not moved."""
+    noisy = make_episodes(task, 2, actions="continuous", observed="full", noise=0.002)
+    for lane in range(2):
+        noisy.seed(lane, lane)
+    part = {}
+    for piece in noisy.layout.observation:
+        start = sum(p.size for p in noisy.layout.observation[: len(part)])
+        part[piece.name] = slice(start, start + piece.size)
+    first = noisy.reset([0, 1])
+    assert np.all(first[:, part["moved"]] == 0.0)
+    second = noisy.act(np.zeros((2, 8))).observation
+    assert second[:, part["moved"]] == pytest.approx(second[:, part["markers"]] - first[:, part["markers"]], abs=1e-6)
+    errors = second[:, part["markers"]] - noisy.marker.reshape(2, -1)
+    assert errors.std() == pytest.approx(0.002, rel=0.25)  # 126 numbers: four deviations
+    if task != REACH:
+        pose = second[:, part["object"]] - noisy.pose
+        assert 0.0 < np.abs(pose[:, :3]).max() < 0.008
+        assert (
+            0.0 < np.abs(pose[:, 3:]).max() < 0.25
+        )  # 2 mm over half a side is 0.11 rad, half of which is in a quaternion
+        assert np.linalg.norm(second[:, part["object"]][:, 3:], axis=1) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_rewards_stay_finite_for_episodes_that_begin_at_the_goal() -> None:
+    """The potential is zero a millimetre from the goal: relative to it, rewards would be anything."""
+    far = np.array([0.05])
+    for first in (0.0, 0.0005, 0.001, 0.0010005):
+        assert reward(far, np.array([first]))[0] == reward(far, np.array([0.005]))[0] < -1.0
+
+
+@pytest.mark.parametrize("action", [-1, 16, 3.0])
+def test_a_discrete_action_that_is_none_is_refused(action) -> None:
+    layout = layout_of(TASKS[REACH], load_robot("trunk_sofa"), "discrete", "paper")
+    with pytest.raises(InputError, match="no action"):
+        layout.change(np.array([0, action]))
 
 
 def test_one_lane_begins_again_while_the_others_go_on(venv, episodes) -> None:
@@ -254,6 +328,22 @@ def test_whole_rows_are_drawn_from_a_posterior(tmp_path) -> None:
     for _ in range(20):
         row = fitting(draws, SPECS).draw(rng)
         assert row["trunk_mass"] == pytest.approx(1e-7 * row["young_modulus"])
+
+
+def test_a_posterior_whose_mechanism_the_simulator_lacks_is_refused(tmp_path) -> None:
+    """Not trained without a word on what is left of it."""
+    names = ("young_modulus", "command_delay")
+    infos = (ParameterInfo(names[0], "Pa", 1e6, 5e7), ParameterInfo(names[1], "s", 0.0, 1.0))
+    PosteriorRecord(infos, dict.fromkeys(names, np.full((1, 4), 4e6))).save(tmp_path / "posterior.nc")
+    with pytest.raises(InputError, match=r"command_delay, of the mechanism 'command_delay'.*add .command_delay."):
+        read_posterior(tmp_path, SPECS)
+
+
+def test_a_phi_of_another_simulator_is_refused(tmp_path) -> None:
+    normal = {"mean": 1.0, "std": 1.0, "low": 0.0, "high": 2.0}
+    (tmp_path / "summary.json").write_text(json.dumps({"method": "rfdropo", "phi": {"stiffness": normal}}))
+    with pytest.raises(InputError, match="shares no parameter"):
+        read_phi(tmp_path, SPECS)
 
 
 def test_impossible_draws_are_counted_and_refused(tmp_path) -> None:

@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import binomtest
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.training import run
 from rfdropo_bayes.training.algorithms import ALGORITHMS, algorithm_class, algorithm_options
 from rfdropo_bayes.training.config import TrainingTable
 from rfdropo_bayes.training.evaluation import (
@@ -107,6 +108,76 @@ def test_a_run_that_was_killed_goes_on_as_if_it_had_not_been(trained, tmp_path) 
         assert np.array_equal(mine.detach().numpy(), theirs.detach().numpy())
 
 
+class Killed(Points):
+    """Points whose process ends in the third of four legs."""
+
+    steps = 0
+
+    def step_wait(self):
+        self.steps += 1
+        if self.steps == 2 * (3200 // 16 + 20) + 50:
+            raise KeyboardInterrupt
+        return super().step_wait()
+
+
+class Logged(Points):
+    """Points that write a line for each episode, as the tasks do."""
+
+    log: Path | None = None
+
+    def step_wait(self):
+        found = super().step_wait()
+        if self.log is not None:
+            with self.log.open("a") as file:
+                file.writelines(json.dumps({"position": p}) + "\n" for p in self.position[found[2]])
+        return found
+
+
+class LoggedAndKilled(Killed, Logged):
+    """Both."""
+
+
+def test_a_kill_in_the_middle_of_a_leg_changes_nothing(tmp_path) -> None:
+    """Neither the curve nor the log of episodes, which holds each one once."""
+    table = TABLE.model_copy(update={"steps": 12800})
+    whole = train(Logged, table, tmp_path / "whole", seed=3, gamma=0.9)
+    with pytest.raises(KeyboardInterrupt):
+        train(LoggedAndKilled, table, tmp_path / "killed", seed=3, gamma=0.9)
+    resumed = train(Logged, table, tmp_path / "killed", seed=3, gamma=0.9, resume=True)
+    assert [row["reward"] for row in resumed.curve] == [row["reward"] for row in whole.curve]
+    logs = [(tmp_path / name / "episodes.jsonl").read_text() for name in ("whole", "killed")]
+    assert logs[0] == logs[1]
+    assert len(logs[0].splitlines()) == 12800 // 20
+
+
+def test_tensorboard_has_the_losses_and_the_evaluations(trained) -> None:
+    event_accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    out, policy = trained
+    tags: dict[str, list] = {}
+    for path in (out / "tensorboard").rglob("events*"):
+        read = event_accumulator.EventAccumulator(str(path))
+        read.Reload()
+        for tag in read.Tags()["scalars"]:
+            tags.setdefault(tag, []).extend(event.value for event in read.Scalars(tag))
+    assert {"train/value_loss", "evaluation/reward"} <= set(tags)
+    assert sorted(tags["evaluation/reward"]) == pytest.approx(sorted(row["reward"] for row in policy.curve), rel=1e-5)
+
+
+def test_exploration_lasts_for_its_share_of_the_whole_run(tmp_path, monkeypatch) -> None:
+    """Half of four legs: after the first it is halfway down, after the second at its end."""
+    options = {"learning_starts": 100, "net_arch": [16], "exploration_fraction": 0.5, "exploration_final_eps": 0.0}
+    sizes = {"steps": 1600, "environments": 4, "evaluate_every": 400, "evaluation_episodes": 4}
+    table, rates, save = TrainingTable(algorithm="DQN", options=options, **sizes), [], run._save
+
+    def noted(model, *rest) -> None:
+        rates.append(model.exploration_rate)
+        save(model, *rest)
+
+    monkeypatch.setattr(run, "_save", noted)
+    train(partial(Points, kind="discrete"), table, tmp_path, seed=1, gamma=0.9)
+    assert rates == pytest.approx([0.5, 0.0, 0.0, 0.0], abs=0.02)
+
+
 def test_a_kill_between_two_renames_loses_nothing(trained, tmp_path) -> None:
     source, _ = trained
     shutil.copytree(source / "checkpoints", tmp_path / "checkpoints.old")
@@ -187,6 +258,26 @@ def test_cases_are_the_same_for_all_policies_and_episodes_follow_them() -> None:
     assert [e.distance for e in idle] == pytest.approx([abs(case.goal[0]) for case in cases])
 
 
+def test_cases_of_two_seeds_have_nothing_in_common() -> None:
+    one, other = (draw_cases(Points(7), 40, seed=seed) for seed in (0, 1))
+    assert not {case.goal for case in one} & {case.goal for case in other}
+
+
+class Shaking(Points):
+    """Points that are seen with noise from the generators of their lanes."""
+
+    def _seen(self):
+        return super()._seen() + 0.1 * np.array([[g.normal(), 0.0] for g in self.generators], dtype=np.float32)
+
+
+def test_noise_is_the_same_for_all_policies_however_many_play_at_once() -> None:
+    cases = draw_cases(Shaking(5), 12, seed=2)
+    found = [[e.distance for e in play(to_the_goal, Shaking(lanes), cases, 4)] for lanes in (5, 12, 1)]
+    assert found[0] == pytest.approx(found[1])
+    assert found[0] == pytest.approx(found[2])
+    assert found[0] != pytest.approx([e.distance for e in play(to_the_goal, Shaking(5), cases, 5)])
+
+
 def test_a_failed_simulation_is_a_failure_at_every_distance() -> None:
     episodes = play(to_the_goal, Points(2), [Case({"gain": 3.0}, (0.0,)), Case({"gain": 1.0}, (0.0,))])
     assert [e.diverged for e in episodes] == [True, False]
@@ -213,6 +304,11 @@ def test_the_interquartile_mean_ignores_the_outer_halves_and_its_interval_holds_
     found, low, high = interquartile_mean(groups, seed=0)
     assert found == pytest.approx(0.02, abs=5e-4)
     assert low < found < high < 0.021
+
+
+def test_failures_of_a_quarter_leave_no_interquartile_mean() -> None:
+    found = interquartile_mean([episodes_with([0.01] * 14 + [np.inf] * 6)], seed=0)
+    assert found == (np.inf, np.inf, np.inf)
 
 
 def test_the_table_has_a_row_for_every_policy_and_case() -> None:

@@ -31,15 +31,15 @@ def finish(out: Path, command: str = "calibrate", **options) -> None:
         (folder / "log.jsonl").write_text("a line\n")
 
 
-def press_control_c(folder: Path) -> None:
+def press_control_c(folder: Path, checkpoint: str) -> None:
     (folder / "checkpoints").mkdir()
-    (folder / "checkpoints" / "smc_0.npz").write_bytes(b"")
+    (folder / "checkpoints" / checkpoint).write_bytes(b"")
     raise KeyboardInterrupt
 
 
-def interrupt(out: Path) -> None:
-    with pytest.raises(Interrupted) as stopped, run_folder(out, "calibrate", **SETTINGS) as folder:
-        press_control_c(folder)
+def interrupt(out: Path, command: str = "calibrate", checkpoint: str = "smc_0.npz") -> None:
+    with pytest.raises(Interrupted) as stopped, run_folder(out, command, **SETTINGS) as folder:
+        press_control_c(folder, checkpoint)
     assert stopped.value.going_on == "--resume"
     assert stopped.value.folder == str(out)
 
@@ -73,6 +73,12 @@ def test_an_interrupted_run_goes_on_or_is_given_up_but_not_forgotten(tmp_path):
     assert (tmp_path / "checkpoints" / "smc_0.npz").exists()
     finish(tmp_path, overwrite=True)
     assert not (tmp_path / "checkpoints").exists()
+
+
+def test_a_training_that_was_killed_is_not_started_anew_by_accident(tmp_path):
+    interrupt(tmp_path, "train", "model.zip")
+    with pytest.raises(InputError, match="interrupted run of train; go on with --resume"):
+        check_folder(tmp_path, "train")
 
 
 @pytest.mark.parametrize(
