@@ -18,7 +18,7 @@ from rfdropo_bayes.audit.differences import Groups
 from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step
 from rfdropo_bayes.audit.fit import Fit, Target, climb, climb_rollouts, widened
 from rfdropo_bayes.audit.forward import Forward, Lanes
-from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain, noise_distance
+from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
 from rfdropo_bayes.audit.inadequacy import as_measured, judged, spread
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
@@ -154,7 +154,7 @@ def audit(
     question = _with_differences_of(question, target)
     noise = target.measured.noise.first
     shared = "" if noise.correlation is None else ", shared between coordinates"
-    report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}{_far_off(target)}")
+    report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}{_far_off(target, base)}")
     finer = None if question.finer is None else _forward(question, True, target.measurements, deadline)
     judge, inquiry = target, Inquiry(target, question.candidates, question.rules, question.seed, finer, report)
     inquiry, base, steps, last = _inquired(inquiry, base)
@@ -228,12 +228,14 @@ def _numerical(target: Target, finer: Forward | None, fit: Fit) -> float | None:
     return float(np.sqrt(3.0 * np.mean(moved.reshape(measured.shape)[measured] ** 2)))
 
 
-def _far_off(target: Target) -> str:
+def _far_off(target: Target, fit: Fit) -> str:
     """What a line of words says of a model that is far off."""
     if target.known is None:
         return ""
-    size = 1e3 * noise_distance(target.noise.first)
-    return f"; it is far off, and judged under white noise of {size:.2g} mm, rows that last counted as fewer"
+    noise, own = target.noise.first.scale, target.measurements.columns[0]
+    left = spread(target, fit)[own]
+    size, share = 1e3 * np.sqrt(3.0 * np.mean(left**2)), float(np.mean((left / noise) ** 2))
+    return f"; it is far off: judged under white noise of the {size:.2g} mm that it leaves, and a row counts {share:.2g}"
 
 
 def _judged(
