@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
@@ -136,7 +137,10 @@ def predict(
     simulator = with_groups(model.simulator, groups)
     fixed, space = fitted_parts(fit)
     recordings = gather_recordings(simulator, [unseen])
-    channels = (_markers(recordings, table.noise, record.attrs.get(KNOWN_NOISE)),)
+    stated, step = model.experiment.noise, float(np.median(np.diff(unseen.time)))
+    lasts = stated.correlation_time if stated is not None and table.noise == STATED else None
+    memory = None if lasts is None else np.array([1.0, np.exp(-step / lasts)])
+    channels = (_markers(recordings, table.noise, record.attrs.get(KNOWN_NOISE), memory),)
     program = TrajectoryModel(simulator, space, fixed, recordings, channels)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
@@ -274,8 +278,11 @@ def _check_noise(record: PosteriorRecord, noise: str) -> None:
         )
 
 
-def _markers(recordings: RecordingSet, noise: str, known: Mapping[str, Any] | None) -> Markers:
-    """The positions to predict, under the noise that was inferred, or that the posterior knows.
+def _markers(
+    recordings: RecordingSet, noise: str, known: Mapping[str, Any] | None, memory: Float[np.ndarray, " lag"] | None
+) -> Markers:
+    """The positions to predict, under the noise that was inferred, or that the posterior knows; with its memory of a row,
+    unless that of these rows is given.
 
     Raises:
         InputError: a noise that is not inferred, and a posterior that does not hold it.
@@ -288,7 +295,10 @@ def _markers(recordings: RecordingSet, noise: str, known: Mapping[str, Any] | No
             where="--posterior",
             remedy="predict with the experiment that was calibrated",
         )
-    own = noise_of_markers(Autoregression.from_dict(known), known["markers"], recordings)
+    recalled = Autoregression.from_dict(known)
+    if memory is not None:
+        recalled = replace(recalled, autocorrelation=memory)
+    own = noise_of_markers(recalled, known["markers"], recordings)
     return Markers.gather(recordings, noise, own)
 
 

@@ -160,6 +160,15 @@ def test_the_rest_of_the_day_is_predicted_from_the_folder(adapted, zeros):
     assert (adapted.folder / "report.html").stat().st_size > 10_000
 
 
+def test_errors_last_as_long_in_rows_of_another_rate(adapted):
+    """The model's error forgets its sign over one row of the fit; nothing moves along y. Standard error: 0.02."""
+    for step in (STEP, 2.0 * STEP):
+        time = step * np.arange(50)
+        noise = rb.predict(adapted, (time, np.zeros((50, 1)))).drawn.predicted[:, :, 0, 1]
+        lag = np.mean(noise[:, 1:] * noise[:, :-1]) / np.mean(noise**2)
+        assert lag == pytest.approx(np.exp(-step / STEP), abs=0.08)
+
+
 def test_the_terminal_shows_the_day_first_and_what_comes_next(adapted, capsys):
     show_calibration(adapted, quiet=False, as_json=False)
     lines = capsys.readouterr().out.splitlines()
