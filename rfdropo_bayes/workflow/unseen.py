@@ -281,8 +281,8 @@ def _check_noise(record: PosteriorRecord, noise: str) -> None:
 def _markers(
     recordings: RecordingSet, noise: str, known: Mapping[str, Any] | None, memory: Float[np.ndarray, " lag"] | None
 ) -> Markers:
-    """The positions to predict, under the noise that was inferred, or that the posterior knows; with its memory of a row,
-    unless that of these rows is given.
+    """The positions to predict, under the noise that was inferred, or that the posterior knows: with the memory that
+    these rows have, where it is given.
 
     Raises:
         InputError: a noise that is not inferred, and a posterior that does not hold it.
