@@ -164,6 +164,21 @@ def test_bands_are_those_of_what_would_be_measured(posterior, tmp_path):
     assert (facts["group"], facts["group_fitted"], facts["cautions"]) == ("demo_3", None, [])  # nothing differs
 
 
+def test_the_chosen_group_says_what_the_drives_follow(posterior, tmp_path):
+    """In April they lose all pulls; the recording is of no group unless one is chosen for it."""
+    overrides = [*COARSE, 'model.drives=[{recordings="april", high=0.0, beyond="lost"}]']
+    moved, said = {}, {}
+    for group in (None, "april"):
+        out = tmp_path / str(group)
+        facts = run_prediction(
+            EXPERIMENTS / "demo.toml", posterior, COMMANDS, out, rows=(0, 30), overrides=overrides, group=group
+        )
+        moved[group] = np.ptp(pd.read_csv(out / "prediction.csv")["m4_x_mean"])
+        said[group] = [caution["code"] for caution in facts["cautions"]]
+    assert said == {None: ["drives_unstated"], "april": []}
+    assert moved["april"] < 0.2 * moved[None]
+
+
 def test_wrong_requests_are_named(posterior, tmp_path):
     with pytest.raises(InputError, match="one file"):
         predict(posterior, COMMANDS, tmp_path, start=COMMANDS)
