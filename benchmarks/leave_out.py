@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.bayes.pooling import whole
 from rfdropo_bayes.data import RecordingEntry
+from rfdropo_bayes.groups import whole
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.report.coverage import predictive_bands

@@ -12,7 +12,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 PACKAGE = REPOSITORY / "rfdropo_bayes"
 
 # Modules at the bottom, open to every room.
-FOUNDATION = {"cautions", "errors", "files", "interrupts", "runtime", "tables"}
+FOUNDATION = {"cautions", "errors", "files", "groups", "interrupts", "runtime", "tables"}
 
 # From the ground up; docs/architecture.md says why. A room may import these, the foundation and the standard library.
 MAY_IMPORT: dict[str, set[str]] = {

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import SPREAD
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 DEVIATION = "_deviation"
-
-Patterns = Mapping[str, str | Sequence[str]]
 
 
 @dataclass(frozen=True)
@@ -29,44 +26,6 @@ class Pooled:
     spread: float
     groups: Mapping[str, tuple[str, ...]]
     family: str = ""
-
-
-def whole(recording: str) -> str:
-    """The recording that a piece is cut from."""
-    return recording.partition("[")[0]
-
-
-def group_of(recording: str, patterns: Patterns) -> str:
-    """Name of the group a recording belongs to; one that belongs to none is a group of its own.
-
-    A group that names the recording comes before those that it is in by a wildcard.
-
-    Args:
-        recording: its name, or that of a piece of it.
-        patterns: names of recordings, or wildcards, by group.
-
-    Raises:
-        InputError: the recording is in two groups.
-    """
-    name = whole(recording)
-    listed = {group: [entries] if isinstance(entries, str) else entries for group, entries in patterns.items()}
-    found = [group for group, entries in listed.items() if name in entries]
-    if not found:
-        found = [group for group, entries in listed.items() if any(fnmatchcase(name, entry) for entry in entries)]
-    if len(found) > 1:
-        raise InputError(
-            f"{name} is in two groups: {found[0]} and {found[1]}", where="[model.groups]", remedy="keep it in one"
-        )
-    return found[0] if found else name
-
-
-def gather_groups(recordings: Sequence[str], patterns: Patterns) -> dict[str, tuple[str, ...]]:
-    """Recordings by group, in the order in which the groups are first met."""
-    groups: dict[str, tuple[str, ...]] = {}
-    for recording in recordings:
-        group = group_of(recording, patterns)
-        groups[group] = (*groups.get(group, ()), recording)
-    return groups
 
 
 def spread_spec(spec: ParameterSpec, pooled: Pooled) -> ParameterSpec:

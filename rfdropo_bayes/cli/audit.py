@@ -99,6 +99,10 @@ def design(
         bool, typer.Option("--adapt", help="the shortest commands that determine another day, for rfdropo adapt")
     ] = False,
     seconds: Annotated[float, typer.Option(help="with --adapt: no proposal is longer")] = 10.0,
+    group: Annotated[
+        str | None,
+        typer.Option("--group", help="with --adapt: recordings whose drives the day has; the last one's by default"),
+    ] = None,
     seed: Seed = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -116,7 +120,7 @@ def design(
     options: dict[str, Any] = {"overrides": overrides or [], "seed": seed, "overwrite": overwrite}
     options["report"] = say_progress(quiet)
     if adapt and base is not None:
-        found = run_day_design(experiment, base, folder, seconds=seconds, **options)
+        found = run_day_design(experiment, base, folder, seconds=seconds, group=group, **options)
     else:
         found = run_design(experiment, folder, base=base, **options)
     say(found, found["sentence"], f"commands: {folder / COMMANDS}", quiet=quiet, as_json=as_json)

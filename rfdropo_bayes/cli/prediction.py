@@ -16,6 +16,10 @@ from rfdropo_bayes.workflow.files import check_folder
 Group = Annotated[
     str | None, typer.Option("--group", help="the day or robot it belongs to; as [model.groups] has it by default")
 ]
+PredictedGroup = Annotated[
+    str | None,
+    typer.Option("--group", help="the day or robot; by default that of adapt, or else as [model.groups] has it"),
+]
 
 
 def predict(
@@ -33,7 +37,7 @@ def predict(
     ] = None,
     rows: Annotated[str | None, typer.Option("--rows", help="FIRST:LAST observation rows, both included")] = None,
     seed: Annotated[int | None, typer.Option(help="seed of the draws; that of the experiment by default")] = None,
-    group: Group = None,
+    group: PredictedGroup = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     as_json: AsJson = False,

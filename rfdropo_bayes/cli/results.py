@@ -53,12 +53,19 @@ def show_calibration(found: Calibration, *, quiet: bool, as_json: bool) -> None:
     for sentence in summary["headline"]:
         style = COLOURS[found.verdict] if sentence == found.sentence else ""
         console.print(Text(sentence, style=style), soft_wrap=True)
+    moved = summary["details"].get("moved", [])  # by an adaptation: what the reader looks for
     rows = [(name, row, "derived" if row.get("derived") else "") for name, row in summary["parameters"].items()]
+    rows.sort(key=lambda row: row[0] not in moved)
     console.print(_parameters(rows[:MOST_ROWS]))
     if len(rows) > MOST_ROWS:
         console.print(f"and {len(rows) - MOST_ROWS} more in {folder / 'summary.json'}", soft_wrap=True)
     for caution in found.cautions:
         console.print(Text(f"caution: {caution.sentence}", style=BAD if caution.grave else FAIR), soft_wrap=True)
+    if summary["method"] == "adapt":
+        seen = next(run for run in summary["recordings"] if run["split"] == "fit")
+        if seen["masked"]:
+            console.print(f"left out: {seen['masked']} of {seen['positions']} positions", soft_wrap=True)
+        console.print(f"next: rfdropo predict {folder} --commands FILE --out OUT", soft_wrap=True)
     console.print(f"report: {report}", soft_wrap=True)
 
 
@@ -105,6 +112,10 @@ def show_prediction(facts: Mapping[str, Any], *, quiet: bool, as_json: bool) -> 
     """Print what a prediction is of; ``facts`` is the content of prediction.json."""
     start = "from the measured first row" if facts["start_pose_known"] else "without a measured first row"
     lines = [f"{facts['rows']} rows {start}, under {facts['draws']} draws of {facts['posterior']}"]
+    if facts["group_fitted"] is not None:
+        values = "fitted" if facts["group_fitted"] else "not fitted: its values are drawn from the spread of groups"
+        lines.append(f"group {facts['group']}, {values}")
+    lines += [f"caution: {caution['sentence']}" for caution in facts["cautions"]]
     lines += ["mean, 50 and 90 % bands in m:", *(f"  {file}" for file in facts["files"])]
     say(facts, *lines, quiet=quiet, as_json=as_json)
 

@@ -182,6 +182,16 @@ def _read_commands(path: Path) -> Float[np.ndarray, "rows 6"]:
     return np.deg2rad(table.numbers(_COMMANDS))
 
 
+def command_columns(
+    time: Float[np.ndarray, " k"], command: Float[np.ndarray, "k 6"], seconds: float
+) -> dict[str, np.ndarray]:
+    """Commands [rad] that hold from their times [s] on, as the columns of a file of commands: a row every 10 ms of so
+    many seconds, in degrees."""
+    row = np.arange(max(1, round(seconds * RATE)))
+    held = np.rad2deg(command)[np.searchsorted(time, row / RATE + 1e-9, side="right") - 1]
+    return {"ID": row, **dict(zip(_COMMANDS, held.T, strict=True))}
+
+
 def _check_consecutive(identity: np.ndarray, where: str) -> None:
     wrong = np.flatnonzero(identity != np.arange(len(identity)))
     if wrong.size:

@@ -70,7 +70,7 @@ def read_optitrack_csv(path: Path, *, mask_missing: bool = False) -> Trajectory:
 
 def _sending_times(time: Float[np.ndarray, " rows"], position: Float[np.ndarray, "rows 4 3"]) -> np.ndarray:
     sent = time[:-1].copy()
-    if len(sent) > 1 and np.array_equal(position[0], position[1]):
+    if len(sent) > 1 and np.array_equal(position[0], position[1], equal_nan=True):
         sent[0] = max(sent[0], sent[1] - FRAME_PERIOD)
     return sent
 

@@ -166,7 +166,8 @@ def _read(spec: DataSpec, source: _Source) -> Trajectory:
             raise InputError(
                 "has no commands",
                 where=str(source.observations),
-                remedy="give {observations = ..., commands = ...}; commands = 'none' where nothing was commanded",
+                remedy="give {observations = ..., commands = ...}, or --commands FILE; "
+                "commands = 'none' where nothing was commanded",
             )
         return read_asl_csv(source.observations, source.commands, mask_missing=mask_missing)
     if spec.format == "csv" and spec.columns is not None:

@@ -23,10 +23,8 @@ from scipy.stats import chi2
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.space import Parameter
 from rfdropo_bayes.inference import next_step
-from rfdropo_bayes.prediction.first_row import LEAST_SHARE, spread_of_draws
+from rfdropo_bayes.prediction.first_row import LEAST_SHARE, SURE, spread_of_draws
 from rfdropo_bayes.prediction.own_fit import OwnFit, fit_own
-
-SURE = 0.95  # probability that noise of the stated size leaves less, from which on it is taken for larger
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 

@@ -14,6 +14,7 @@ import numpy as np
 from blackjax.smc import resampling
 from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.special import softmax
+from scipy.stats import chi2
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.channels.object_pose import OFFSETS
@@ -21,11 +22,13 @@ from rfdropo_bayes.bayes.recordings import RecordingSet
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import next_step
+from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.prediction.own_fit import fit_own
 
 SMALLEST_ERROR = 1e-6  # [m]
 LEAST_SHARE = 0.1  # of the draws: a row that leaves fewer says that the model is wrong, not which draw is right
+SURE = 0.95  # probability that an error of the stated size leaves less, from which on it is taken for larger
 
 Batch = dict[str, Float[np.ndarray, " n"]]
 
@@ -110,6 +113,26 @@ def weighed_by_first_row(
         power, _ = next_step(partial(np.multiply, density), 1.0, LEAST_SHARE)
         index[:, place] = resampling.systematic(jax.random.fold_in(key, place), softmax(power * density), count)
     return index
+
+
+def far_first_rows(predictions: Sequence[RecordingPrediction], left: ModelError | None) -> dict[str, float]:
+    """How many times as far as the model is wrong measured first rows are from the predicted ones, where that is too
+    much for chance.
+
+    A row's errors are taken for normal, of the sizes that the model has left, in as many independent coordinates as
+    these have shown (`ModelError.share`).
+    """
+    found = {}
+    for p in predictions:
+        seen = [i for i, name in enumerate(p.marker_names) if p.mask[0, i] and left and name in left.markers]
+        if left is None or not seen:
+            continue
+        error = np.linalg.norm(p.observed[0, seen] - p.central[0, seen], axis=1)
+        size = np.sqrt(left.share) * _errors([p.marker_names[i] for i in seen], left)
+        times, count = float(np.sqrt(np.mean((error / size) ** 2))), 3.0 * left.share * len(seen)
+        if count * times**2 > chi2.ppf(SURE, count):
+            found[p.name] = times
+    return found
 
 
 def _with_offsets(problem: CalibrationProblem, values: Batch, names: Sequence[str], left: ModelError | None) -> Batch:

@@ -13,19 +13,20 @@ from jaxtyping import Float, PRNGKeyArray
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.model import TrajectoryModel
-from rfdropo_bayes.bayes.pooling import Patterns, gather_groups, whole
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.prediction.cube_start import measured_objects, with_measured_starts
-from rfdropo_bayes.prediction.first_row import match_first_row, weighed_by_first_row
+from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
 from rfdropo_bayes.prediction.model_error import ModelError
 
 # Among the attributes of a posterior.
 FITTED, HELD = "fitted_recordings", "held_parameters"
+ADAPTED_TO = "adapted_to"  # the day, of an adaptation
 NOISE, BEGUN = "noise_model", "fitted_recordings_begin"
 KNOWN_NOISE = "known_noise"  # of the positions, where its parameters are not inferred
 
@@ -33,21 +34,37 @@ Batch = dict[str, Float[np.ndarray, " n"]]
 
 
 class NewPredictions(NamedTuple):
-    """Predictions of recordings that no fit has seen, and how many draws did not converge in matching a first row."""
+    """Predictions of recordings that no fit has seen.
+
+    Attributes:
+        recordings: the predictions.
+        unmatched: draws that did not converge in matching a first row.
+        far: how many times as far as the model is wrong in the fitted recordings a first row is from the simulated one,
+            by recording, where that is too much for chance.
+    """
 
     recordings: list[RecordingPrediction]
     unmatched: int
+    far: dict[str, float]
 
 
 def match_cautions(found: NewPredictions) -> list[Caution]:
-    """A caution where draws did not converge in matching a first row."""
-    if not found.unmatched:
-        return []
-    sentence = (
-        f"{found.unmatched} draws of a new group's parameters did not converge in matching its first row: they count "
-        "as they are, and the bands may be too wide"
-    )
-    return [Caution(Code.FIRST_ROW_UNMATCHED, sentence)]
+    """Cautions where draws did not converge in matching a first row, or where one stays far from the simulated one."""
+    cautions = []
+    if found.unmatched:
+        sentence = (
+            f"{found.unmatched} draws of a new group's parameters did not converge in matching its first row: they "
+            "count as they are, and the bands may be too wide"
+        )
+        cautions.append(Caution(Code.FIRST_ROW_UNMATCHED, sentence))
+    for name, times in found.far.items():
+        sentence = (
+            f"the first row of {name} is {times:.2g} times as far from the simulated one as the model was wrong in the "
+            "fitted recordings: see that frame, units and start are those of the fitted recordings, or adapt to a "
+            "recording of that day"
+        )
+        cautions.append(Caution(Code.FIRST_ROW_FAR, sentence))
+    return cautions
 
 
 def thin(draws: Mapping[str, Float[np.ndarray, "chain draw"]], count: int) -> Batch:
@@ -112,7 +129,8 @@ def predict_new(
         problem = CalibrationProblem(placed, chunk=chunk)
     matched = {member for p in drawn for member in p.members}
     unseen = [n for n in new if n not in matched]
-    return NewPredictions(_predictions(problem, extended, noise_key, "test", unseen=unseen, left=left), unmatched)
+    predictions = _predictions(problem, extended, noise_key, "test", unseen=unseen, left=left)
+    return NewPredictions(predictions, unmatched, far_first_rows(predictions, left))
 
 
 def _for_new_recordings(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Literal
@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import Field, model_validator
 
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import whole
 from rfdropo_bayes.robots.table import Table
 from rfdropo_bayes.tables import nearest
 
@@ -73,10 +75,10 @@ class DriveTravel(Table):
         value = getattr(self, name)
         return np.broadcast_to(np.asarray(_NUMBERS[name] if value is None else value, float), (count,))
 
-    def holds_for(self, recording: str) -> bool:
-        """Whether the table speaks of a recording, or of a piece of it."""
+    def holds_for(self, recording: str, group: str) -> bool:
+        """Whether the table speaks of a recording of a group, or of a piece of it."""
         patterns = (self.recordings,) if isinstance(self.recordings, str) else self.recordings
-        return any(fnmatchcase(recording.partition("[")[0], pattern) for pattern in patterns)
+        return group in patterns or any(fnmatchcase(whole(recording), pattern) for pattern in patterns)
 
     def columns(self, channels: Sequence[str]) -> list[int]:
         """Where its cables are among the command channels.
@@ -135,7 +137,11 @@ class Travel:
 
 
 def travel_in(
-    tables: Sequence[DriveTravel], channels: Sequence[str], recording: str, initial: Float[np.ndarray, " channel"]
+    tables: Sequence[DriveTravel],
+    channels: Sequence[str],
+    recording: str,
+    initial: Float[np.ndarray, " channel"],
+    group: str = "",
 ) -> Travel | None:
     """What is stated of the drives in one recording; None if nothing is.
 
@@ -144,11 +150,12 @@ def travel_in(
         channels: names of the command channels.
         recording: name of the recording.
         initial: command before its first row [m or rad].
+        group: that it belongs to.
 
     Raises:
         InputError: an unknown cable, two tables that state the travel of one cable, or a recording that begins outside.
     """
-    holding = [table for table in tables if table.holds_for(recording)]
+    holding = [table for table in tables if table.holds_for(recording, group)]
     if not holding:
         return None
     size = len(channels)
@@ -175,3 +182,30 @@ def travel_in(
             )
         low[columns], high[columns] = ends
     return Travel(low, high, beyond == "lost", beyond == "kept")
+
+
+def unstated_travel(
+    tables: Sequence[DriveTravel], channels: Sequence[str], belonging: Mapping[str, str]
+) -> list[Caution]:
+    """A caution where the travel of cables is stated for other recordings, and for some of these is not.
+
+    Args:
+        tables: of a robot and its experiment.
+        channels: names of the command channels.
+        belonging: the group of each recording.
+    """
+    stated = {column for table in tables for column in table.columns(channels)}
+    lacking: dict[tuple[int, ...], list[str]] = {}
+    for recording, group in belonging.items():
+        held = {column for table in tables if table.holds_for(recording, group) for column in table.columns(channels)}
+        if stated - held:
+            lacking.setdefault(tuple(sorted(stated - held)), []).append(recording)
+    return [
+        Caution(
+            Code.DRIVES_UNSTATED,
+            f"the travel of {', '.join(channels[column] for column in columns)} is stated for other recordings and not "
+            f"for {', '.join(recordings)}: commands are taken as they were sent; name it in recordings of "
+            "[[model.drives]]",
+        )
+        for columns, recordings in lacking.items()
+    ]

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
+from rfdropo_bayes.cautions import Caution
+from rfdropo_bayes.groups import Patterns, group_of, whole
 from rfdropo_bayes.robots.body import Body
 from rfdropo_bayes.robots.cable import Cable, Channels
-from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in
+from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in, unstated_travel
 from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.table import Name, Positive, Table, Vector
@@ -96,6 +98,7 @@ class Robot(Table):
         default=(), description="what is known of the drives: limits of travel, and what happens to commands beyond"
     )
     parameters: dict[Name, Parameter] = Field(description="physical parameters with bounds and default priors, by name")
+    _groups: Patterns = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
     def _consistent(self) -> Robot:
@@ -166,7 +169,19 @@ class Robot(Table):
 
     def travel(self, recording: str, initial: Float[np.ndarray, " channel"]) -> Travel | None:
         """What is stated of the drives in a recording that begins at this command [m or rad]; see `travel_in`."""
-        return travel_in(self.drives, self.channel_names, recording, initial)
+        group = group_of(recording, self._groups)
+        return travel_in(self.drives, self.channel_names, recording, initial, group)
+
+    def unstated(self, recordings: Iterable[str]) -> list[Caution]:
+        """A caution where the travel of drives is stated for other recordings only; see `unstated_travel`."""
+        belonging = {name: group_of(name, self._groups) for name in map(whole, recordings)}
+        return unstated_travel(self.drives, self.channel_names, belonging)
+
+    def grouped(self, groups: Patterns) -> Robot:
+        """The same robot, whose drives may be stated by groups of recordings."""
+        found = self.model_copy()
+        found._groups = groups
+        return found
 
     @property
     def gravity(self) -> Float[np.ndarray, "3"]:

@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.channels import Markers
@@ -19,13 +18,13 @@ from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.noise.autoregression import STATED
-from rfdropo_bayes.bayes.pooling import group_of
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.space import Parameter, ParameterSpace, deviations, spread_of
+from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace, deviations, spread_of
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory, load_recordings
 from rfdropo_bayes.data.spec import RecordingEntry
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import group_of, in_group
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
@@ -33,10 +32,12 @@ from rfdropo_bayes.prediction.day import DayFit, fit_day
 from rfdropo_bayes.prediction.model_error import ModelError, recorded_model_error
 from rfdropo_bayes.prediction.own_fit import MOST_STEPS
 from rfdropo_bayes.prediction.predictive import (
+    ADAPTED_TO,
     FITTED,
     KNOWN_NOISE,
     NOISE,
     Batch,
+    match_cautions,
     predict_fitted,
     predict_new,
     thin,
@@ -53,6 +54,7 @@ from rfdropo_bayes.workflow.model import Model
 from rfdropo_bayes.workflow.unseen import fitted_parts, model_of
 
 DRAWS = 100
+MUCH_WORSE = 2.0**0.5  # from here on more than half of the squared error is not what the model left of the fitted days
 
 
 def adapt(
@@ -99,10 +101,12 @@ def adapt(
     left = model_error_of(fit.record)
     adapted = _experiment(model.experiment, left, recording, group, entry)
     moved = Model.of_experiment(adapted, model.folder)
+    space = day_space(fitted_parts(fit)[1], moved, [head.name], day, fit.record.attrs[FITTED])
+    own = _own_of_day(fit.record, space, recording.name, day)
     settings: dict[str, Any] = {"tables": moved.tables(), "folder": model.folder, "texts": moved.texts()}
     settings |= {"data": hashes([recording, *test]), "options": {"run": fit.folder, "seconds": seconds, "group": group}}
     tested = [*([] if rest is None else [rest]), *test]
-    run = partial(_adapt, fit, moved, head, tested, day, left, draws, seed, show)
+    run = partial(_adapt, fit, moved, space, own, head, tested, day, left, draws, seed, show)
     if out is None:
         return run(None, describe(moved.tables()))
     with run_folder(Path(out), "adapt", **settings, overwrite=overwrite) as folder:
@@ -114,6 +118,8 @@ def adapt(
 def _adapt(
     fit: Calibration,
     model: Model,
+    space: ParameterSpace,
+    own: Sequence[Parameter],
     head: Trajectory,
     tested: Sequence[Trajectory],
     day: str,
@@ -127,12 +133,13 @@ def _adapt(
     """Fit the day and predict its recording; ``text`` is the experiment as TOML."""
     began = time.monotonic()
     simulator, key = model.simulator, jax.random.key(seed)
-    fixed, space = fitted_parts(fit)
+    fixed, _ = fitted_parts(fit)
     recordings = gather_recordings(simulator, [head])
     noise = noise_of_markers(left.every(float(np.median(np.diff(head.time)))), left.markers, recordings)
-    space = day_space(space, model, [head.name], day, fit.record.attrs[FITTED])
     spread_key, fit_key, fitted_key, rest_key = jax.random.split(key, 4)
-    body, own = _body_and_day(fit, space, draws, spread_key)
+    posterior = fit.record.posterior
+    body = thin({p.name: posterior[p.name] for p in space.parameters if p.name in posterior}, draws)
+    body |= _drawn_spreads(space, body, spread_key)
     channel = Markers.gather(recordings, STATED, noise)
     program = TrajectoryModel(simulator, space, fixed, recordings, (channel,))
     problem = CalibrationProblem(program, chunk=simulator.lanes)
@@ -146,46 +153,49 @@ def _adapt(
     noise = replace(noise, scale=found.excess * noise.scale)
     problem = CalibrationProblem(replace(program, channels=(replace(channel, known=noise),)), chunk=simulator.lanes)
     predictions = predict_fitted(problem, found.values, fitted_key)
+    cautions = _cautions(found)
     if tested:
         known: dict[str, Any] = {"fitted": [head.name], "left": left}
         known |= {"groups": {day: [head.name, *(run.name for run in tested)]}, "chunk": simulator.lanes}
-        predictions += predict_new(problem.model, tested, found.values, rest_key, **known).recordings
+        new = predict_new(problem.model, tested, found.values, rest_key, **known)
+        predictions, cautions = predictions + new.recordings, cautions + match_cautions(new)
     result = InferenceResult(
         method="adapt",
         draws={name: column[None] for name, column in found.values.items()},
         rollouts=float(np.sum(evaluations)),
         evaluations=round(float(np.sum(evaluations))),
-        cautions=_cautions(found),
+        cautions=cautions,
         seconds=time.monotonic() - began,
-        details={**{name: getattr(found, name) for name in ("power", "excess", "steps", "unconverged")}, "day": day},
+        details=_details(found, day, own),
     )
     before = {p.name: np.asarray(v) for p, v in zip(own, _prior(space, own, body, seed), strict=True)} | body
-    record = _record(fit.record, problem, result, before, predictions, noise.as_dict(), seed)
+    record = _record(fit.record, problem, result, before, predictions, noise.as_dict(), day, seed)
     facts = gather_facts(
         f"{fit.content.get('title', model.name)}: {day}", seed, problem, result, [head], tested, record
     )
     return Calibration(record, build_summary(record, facts), text, model, out)
 
 
-def _body_and_day(
-    fit: Calibration, space: ParameterSpace, draws: int, key: PRNGKeyArray
-) -> tuple[dict[str, np.ndarray], list[Parameter]]:
-    """Draws of what the body keeps, and the parameters that are the day's.
+def _own_of_day(fit: PosteriorRecord, space: ParameterSpace, recording: str, day: str) -> list[Parameter]:
+    """The parameters that are the day's.
 
     Raises:
         InputError: nothing is the day's.
     """
-    posterior = fit.record.posterior
-    body = thin({p.name: posterior[p.name] for p in space.parameters if p.name in posterior}, draws)
-    body |= _drawn_spreads(space, body, key)
-    own = [p for p in space.parameters if p.name not in body]
+    own = [p for p in space.parameters if p.name not in fit.posterior and p.name not in space.scales]
+    if not own and day in {info.name.partition(SEPARATOR)[2] for info in fit.free}:
+        raise InputError(
+            f"{recording} belongs to {day}, which was fitted",
+            where="adapt",
+            remedy="predict it as it is, or give its day a new --group",
+        )
     if not own:
         raise InputError(
             "nothing of the model differs between days",
             where="[model.per_group]",
             remedy="name what does, e.g. --set model.per_group.initial_displacement=0.002, and a new --group",
         )
-    return body, own
+    return own
 
 
 def run_adaptation(
@@ -202,7 +212,7 @@ def run_adaptation(
     overwrite: bool = False,
     show: bool | None = None,
 ) -> Calibration:
-    """`adapt` a run's folder to a recording in the format of its experiment.
+    """`adapt` a run's folder to a recording in the format of its experiment; lost markers are left out.
 
     Args:
         run: folder of a calibration, or of an earlier adaptation.
@@ -222,7 +232,7 @@ def run_adaptation(
     if read.data is None:
         raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format recordings are")
     entry = RecordingEntry(observations=recording, commands=commands)
-    found = load_recordings(read.data.model_copy(update={"fit": [entry], "test": []}), model.folder)
+    found = load_recordings(read.data.model_copy(update={"fit": [entry], "test": [], "missing": "mask"}), model.folder)
     if len(found) > 1:
         raise InputError(f"names {len(found)} files", where=recording, remedy="adapt to one at a time")
     record = PosteriorRecord.load(run / POSTERIOR)
@@ -233,7 +243,7 @@ def run_adaptation(
 
 
 def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, Trajectory | None]:
-    """The first seconds, and the whole recording with their measurements taken out; None where nothing is left.
+    """The first seconds, and the whole recording with their measurements taken out; None where none is left.
 
     Raises:
         InputError: less than two rows.
@@ -247,6 +257,8 @@ def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, T
         return recording, None
     mask = recording.position_mask.copy()
     mask[: last + 1] = False
+    if not mask.any():
+        return recording.slice_rows(0, last), None
     dataset = recording.dataset.copy()
     dataset["position_mask"] = dataset["position_mask"].copy(data=mask)
     return recording.slice_rows(0, last), Trajectory(dataset)
@@ -272,18 +284,14 @@ def _experiment(
     experiment: Experiment, left: ModelError, recording: Trajectory, group: str | None, entry: RecordingEntry | None
 ) -> Experiment:
     """The experiment file of the adapted run: its noise is known, and its group and its recording are named."""
-    listed = {name: [each] if isinstance(each, str) else list(each) for name, each in experiment.model.groups.items()}
-    if group is not None:  # which the recording belongs to now, whatever group named it
-        listed = {name: [entry for entry in entries if entry != recording.name] for name, entries in listed.items()}
-        listed[group] = [*listed.get(group, []), recording.name]
-    groups = {name: entries for name, entries in listed.items() if entries}
+    groups = experiment.model.groups if group is None else in_group(recording.name, group, experiment.model.groups)
     model = experiment.model.model_copy(update={"noise": STATED, "groups": groups})
     noise = NoiseTable(
         standard_deviation=float(np.sqrt(np.mean(np.square(left.scale)))), correlation_time=left.correlation_time
     )
     changes: dict[str, Any] = {"model": model, "noise": noise}
     if entry is not None and experiment.data is not None:
-        changes["data"] = experiment.data.model_copy(update={"fit": [entry], "test": []})
+        changes["data"] = experiment.data.model_copy(update={"fit": [entry], "test": [], "missing": "mask"})
     return experiment.model_copy(update=changes)
 
 
@@ -334,8 +342,20 @@ def _prior(space: ParameterSpace, own: Sequence[Parameter], body: Mapping[str, n
     return [drawn[p.name] for p in own]
 
 
+def _details(found: DayFit, day: str, own: Sequence[Parameter]) -> dict[str, Any]:
+    fitted = {name: getattr(found, name) for name in ("power", "excess", "steps", "unconverged")}
+    return {**fitted, "day": day, "moved": [p.name for p in own]}
+
+
 def _cautions(found: DayFit) -> list[Caution]:
     cautions = []
+    if found.excess > MUCH_WORSE:
+        sentence = (
+            f"the day is fitted {found.excess:.2g} times worse than the fitted days: most of its squared error is of a "
+            "kind that these did not have, and that none of the day's parameters explains; see that the recording and "
+            "its commands are right, name more in [model.per_group], or calibrate with it"
+        )
+        cautions.append(Caution(Code.DAY_UNMATCHED, sentence))
     if found.unconverged:
         sentence = (
             f"the day's parameters did not converge in {MOST_STEPS} steps under {found.unconverged} of "
@@ -358,6 +378,7 @@ def _record(
     prior: Mapping[str, np.ndarray],
     predictions: Sequence[RecordingPrediction],
     noise: dict[str, Any],
+    day: str,
     seed: int,
 ) -> PosteriorRecord:
     """The draws, with what predictions of further recordings need."""
@@ -367,6 +388,6 @@ def _record(
         for p in problem.model.space.parameters
     )
     known = {NOISE: STATED, KNOWN_NOISE: {"markers": list(recordings.markers), **noise}}
-    attributes = {**fit.attrs, **known, FITTED: list(recordings.names), "seed": seed}
+    attributes = {**fit.attrs, **known, FITTED: list(recordings.names), ADAPTED_TO: day, "seed": seed}
     record = PosteriorRecord(infos, result.draws, dict(prior), tuple(predictions), attrs=attributes)
     return record.with_derived(scale_free_ratios(problem.names))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, overload
 
@@ -30,12 +31,13 @@ from rfdropo_bayes.bayes.noise import (
     noise_specs,
 )
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
-from rfdropo_bayes.bayes.pooling import Pooled, gather_groups
+from rfdropo_bayes.bayes.pooling import Pooled
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.repeats import group_recordings, with_noise_of_repeats
 from rfdropo_bayes.bayes.space import ParameterSpace, build_space
 from rfdropo_bayes.data import Trajectory, find_data_file, load_recordings
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import Patterns, gather_groups
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.robots import Robot, load_robot
@@ -126,19 +128,22 @@ def build_simulator(
 
 
 def with_drives(robot: Robot, table: ModelTable) -> Robot:
-    """A robot with what the experiment states of its drives; names of groups stand for their recordings.
+    """A robot with what the experiment states of its drives, and the groups that it states it for.
 
     Raises:
         InputError: a cable that the robot does not have.
     """
-    stated = []
-    for drives in (*robot.drives, *table.drives):
+    stated = (*robot.drives, *table.drives)
+    for drives in stated:
         drives.columns(robot.channel_names)
-        named = [drives.recordings] if isinstance(drives.recordings, str) else drives.recordings
-        patterns = (table.groups.get(name, name) for name in named)
-        flat = [each for entry in patterns for each in ([entry] if isinstance(entry, str) else entry)]
-        stated.append(drives.model_copy(update={"recordings": tuple(flat)}))
-    return robot.model_copy(update={"drives": tuple(stated)}) if stated else robot
+    return robot.model_copy(update={"drives": stated}).grouped(table.groups) if stated else robot
+
+
+def with_groups(simulator: AnySimulator, groups: Patterns) -> AnySimulator:
+    """The same simulator, whose drives take commands as is stated for these groups of recordings."""
+    if isinstance(simulator, BlackBoxSimulator) or not simulator.robot.drives:
+        return simulator
+    return replace(simulator, robot=simulator.robot.grouped(groups))  # type: ignore[type-var]
 
 
 def measurement_specs(table: ModelTable) -> tuple[ParameterSpec, ...]:

@@ -13,9 +13,9 @@ from rfdropo_bayes.audit.differences import WHERE, Groups
 from rfdropo_bayes.audit.fit import widening
 from rfdropo_bayes.audit.held import OwnParameter
 from rfdropo_bayes.audit.pipeline import Answer
-from rfdropo_bayes.bayes.pooling import Patterns, gather_groups, whole
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.tables import nearest
 
 Between = Sequence[str] | Mapping[str, Sequence[str | Trajectory] | str | Trajectory]

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
-from rfdropo_bayes.bayes.pooling import Patterns
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import Patterns
 from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
@@ -291,6 +291,7 @@ def gather_facts(
     added: Any = description.get("mechanisms", ())
     checks = check_fit(problem, record, problem.model.markers.name in result.details.get("lasting", {}))
     floor = noise_floor([*fitted, *tested])
+    undriven = robot.unstated(run.name for run in (*fitted, *tested)) if isinstance(robot, Robot) else []
     return RunFacts(
         title=title,
         robot=str(description["robot"]),
@@ -303,7 +304,7 @@ def gather_facts(
         evaluations=result.evaluations,
         log_evidence=result.log_evidence,
         excluded=result.excluded,
-        cautions=[*result.cautions, *unmatched, *residual_cautions(checks, problem.model.noise)],
+        cautions=[*result.cautions, *unmatched, *undriven, *residual_cautions(checks, problem.model.noise)],
         residuals=checks,
         recordings=[
             *(RecordingFacts.of_trajectory(t, "fit") for t in fitted),

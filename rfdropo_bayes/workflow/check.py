@@ -76,6 +76,8 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
     for role, trajectories in recordings.items():
         for trajectory in trajectories:
             _say_recording(found, trajectory, role, robot)
+    named = [trajectory.name for trajectories in recordings.values() for trajectory in trajectories]
+    found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
     _say_repeats(found, [*recordings["fit"], *recordings["test"]])
     _say_model(found, experiment, robot, folder, recordings["fit"])
     if any(recordings.values()):

@@ -15,22 +15,25 @@ from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Trajectory, actions
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import Patterns, gather_groups, group_of, whole
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.prediction.day import physical_of_normal
 from rfdropo_bayes.prediction.own_fit import STEP
 from rfdropo_bayes.prediction.predictive import FITTED, Batch
 from rfdropo_bayes.report.run_folder import POSTERIOR
+from rfdropo_bayes.tables import nearest
 from rfdropo_bayes.workflow.adaptation import day_space, model_error_of
 from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.design import COMMANDS, Design, command_table, proposals
+from rfdropo_bayes.workflow.design import COMMANDS, Design, command_table, proposals, units_said
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
 from rfdropo_bayes.workflow.unseen import fitted_parts, model_of
 
 LONGEST = 10.0  # [s] of a proposal, unless more is asked for
 DAY = "another day"
+PER_ACTION = "displacement_per_action"  # among the settings of a recording whose commands are actions
 
 
 class Outlook(NamedTuple):
@@ -44,45 +47,55 @@ class Outlook(NamedTuple):
     seconds: float
     left: float
 
+    def as_dict(self) -> dict[str, float | None]:
+        """For design.json."""
+        return {
+            "seconds": self.seconds if np.isfinite(self.seconds) else None,
+            "tip_uncertain_after_mm": 1e3 * self.left,
+        }
+
 
 def design_day(
     fit: Calibration,
     runs: Sequence[Trajectory],
     *,
     seconds: float = LONGEST,
+    group: str | None = None,
     seed: int = 0,
     report: Callable[[str], None] = lambda line: None,
 ) -> Design:
     """Propose the shortest commands whose recording determines what a day changes.
 
-    Of random walks, holds, slow loops and chirps within the range of the recordings at hand, each is looked at from its
-    beginning. It is long enough where the last marker, under the commands of the recordings at hand, is as uncertain by
-    the day as it is by what the model misses. The noise is that of `adapt`, and so are the day's parameters.
+    Of random walks, holds, slow loops and chirps that the drives follow, each is looked at from its beginning. It is
+    long enough where the last marker, under the commands of the recordings at hand, is as uncertain by the day as it is
+    by what the model misses. The noise is that of `adapt`, and so are the day's parameters. Proposals stay within what
+    the drives did in the recordings at hand and what is stated of them; where commands are actions, which pull or
+    release one cable, proposals are made of these.
 
     Args:
         fit: a calibration, with its model.
         runs: recordings at hand.
         seconds: no proposal is longer.
+        group: among the recordings at hand, whose drives and commands the day is to have; that of the last by default.
         seed: of the proposals.
         report: called with a line of words now and then.
 
     Raises:
-        InputError: nothing of the model differs between days.
+        InputError: nothing of the model differs between days, or no recording is of the group.
     """
-    left = model_error_of(fit.record)
-    head = (
-        runs[0] if seconds >= runs[0].time[-1] else runs[0].slice_rows(0, int(np.searchsorted(runs[0].time, seconds)))
-    )
-    tried = list(proposals(head, runs, np.random.default_rng(seed)))
-    tried.sort(key=lambda proposal: proposal[0])
-    sequences = [_as_recording(head, f"proposal {k}", time, value) for k, (_, time, value) in enumerate(tried)]
+    model, left = model_of(fit), model_error_of(fit.record)
+    day, known = _of_group(runs, model.experiment.model.groups, group)
+    begun = _begun_like(known[0], seconds)
+    tried = _followed_proposals(model, begun, known[0], runs, np.random.default_rng(seed))
+    sequences = [_as_recording(begun, f"{begun.name}[proposal {k}]", *tried[k][1:]) for k in range(len(tried))]
     problem, names, at = _problem(fit, sequences)
     report(f"{len(sequences)} command sequences, {len(names)} parameters of a day")
     white = problem.residual_batch(at, problem.n_rows).reshape(2, len(names), len(sequences), problem.n_rows, -1)
     slope = (white[0] - white[1]) / (2.0 * STEP)
     report("how the recordings at hand depend on them")
-    known, _, at = _problem(fit, [run.slice_rows(0, min(len(run.time) - 1, 2 * problem.n_rows)) for run in runs[:2]])
-    position, _ = known.predict(at)
+    heads = [run.slice_rows(0, min(len(run.time) - 1, 2 * problem.n_rows)) for run in known[:2]]
+    at_hand, _, at = _problem(fit, heads)
+    position, _ = at_hand.predict(at)
     tip = position[:, :, :, -1].reshape(2, len(names), -1)
     weight = (tip[0] - tip[1]) / (2.0 * STEP)
     rows = weight.shape[1] / 3.0
@@ -95,30 +108,27 @@ def design_day(
     found = [_outlook(slope[:, k], problem.model.recordings.time[k], uncertain, error) for k in range(len(sequences))]
     best = min(range(len(found)), key=lambda k: (found[k].seconds, found[k].left))
     kind, times, value = tried[best]
-    length = min(found[best].seconds, float(head.time[-1]))
+    length = min(found[best].seconds, float(begun.time[-1]))
     kept = times <= length
     before = uncertain(np.zeros((len(names), len(names))))
     content = {
-        "sentence": _sentence(kind, found[best], length, before, error),
+        "sentence": _sentence(kind, found[best], length, before, error) + units_said(model.experiment),
         "kind": kind,
+        "group": day,
         "seconds": length,
         "determined": bool(np.isfinite(found[best].seconds)),
         "tip_uncertain_before_mm": 1e3 * before,
         "tip_uncertain_after_mm": 1e3 * found[best].left,
         "tip_error_of_the_model_mm": 1e3 * error,
         "parameters_of_a_day": names,
-        "tried": [
-            {
-                "kind": k,
-                "seconds": o.seconds if np.isfinite(o.seconds) else None,
-                "tip_uncertain_after_mm": 1e3 * o.left,
-            }
-            for (k, _, _), o in zip(tried, found, strict=True)
-        ],
+        "tried": [{"kind": k, **outlook.as_dict()} for (k, _, _), outlook in zip(tried, found, strict=True)],
         "seed": seed,
         "schema_version": 1,
     }
-    return Design(content, command_table(model_of(fit).experiment, runs[0], times[kept], value[kept]))
+    table = command_table(model.experiment, begun, times[kept], value[kept], length)
+    if PER_ACTION in known[0].settings:
+        table["action"] = actions.actions_of(value[kept], begun.initial_command)
+    return Design(content, table)
 
 
 def run_day_design(
@@ -127,6 +137,7 @@ def run_day_design(
     out: Path,
     *,
     seconds: float = LONGEST,
+    group: str | None = None,
     overrides: Sequence[str] = (),
     seed: int | None = None,
     overwrite: bool = False,
@@ -137,10 +148,10 @@ def run_day_design(
     runs = model.recordings("fit")
     fit = Calibration(PosteriorRecord.load(base / POSTERIOR), {}, "", model, base)
     chosen = model.experiment.seed if seed is None else seed
-    options = {"base": base, "seed": chosen, "adapt": True, "seconds": seconds}
+    options = {"base": base, "seed": chosen, "adapt": True, "seconds": seconds, "group": group}
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(runs), "options": options}
     with run_folder(out, "design", **settings, overwrite=overwrite) as out:
-        found = design_day(fit, runs, seconds=seconds, seed=chosen, report=report)
+        found = design_day(fit, runs, seconds=seconds, group=group, seed=chosen, report=report)
         return {**found.content, "commands": str(found.save(out))}
 
 
@@ -190,21 +201,76 @@ def _outlook(
     return Outlook(float(time[low]), left(low))
 
 
-def _as_recording(head: Trajectory, name: str, time: np.ndarray, value: np.ndarray) -> Trajectory:
-    """Commands as a recording that is observed when another one was, by all of its markers."""
+def _of_group(runs: Sequence[Trajectory], groups: Patterns, group: str | None) -> tuple[str, list[Trajectory]]:
+    """The group of that name, of the last recording by default, and its recordings.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = gather_groups([run.name for run in runs], groups)
+    day = group_of(runs[-1].name, groups) if group is None else group
+    if day not in found:
+        raise InputError(f"no recording at hand is of the group {day!r}", where="--group", remedy=nearest(day, found))
+    return day, [run for run in runs if run.name in found[day]]
+
+
+def _begun_like(run: Trajectory, seconds: float) -> Trajectory:
+    """A recording of so many seconds that begins as another one, is observed as often, by all of its markers."""
+    step = float(np.median(np.diff(run.time)))
+    time = step * np.arange(max(2, int(seconds / step + 1e-6) + 1))
+    return _as_recording(run, whole(run.name), np.zeros(1), run.initial_command[None], time)
+
+
+def _followed_proposals(
+    model: Model, begun: Trajectory, like: Trajectory, runs: Sequence[Trajectory], rng: np.random.Generator
+) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Proposals, in the order of their kinds, that the drives follow: within what they did in the recordings at hand,
+    and made of actions where the commands of ``like`` are."""
+    simulator = model.simulator
+
+    def taken(run: Trajectory, value: np.ndarray) -> np.ndarray:
+        return simulator.taken(run.name, run.initial_command, value)
+
+    done = [
+        Trajectory(run.dataset.assign(command=run.dataset["command"].copy(data=taken(run, run.command))))
+        for run in runs
+    ]
+    found = []
+    for kind, time, value in sorted(proposals(begun, done, rng), key=lambda proposal: proposal[0]):
+        value = taken(begun, value)
+        if PER_ACTION in like.settings:
+            time, value = _as_actions(begun, float(np.median(np.diff(like.command_time))), time, value)
+        if len(value):
+            found.append((kind, time, value))
+    return found
+
+
+def _as_actions(begun: Trajectory, period: float, time: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same as far as actions can, one every ``period`` seconds."""
+    initial = begun.initial_command
+    due = period * np.arange(int(begun.time[-1] / period + 1e-6))
+    target = value[np.maximum(np.searchsorted(time, due + 1e-9, side="right") - 1, 0)]
+    sent = actions.actions_towards(target, initial)
+    return due[: len(sent)], initial + actions.cumulative_displacement(sent)
+
+
+def _as_recording(
+    like: Trajectory, name: str, time: np.ndarray, value: np.ndarray, seen: np.ndarray | None = None
+) -> Trajectory:
+    """Commands as a recording that begins as another one and is observed when that was, by all of its markers."""
+    observed = like.time if seen is None else seen
     return Trajectory.build(
         name=name,
-        robot=head.robot,
+        robot=like.robot,
         format="memory",
-        time=head.time,
-        position=np.array(head.position),
-        position_mask=np.ones(head.position_mask.shape, dtype=bool),
-        marker_names=head.marker_names,
+        time=observed,
+        position=np.tile(like.position[:1], (len(observed), 1, 1)),
+        marker_names=like.marker_names,
         command_time=time,
         command=value,
-        command_unit=head.command_unit,
-        initial_command=head.initial_command,
-        cable_names=head.cable_names,
+        command_unit=like.command_unit,
+        initial_command=like.initial_command,
+        cable_names=like.cable_names,
         settings={"unseen": True},
     )
 

@@ -21,7 +21,8 @@ from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry
 from rfdropo_bayes.audit.fit import Fit, Target
 from rfdropo_bayes.audit.pipeline import Question, base_model
 from rfdropo_bayes.bayes.recordings import commands_after
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Trajectory, asl_csv
+from rfdropo_bayes.data.asl_csv import FORMAT as ASL
 from rfdropo_bayes.data.plain_csv import command_columns
 from rfdropo_bayes.files import whole, write_json
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
@@ -131,7 +132,9 @@ def design(
     kind, times, value = tried[chosen]
     now = at_hand(target, hypotheses)
     content = {
-        "sentence": _sentence(kind, outlook[chosen], now, SCREENING not in clock.missed) + _unfinished(clock),
+        "sentence": _sentence(kind, outlook[chosen], now, SCREENING not in clock.missed)
+        + units_said(experiment)
+        + _unfinished(clock),
         "kind": kind,
         "hypotheses": [h.name for h in hypotheses],
         "separation_now": {" / ".join(pair): value for pair, value in now.items()},
@@ -147,7 +150,7 @@ def design(
         "seed": question.seed,
         "schema_version": 1,
     }
-    return Design(content, command_table(experiment, runs[0], times, value))
+    return Design(content, command_table(experiment, runs[0], times, value, float(runs[0].time[-1])))
 
 
 def run_design(
@@ -213,12 +216,23 @@ def _outlooks(
     return outlook
 
 
-def command_table(experiment: Experiment, first: Trajectory, time: np.ndarray, value: np.ndarray) -> pd.DataFrame:
-    """The proposal in the columns of the experiment's recordings."""
+def command_table(
+    experiment: Experiment, first: Trajectory, time: np.ndarray, value: np.ndarray, seconds: float
+) -> pd.DataFrame:
+    """The proposal, of so many seconds, in the columns of the experiment's recordings."""
+    if experiment.data is not None and experiment.data.format == ASL:
+        return pd.DataFrame(asl_csv.command_columns(time, value, seconds))
     if experiment.data is not None and experiment.data.columns is not None:
         return pd.DataFrame(command_columns(experiment.data.columns, time, value))
     channels = {f"{c}_{first.command_unit}": value[:, k] for k, c in enumerate(first.cable_names)}
     return pd.DataFrame({"time_s": time, **channels})
+
+
+def units_said(experiment: Experiment) -> str:
+    """What the columns of `command_table` are in, where their names do not say it."""
+    if experiment.data is not None and experiment.data.format == ASL:
+        return " Columns u1 to u6 are in degrees, a row every 10 ms, as that format has them."
+    return ""
 
 
 def _shaped(sequences: Sequence[Commands], like: Commands) -> list[Commands]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,27 +17,33 @@ from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
+from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory, commands_alone, first_row_only, load_unseen, start_is_known
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_json
+from rfdropo_bayes.groups import group_of, in_group
 from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.model_error import recorded_model_error
 from rfdropo_bayes.prediction.predictive import (
+    ADAPTED_TO,
     BEGUN,
     FITTED,
     HELD,
     KNOWN_NOISE,
     NOISE,
+    match_cautions,
     predict_new,
     thin,
 )
 from rfdropo_bayes.report.run_folder import POSTERIOR
 from rfdropo_bayes.report.trajectory_figures import draw_band
 from rfdropo_bayes.simulators.parameters import ParameterSpec
-from rfdropo_bayes.workflow.assembly import KNOWN, fixed_values, measurement_specs
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.workflow.assembly import KNOWN, fixed_values, measurement_specs, with_groups
 from rfdropo_bayes.workflow.calibrated import Calibration, axes_or_new
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
@@ -58,10 +64,16 @@ class Prediction:
     Attributes:
         bands: mean and 5, 25, 75 and 95 % quantiles [m] of what would be measured, (time, marker, axis).
         drawn: the same as draws.
+        group: that the commands were taken to belong to.
+        group_fitted: whether the posterior has values of it; None where nothing differs between groups.
+        cautions: what speaks against the prediction.
     """
 
     bands: xr.Dataset
     drawn: RecordingPrediction
+    group: str = ""
+    group_fitted: bool | None = None
+    cautions: list[Caution] = field(default_factory=list)
 
     @property
     def frame(self) -> pd.DataFrame:
@@ -110,18 +122,25 @@ def predict(
         start: positions of the markers in the first row [m], (marker, 3), beside such a pair; unknown by default.
         draws: of the posterior that are rolled out.
         seed: of what is random.
-        group: the day, robot or other group that they belong to; as [model.groups] has it by default.
+        group: the day, robot or other group that they belong to; by default the day that `adapt` has taken the fit to,
+            or else as [model.groups] has it.
 
     Raises:
         InputError: a calibration without its model, or commands of another robot.
     """
     record, model = fit.record, model_of(fit)
-    simulator, table = model.simulator, model.experiment.model
+    table = model.experiment.model
     _check_noise(record, table.noise)
     unseen = first_row_only(commands) if isinstance(commands, Trajectory) else _commanded(model, *commands, start)
+    group = record.attrs.get(ADAPTED_TO) if group is None else group
+    groups = table.groups if group is None else in_group(unseen.name, group, table.groups)
+    simulator = with_groups(model.simulator, groups)
     fixed, space = fitted_parts(fit)
     recordings = gather_recordings(simulator, [unseen])
-    channels = (_markers(recordings, table.noise, record.attrs.get(KNOWN_NOISE)),)
+    stated, step = model.experiment.noise, float(np.median(np.diff(unseen.time)))
+    lasts = stated.correlation_time if stated is not None and table.noise == STATED else None
+    memory = None if lasts is None else np.array([1.0, np.exp(-step / lasts)])
+    channels = (_markers(recordings, table.noise, record.attrs.get(KNOWN_NOISE), memory),)
     program = TrajectoryModel(simulator, space, fixed, recordings, channels)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
@@ -134,13 +153,18 @@ def predict(
         chunk=simulator.lanes,
         fitted=fitted,
         left=recorded_model_error(record),
-        groups=table.groups if group is None else {group: unseen.name},
+        groups=groups,
     )
     predicted = found.recordings[0]
     bands = summarise(predicted)
     bands.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": model.name, "recording": unseen.name}
     bands.attrs["draws_that_did_not_match_the_first_row"] = found.unmatched
-    return Prediction(bands, predicted)
+    group = bands.attrs["group"] = group_of(unseen.name, groups)
+    known = {p.recording for p in space.parameters if p.added_to}
+    cautions = match_cautions(found)
+    if isinstance(simulator, RobotSimulator):
+        cautions += simulator.robot.unstated([unseen.name])
+    return Prediction(bands, predicted, group, group in known if known else None, cautions)
 
 
 def model_of(fit: Calibration) -> Model:
@@ -228,9 +252,12 @@ def run_prediction(
             "commands": commands,
             "start_pose_known": start_is_known(unseen),
             "first_command": unseen.first_command,
+            "group": found.group,
+            "group_fitted": found.group_fitted,
             "rows": len(found.drawn.time),
             "draws": int(found.drawn.predicted.shape[0]),
             "draws_that_did_not_match_the_first_row": found.bands.attrs["draws_that_did_not_match_the_first_row"],
+            "cautions": [caution.as_dict() for caution in found.cautions],
             "unit": "m",
             "frame": unseen.dataset.attrs["frame"],
             "simulator": model.simulator.description,
@@ -251,8 +278,11 @@ def _check_noise(record: PosteriorRecord, noise: str) -> None:
         )
 
 
-def _markers(recordings: RecordingSet, noise: str, known: Mapping[str, Any] | None) -> Markers:
-    """The positions to predict, under the noise that was inferred, or that the posterior knows.
+def _markers(
+    recordings: RecordingSet, noise: str, known: Mapping[str, Any] | None, memory: Float[np.ndarray, " lag"] | None
+) -> Markers:
+    """The positions to predict, under the noise that was inferred, or that the posterior knows: with the memory that
+    these rows have, where it is given.
 
     Raises:
         InputError: a noise that is not inferred, and a posterior that does not hold it.
@@ -265,7 +295,10 @@ def _markers(recordings: RecordingSet, noise: str, known: Mapping[str, Any] | No
             where="--posterior",
             remedy="predict with the experiment that was calibrated",
         )
-    own = noise_of_markers(Autoregression.from_dict(known), known["markers"], recordings)
+    recalled = Autoregression.from_dict(known)
+    if memory is not None:
+        recalled = replace(recalled, autocorrelation=memory)
+    own = noise_of_markers(recalled, known["markers"], recordings)
     return Markers.gather(recordings, noise, own)
 
 

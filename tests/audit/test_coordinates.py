@@ -9,8 +9,9 @@ import pytest
 from scipy import stats
 
 from rfdropo_bayes.audit.coordinates import Coordinates
-from rfdropo_bayes.bayes.pooling import Pooled, gather_groups
+from rfdropo_bayes.bayes.pooling import Pooled
 from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.groups import gather_groups
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SPECS = (

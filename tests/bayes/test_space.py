@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rfdropo_bayes.bayes.pooling import Pooled, gather_groups, group_of
+from rfdropo_bayes.bayes.pooling import Pooled
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import gather_groups, group_of, in_group
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SPECS = (
@@ -145,6 +146,13 @@ def test_a_group_that_names_a_recording_comes_before_wildcards():
     assert group_of("a1", {**DAYS, "winter": "a1"}) == "winter"
     assert group_of("a1[0:45]", {**DAYS, "winter": ["a1", "b"]}) == "winter"
     assert group_of("a2", {**DAYS, "winter": "a1"}) == "january"
+    assert group_of("a1[0:45]", {**DAYS, "winter": "a1[0:45]"}) == "winter"  # a piece names its recording
+
+
+def test_a_recording_is_moved_to_a_group_from_the_one_that_named_it():
+    moved = in_group("a1[0:9]", "today", {**DAYS, "winter": ["a1[5:7]", "b"], "spring": "a1"})
+    assert moved == {"january": ["a*"], "april": ["b"], "winter": ["b"], "today": ["a1"]}
+    assert group_of("a1", moved) == "today"
 
 
 def test_what_cannot_be_pooled_is_refused():

@@ -52,6 +52,16 @@ def test_optitrack_timing_and_units(optitrack_table, write, tmp_path):
     np.testing.assert_allclose(recording.position[0, 3], [0.0, -0.03, 0.16], atol=1e-4)
 
 
+def test_a_marker_lost_in_the_first_rows_does_not_move_the_first_action(optitrack_table, write, tmp_path):
+    table = optitrack_table()
+    places = [name for name in table if name[0] in "xyz"]
+    table.loc[1, places] = table.loc[0, places]
+    for lost in ([], ["x4", "y4", "z4"]):
+        table.loc[:1, lost] = np.nan
+        recording = read_optitrack_csv(write(table, tmp_path / "run.csv"), mask_missing=True)
+        np.testing.assert_allclose(recording.command_time[:2], [0.1 - 1 / 120, 0.1], atol=1e-9)
+
+
 def test_optitrack_file_by_hand(datasets):
     name = "AKLWI_collected_data_20250130-145317.csv"
     recording = read_optitrack_csv(datasets / "sim2real_trunk" / name)

@@ -97,7 +97,7 @@ def test_commands_of_their_own_only_where_the_format_has_them(folder):
 
 def test_asl_observations_without_commands_ask_for_them(folder):
     spec = DataSpec.parse({"format": "asl-csv", "fit": ["observations.csv.gz"]})
-    with pytest.raises(InputError, match="commands = 'none'"):
+    with pytest.raises(InputError, match=r"--commands FILE; commands = 'none'"):
         load_recordings(spec, folder)
 
 

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import group_of, in_group
 from rfdropo_bayes.robots import DriveTravel, Robot, load_robot, travel_in
+from rfdropo_bayes.robots.drive_travel import unstated_travel
+from rfdropo_bayes.workflow.assembly import with_groups
 from rfdropo_bayes.workflow.model import Model
 
+EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
+CONFIG = "reports/sim2real_trunk/config.toml"
 CHANNELS = ("a", "b")
 UP_AND_BACK = 0.005 * np.cumsum([1, 1, 1, 1, -1, -1, -1])[:, None] * np.ones(2)
 EXPECTED = {  # with 12 mm of travel, in mm
@@ -55,6 +64,28 @@ def test_tables_hold_for_their_recordings():
     assert travel_in(tables, CHANNELS, "run_20251", np.zeros(2)) is None
     assert travel_in(tables, CHANNELS, "run_20253[5, 10]", np.zeros(2)).high[0] == 0.012
     assert travel_in(tables, CHANNELS, "april", np.zeros(2)).high[0] == 0.02
+    assert travel_in(tables, CHANNELS, "run_20251", np.zeros(2), "april").high[0] == 0.02  # by its group
+
+
+def test_a_recording_without_the_limits_of_others_has_a_caution():
+    tables = [table(recordings="march", cables=("a",)), table(recordings="spring", cables=("b",))]
+    belonging = {"march": "spring", "april": "spring", "june": "june"}
+    found = unstated_travel(tables, CHANNELS, belonging)
+    assert [caution.code for caution in found] == [Code.DRIVES_UNSTATED] * 2
+    assert "the travel of a is stated for other recordings and not for april:" in found[0].sentence
+    assert "the travel of a, b is stated for other recordings and not for june:" in found[1].sentence
+    assert not unstated_travel([], CHANNELS, belonging)
+
+
+@pytest.mark.parametrize("path", [*sorted(EXPERIMENTS.glob("sim2real_trunk*.toml")), EXPERIMENTS.parent / CONFIG])
+def test_the_trunk_s_drives_are_stated_for_every_day(path):
+    """January 2025 by one pair of tables, all that came later by another; no recording by both."""
+    stated = tomllib.loads(path.read_text(encoding="utf-8"))["model"]
+    tables = [DriveTravel(**entry) for entry in stated.get("drives", [])]
+    for day in ("20250130-145317", "20250201-1", "20250423-103701", "20251231-1", "20260101-1", "20310130-1"):
+        name = f"AKLWI_collected_data_{day}"
+        held = [t for t in tables if t.holds_for(name, group_of(name, stated.get("groups", {})))]
+        assert len(held) == (0 if not tables else 2 if day.startswith("202501") else 1)
 
 
 @pytest.mark.parametrize(
@@ -116,3 +147,9 @@ def test_a_model_drives_a_recording_as_its_group_does():
     sent = UP_AND_BACK[-1, 0]
     np.testing.assert_allclose(step[:, -1, 0], [-0.005, -0.003, sent], atol=1e-12)
     np.testing.assert_allclose(step[:, -1, 1], [sent, -0.003, sent], atol=1e-12)
+    assert [caution.sentence.split(":")[0][-6:] for caution in model.simulator.robot.unstated(["friday"])] == ["friday"]
+    # a recording belongs to the group that is chosen for it, and to no other
+    for name, group, taken in (("friday", "mondays", -0.005), ("monday_1", "today", sent)):
+        chosen = with_groups(model.simulator, in_group(name, group, model.experiment.model.groups))
+        found = gather_recordings(chosen, [recording(name, robot)]).commands.step
+        np.testing.assert_allclose(found[0, -1, 0], taken, atol=1e-12)

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from typer.testing import CliRunner
 
 import rfdropo_bayes as rb
+from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.cli.main import app
+from rfdropo_bayes.cli.results import show_calibration, show_prediction
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR
 from rfdropo_bayes.prediction.predictive import FITTED, NOISE
+from rfdropo_bayes.workflow import adaptation, day_design
 
+DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo" / "demo_1.nc"
 STEP, SIGMA, SPREAD = 0.02, 2e-4, 0.01
 GAIN, LAG = 1.4, 0.25
 
@@ -144,10 +150,115 @@ def test_the_rest_of_the_day_is_predicted_from_the_folder(adapted, zeros):
     bands = [rb.predict(adapted, commands, group=day).bands for day in ("today", "tomorrow")]
     today, tomorrow = (float(np.mean(b["q95"].values - b["q05"].values)) for b in bands)
     assert tomorrow > 5.0 * today
+    by_default = rb.predict(adapted, commands)  # of its own day
+    np.testing.assert_array_equal(by_default.bands["mean"], bands[0]["mean"])
+    assert (by_default.group, by_default.group_fitted) == ("today", True)
+    assert not rb.predict(adapted, commands, group="tomorrow").group_fitted
     back = rb.load(adapted.folder)
     np.testing.assert_array_equal(back.record.flat("zero_spread"), adapted.record.flat("zero_spread"))
     assert json.loads((adapted.folder / "summary.json").read_text())["method"] == "adapt"
     assert (adapted.folder / "report.html").stat().st_size > 10_000
+
+
+def test_errors_last_as_long_in_rows_of_another_rate(adapted):
+    """The model's error forgets its sign over one row of the fit; nothing moves along y. Standard error: 0.02."""
+    for step in (STEP, 2.0 * STEP):
+        time = step * np.arange(50)
+        noise = rb.predict(adapted, (time, np.zeros((50, 1)))).drawn.predicted[:, :, 0, 1]
+        lag = np.mean(noise[:, 1:] * noise[:, :-1]) / np.mean(noise**2)
+        assert lag == pytest.approx(np.exp(-step / STEP), abs=0.08)
+
+
+def test_the_terminal_shows_the_day_first_and_what_comes_next(adapted, capsys):
+    show_calibration(adapted, quiet=False, as_json=False)
+    lines = capsys.readouterr().out.splitlines()
+    header = next(k for k, line in enumerate(lines) if line.startswith("parameter"))
+    assert lines[header + 1].startswith("zero_deviation@today")
+    assert f"next: rfdropo predict {adapted.folder} --commands FILE --out OUT" in lines
+    facts = {"start_pose_known": True, "rows": 3, "draws": 2, "posterior": "P", "files": ["f"]}
+    facts |= {"group": "today", "group_fitted": True, "cautions": [{"sentence": "1 draws did not converge"}]}
+    show_prediction(facts, quiet=False, as_json=False)
+    assert capsys.readouterr().out.splitlines()[1:3] == ["group today, fitted", "caution: 1 draws did not converge"]
+
+
+def test_as_many_draws_as_were_asked_for_are_no_verdict(adapted):
+    """Sixty draws cannot have a hundred effective ones."""
+    assert adapted.summary["ess_bulk"].min() < 100.0
+    assert "effective draws" not in adapted.sentence
+    assert adapted.verdict != "unsafe"
+
+
+def test_a_piece_of_a_recording_belongs_to_its_group(known, zeros):
+    """By name in the fit and in the prediction of a further piece."""
+    run = recorded(["morning"], zeros[9:10], 30)[0]
+    piece = rb.adapt(known, run.slice_rows(0, 25), group="today", seed=1, show=False)
+    assert "zero_deviation@today" in piece.record.posterior
+    assert not piece.cautions
+    found = rb.predict(piece, run.slice_rows(50, 90, lead_in=1.0), group="today")
+    assert found.group_fitted
+    assert np.sqrt(np.mean((found.bands["mean"].values - run.position[50:91]) ** 2)) < 5.0 * SIGMA
+
+
+def test_a_day_that_the_model_cannot_fit_has_a_caution(known, zeros):
+    """A drift that no parameter makes, ten times as large as the model's error."""
+    run = recorded(["b"], zeros[1:2], 51)[0]
+    drift = 10.0 * SIGMA * np.sqrt(3.0) * np.sin(40.0 * run.time)
+    off = rb.Trajectory(run.dataset.assign(position=run.dataset["position"] + xr.DataArray(drift, dims="time")))
+    said = [caution for caution in rb.adapt(known, off, show=False).cautions if caution.code == Code.DAY_UNMATCHED]
+    times = float(said[0].sentence.removeprefix("the day is fitted ").partition(" ")[0])
+    assert times == pytest.approx(np.sqrt(1.0 + 10.0**2 * 3.0 / 2.0), rel=0.25)
+    assert not [c for c in rb.adapt(known, run, show=False).cautions if "times worse" in c.sentence]
+
+
+def test_a_first_row_that_nothing_explains_has_a_caution(known, zeros):
+    """What a day's zero moves along x is matched; five millimetres along y are not."""
+    run = recorded(["b"], zeros[1:2], 51)[0]
+    assert not rb.predict(known, run).cautions
+    shift = xr.DataArray([0.0, 25.0 * SIGMA, 0.0], dims="axis")
+    off = rb.Trajectory(run.dataset.assign(position=run.dataset["position"] + shift))
+    (caution,) = rb.predict(known, off).cautions
+    assert caution.code == Code.FIRST_ROW_FAR
+    times = float(caution.sentence.removeprefix("the first row of b is ").partition(" ")[0])
+    assert times == pytest.approx(25.0 / np.sqrt(3.0), rel=0.1)  # a row's noise is 4 % of it
+
+
+def test_what_is_masked_after_the_first_seconds_is_no_rest(known, zeros):
+    run = recorded(["b"], zeros[1:2], 51)[0]
+    mask = run.position_mask & (run.time < 0.5)[:, None]
+    lost = rb.Trajectory(run.dataset.assign(position_mask=run.dataset["position_mask"].copy(data=mask)))
+    found = rb.adapt(known, lost, seconds=0.6, show=False)
+    assert [prediction.split for prediction in found.record.recordings] == ["fit"]
+
+
+def test_lost_markers_are_left_out(known, tmp_path, monkeypatch):
+    """The file is read as `predict` reads it, and what is left out is said."""
+    asked = {}
+
+    def read(spec, folder):
+        asked["missing"] = spec.missing
+        raise rb.InputError("read")
+
+    monkeypatch.setattr(adaptation, "load_recordings", read)
+    (tmp_path / "config.toml").write_text('robot = "smooth_arm"\n[data]\nformat = "netcdf"\nfit = ["a.nc"]\n')
+    with pytest.raises(rb.InputError, match="read"):
+        adaptation.run_adaptation(tmp_path, "b.nc", tmp_path / "out")
+    assert asked["missing"] == "mask"
+
+
+def test_what_was_left_out_is_printed(adapted, capsys):
+    recordings = [{**row, "masked": 2} for row in adapted.content["recordings"]]
+    show_calibration(
+        replace(adapted, content={**adapted.content, "recordings": recordings}), quiet=False, as_json=False
+    )
+    assert "left out: 2 of 26 positions" in capsys.readouterr().out
+
+
+def test_a_day_that_was_fitted_is_refused_before_a_folder_is_made(known, zeros, tmp_path):
+    run = recorded(["day_0_b"], zeros[:1], 52)[0]
+    with pytest.raises(rb.InputError, match=r"day_0_b belongs to day_0, which was fitted.*new --group"):
+        rb.adapt(known, run, out=tmp_path / "out", show=False)
+    assert not (tmp_path / "out").exists()
+    assert rb.adapt(known, run, group="anew", show=False).content["details"]["moved"] == ["zero_deviation@anew"]
 
 
 def test_the_shortest_commands_that_determine_a_day(known, zeros):
@@ -161,9 +272,52 @@ def test_the_shortest_commands_that_determine_a_day(known, zeros):
     assert found.content["tip_uncertain_after_mm"] <= found.content["tip_error_of_the_model_mm"]
     assert list(found.commands.columns) == ["time_s", "pull_m"]
     assert f"Record the first {found.content['seconds']:.3g} s" in found.sentence
+    assert found.content["group"] == "day_0"
     none = {**known.record.posterior, "zero_spread": np.full((1, 60), 1e-9)}
     same = rb.design_day(replace(known, record=replace(known.record, posterior=none)), runs, seconds=1.0)
     assert same.content["tip_uncertain_before_mm"] < 1e-3
+
+
+def test_proposals_are_as_long_as_asked_for(known, zeros):
+    """Longer than the recordings at hand, and from rest as they began; a group that none is of is refused."""
+    runs = [run.slice_rows(0, 25) for run in recorded(["day_0_a", "day_1_a"], zeros[:2], 0)]
+    begun = day_design._begun_like(runs[0], 5.0)
+    assert begun.name == "day_0_a"
+    np.testing.assert_allclose(begun.time, STEP * np.arange(251))
+    tried = day_design._followed_proposals(known.model, begun, runs[0], runs, np.random.default_rng(0))
+    assert max(time[-1] for _, time, _ in tried) > 4.5
+    assert rb.design_day(known, runs, seconds=1.0).content["group"] == "day_1"
+    with pytest.raises(rb.InputError, match="no recording at hand is of the group 'day_2'"):
+        rb.design_day(known, runs, group="day_2")
+
+
+@pytest.fixture
+def stated():
+    """An arm whose first drive ignores what is beyond 12 mm in April, and forgets it in January."""
+    named = {"january": "jan_*", "april": "apr_*"}
+    drives = [{"recordings": name, "low": 0.0, "high": 0.012, "beyond": "lost", "cables": ["up"]} for name in named]
+    return rb.Model("smooth_arm", groups=named, drives=[drives[0] | {"high": 0.03}, drives[1]])
+
+
+def test_proposals_are_what_the_drives_of_the_day_follow(stated):
+    """Commands of up to 40 mm were sent, of which the drives followed 30 mm in January and 12 mm in April."""
+    made = rb.Trajectory.load(DEMO)
+    command = 0.04 * np.linspace(0.0, 1.0, len(made.command))[:, None] * np.array([1.0, 0.5, 0.0, 0.0])
+    runs = [
+        rb.Trajectory(made.dataset.assign(command=made.dataset["command"].copy(data=command))).with_attributes(
+            name=name
+        )
+        for name in ("jan_1", "apr_1")
+    ]
+    for run, most in zip(runs, (0.03, 0.012), strict=True):
+        begun = day_design._begun_like(run, 2.0)
+        tried = day_design._followed_proposals(stated, begun, run, runs, np.random.default_rng(1))
+        top = np.max([value.max(axis=0) for _, _, value in tried], axis=0)
+        assert 0.6 * most < top[0] <= most
+        assert 0.01 < top[1] <= 0.02
+        for _, _, value in tried:  # as sent
+            taken = stated.simulator.taken(f"{run.name}[proposal 3]", run.initial_command, value)
+            np.testing.assert_array_equal(taken, value)
 
 
 def test_a_model_that_is_the_same_on_all_days_says_what_to_name(known, zeros):

@@ -14,6 +14,7 @@ import arviz
 import numpy as np
 import pytest
 
+from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import PosteriorRecord, load_posterior
 from rfdropo_bayes.workflow.calibration import earlier_draws, run_calibration
@@ -32,7 +33,9 @@ SHORT = [
 
 @pytest.mark.slow
 def test_a_calibration_writes_what_it_promises(tmp_path):
-    found = run_calibration(DEMO, tmp_path, overrides=SHORT)
+    stated = 'model.drives=[{recordings="demo_1", high=1.0, beyond="lost"}]'
+    found = run_calibration(DEMO, tmp_path, overrides=[*SHORT, stated])
+    assert Code.DRIVES_UNSTATED in [caution.code for caution in found.cautions]  # of the test recording
     assert found.verdict in ("safe", "with care", "unsafe")
     assert (tmp_path / "report.html").read_text().startswith("<!DOCTYPE html>")
     summary = json.loads((tmp_path / "summary.json").read_text())

@@ -66,6 +66,14 @@ def test_a_recording_that_fits_is_described_and_drawn(tmp_path):
     assert np.asarray(Image.open(picture).convert("RGB")).std() > 10.0
 
 
+def test_a_recording_without_the_limits_of_others_has_a_note(tmp_path):
+    drives = '[[model.drives]]\nrecordings = "april_*"\nhigh = 0.1\nbeyond = "lost"\n'
+    found = checked(tmp_path, more=drives)
+    assert not found.problems
+    said = "the travel of up, left, down, right is stated for other recordings and not for run:"
+    assert [note for note in found.notes if note.startswith(said)]
+
+
 def test_markers_of_other_names_are_a_problem_that_says_what_to_write(tmp_path):
     found = checked(tmp_path, more='markers = ["base", "low", "high", "tip"]')
     assert any("base, low, high, tip" in p and "m1, m2, m3, m4" in p for p in found.problems)

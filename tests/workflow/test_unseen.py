@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,13 +15,14 @@ import pytest
 import tomli_w
 import xarray as xr
 
-from rfdropo_bayes.bayes.pooling import Pooled, gather_groups
+from rfdropo_bayes.bayes.pooling import Pooled
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import gather_groups
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
-from rfdropo_bayes.prediction.first_row import match_first_row, weighed_by_first_row
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError
 from rfdropo_bayes.prediction.predictive import NOISE, _for_new_recordings
 from rfdropo_bayes.robots import load_robot
@@ -158,6 +160,23 @@ def test_bands_are_those_of_what_would_be_measured(posterior, tmp_path):
     np.testing.assert_allclose(table["m4_z_q95"], found["q95"].sel(marker="m4", axis="z"), atol=1e-5)
     np.testing.assert_array_equal(table["time"].round(6), found["time"].values.round(6))
     assert found["mean"].attrs["units"] == "m"
+    facts = json.loads((tmp_path / "prediction.json").read_text())
+    assert (facts["group"], facts["group_fitted"], facts["cautions"]) == ("demo_3", None, [])  # nothing differs
+
+
+def test_the_chosen_group_says_what_the_drives_follow(posterior, tmp_path):
+    """In April they lose all pulls; the recording is of no group unless one is chosen for it."""
+    overrides = [*COARSE, 'model.drives=[{recordings="april", high=0.0, beyond="lost"}]']
+    moved, said = {}, {}
+    for group in (None, "april"):
+        out = tmp_path / str(group)
+        facts = run_prediction(
+            EXPERIMENTS / "demo.toml", posterior, COMMANDS, out, rows=(0, 30), overrides=overrides, group=group
+        )
+        moved[group] = np.ptp(pd.read_csv(out / "prediction.csv")["m4_x_mean"])
+        said[group] = [caution["code"] for caution in facts["cautions"]]
+    assert said == {None: ["drives_unstated"], "april": []}
+    assert moved["april"] < 0.2 * moved[None]
 
 
 def test_wrong_requests_are_named(posterior, tmp_path):
@@ -263,6 +282,26 @@ def test_draws_count_as_they_predict_the_first_row():
     ]
     share = np.bincount(few, minlength=4000) / 4000
     assert 1.0 / np.sum(share**2) == pytest.approx(400, rel=0.1)
+
+
+def test_a_first_row_far_from_the_model_s_is_found_by_the_model_s_own_error():
+    """Markers are off by 2 and 3 times the model's error: 2.55 times in root mean square. By chance alone one of twenty
+    rows of independent normal errors is."""
+    left = ModelError(("a", "b"), (1.0, 2.0, 2.0, 4.0, 4.0, 2.0), 0.1)  # off by 3 and by 6
+    simulated, seen = np.zeros((1, 2, 2, 3)), np.ones((2, 2), dtype=bool)
+    off = np.array([[[6.0, 0.0, 0.0], [0.0, 0.0, 18.0]], [[99.0, 0.0, 0.0]] * 2])
+
+    def far(observed, mask=seen, error=left):
+        row = RecordingPrediction("run", "test", np.arange(2.0), ("a", "b"), observed, mask, simulated)
+        return far_first_rows([row], error)
+
+    assert far(off)["run"] == pytest.approx(np.sqrt((2.0**2 + 3.0**2) / 2))
+    assert far(off, np.array([[True, False], [True, True]]))["run"] == pytest.approx(2.0)
+    assert not far(off, np.array([[False, False], [True, True]]))
+    assert not far(0.4 * off)
+    assert not far(off, error=None)
+    rows = np.random.default_rng(0).normal(size=(2000, 2, 2, 3)) * np.reshape(left.scale, (2, 3))
+    assert 0.03 < np.mean([bool(far(row)) for row in rows]) < 0.09
 
 
 def test_noise_is_not_pooled():

@@ -1,0 +1,61 @@
+"""Recordings that belong together: of one day, one robot, one set-up."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+
+from rfdropo_bayes.errors import InputError
+
+Patterns = Mapping[str, str | Sequence[str]]
+"""Names of recordings, or wildcards, by the name of their group."""
+
+
+def whole(recording: str) -> str:
+    """The recording that a piece is cut from."""
+    return recording.partition("[")[0]
+
+
+def group_of(recording: str, patterns: Patterns) -> str:
+    """Name of the group a recording belongs to; one that belongs to none is a group of its own.
+
+    A group that names the recording comes before those that it is in by a wildcard.
+
+    Args:
+        recording: its name, or that of a piece of it.
+        patterns: names of recordings, or wildcards, by group.
+
+    Raises:
+        InputError: the recording is in two groups.
+    """
+    name = whole(recording)
+    listed = _listed(patterns)
+    found = [group for group, entries in listed.items() if name in map(whole, entries)]
+    if not found:
+        found = [group for group, entries in listed.items() if any(fnmatchcase(name, entry) for entry in entries)]
+    if len(found) > 1:
+        raise InputError(
+            f"{name} is in two groups: {found[0]} and {found[1]}", where="[model.groups]", remedy="keep it in one"
+        )
+    return found[0] if found else name
+
+
+def gather_groups(recordings: Sequence[str], patterns: Patterns) -> dict[str, tuple[str, ...]]:
+    """Recordings by group, in the order in which the groups are first met."""
+    groups: dict[str, tuple[str, ...]] = {}
+    for recording in recordings:
+        group = group_of(recording, patterns)
+        groups[group] = (*groups.get(group, ()), recording)
+    return groups
+
+
+def in_group(recording: str, group: str, patterns: Patterns) -> dict[str, list[str]]:
+    """Patterns under which a recording belongs to a group, whatever group named it before."""
+    name = whole(recording)
+    found = {each: [entry for entry in entries if whole(entry) != name] for each, entries in _listed(patterns).items()}
+    found[group] = [*found.get(group, []), name]
+    return {each: entries for each, entries in found.items() if entries}
+
+
+def _listed(patterns: Patterns) -> dict[str, list[str]]:
+    return {group: [entries] if isinstance(entries, str) else list(entries) for group, entries in patterns.items()}
