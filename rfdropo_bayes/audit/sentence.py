@@ -142,7 +142,8 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     elif answer.looks[-1].omnibus.p > answer.question.rules.extended_passes:
         head = f"The best of the library, {named}, explains {share}; the rest may be noise, but that is not certain"
     else:
-        head = f"The best of the library, {named}, explains {share}, but not all: something else is at work"
+        rest = "" if _only_noise(answer) else ", but not all: something else is at work"
+        head = f"The best of the library, {named}, explains {share}{rest}"
     return f"{head}{_excluded(answer)}; {_remains(answer)}{_assumption(answer)}.{_adoption(answer)}"
 
 
@@ -209,15 +210,24 @@ def _excluded(answer: Answer) -> str:
     return f"; {', '.join(worse[:MOST_EXCLUDED])} excluded" if worse else ""
 
 
+def _only_noise(answer: Answer) -> bool:
+    """Whether unseen recordings are missed by no more than repeats differ by."""
+    noise = answer.target.noise
+    return (
+        noise.source == REPEATS and answer.gain is not None and noise_distance(noise.first) >= answer.gain.rmse_extended
+    )
+
+
 def _remains(answer: Answer) -> str:
     assert answer.gain is not None
-    noise = noise_distance(answer.target.noise.first)
-    remain = f"{1e3 * answer.gain.rmse_extended:.2g} mm remain"
+    remain, last = f"{1e3 * answer.gain.rmse_extended:.2g} mm remain", answer.looks[-1].omnibus.p
+    if _only_noise(answer):
+        rules = answer.question.rules
+        pattern = f", but the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
+        return f"{remain}, no more than repeats differ by{pattern if last <= rules.extended_passes else ''}"
     if answer.target.noise.source != REPEATS:
         return remain
-    return (
-        f"{remain}, {1e3 * noise:.2g} mm of it noise" if noise < answer.gain.rmse_extended else f"{remain}, all noise"
-    )
+    return f"{remain}, {1e3 * noise_distance(answer.target.noise.first):.2g} mm of it noise"
 
 
 def _resolution(answer: Answer) -> str:
