@@ -129,8 +129,8 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if unclear(answer.question.rules, gain):
         verb, likelier = "is" if len(findings) == 1 else "are", "" if gain.elpd_difference > 0.0 else "no "
         head = (
-            f"{named} {verb} named, but the discrepancy is too small to say how much of it that explains "
-            f"([{low:.0f}, {high:.0f}] %); unseen recordings are {likelier}likelier with it"
+            f"{named} {verb} named, but unseen recordings do not say how much of the discrepancy that explains "
+            f"([{low:.0f}, {high:.0f}] %); they are {likelier}likelier with it"
         )
     elif gain.worse:
         errors = f"{1e3 * gain.rmse_base:.3g} mm without, {1e3 * gain.rmse_extended:.3g} mm with it"

@@ -267,7 +267,7 @@ def with_ratios(record: PosteriorRecord, names: Sequence[str]) -> PosteriorRecor
 
     Stiffness over mass, and each payload over both; a payload that is zero in some draw has none.
     """
-    scales = [(name, unit) for name, unit in (("young_modulus", "Pa"), ("trunk_mass", "kg")) if name in names]
+    scales = [(name, unit) for name, unit in (("young_modulus", "kg/Pa"), ("trunk_mass", "-")) if name in names]
     found = []
     if len(scales) == 2:
         powers = {"young_modulus": 1.0, "trunk_mass": -1.0}
@@ -276,9 +276,9 @@ def with_ratios(record: PosteriorRecord, names: Sequence[str]) -> PosteriorRecor
     for payload in (name for name in names if name.partition(SEPARATOR)[0] == PAYLOAD):
         own = payload.removeprefix(PAYLOAD)
         for name, unit in scales:
-            words = "payload over stiffness or mass: what motion determines, whatever their common scale is"
             powers = {payload: 1.0, name: -1.0}
-            found.append(ProductOfPowers(f"{PAYLOAD}_over_{name}{own}", f"kg/{unit}", powers, words))
+            words = f"payload over {name.replace('_', ' ')}: what motion determines, whatever their common scale is"
+            found.append(ProductOfPowers(f"{PAYLOAD}_over_{name}{own}", unit, powers, words))
     drawn = [draws for draws in (record.posterior, record.prior) if draws]
     return record.with_derived([p for p in found if all(np.all(draws[n] > 0.0) for draws in drawn for n in p.powers)])
 
