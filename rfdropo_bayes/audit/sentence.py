@@ -142,8 +142,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     elif answer.looks[-1].omnibus.p > answer.question.rules.extended_passes:
         head = f"The best of the library, {named}, explains {share}; the rest may be noise, but that is not certain"
     else:
-        rest = "" if _only_noise(answer) else ", but not all: something else is at work"
-        head = f"The best of the library, {named}, explains {share}{rest}"
+        head = f"The best of the library, {named}, explains {share}, but {_pattern(answer)}"
     return f"{head}{_excluded(answer)}; {_remains(answer)}{_assumption(answer)}.{_adoption(answer)}"
 
 
@@ -218,13 +217,19 @@ def _only_noise(answer: Answer) -> bool:
     )
 
 
+def _pattern(answer: Answer) -> str:
+    """What the joint test says of an extended model that does not pass it."""
+    rules, last = answer.question.rules, answer.looks[-1].omnibus.p
+    words = f"the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
+    sure = last <= rules.base_passes and not _only_noise(answer)
+    return f"{words}: something else is at work" if sure else words
+
+
 def _remains(answer: Answer) -> str:
     assert answer.gain is not None
-    remain, last = f"{1e3 * answer.gain.rmse_extended:.2g} mm remain", answer.looks[-1].omnibus.p
+    remain = f"{1e3 * answer.gain.rmse_extended:.2g} mm remain"
     if _only_noise(answer):
-        rules = answer.question.rules
-        pattern = f", but the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
-        return f"{remain}, no more than repeats differ by{pattern if last <= rules.extended_passes else ''}"
+        return f"{remain}, no more than repeats differ by"
     if answer.target.noise.source != REPEATS:
         return remain
     return f"{remain}, {1e3 * noise_distance(answer.target.noise.first):.2g} mm of it noise"

@@ -20,7 +20,7 @@ TRUTH = {"gain": 1.3, "bend": -0.4}
 
 @pytest.fixture(scope="module")
 def opposed():
-    """Stretch and slack of opposite signs, each of which alone takes next to nothing from what the base model leaves."""
+    """Stretch and slack of opposite signs, each of which alone takes next to nothing of what the base model leaves."""
     return question_of(Opposed(), {**TRUTH, "stretch": 25.0, "slack": -25.0}, 3)
 
 

@@ -57,8 +57,8 @@ def test_what_a_document_shows_can_be_run(document, command, words):
     try:
         _, options = parsed(command)
     except typer.BadParameter as error:
-        assert words, command
-        assert type(error).__name__ == "MissingParameter"
+        if not words or type(error).__name__ != "MissingParameter":
+            raise
         return
     experiment = str(options.get("experiment"))
     assert not experiment.startswith(("experiments/", "benchmarks/")) or (ROOT / experiment).is_file()
