@@ -14,6 +14,7 @@ from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.bayes.space import Parameter, ParameterSpace
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
+ZEROS = "initial_displacement"  # of cables, see `Robot`
 MEASURED = "offset_"  # of the frame: `camera_offset` is the library's name for it
 
 
@@ -50,15 +51,22 @@ def with_held(
         for spec in family:
             prior = prior_from_table(spec, dict(spec.prior), where=spec.name)
             parameters.append(Parameter(spec, prior, "", dict(spec.prior)))
-        words = stem(family).replace("_", " ")
-        own = OwnParameter(
-            stem(family),
-            tuple(family),
-            f"{family[0].description}: not the nominal one",
-            f"measure the {words} of each, or give it a prior in [model.priors]",
-        )
+        cause = f"{family[0].description}: not the nominal one"
+        own = OwnParameter(stem(family), tuple(family), cause, _remedy(family))
         candidates.append(Candidate(own.name, tuple(range(first, len(parameters))), own, own.name))
     return ParameterSpace(tuple(parameters)), candidates
+
+
+def _remedy(family: Sequence[ParameterSpec]) -> str:
+    """What to do at the robot."""
+    name = stem(family)
+    if name == ZEROS:
+        return (
+            "send zero to all drives, and turn each until its cable just begins to move the body; set the drive's zero "
+            "there, or infer initial_displacement in [model.priors]"
+        )
+    places = ", ".join(spec.name.removeprefix(f"{name}_").replace("_", " ") for spec in family)
+    return f"measure the {name.replace('_', ' ')} at each place ({places}), and state it in [model.fixed]"
 
 
 def families(specs: Sequence[ParameterSpec]) -> list[list[ParameterSpec]]:

@@ -98,7 +98,6 @@ def _noise(answer: Answer) -> dict[str, Any]:
 
 def next_experiment(answer: Answer) -> dict[str, Any]:
     """What to do at the robot next, in a sentence, and the candidates that this tells apart."""
-    name = answer.steps[0].name if answer.steps else ""
     apart = next((step for step in answer.steps if len(step.members) > 1), None)
     if answer.verdict == NO_DISCREPANCY:
         words = "Nothing is to be mended for commands like these; record larger and faster ones, and audit them."
@@ -123,11 +122,20 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         words = f"Send what `rfdropo design` proposes to separate {asked}, each three times; {_watch(answer)}."
         return {"sentence": words, "separates": leading}
     else:
-        words = f"Check {spoken(name)} on the robot: {_remedy(answer, name)}."
+        name, share = _largest(answer)
+        most = f", {100 * share:.0f} % of what is wrong" if share and len(answer.steps) > 1 else ""
+        words = f"Check {spoken(name)} on the robot{most}: {_remedy(answer, name)}."
         if not answer.adopted:
             words = f"{words[:-1]}; and record {MORE_TESTS} more test recordings: they show whether the model needs it."
         return {"sentence": words, "separates": [name]}
     return {"sentence": words, "separates": []}
+
+
+def _largest(answer: Answer) -> tuple[str, float | None]:
+    """The step that explains most of the discrepancy, and the share; the first one where no share is known."""
+    shares = zip(answer.steps, _shares(answer), strict=True)
+    step, share = max(shares, key=lambda entry: -np.inf if entry[1] is None else entry[1])
+    return step.name, share
 
 
 def _remedy(answer: Answer, name: str) -> str:

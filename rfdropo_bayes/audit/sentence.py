@@ -129,8 +129,8 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if unclear(answer.question.rules, gain):
         verb, likelier = "is" if len(findings) == 1 else "are", "" if gain.elpd_difference > 0.0 else "no "
         head = (
-            f"{named} {verb} named, but the discrepancy is too small to say how much of it that explains "
-            f"([{low:.0f}, {high:.0f}] %); unseen recordings are {likelier}likelier with it"
+            f"{named} {verb} named, but unseen recordings do not say how much of the discrepancy that explains "
+            f"([{low:.0f}, {high:.0f}] %); they are {likelier}likelier with it"
         )
     elif gain.worse:
         errors = f"{1e3 * gain.rmse_base:.3g} mm without, {1e3 * gain.rmse_extended:.3g} mm with it"
@@ -142,7 +142,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     elif answer.looks[-1].omnibus.p > answer.question.rules.extended_passes:
         head = f"The best of the library, {named}, explains {share}; the rest may be noise, but that is not certain"
     else:
-        head = f"The best of the library, {named}, explains {share}, but not all: something else is at work"
+        head = f"The best of the library, {named}, explains {share}, but {_pattern(answer)}"
     return f"{head}{_excluded(answer)}; {_remains(answer)}{_assumption(answer)}.{_adoption(answer)}"
 
 
@@ -209,15 +209,30 @@ def _excluded(answer: Answer) -> str:
     return f"; {', '.join(worse[:MOST_EXCLUDED])} excluded" if worse else ""
 
 
+def _only_noise(answer: Answer) -> bool:
+    """Whether unseen recordings are missed by no more than repeats differ by."""
+    noise = answer.target.noise
+    return (
+        noise.source == REPEATS and answer.gain is not None and noise_distance(noise.first) >= answer.gain.rmse_extended
+    )
+
+
+def _pattern(answer: Answer) -> str:
+    """What the joint test says of an extended model that does not pass it."""
+    rules, last = answer.question.rules, answer.looks[-1].omnibus.p
+    words = f"the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
+    sure = last <= rules.base_passes and not _only_noise(answer)
+    return f"{words}: something else is at work" if sure else words
+
+
 def _remains(answer: Answer) -> str:
     assert answer.gain is not None
-    noise = noise_distance(answer.target.noise.first)
     remain = f"{1e3 * answer.gain.rmse_extended:.2g} mm remain"
+    if _only_noise(answer):
+        return f"{remain}, no more than repeats differ by"
     if answer.target.noise.source != REPEATS:
         return remain
-    return (
-        f"{remain}, {1e3 * noise:.2g} mm of it noise" if noise < answer.gain.rmse_extended else f"{remain}, all noise"
-    )
+    return f"{remain}, {1e3 * noise_distance(answer.target.noise.first):.2g} mm of it noise"
 
 
 def _resolution(answer: Answer) -> str:

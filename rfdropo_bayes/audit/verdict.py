@@ -18,8 +18,8 @@ NO_DISCREPANCY, EXPLAINED, EQUIVALENT, PARTLY, UNEXPLAINED = (
 
 
 def unclear(rules: Rules, gain: Gain) -> bool:
-    """Whether the discrepancy is too small on unseen trajectories to say how much of it is explained: the interval of
-    the fraction reaches from "none" to "all"."""
+    """Whether unseen trajectories do not say how much of the discrepancy is explained: it is too small, or the fraction
+    differs too much between them, so that its interval reaches from "none" to "all"."""
     return gain.interval[0] <= rules.significant and gain.interval[1] >= rules.explained
 
 

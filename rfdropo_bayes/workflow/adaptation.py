@@ -46,7 +46,7 @@ from rfdropo_bayes.report import build_summary
 from rfdropo_bayes.report.run_folder import CONFIG, POSTERIOR
 from rfdropo_bayes.workflow.assembly import pooling
 from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.calibration import gather_facts, scale_free_ratios
+from rfdropo_bayes.workflow.calibration import gather_facts, with_ratios
 from rfdropo_bayes.workflow.experiment import Experiment, NoiseTable
 from rfdropo_bayes.workflow.experiment_file import describe
 from rfdropo_bayes.workflow.files import hashes, run_folder
@@ -390,4 +390,4 @@ def _record(
     known = {NOISE: STATED, KNOWN_NOISE: {"markers": list(recordings.markers), **noise}}
     attributes = {**fit.attrs, **known, FITTED: list(recordings.names), ADAPTED_TO: day, "seed": seed}
     record = PosteriorRecord(infos, result.draws, dict(prior), tuple(predictions), attrs=attributes)
-    return record.with_derived(scale_free_ratios(problem.names))
+    return with_ratios(record, problem.names)

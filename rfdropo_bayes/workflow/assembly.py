@@ -21,7 +21,6 @@ from rfdropo_bayes.bayes.channels import (
 from rfdropo_bayes.bayes.channels.motor_angle import MOTOR_ANGLE_NOISE
 from rfdropo_bayes.bayes.channels.object_pose import OBJECT_CORRELATION_TIME, OBJECT_NOISE, OBJECT_TURN_NOISE
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN, TENSION_NOISE
-from rfdropo_bayes.bayes.channels.weighed import check_weighed
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import (
     NOISE_CORRELATION_TIME,
@@ -228,9 +227,7 @@ def build_model(experiment: Experiment, simulator: AnySimulator, trajectories: S
     recordings = gather_recordings(simulator, trajectories)
     specs = simulator.parameters + measurement_specs(experiment.model)
     space = model_space(experiment, simulator, specs, recordings.names)
-    channels = gather_channels(experiment, simulator, trajectories, recordings)
-    if isinstance(channels[-1], WeighedParts):
-        check_weighed(channels[-1].entries, space.names)
+    channels = gather_channels(experiment, simulator, trajectories, recordings, space.names)
     return TrajectoryModel(simulator, space, fixed_values(experiment, simulator), recordings, channels)
 
 
@@ -282,11 +279,13 @@ def gather_channels(
     simulator: AnySimulator,
     trajectories: Sequence[Trajectory],
     recordings: RecordingSet,
+    inferred: Sequence[str],
     fitted: int | None = None,
 ) -> tuple[Channel, ...]:
     """What was measured and is to be used, markers first and weighed parts last.
 
-    ``fitted`` is the number of recordings, the first ones, that need what [model] asks for; all by default.
+    ``inferred`` are the names of parameters, of which some may be weighed; ``fitted`` is the number of recordings, the
+    first ones, that need what [model] asks for; all by default.
     """
     table, length = experiment.model, recordings.time.shape[1]
     stated = stated_noise(experiment, recordings, trajectories[0]) if table.noise == STATED else None
@@ -302,7 +301,7 @@ def gather_channels(
         channels = [with_noise_of_repeats(channel, groups) for channel in channels if isinstance(channel, Series)]
     if table.weighed:
         entries = (Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed)
-        channels.append(WeighedParts(tuple(entries)))
+        channels.append(WeighedParts(tuple(entries)).named(inferred))
     return tuple(channels)
 
 

@@ -419,7 +419,7 @@ def _model(
     space = space.holding(space.typical_scales)  # evidences are compared at one spread between groups
     of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
     base = sum(p.spec.name not in of_candidates for p in space.parameters)
-    channels = gather_channels(experiment, simulator, trajectories, recordings, fitted)
+    channels = gather_channels(experiment, simulator, trajectories, recordings, space.names, fitted)
     return TrajectoryModel(simulator, space, fixed_values(experiment, simulator), recordings, channels), base
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
@@ -49,6 +50,7 @@ PREDICTIVE_DRAWS = 200
 PRIOR_DRAWS = 2000
 PRIOR_PREDICTIVE_DRAWS = 64
 START_DRAWS = 1000
+PAYLOAD = "payload_mass"  # which recordings may have for themselves
 CLIMBING = ("laplace", "bridge", "smc")  # smc where it starts at the optima
 
 
@@ -233,7 +235,7 @@ def record_posterior(
             **known_noise(problem),
         },
     )
-    return record.with_derived(scale_free_ratios(problem.names)), cautions
+    return with_ratios(record, problem.names), cautions
 
 
 def row_log_likelihood(
@@ -259,19 +261,26 @@ def check_fit(problem: CalibrationProblem, record: PosteriorRecord, counted: boo
     return check_residuals(list(white), problem.model.recordings.markers, counted=counted)
 
 
-def scale_free_ratios(names: Sequence[str]) -> list[ProductOfPowers]:
-    """Ratios that motion determines where single stiffnesses and masses are not: cables that impose lengths leave the
-    common scale of all stiffnesses and masses free."""
-    if "young_modulus" in names and "trunk_mass" in names:
-        return [
-            ProductOfPowers(
-                "young_modulus_over_trunk_mass",
-                "Pa/kg",
-                {"young_modulus": 1.0, "trunk_mass": -1.0},
-                "stiffness over mass: what the motion of a trunk with length-driven cables determines",
-            )
-        ]
-    return []
+def with_ratios(record: PosteriorRecord, names: Sequence[str]) -> PosteriorRecord:
+    """The record with ratios that motion determines where single stiffnesses and masses are not: cables that impose
+    lengths leave the common scale of all stiffnesses and masses free.
+
+    Stiffness over mass, and each payload over both; a payload that is zero in some draw has none.
+    """
+    scales = [(name, unit) for name, unit in (("young_modulus", "kg/Pa"), ("trunk_mass", "-")) if name in names]
+    found = []
+    if len(scales) == 2:
+        powers = {"young_modulus": 1.0, "trunk_mass": -1.0}
+        words = "stiffness over mass: what the motion of a trunk with length-driven cables determines"
+        found.append(ProductOfPowers("young_modulus_over_trunk_mass", "Pa/kg", powers, words))
+    for payload in (name for name in names if name.partition(SEPARATOR)[0] == PAYLOAD):
+        own = payload.removeprefix(PAYLOAD)
+        for name, unit in scales:
+            powers = {payload: 1.0, name: -1.0}
+            words = f"payload over {name.replace('_', ' ')}: what motion determines, whatever their common scale is"
+            found.append(ProductOfPowers(f"{PAYLOAD}_over_{name}{own}", unit, powers, words))
+    drawn = [draws for draws in (record.posterior, record.prior) if draws]
+    return record.with_derived([p for p in found if all(np.all(draws[n] > 0.0) for draws in drawn for n in p.powers)])
 
 
 def gather_facts(

@@ -30,7 +30,9 @@ class Table(BaseModel):
 class WeighedTable(Table):
     """[[model.weighed]]: parts that were weighed, or other sums of parameters that were measured."""
 
-    parameters: list[str] = Field(min_length=1, description="parameters whose sum was measured")
+    parameters: list[str] = Field(
+        min_length=1, description="parameters whose sum was measured; payload_mass@NAME is that of the recording NAME"
+    )
     value: float = Field(description="the sum, in their unit")
     sd: float = Field(gt=0.0, description="standard deviation of the measurement")
 

@@ -73,7 +73,7 @@ def test_an_effect_too_small_to_say_how_much_it_explains_is_named_and_not_belitt
     assert content["findings"][0]["mechanism"] == "play"
     assert content["gain"]["explained_fraction"] < 0.2  # by chance: the interval goes from 0 to 100 %
     assert content["verdict"] == "unexplained"
-    assert "too small to say how much" in content["sentence"]
+    assert "do not say how much of the discrepancy" in content["sentence"]
 
 
 def test_effects_that_look_the_same_are_one_class():

@@ -173,6 +173,26 @@ def test_the_explained_fraction_is_that_of_the_discrepancy():
     assert covered >= 46
 
 
+@pytest.mark.parametrize("count", [3, 6])
+def test_the_explained_fraction_holds_for_other_recordings_too(count):
+    """Of each recording another share is explained, 40 to 90 %, of a discrepancy of another size. 90 % intervals: 100
+    data sets, of which fewer than 76 cover the truth, 65 %, for one seed in 1000: they hold 87 and 89 % (600 data
+    sets), as jackknife intervals of so few and uneven recordings do. Those of the noise alone hold 11 and 8 %."""
+    rng = np.random.default_rng(11)
+    noise = Stacked((Autoregression(np.ones(12), np.array([1.0, 0.6]), STATED, np.inf),))
+    time = np.arange(60)[:, None]
+    wave = 5.0 * np.sin(time / 9.0 + np.arange(12)) * np.linspace(0.2, 1.6, 12)
+    pattern = noise.whiten(wave + ar1(rng, (2, 60, 12), 0.6), np.ones((2, 60, 12), dtype=bool))
+    valid, covered = np.ones((count, 60, 12), dtype=bool), 0
+    for _ in range(100):
+        error = ar1(rng, (count, 60, 12), 0.6)
+        size, share = np.exp(0.2 * rng.standard_normal((count, 1, 1))), rng.uniform(0.4, 0.9, (count, 1, 1))
+        base, extended = error + size * wave, error + np.sqrt(1.0 - share) * size * wave
+        _, (low, high) = explained_fraction(Unseen(error, valid), base, extended, noise, pattern, rng)
+        covered += low <= 0.65 <= high
+    assert covered >= 76
+
+
 def test_the_error_of_the_noise_floor_is_that_of_repeated_estimates():
     """The floor at slow frequencies is known worse than the variance. 200 estimates show a deviation to 5 %, three
     times of which fails for one seed in 400."""

@@ -28,6 +28,7 @@ STEP = 0.05
 ROWS = 80
 NOISE, MEMORY = 5e-4, 0.6
 WEIGHTS = np.random.default_rng(7).normal(size=(7, 4, 3)) * 1e-2
+FURTHER = 0.03 * np.linalg.qr(np.random.default_rng(8).normal(size=(12, 2)))[0].T.reshape(2, 4, 3)
 WIDE = {"distribution": "Normal", "loc": 0.0, "scale": 1.0}
 
 
@@ -92,7 +93,7 @@ class Named:
 
     def __init__(self, name: str) -> None:
         self.name, self.cause, self.remedy = name, "a cause", "a remedy"
-        self.parameters = CANDIDATES_OF_CABLES[name]
+        self.parameters = EVERY_CANDIDATE[name]
 
 
 class Pulling(Toy):
@@ -107,7 +108,39 @@ class Pulling(Toy):
         return super().rollout(parameters, commands, steps)._replace(tension=tension)
 
 
-CANDIDATES_OF_CABLES = {**CANDIDATES, "drag": (Pulling.parameters[-1],)}
+FREE = {"distribution": "Normal", "loc": 0.0, "scale": 20.0}
+
+
+class Opposed(Toy):
+    """The toy with two effects that nearly look the same: ``stretch`` and ``slack`` of opposite signs are a third."""
+
+    added = types.MappingProxyType({"stretch": (spec("stretch", prior=FREE),), "slack": (spec("slack", prior=FREE),)})
+    parameters = (*Toy.parameters, *added["stretch"], *added["slack"])
+
+    def rollout(self, parameters, commands, steps=None):
+        seen = super().rollout(parameters, commands, steps)
+        level = jnp.concatenate([commands.initial[None], commands.step])[:, 1, None, None]
+        stretch, slack = (parameters.get(name, 0.0) for name in self.added)
+        return seen._replace(
+            position=seen.position + level * ((stretch + slack) * FURTHER[0] + 0.02 * (stretch - slack) * FURTHER[1])
+        )
+
+
+class Geared(Toy):
+    """The toy with a gain of each of its two cables beside ``radius``, which is a gain of both."""
+
+    added = types.MappingProxyType({"cable_gains": (spec("gain_a"), spec("gain_b"))})
+    parameters = (spec("radius"), *Toy.parameters, *added["cable_gains"])
+
+    def rollout(self, parameters, commands, steps=None):
+        seen = super().rollout(parameters, commands, steps)
+        level = jnp.concatenate([commands.initial[None], commands.step])
+        radius, first, second = (parameters.get(name, 0.0) for name in ("radius", "gain_a", "gain_b"))
+        turned = (radius + first) * level[:, 0, None, None] * FURTHER[0]
+        return seen._replace(position=seen.position + turned + (radius + second) * level[:, 1, None, None] * FURTHER[1])
+
+
+EVERY_CANDIDATE = {**CANDIDATES, "drag": (Pulling.parameters[-1],), **Opposed.added, **Geared.added}
 
 
 def recordings(truth: dict, seed: int, toy: Toy | None = None) -> list[Trajectory]:
@@ -205,3 +238,22 @@ def question_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Wei
 
 
 TRUTH_OF_CABLES = {"gain": 1.3, "bend": -0.4}
+
+
+def question_of(toy: Opposed | Geared, truth: dict, seed: int, base: int = len(BASE)) -> Question:
+    """A data set of a toy with further candidates, which are all that may be named."""
+    asked, trajectories = question({}, seed), recordings(truth, seed, toy)
+    gathered = gather_recordings(toy, trajectories)
+    space = build_space(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
+    nominal = {s.name: s.nominal for s in toy.parameters}
+    place = {name: i for i, name in enumerate(space.names)}
+    return replace(
+        asked,
+        lanes=Lanes(toy, np.arange(4)),
+        coordinates=Coordinates(space, base, tuple(nominal), nominal, {}),
+        model=TrajectoryModel(toy, space, {}, gathered, (Markers.gather(gathered, "repeats"),)),
+        trajectories=trajectories[:4],
+        candidates=[
+            Candidate(name, tuple(place[s.name] for s in specs), Named(name), name) for name, specs in toy.added.items()
+        ],
+    )

@@ -14,7 +14,6 @@ from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.channels import Markers, Seen, Tension, Weighed, WeighedParts
 from rfdropo_bayes.bayes.channels.channel import ABOVE_ZERO
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN, TENSION_NOISE
-from rfdropo_bayes.bayes.channels.weighed import check_weighed
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
@@ -160,11 +159,26 @@ def test_what_cannot_be_used_is_refused():
     with pytest.raises(InputError, match="has no cable tensions"):
         Tension.gather(HangingMass(), [recording(tension=False)], 15)
     with pytest.raises(InputError, match="weighed but is not inferred"):
-        check_weighed([Weighed(("maas",), 0.1, 0.01)], ("mass",))
+        WeighedParts((Weighed(("maas",), 0.1, 0.01),)).named(("mass",))
     other = HangingMass()
     other.cable_names = ("push",)
     with pytest.raises(InputError, match="no cables of the robot"):
         Tension.gather(other, [recording()], 15)
+
+
+def test_a_weighed_part_of_one_recording_goes_by_the_name_of_the_whole_where_one_piece_is_fitted():
+    names = ("load@a[0:99]", "load@b[0:9]", "load@b[20:29]", "load")
+
+    def named(name: str) -> tuple[str, ...]:
+        return WeighedParts((Weighed((name,), 0.1, 0.01),)).named(names).entries[0].parameters
+
+    assert named("load@a") == named("load@a[0:99]") == ("load@a[0:99]",)
+    assert named("load") == ("load",)
+    assert named("load@b[20:29]") == ("load@b[20:29]",)
+    with pytest.raises(InputError, match="several pieces"):
+        named("load@b")
+    with pytest.raises(InputError, match="not inferred"):
+        named("load@c")
 
 
 def test_a_parameter_of_the_second_recording_alone_acts_there_and_is_nominal_in_the_first():

@@ -139,18 +139,6 @@ def bench(request, tmp_path_factory, bar_mesh) -> Bench:
     return made
 
 
-def words_of(documents: list[str]) -> set[str]:
-    """Commands that the documents call."""
-    text = "\n".join((REPOSITORY / name).read_text() for name in documents)
-    return set(re.findall(r"rfdropo (\w+)", text)) - {"COMMAND"}
-
-
-def test_every_command_of_the_documents_exists() -> None:
-    known = {command.name or command.callback.__name__ for command in app.registered_commands}
-    known |= {group.name for group in app.registered_groups}
-    assert words_of(["README.md", "docs/your_robot.md", "docs/audit.md", "docs/inference.md"]) <= known
-
-
 def test_every_command_is_in_the_matrix() -> None:
     """Those of a calibration; lists, training and motors have tests of their own."""
     source = Path(__file__).read_text()
@@ -249,6 +237,34 @@ def test_design_proposes_commands(bench, tmp_path) -> None:
     rfdropo("design", bench.experiment, "--out", tmp_path / "design", overrides=bench.overrides)
     assert json.loads((tmp_path / "design" / "design.json").read_text())["sentence"]
     assert len(pd.read_csv(tmp_path / "design" / "next_commands.csv"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bench", ["demo"], indirect=True)
+def test_two_groups_of_recordings_are_compared(bench, tmp_path) -> None:
+    pieces = ", ".join(f'{{observations="{DEMO.parent}/demo/demo_{k}.nc", rows=[0, {ROWS}]}}' for k in (1, 2))
+    groups = ['model.groups.before=["demo_1*"]', 'model.groups.after=["demo_2*"]']
+    rfdropo(
+        *("audit", bench.experiment, "--between", "before", "after", "--out", tmp_path / "days"),
+        overrides=[*bench.overrides, f"data.fit=[{pieces}]", *groups],
+    )
+    found = json.loads((tmp_path / "days" / "audit.json").read_text())
+    assert found["between"]["groups"] == {name: [f"demo_{k}[0:{ROWS}]"] for name, k in (("before", 1), ("after", 2))}
+    assert (tmp_path / "days" / "report.html").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bench", ["demo"], indirect=True)
+def test_design_proposes_commands_that_determine_a_day(bench, tmp_path) -> None:
+    rfdropo(
+        *("design", bench.experiment, "--base", bench.run, "--adapt", "--seconds", "1", "--out", tmp_path / "day"),
+        overrides=[*bench.overrides, "model.per_group.young_modulus=1e5"],
+    )
+    proposed = pd.read_csv(tmp_path / "day" / "next_commands.csv")
+    assert proposed["time_s"].between(0.0, 1.0).all()
+    assert np.isfinite(proposed.to_numpy()).all()
+    assert proposed.shape[1] == 5  # time and the four cables
+    assert json.loads((tmp_path / "day" / "design.json").read_text())["sentence"]
 
 
 @pytest.mark.slow

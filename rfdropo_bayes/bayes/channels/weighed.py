@@ -7,7 +7,7 @@ balance fixes the factor, as a tension reading does.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -16,7 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.channels.channel import Channel, Seen
+from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import whole
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
@@ -40,6 +42,19 @@ class WeighedParts(Channel):
 
     name: ClassVar[str] = "weighed"
     entries: tuple[Weighed, ...]
+
+    def named(self, names: Sequence[str]) -> WeighedParts:
+        """The same, each parameter by the name under which it is inferred.
+
+        The whole recording's name stands for its only piece: ``payload_mass@a`` for ``payload_mass@a[0:99]``.
+
+        Raises:
+            InputError: a part that is no inferred parameter, or one of several.
+        """
+        entries = (
+            entry._replace(parameters=tuple(_found(p, names) for p in entry.parameters)) for entry in self.entries
+        )
+        return replace(self, entries=tuple(entries))
 
     @property
     def specs(self) -> tuple[ParameterSpec, ...]:
@@ -72,17 +87,10 @@ class WeighedParts(Channel):
         return self._sums(seen.values) + self._sd * jax.random.normal(key, (len(self.entries),))
 
 
-def check_weighed(weighed: Sequence[Weighed], names: Sequence[str]) -> None:
-    """Raise InputError for a part that is no inferred parameter, or a deviation that is not positive."""
-    for entry in weighed:
-        for name in entry.parameters:
-            if name not in names:
-                raise InputError(
-                    f"{name!r} was weighed but is not inferred",
-                    where="[[model.weighed]]",
-                    remedy=f"one of {', '.join(names)}",
-                )
-        if not (entry.sd > 0.0 and np.isfinite(entry.value)):
-            raise InputError(
-                "a weighed value needs a positive sd", where="[[model.weighed]]", remedy="give value and sd"
-            )
+def _found(name: str, names: Sequence[str]) -> str:
+    """The one of ``names`` that is meant."""
+    pieces = [known for known in names if SEPARATOR in known and whole(known) == name]
+    if name in names or len(pieces) == 1:
+        return name if name in names else pieces[0]
+    what = f"several pieces of {name!r} are fitted" if pieces else f"{name!r} was weighed but is not inferred"
+    raise InputError(what, where="[[model.weighed]]", remedy=f"one of {', '.join(pieces or names)}")
