@@ -277,6 +277,8 @@ def _as_recording(
 
 def _sentence(kind: str, outlook: Outlook, length: float, before: float, error: float) -> str:
     what = f"Record the first {length:.3g} s of the {kind} in {COMMANDS}"
+    if length == 0.0:
+        what = "The first row of a recording is enough, before anything moves"
     change = f"what is not known of the day then moves the last marker by {1e3 * outlook.left:.2g} mm"
     change = f"{change}, and by {1e3 * before:.2g} mm without it"
     if np.isfinite(outlook.seconds):

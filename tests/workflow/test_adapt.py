@@ -337,3 +337,12 @@ def test_the_command_refuses_a_folder_without_a_posterior(tmp_path):
     found = CliRunner().invoke(app, ["adapt", str(tmp_path), "--recording", "x.csv", "--out", str(tmp_path / "out")])
     assert isinstance(found.exception, rb.InputError)
     assert "holds no posterior.nc" in str(found.exception)
+
+
+def test_a_day_that_one_row_determines_needs_no_motion() -> None:
+    assert day_design._sentence("chirp", day_design.Outlook(left=0.001, seconds=0.0), 0.0, 0.002, 0.005).startswith(
+        "The first row"
+    )
+    assert day_design._sentence("chirp", day_design.Outlook(left=0.001, seconds=1.5), 1.5, 0.02, 0.005).startswith(
+        "Record the first 1.5 s"
+    )
