@@ -111,12 +111,12 @@ def test_an_episode_is_recorded_as_a_video(tmp_path) -> None:
     pytest.importorskip("moviepy", reason="an extra that RecordVideo needs")
     env = gymnasium.make(REACH, actions="continuous", render_mode="rgb_array", period=0.1)
     assert env.unwrapped.metadata["render_fps"] == 10
-    filmed = gymnasium.wrappers.RecordVideo(env, str(tmp_path))
+    filmed = gymnasium.wrappers.RecordVideo(env, str(tmp_path / "videos"))
     filmed.reset(seed=0)
     for _ in range(3):
         filmed.step(np.zeros(8, dtype=np.float32))
     filmed.close()
-    assert next(tmp_path.glob("*.mp4")).stat().st_size > 5000
+    assert next((tmp_path / "videos").glob("*.mp4")).stat().st_size > 5000
 
 
 def test_episodes_without_a_seed_differ() -> None:
