@@ -142,8 +142,9 @@ class ParameterSpace:
     ) -> dict[str, Float[Array, " n"]]:
         """Prior draws with draws of an earlier posterior in the place of the parameters that it holds.
 
-        A parameter of one recording takes the value of the same recording, else that which all recordings shared, else
-        that of another recording; a deviation of one group takes that of the same group or none.
+        The first takes the first of these, the others take them at random. A parameter of one recording takes the value
+        of the same recording, else that which all recordings shared, else that of another recording; a deviation of one
+        group takes that of the same group or none.
         """
         prior_key, choice = jax.random.split(key)
         values = self.sample(prior_key, n)
@@ -154,7 +155,7 @@ class ParameterSpace:
             if known:
                 # The same rows for all parameters: their values belong together.
                 draws = jnp.asarray(earlier[known[0]])
-                chosen = draws[jax.random.randint(choice, (n,), 0, len(draws))]
+                chosen = draws[jax.random.randint(choice, (n,), 0, len(draws)).at[0].set(0)]
                 values[parameter.name] = parameter.inside(chosen, values[parameter.name])
         return values
 

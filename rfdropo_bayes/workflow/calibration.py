@@ -38,7 +38,8 @@ from rfdropo_bayes.prediction.predictive import (
 from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, build_summary, software_versions
 from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
-from rfdropo_bayes.report.run_folder import POSTERIOR
+from rfdropo_bayes.report.run_folder import POSTERIOR, SUMMARY
+from rfdropo_bayes.report.summary import read_summary
 from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.workflow.calibrated import Calibration
 from rfdropo_bayes.workflow.experiment import Experiment, InferenceTable
@@ -79,7 +80,7 @@ def calibrate(
         seed: of all that is random. The same seed gives the same draws.
         out: folder that gets posterior.nc, summary.json, report.html and checkpoints; None writes nothing.
         start: an earlier calibration of the same robot, or its folder, perhaps with fewer mechanisms or other
-            recordings: climbs start from its posterior. What is inferred, and from which data, does not change.
+            recordings: climbs start from its optimum and draws. What is inferred, and from which data, does not change.
         title: heading of the report; the robot's name by default.
         resume: go on from the checkpoint of an interrupted run of the same experiment in ``out``.
         overwrite: start anew whatever ``out`` holds.
@@ -165,7 +166,10 @@ def run_calibration(
 
 
 def earlier_draws(start: Calibration | Path | None, method: str) -> Batch | None:
-    """Draws of an earlier calibration, or of its folder, chains joined; None without one.
+    """What an earlier calibration, or its folder, says of where climbs may start; None without one.
+
+    Its optimum where it has one, the first of the rows, and as often its draws: of many parameters that rollouts do not
+    take linearly a draw may fit far worse than the optimum that it was drawn around.
 
     Raises:
         InputError: a folder that holds no posterior, or a method that does not climb.
@@ -178,8 +182,16 @@ def earlier_draws(start: Calibration | Path | None, method: str) -> Batch | None
             where="--from",
             remedy=f"leave it out, or use one of {', '.join(CLIMBING)}",
         )
-    record = start.record if isinstance(start, Calibration) else PosteriorRecord.load(Path(start) / POSTERIOR)
-    return thin({info.name: record.posterior[info.name] for info in record.free}, START_DRAWS)
+    if isinstance(start, Calibration):
+        record, content = start.record, start.content
+    else:
+        record = PosteriorRecord.load(Path(start) / POSTERIOR)
+        content = read_summary(Path(start) / SUMMARY) if (Path(start) / SUMMARY).is_file() else {}
+    draws = thin({info.name: record.posterior[info.name] for info in record.free}, START_DRAWS)
+    optimum = content.get("optimum") or {}
+    if not set(draws) <= set(optimum):
+        return draws
+    return {name: np.concatenate([np.full(len(column), optimum[name]), column]) for name, column in draws.items()}
 
 
 def inference_options(experiment: Experiment) -> dict[str, Any]:

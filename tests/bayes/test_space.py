@@ -142,6 +142,15 @@ def test_a_climb_starts_from_a_group_s_own_deviation_and_from_no_other_s():
     assert len(np.unique(values["offset_x_deviation@april"])) == 50
 
 
+def test_the_first_draw_around_an_earlier_posterior_is_its_first():
+    earlier = {"young_modulus": np.linspace(1.1e6, 2e6, 30), "offset_x": np.linspace(0.001, 0.01, 30)}
+    for seed in range(5):
+        values = pooled_space().sample_around(earlier, jax.random.key(seed), 3)
+        np.testing.assert_allclose(values["young_modulus"][0], 1.1e6)
+        assert values["offset_x"][0] == pytest.approx(0.001)
+        assert len(np.unique(values["young_modulus"])) > 1
+
+
 def test_a_group_that_names_a_recording_comes_before_wildcards():
     assert group_of("a1", {**DAYS, "winter": "a1"}) == "winter"
     assert group_of("a1[0:45]", {**DAYS, "winter": ["a1", "b"]}) == "winter"

@@ -16,7 +16,8 @@ import pytest
 
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.posteriors import PosteriorRecord, load_posterior
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, load_posterior
+from rfdropo_bayes.workflow.calibrated import Calibration
 from rfdropo_bayes.workflow.calibration import earlier_draws, run_calibration
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -100,3 +101,15 @@ def test_a_start_is_refused_where_it_would_be_ignored_or_is_not_there(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         earlier_draws(tmp_path, "laplace")
     assert earlier_draws(None, "nested") is None
+
+
+def test_climbs_start_from_the_optimum_of_an_earlier_calibration(tmp_path):
+    """Draws of many parameters may all fit worse than the optimum; a folder without summary has draws alone."""
+    draws = {"young_modulus": np.array([[1e6, 2e6, 3e6]])}
+    info = ParameterInfo("young_modulus", "Pa", 0.0, np.inf, {}, "")
+    record = PosteriorRecord((info,), draws, draws, ())
+    record.save(tmp_path / "posterior.nc")
+    np.testing.assert_allclose(earlier_draws(tmp_path, "laplace")["young_modulus"], [1e6, 2e6, 3e6])
+    for optimum, expected in (({"young_modulus": 5e6}, [5e6, 5e6, 5e6, 1e6, 2e6, 3e6]), (None, [1e6, 2e6, 3e6])):
+        found = earlier_draws(Calibration(record, {"optimum": optimum}, ""), "laplace")
+        np.testing.assert_allclose(found["young_modulus"], expected)
