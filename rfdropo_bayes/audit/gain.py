@@ -45,10 +45,12 @@ class Unseen(NamedTuple):
     Attributes:
         position: coordinates of the markers [m], which are the first columns.
         valid: where a value may be used, in all columns.
+        names: of the trajectories.
     """
 
     position: Float[np.ndarray, "trajectory time coordinate"]
     valid: Bool[np.ndarray, "trajectory time column"]
+    names: tuple[str, ...]
 
     @property
     def markers(self) -> int:
@@ -58,6 +60,19 @@ class Unseen(NamedTuple):
     def predicted(self, prediction: Prediction) -> Float[np.ndarray, "trajectory time coordinate"]:
         """Where a model has the markers, in the mean over its draws [m]."""
         return self.position - prediction.mean[..., : self.markers]
+
+
+class Difference(NamedTuple):
+    """Base model against extended model, on one unseen trajectory.
+
+    Attributes:
+        rmse_base, rmse_extended: root mean square distance of a marker [m].
+        elpd: log predictive density of the extended model less that of the base.
+    """
+
+    rmse_base: float
+    rmse_extended: float
+    elpd: float
 
 
 @dataclass(frozen=True)
@@ -73,8 +88,7 @@ class Gain:
         explained: share of the base model's discrepancy that the extension takes away; interval: its 90 % interval,
             for recordings like these.
         floor: the noise's root mean square distance of a marker [m].
-        trajectories: how many.
-        elpd_least: the smallest difference of any of them.
+        differences: the same of each trajectory, by name.
     """
 
     rmse_base: float
@@ -86,8 +100,12 @@ class Gain:
     explained: float
     interval: tuple[float, float]
     floor: float
-    trajectories: int
-    elpd_least: float
+    differences: dict[str, Difference]
+
+    @property
+    def trajectories(self) -> int:
+        """How many there are."""
+        return len(self.differences)
 
     @property
     def worse(self) -> bool:
@@ -97,7 +115,12 @@ class Gain:
     @property
     def opposed(self) -> bool:
         """Whether one of a few trajectories speaks clearly against the extension, though all together favour it."""
-        return self.elpd_p is None and self.elpd_difference > 0.0 and self.elpd_least <= -TELLING
+        return self.elpd_p is None and self.elpd_difference > 0.0 and bool(self.against)
+
+    @property
+    def against(self) -> dict[str, Difference]:
+        """Trajectories that are clearly less likely with the extension."""
+        return {name: each for name, each in self.differences.items() if each.elpd <= -TELLING}
 
     @property
     def clear(self) -> bool:
@@ -135,15 +158,17 @@ def measure_gain(
         spread: deviation of the extended model's errors, for its bands; that of the measurements' noise by default.
     """
     first, second = (np.where(unseen.valid, p.mean, 0.0) for p in (base, extended))
-    markers = max(unseen.valid[..., : unseen.markers].sum() / 3.0, 1.0)
+    distances = np.array([_distances(unseen, left) for left in (first, second)])
     own = [_elpd(unseen, p, judge or noise) for p in (base, extended)]
     difference = own[1] - own[0]
     count = len(difference)
     explained, interval = explained_fraction(unseen, first, second, noise, pattern, rng)
-    rmse = [float(np.sqrt(np.sum(left[..., : unseen.markers] ** 2) / markers)) for left in (first, second)]
+    seen = unseen.valid[..., : unseen.markers].sum(axis=(1, 2))
+    rmse = np.sqrt(distances**2 @ seen / max(seen.sum(), 1))
+    each = (Difference(*map(float, row)) for row in zip(*distances, difference, strict=True))
     return Gain(
-        rmse_base=rmse[0],
-        rmse_extended=rmse[1],
+        rmse_base=float(rmse[0]),
+        rmse_extended=float(rmse[1]),
         elpd_difference=float(difference.sum()),
         elpd_difference_se=float(np.sqrt(count) * difference.std(ddof=1)) if count >= DIFFERENCE_FROM else None,
         elpd_p=sign_flip_p(difference, rng) if count >= DIFFERENCE_FROM else None,
@@ -151,9 +176,14 @@ def measure_gain(
         explained=explained,
         interval=interval,
         floor=noise_distance(noise.first),
-        trajectories=count,
-        elpd_least=float(difference.min()),
+        differences=dict(zip(unseen.names, each, strict=True)),
     )
+
+
+def _distances(unseen: Unseen, left: Float[np.ndarray, "trajectory time column"]) -> Float[np.ndarray, " trajectory"]:
+    """Root mean square distance of a marker [m], of each trajectory."""
+    markers = np.maximum(unseen.valid[..., : unseen.markers].sum(axis=(1, 2)) / 3.0, 1.0)
+    return np.sqrt(np.sum(left[..., : unseen.markers] ** 2, axis=(1, 2)) / markers)
 
 
 def sign_flip_p(difference: Float[np.ndarray, " n"], rng: np.random.Generator) -> float:

@@ -534,7 +534,7 @@ def _predicted(question: Question, judge: Target, inquiry: Inquiry, base: Fit, s
     if every > count:
         which = "test recordings"
         tested = measurements_of(question, range(count, every))
-        unseen = _unseen(tested, tested.valid)
+        unseen = _unseen(tested, tested.valid, question.model.recordings.names[count:])
         predictions = []
         for i, fit in enumerate(fits):
             forward = simulated(question, DISCRETISATION in names[: i + 1], tested, range(count, every))
@@ -547,9 +547,10 @@ def _predicted(question: Question, judge: Target, inquiry: Inquiry, base: Fit, s
     return HeldOut(which, unseen, predictions, patterns, target.noise, noises, spreads, question.seed)
 
 
-def _unseen(tested: Measurements, valid: np.ndarray) -> Unseen:
+def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) -> Unseen:
     position = np.asarray(tested.channels[0].measured)
-    return Unseen(position.reshape(*position.shape[:2], -1), valid)
+    names = tuple(" and ".join(recordings[i] for i in group) for group in tested.members)
+    return Unseen(position.reshape(*position.shape[:2], -1), valid, names)
 
 
 def _left_out(
@@ -584,4 +585,4 @@ def _left_out(
             joined = np.where(mask, part[:draws], joined)
         predictions.append(Prediction(joined))
     valid = measured.valid & np.any(np.broadcast_arrays(*masks, measured.valid)[:-1], axis=0)
-    return held_out, _unseen(measured, valid), predictions
+    return held_out, _unseen(measured, valid, question.model.recordings.names), predictions

@@ -163,10 +163,10 @@ def _p(answer: Answer) -> str:
 def _adoption(answer: Answer) -> str:
     """What of the findings joins the model for good."""
     if not answer.adopted and answer.gain is not None and answer.gain.opposed and not answer.gain.worse:
-        return (
-            " One of the unseen recordings is clearly less likely with this: extended.toml keeps the base model. "
-            "Compare groups of recordings with --between."
-        )
+        worst, found = min(answer.gain.against.items(), key=lambda item: item[1].elpd)
+        errors = f"{1e3 * found.rmse_base:.3g} mm without, {1e3 * found.rmse_extended:.3g} mm with it"
+        compare = "" if answer.question.groups else " Compare groups of recordings with --between."
+        return f" {worst} is clearly less likely with this ({errors}): extended.toml keeps the base model.{compare}"
     if not answer.adopted:
         return " Unseen recordings do not clearly support this: extended.toml keeps the base model."
     if answer.unsupported:

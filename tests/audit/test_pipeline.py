@@ -7,6 +7,7 @@ import json
 import re
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,12 +21,12 @@ from rfdropo_bayes.audit.experiment_design import Hypothesis, at_hand, outlooks
 from rfdropo_bayes.audit.extension import Inquiry, Rules, Step
 from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
-from rfdropo_bayes.audit.gain import Gain
+from rfdropo_bayes.audit.gain import Difference, Gain
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import gather_measurements
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.record import next_experiment, record
-from rfdropo_bayes.audit.sentence import _named
+from rfdropo_bayes.audit.sentence import _adoption, _named
 from rfdropo_bayes.audit.verdict import decide
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
@@ -524,7 +525,8 @@ def test_the_smallest_p_value_of_a_bootstrap_is_a_bound():
     assert p_value(0.012) == "0.012"
 
 
-GAIN = Gain(2.0, 1.0, 50.0, 5.0, 0.02, {}, 0.5, (0.3, 0.7), 0.5, 6, 0.0)
+GAIN = Gain(2.0, 1.0, 50.0, 5.0, 0.02, {}, 0.5, (0.3, 0.7), 0.5, {"run": Difference(2.0, 1.0, 50.0)})
+OPPOSED = {"a": Difference(2.0, 1.0, 54.0), "b": Difference(2.0, 2.1, -4.0)}
 
 
 @pytest.mark.parametrize(
@@ -538,7 +540,7 @@ GAIN = Gain(2.0, 1.0, 50.0, 5.0, 0.02, {}, 0.5, (0.3, 0.7), 0.5, 6, 0.0)
         ({"elpd_difference": -1.0, "elpd_p": None}, False, False),
         ({"elpd_difference": 4.0, "elpd_p": None}, False, True),  # too few recordings to tell from chance
         ({"elpd_difference": 2.0, "elpd_p": None}, False, False),  # of few, a twentieth of a chance is allowed
-        ({"elpd_p": None, "elpd_least": -4.0}, False, False),  # one of these few speaks against it
+        ({"elpd_p": None, "differences": OPPOSED}, False, False),  # one of these few speaks against it
     ],
 )
 def test_a_verdict_agrees_with_the_errors(changes, worse, clear):
@@ -548,6 +550,15 @@ def test_a_verdict_agrees_with_the_errors(changes, worse, clear):
     assert (verdict == "unexplained") == worse
     if not clear:
         assert decide(Rules(), 0.001, 0.5, [1], replace(gain, explained=0.95)) not in ("explained", "equivalent")
+
+
+@pytest.mark.parametrize("groups", [None, ((0,), (1,))])
+def test_the_recording_that_speaks_against_an_extension_is_named(groups):
+    """Groups are to be compared where they have not been."""
+    gain = replace(GAIN, elpd_p=None, differences=OPPOSED)
+    words = _adoption(SimpleNamespace(adopted=[], gain=gain, unsupported=[], question=SimpleNamespace(groups=groups)))
+    assert words.startswith(" b is clearly less likely with this (2e+03 mm without, 2.1e+03 mm with it)")
+    assert ("--between" in words) == (groups is None)
 
 
 def test_of_many_sizes_the_surest_are_said_in_their_order():

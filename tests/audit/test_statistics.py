@@ -14,7 +14,15 @@ from rfdropo_bayes.audit.bootstrap import null_residuals, tail
 from rfdropo_bayes.audit.coordinates import Support
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.fit import Fit, widened
-from rfdropo_bayes.audit.gain import Gain, Unseen, _floor_error, _noise_power, explained_fraction, sign_flip_p
+from rfdropo_bayes.audit.gain import (
+    Difference,
+    Gain,
+    Unseen,
+    _floor_error,
+    _noise_power,
+    explained_fraction,
+    sign_flip_p,
+)
 from rfdropo_bayes.audit.omnibus import joint_test, statistics
 from rfdropo_bayes.audit.score import Signature, joint_statistic, likeness, project_out, signature, span, statistic
 from rfdropo_bayes.audit.verdict import decide
@@ -165,7 +173,7 @@ def test_the_explained_fraction_is_that_of_the_discrepancy():
         stated = Autoregression(size * np.ones(12), noise.autocorrelation, REPEATS, 2400.0)
         pattern = stated.whiten(ar1(RNG, (2, 100, 12), 0.6) + wave, np.ones((2, 100, 12), dtype=bool))
         point, (low, high) = explained_fraction(
-            Unseen(error, valid), error + wave, error + 0.5 * wave, Stacked((stated,)), pattern, RNG
+            Unseen(error, valid, tuple("abcdef")), error + wave, error + 0.5 * wave, Stacked((stated,)), pattern, RNG
         )
         points.append(point)
         covered += low <= 0.75 <= high
@@ -188,7 +196,9 @@ def test_the_explained_fraction_holds_for_other_recordings_too(count):
         error = ar1(rng, (count, 60, 12), 0.6)
         size, share = np.exp(0.2 * rng.standard_normal((count, 1, 1))), rng.uniform(0.4, 0.9, (count, 1, 1))
         base, extended = error + size * wave, error + np.sqrt(1.0 - share) * size * wave
-        _, (low, high) = explained_fraction(Unseen(error, valid), base, extended, noise, pattern, rng)
+        _, (low, high) = explained_fraction(
+            Unseen(error, valid, tuple("abcdef"[:count])), base, extended, noise, pattern, rng
+        )
         covered += low <= 0.65 <= high
     assert covered >= 76
 
@@ -233,7 +243,7 @@ def test_coordinates_are_those_of_the_prior_s_own_transform(prior, low, high):
 
 
 def gain(explained: float, low: float) -> Gain:
-    return Gain(2e-3, 1e-3, 10.0, 2.0, 0.02, {}, explained, (low, 1.0), 9e-4, 6, 0.0)
+    return Gain(2e-3, 1e-3, 10.0, 2.0, 0.02, {}, explained, (low, 1.0), 9e-4, {"run": Difference(2e-3, 1e-3, 10.0)})
 
 
 @pytest.mark.parametrize(
