@@ -134,9 +134,17 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         most = f", {100 * share:.0f} % of what is wrong" if share and len(answer.steps) > 1 else ""
         words = f"Check {spoken(name)} on the robot{most}: {_remedy(answer, name)}."
         if not answer.adopted:
-            words = f"{words[:-1]}; and record {MORE_TESTS} more test recordings: they show whether the model needs it."
+            words = f"{words[:-1]}; and {_doubt(answer)}."
         return {"sentence": words, "separates": [name]}
     return {"sentence": words, "separates": []}
+
+
+def _doubt(answer: Answer) -> str:
+    """What shows whether a mechanism that is not adopted is there."""
+    gain = answer.gain
+    if gain is None or not gain.opposed or gain.worse or answer.question.groups:
+        return f"record {MORE_TESTS} more test recordings: they show whether the model needs it"
+    return f"see whether it was otherwise in {' and '.join(gain.against)}: compare groups of recordings with --between"
 
 
 def _largest(answer: Answer) -> tuple[str, float | None]:

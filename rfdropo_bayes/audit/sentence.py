@@ -165,8 +165,7 @@ def _adoption(answer: Answer) -> str:
     if not answer.adopted and answer.gain is not None and answer.gain.opposed and not answer.gain.worse:
         worst, found = min(answer.gain.against.items(), key=lambda item: item[1].elpd)
         errors = f"{1e3 * found.rmse_base:.3g} mm without, {1e3 * found.rmse_extended:.3g} mm with it"
-        compare = "" if answer.question.groups else " Compare groups of recordings with --between."
-        return f" {worst} is clearly less likely with this ({errors}): extended.toml keeps the base model.{compare}"
+        return f" {worst} is clearly less likely with this ({errors}): extended.toml keeps the base model."
     if not answer.adopted:
         return " Unseen recordings do not clearly support this: extended.toml keeps the base model."
     if answer.unsupported:

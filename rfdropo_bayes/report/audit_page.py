@@ -89,10 +89,10 @@ def shown(answer: Answer) -> figures.Shown:
     probed = [row for row in answer.looks[0].rows if row.probe is not None][:MOST_COSINES]
     marks = [row.probe.mark for row in probed if row.probe is not None]
     unseen = None
-    if answer.predictions is not None and answer.unseen is not None:
+    if answer.predictions is not None and answer.unseen is not None and answer.gain is not None:
         recordings, (base, extended) = answer.unseen, map(answer.unseen.predicted, answer.predictions)
         valid = recordings.valid[..., : recordings.markers]
-        worst = int(np.argmax(np.sum((recordings.position - base) ** 2 * valid, (1, 2))))
+        worst = int(np.argmax([each.rmse_base for each in answer.gain.differences.values()]))
         seen = valid[worst].any(axis=1)
         measured = np.where(valid, recordings.position, np.nan)
         series = {"measured": measured, "base model": base, "extended model": extended}

@@ -25,7 +25,7 @@ from rfdropo_bayes.audit.gain import Difference, Gain
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import gather_measurements
 from rfdropo_bayes.audit.pipeline import audit, base_model
-from rfdropo_bayes.audit.record import next_experiment, record
+from rfdropo_bayes.audit.record import _doubt, next_experiment, record
 from rfdropo_bayes.audit.sentence import _adoption, _named
 from rfdropo_bayes.audit.verdict import decide
 from rfdropo_bayes.bayes.channels import Markers
@@ -556,9 +556,9 @@ def test_a_verdict_agrees_with_the_errors(changes, worse, clear):
 def test_the_recording_that_speaks_against_an_extension_is_named(groups):
     """Groups are to be compared where they have not been."""
     gain = replace(GAIN, elpd_p=None, differences=OPPOSED)
-    words = _adoption(SimpleNamespace(adopted=[], gain=gain, unsupported=[], question=SimpleNamespace(groups=groups)))
-    assert words.startswith(" b is clearly less likely with this (2e+03 mm without, 2.1e+03 mm with it)")
-    assert ("--between" in words) == (groups is None)
+    answer = SimpleNamespace(adopted=[], gain=gain, unsupported=[], question=SimpleNamespace(groups=groups))
+    assert _adoption(answer).startswith(" b is clearly less likely with this (2e+03 mm without, 2.1e+03 mm with it)")
+    assert ("otherwise in b: compare groups of recordings with --between" in _doubt(answer)) == (groups is None)
 
 
 def test_of_many_sizes_the_surest_are_said_in_their_order():
