@@ -87,7 +87,10 @@ class CalibrationProblem:
         if not values:
             return self
         model = replace(self.model, space=self.model.space.holding(values), fixed={**self.model.fixed, **values})
-        return CalibrationProblem(model, chunk=self.chunk)
+        other = CalibrationProblem(model, chunk=self.chunk, earlier=self.earlier)
+        other.measured, other.shares = self.measured, self.shares
+        other.jacobian, other.watch = self.jacobian, self.watch
+        return other
 
     def scale_log_prior(self, values: Float[np.ndarray, "n scale"]) -> Float[np.ndarray, " n"]:
         """Log density of the prior of the standard deviations, in the order of ``scales``."""

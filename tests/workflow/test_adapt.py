@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import xarray as xr
@@ -75,6 +76,22 @@ def fit(zeros):
     runs = recorded([f"day_{k}_a" for k in range(5)], zeros[:5], 0)
     unseen = recorded([f"new_{k}" for k in range(10)], zeros[5:], 10)
     return rb.calibrate(model, runs, rb.Laplace(draws=800, starts=2, screen=32), test=unseen, seed=0, show=False)
+
+
+def test_a_model_of_days_whose_spread_is_held_keeps_start_data_and_listeners():
+    """Its climbs start where an earlier fit ended, fit the data that they were given, and say how far they are."""
+    model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"zero": 0.02})
+    earlier = {"gain": np.full(2, 1.1 * GAIN), "zero_deviation@day_1": np.full(2, 0.004)}
+    whole = model.problem(recorded(["day_0_a", "day_1_a"], [0.0, 0.01], 0), earlier)
+    other = {name: 2.0 * measured for name, measured in whole.measured.items()}
+    whole = whole.with_measured(other).counting({"markers": 0.5})
+    whole.watch = [].append
+    held = whole.holding(whole.typical_scales)
+    assert set(whole.names) - set(held.names) == {"zero_spread"}
+    starts = held.sample_starts(jax.random.key(0), 3)
+    np.testing.assert_allclose(starts["gain"], 1.1 * GAIN)
+    np.testing.assert_allclose(starts["zero_deviation@day_1"], 0.004)
+    assert (held.measured, held.watch, held.shares) == (whole.measured, whole.watch, whole.shares)
 
 
 @pytest.mark.slow
