@@ -65,9 +65,9 @@ def test_the_carried_likelihood_belongs_to_the_draws(linear):
 def test_what_a_budget_has_left_becomes_further_draws():
     """Means of 5 x 400 draws, at worst of 5 x 100 independent ones, are off by 0.045 sd: four times that fails once
     in 5000, three parameters together."""
-    problem = LinearGaussian()
+    problem, options = LinearGaussian(), {"rollouts": 4000.0, "particles": 100, "replicates": 1}
     few, many = (
-        [sampler.run(problem, SmcConfig(rollouts=4000.0, particles=100, draws=d), jax.random.key(i)) for i in range(5)]
+        [sampler.run(problem, SmcConfig(draws=d, **options), jax.random.key(i)) for i in range(5)]
         for d in (100, 400)
     )
     for plain, result in zip(few, many, strict=True):

@@ -216,7 +216,7 @@ def test_the_mixture_is_a_density_that_its_draws_have():
 def test_climbs_keep_their_budget():
     problem = Decay(n_rows=40, traceable=False)
     result = methods.run(problem, "laplace", {"rollouts": 120, "screen": 16}, KEY)
-    assert result.rollouts <= 160  # the Laplace approximation itself comes on top
+    assert result.trace[-1]["rollouts"] <= 120  # normal approximations of the optima come on top
     free = methods.run(Decay(n_rows=40, traceable=False), "laplace", {"screen": 16}, KEY)
     assert free.rollouts > result.rollouts
 
