@@ -108,7 +108,7 @@ def test_climbs_start_from_the_optimum_of_an_earlier_calibration(tmp_path):
     """Draws of many parameters may all fit worse than the optimum; a folder without summary has draws alone."""
     draws = {"young_modulus": np.array([[1e6, 2e6, 3e6]])}
     info = ParameterInfo("young_modulus", "Pa", 0.0, np.inf, {}, "")
-    record = PosteriorRecord((info,), draws, draws, ())
+    record = PosteriorRecord((info,), draws, {"young_modulus": draws["young_modulus"][0]}, ())
     record.save(tmp_path / "posterior.nc")
     np.testing.assert_allclose(earlier_draws(tmp_path, "laplace")["young_modulus"], [1e6, 2e6, 3e6])
     for optimum, expected in (({"young_modulus": 5e6}, [5e6, 5e6, 5e6, 1e6, 2e6, 3e6]), (None, [1e6, 2e6, 3e6])):
