@@ -50,6 +50,7 @@ def test_a_calibration_writes_what_it_promises(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Estimated shape parameter of Pareto")  # a hundred draws: k is 0.67 for one row
+@pytest.mark.filterwarnings("ignore:The inplace keyword")  # of pandas 3, in ArviZ
 def test_two_runs_of_the_same_data_are_compared_by_what_they_predict_of_each_row(tmp_path):
     """Independent replicates are chains, and every row's log likelihood is there for ArviZ."""
     runs = {}
