@@ -78,11 +78,7 @@ def lock_memory(locked: bool) -> bool:
 
 @contextlib.contextmanager
 def steady_interpreter() -> Iterator[None]:
-    """No pauses of the garbage collector or for lost pages, and short turns for the other threads.
-
-    To be entered before `schedule_fifo`: where a process has one processor only, the system may wait for ever for what
-    ordinary threads have to do before its memory is locked.
-    """
+    """No pauses of the garbage collector or for lost pages, and short turns for the other threads."""
     switch, collecting = sys.getswitchinterval(), gc.isenabled()
     gc.collect()
     gc.disable()

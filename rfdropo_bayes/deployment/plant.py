@@ -182,12 +182,11 @@ def _serve(pipe: Connection, name: str, robot: dict[str, Any], settings: dict[st
         plant = build_plant(name, Robot.model_validate(robot), settings)
         length = np.zeros(len(robot["channels"]["names"]))
         state = plant.advance(length, 0.0)
+        for thread in os.listdir("/proc/self/task") if sys.platform == "linux" else ():  # numerical libraries have some
+            schedule_fifo(int(thread), PLANT_PRIORITY)
+        pipe.send((0.0, state))
+        reached = 0.0
         with steady_interpreter():
-            # Numerical libraries have threads of their own.
-            for thread in os.listdir("/proc/self/task") if sys.platform == "linux" else ():
-                schedule_fifo(int(thread), PLANT_PRIORITY)
-            pipe.send((0.0, state))
-            reached = 0.0
             while True:
                 instant, length = pipe.recv()
                 while pipe.poll():

@@ -189,8 +189,8 @@ def serve(table: SimulationTable, ready: Path | None = None) -> None:
         else:
             plant = PlantHere(build_plant(table.plant, robot, table.settings))
         drives = SimulatedDrives(robot, table, bus, plant)
-        stack.enter_context(steady_interpreter())
         schedule_fifo()
+        stack.enter_context(steady_interpreter())
         if ready is not None:  # last of all: making the interpreter steady takes longer than an SDO client waits
             ready.write_text(bus_table.channel, encoding="utf-8")
         with contextlib.suppress(can.CanError):  # the bus has gone, and the drives with it
@@ -219,8 +219,8 @@ def run_hub(channel: str) -> None:
     """Body of the hub's process: says where it listens, and ends when its parent does."""
     hub, parent = Hub(channel), os.getppid()
     print(hub.channel, flush=True)
+    schedule_fifo()
     with steady_interpreter():
-        schedule_fifo()
         hub.serve(stop=lambda: os.getppid() != parent)
 
 
