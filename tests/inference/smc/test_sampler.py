@@ -67,8 +67,7 @@ def test_what_a_budget_has_left_becomes_further_draws():
     in 5000, three parameters together."""
     problem, options = LinearGaussian(), {"rollouts": 4000.0, "particles": 100, "replicates": 1}
     few, many = (
-        [sampler.run(problem, SmcConfig(draws=d, **options), jax.random.key(i)) for i in range(5)]
-        for d in (100, 400)
+        [sampler.run(problem, SmcConfig(draws=d, **options), jax.random.key(i)) for i in range(5)] for d in (100, 400)
     )
     for plain, result in zip(few, many, strict=True):
         assert result.draws["x0"].shape == (1, 400)
