@@ -16,8 +16,13 @@ DATA_VARIABLE = "RFDROPO_DATA"
 _GLOB = "*?["
 
 
-def find_files(pattern: str, base: Path) -> list[Path]:
+def find_files(pattern: str, base: Path, *, folders: bool = False) -> list[Path]:
     """Files of a name or glob in the first folder that has any: RFDROPO_DATA, or else ``base``.
+
+    Args:
+        pattern: the name or glob.
+        base: folder that it is relative to.
+        folders: whether a folder may stand for the files in it.
 
     Raises:
         InputError: no such file.
@@ -29,7 +34,7 @@ def find_files(pattern: str, base: Path) -> list[Path]:
         roots, wanted = [Path(wanted.anchor)], wanted.relative_to(wanted.anchor)
     for root in roots:
         files = sorted(root.glob(str(wanted))) if any(sign in pattern for sign in _GLOB) else [root / wanted]
-        found = [file for file in files if file.is_file()]
+        found = [file for file in files if file.is_file() or (folders and file.is_dir())]
         if found:
             return found
         if files and files[0].is_dir():

@@ -37,7 +37,16 @@ class Questions:
 
 
 Recordings = Annotated[
-    list[str] | None, typer.Option("--recording", help="CSV to fit, or a quoted pattern; may be given several times")
+    list[str] | None,
+    typer.Option(
+        "--recording",
+        help="CSV, Motive export, ROS bag, MCAP file or LeRobotDataset to fit, or a quoted pattern; may be given "
+        "several times",
+    ),
+]
+Commands = Annotated[
+    list[str] | None,
+    typer.Option("--commands", help="CSV of each recording's commands, or a quoted pattern, if they are not in it"),
 ]
 Shape = Annotated[str | None, typer.Option(help="cylinder, cone, tube, or disks (on a backbone)")]
 Length = Annotated[float | None, typer.Option("--length-mm", help="length of the body")]
@@ -73,6 +82,7 @@ Defaults = Annotated[bool, typer.Option("--defaults", help="ask nothing: take de
 def init(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder to write to; the robot takes its name")],
     recording: Recordings = None,
+    commands: Commands = None,
     shape: Shape = None,
     length: Length = None,
     radius: Radius = None,
@@ -94,11 +104,17 @@ def init(
     defaults: Defaults = False,
 ) -> None:
     """Write a commented robot file and experiment file from a few answers, options, and the columns of a recording."""
-    from rfdropo_bayes.workflow.first_files import guess_units, matching_recordings, write_first_files
+    from rfdropo_bayes.workflow.first_files import (
+        guess_units,
+        matching_commands,
+        matching_recordings,
+        write_first_files,
+    )
 
     ask = Questions(sys.stdin.isatty() and not defaults)
     files = matching_recordings(recording or [])
-    guess = guess_units(files[0], command_unit, position_unit) if files else None
+    sent = matching_commands(commands or [], files)
+    guess = guess_units(files[0], sent[0] if sent else None, command_unit, position_unit) if files else None
     unit = guess.command_unit if guess else ask.answer("command_unit", command_unit, "Commands in", "mm")
     if unit not in UNITS:
         raise InputError(f"commands in {unit!r}", where="--command-unit", remedy=f"use one of {', '.join(UNITS)}")
@@ -113,7 +129,7 @@ def init(
     answers["young_modulus"] = ask.answer("young_modulus", modulus, "Young's modulus [MPa]", 1.0)
     answers["markers"] = _markers(ask, guess, markers, answers["length"])
     outline = _outline(_name(folder), disks, unit, answers, ask.assumed)
-    for path in write_first_files(folder, outline, files, guess):
+    for path in write_first_files(folder, outline, files, sent, guess):
         typer.echo(f"wrote {path}")
     if ask.assumed:
         typer.echo(f"assumed, and marked ASSUMED in the robot file: {', '.join(sorted(ask.assumed))}")

@@ -20,6 +20,9 @@ from jaxtyping import Float
 
 from rfdropo_bayes.errors import InputError
 
+MOTIVE = "Format Version"
+"""How the first line of an export of Motive's begins."""
+
 
 def closest(name: str, known: Sequence[str]) -> str:
     """Hint that names the known entry nearest to ``name``, or lists them if none is near."""
@@ -113,21 +116,30 @@ class CsvTable:
         lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
         if lines[0].lower().startswith("sep="):  # spreadsheets write so which separator follows
             lines.pop(0)
-        while lines and not lines[-1].strip():
-            lines.pop()
-        if not lines:
-            raise InputError("the file is empty", where=str(path), remedy="give a CSV with a header and rows")
-        if len(lines) == 1:
-            raise InputError("has a header but no rows", where=str(path), remedy="record or export it again")
-        dialect = dialect_of(lines)
-        self.decimal = dialect.decimal
-        _check_rectangular(path, lines, dialect.separator)
+        if lines and lines[0].startswith(MOTIVE):
+            raise InputError(
+                "is Motive's own export, whose header has several lines", where=str(path), remedy='use "motive-csv"'
+            )
+        self._parse(lines)
         if machine_written and not text.endswith("\n"):
             raise InputError(
                 "the last line does not end: the file is cut short",
-                where=f"{path}, row {len(lines) - 2}",
+                where=f"{path}, row {len(self) - 1}",
                 remedy="fetch it again, or drop that row, or end it with a newline if it is whole",
             )
+        self.require(required)
+
+    def _parse(self, lines: list[str]) -> None:
+        """Read a header and rows; empty lines at the end are none."""
+        while lines and not lines[-1].strip():
+            lines.pop()
+        if not lines:
+            raise InputError("the file is empty", where=str(self.path), remedy="give a CSV with a header and rows")
+        if len(lines) == 1:
+            raise InputError("has a header but no rows", where=str(self.path), remedy="record or export it again")
+        dialect = dialect_of(lines)
+        self.decimal = dialect.decimal
+        _check_rectangular(self.path, lines, dialect.separator)
         self.frame = pd.read_csv(
             io.StringIO("\n".join(lines)),
             sep=dialect.separator,
@@ -137,7 +149,18 @@ class CsvTable:
             index_col=False,
         )
         self.frame.columns = [str(name).strip() for name in self.frame.columns]
-        self.require(required)
+
+    @classmethod
+    def of_lines(cls, path: Path, lines: list[str]) -> CsvTable:
+        """A table whose header, the first of ``lines``, a reader of its own has made of a file's.
+
+        Raises:
+            InputError: see the class.
+        """
+        table = cls.__new__(cls)
+        table.path = path
+        table._parse(lines)
+        return table
 
     @classmethod
     def of_frame(cls, frame: pd.DataFrame, name: str, required: Sequence[str]) -> CsvTable:

@@ -2,7 +2,7 @@
 
 Timing. The command in row k is in force from the time of row k until that of row k + 1, as a loop that measures, then
 commands, writes it; what was in force before row 0 is another matter (`first_command`). Commands may stand in a file of
-their own, with as many rows as the observations or one fewer.
+their own, with as many rows as the observations or one fewer; or with times of their own, and then with any number.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 
 FORMAT = "csv"
+SECONDS = {"s": 1.0, "ms": 1e-3}
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "rad": ("rad", 1.0),
@@ -55,7 +56,11 @@ class CsvColumns(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    time: str | None = Field(default=None, description="column of the times; or give sample_time")
+    time: str | None = Field(
+        default=None,
+        description='column of the times; or give sample_time; for "rosbag": "header", stamps where messages have '
+        'them, or "log", the recorder\'s times',
+    )
     time_unit: Literal["s", "ms"] = Field(default="s", description="unit of the times")
     sample_time: float | None = Field(
         default=None, gt=0, description="time between rows [s], where no column holds times"
@@ -67,10 +72,25 @@ class CsvColumns(BaseModel):
     command_unit: Literal["m", "cm", "mm", "rad", "deg"] = Field(
         description="unit of the commands: a length of cable, or an angle of a motor"
     )
+    command_time: str | None = Field(
+        default=None,
+        description="column of the commands' own times, in their file; by default command k is sent in row k of the "
+        "observations",
+    )
+    command_time_unit: Literal["s", "ms"] | None = Field(
+        default=None, description="unit of command_time; that of time by default"
+    )
+    command_offset: float = Field(
+        default=0.0,
+        description="added to the commands' own times [s]: what the clock of the observations shows when that of the "
+        "commands shows zero",
+    )
     positions: list[tuple[str, str, str]] = Field(
         min_length=1, description="columns of x, y and z of each marker, base to tip"
     )
-    position_unit: Literal["m", "cm", "mm"] = Field(description="unit of the positions")
+    position_unit: Literal["m", "cm", "mm"] = Field(
+        description='unit of the positions; the header of a "motive-csv" file comes first'
+    )
     axes: Annotated[tuple[str, str, str], AfterValidator(_right_handed)] = Field(
         ("x", "y", "z"),
         description="the base frame's x, y, z in terms of the file's axes, e.g. "
@@ -159,26 +179,37 @@ def read_plain_csv(
     Raises:
         InputError: on a damaged file (see ``CsvTable``), a column that is not there, or files that do not fit together.
     """
-    table = CsvTable(path, _coordinates(columns), machine_written=False)
-    source = None if commands is None else CsvTable(commands, columns.commands, machine_written=False)
-    return _recording(table, source or table, columns, mask_missing)
+    table = CsvTable(path, coordinates(columns), machine_written=False)
+    return read_tables(table, command_table(commands, columns) or table, columns, mask_missing=mask_missing)
+
+
+def command_table(path: Path | None, columns: CsvColumns) -> CsvTable | None:
+    """The file of the commands, where they have one of their own."""
+    return None if path is None else CsvTable(path, columns.commands, machine_written=False)
 
 
 def read_frame(frame: pd.DataFrame, columns: CsvColumns, name: str, *, mask_missing: bool = False) -> Trajectory:
     """One recording from a table in memory; otherwise as `read_plain_csv`."""
-    table = CsvTable.of_frame(frame, name, _coordinates(columns))
-    return _recording(table, table, columns, mask_missing)
+    table = CsvTable.of_frame(frame, name, coordinates(columns))
+    return read_tables(table, table, columns, mask_missing=mask_missing)
 
 
-def _coordinates(columns: CsvColumns) -> list[str]:
+def coordinates(columns: CsvColumns) -> list[str]:
+    """The columns of the positions."""
     return [name for point in columns.positions for name in point]
 
 
-def _recording(table: CsvTable, source: CsvTable, columns: CsvColumns, mask_missing: bool) -> Trajectory:
-    """The recording in a table, whose commands are in ``source``."""
+def read_tables(
+    table: CsvTable, source: CsvTable, columns: CsvColumns, *, mask_missing: bool = False, **facts: str
+) -> Trajectory:
+    """The recording in a table, whose commands are in ``source``, which may be the same.
+
+    Further arguments take the place of the ``name``, ``format`` and ``provenance`` of a CSV.
+    """
     position, time = _points(table, columns, mask_missing=mask_missing), _times(table, columns)
     faults = find_faults(time, position)
     command = _commands(table, source, columns)
+    sent = time[: len(command)] if columns.command_time is None else _command_times(table, source, columns)
     angle = None
     if columns.motor_angles is not None:
         degree = np.pi / 180.0 if columns.motor_angle_unit == "deg" else 1.0
@@ -187,14 +218,14 @@ def _recording(table: CsvTable, source: CsvTable, columns: CsvColumns, mask_miss
         time=time,
         position=fill_missing(time, position),
         position_mask=faults.mask,
-        command_time=time[: len(command)],
+        command_time=sent,
         command=command,
         initial_command=command[0],
         tension=None if columns.tensions is None else table.numbers(columns.tensions, allow_missing=True),
         motor_angle=angle,
         object_pose=_pose(table, columns),
         settings={"faults": faults.counts} | ({} if angle is None else {"motor_angle_hold": hold_time(time, angle)}),
-        **_facts(table, columns),
+        **_facts(table, columns) | facts,
     )
 
 
@@ -213,27 +244,24 @@ def _facts(table: CsvTable, columns: CsvColumns) -> dict[str, Any]:
 
 def _points(table: CsvTable, columns: CsvColumns, *, mask_missing: bool) -> Float[np.ndarray, "rows marker 3"]:
     """Positions of the markers [m] in the base frame."""
-    points = table.points(_coordinates(columns), allow_missing=mask_missing)
+    points = table.points(coordinates(columns), allow_missing=mask_missing)
     return METRES[columns.position_unit] * points @ axes_matrix(columns.axes).T
 
 
-def read_csv_start(path: Path, columns: CsvColumns, start: Path | None, row: int = 0) -> Trajectory:
-    """Commands with the start pose at most, from ``row`` of the file ``start``; see `commands_alone`.
+def read_csv_start(path: Path, columns: CsvColumns, start: CsvTable | None, row: int = 0) -> Trajectory:
+    """Commands with the start pose at most, from ``row`` of the observations ``start``; see `commands_alone`.
 
     Raises:
         InputError: on a damaged file, a column that is not there, or a start without that row.
     """
     table = CsvTable(path, columns.commands, machine_written=False)
-    points = None
-    if start is not None:
-        coordinates = _coordinates(columns)
-        points = _points(CsvTable(start, coordinates, machine_written=False), columns, mask_missing=True)
+    clock, seconds = _command_clock(columns)
     return commands_alone(
-        _times(table, columns),
+        _times(table, columns) if clock is None else _since_first(seconds * table.numbers([clock])[:, 0]),
         _commands(table, table, columns),
-        start=points,
+        start=None if start is None else _points(start, columns, mask_missing=True),
         row=row,
-        start_file=str(start),
+        start_file="" if start is None else str(start.path),
         **_facts(table, columns),
     )
 
@@ -242,31 +270,61 @@ def command_columns(
     columns: CsvColumns, time: Float[np.ndarray, " rows"], command: Float[np.ndarray, "rows cable"]
 ) -> dict[str, Float[np.ndarray, " rows"]]:
     """Times [s] and commands [m or rad] as the columns of a file that this table describes."""
-    stamped = {} if columns.time is None else {columns.time: time * (1e3 if columns.time_unit == "ms" else 1.0)}
+    clock, seconds = _command_clock(columns)
+    stamped = {} if clock is None else {clock: time / seconds}
     return stamped | dict(zip(columns.commands, command.T / COMMAND_UNITS[columns.command_unit][1], strict=True))
 
 
 def holds_commands_alone(path: Path, columns: CsvColumns) -> bool:
     """Whether a file holds commands with their times, and no positions."""
     table = CsvTable(path, columns.commands, machine_written=False)
-    timed = columns.time is None or columns.time in table
+    clock, _ = _command_clock(columns)
+    timed = clock is None or clock in table
     return timed and not any(name in table for point in columns.positions for name in point)
 
 
 def _times(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " rows"]:
     if columns.time is None:
         return float(columns.sample_time or 0.0) * np.arange(len(table))
-    time = table.numbers([columns.time])[:, 0] * (1e-3 if columns.time_unit == "ms" else 1.0)
+    return _since_first(SECONDS[columns.time_unit] * table.numbers([columns.time])[:, 0])
+
+
+def _since_first(time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
     return time - time[0]
+
+
+def _command_clock(columns: CsvColumns) -> tuple[str | None, float]:
+    """Column of times in a file of commands, and its unit [s]."""
+    return columns.command_time or columns.time, SECONDS[columns.command_time_unit or columns.time_unit]
+
+
+def _command_times(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " command"]:
+    """The commands' own times [s] from the first observation on.
+
+    Raises:
+        InputError: commands that were sent at other times than the recording.
+    """
+    clock, seconds = _command_clock(columns)
+    sent = seconds * source.numbers([str(clock)])[:, 0] + columns.command_offset
+    first = 0.0 if columns.time is None else SECONDS[columns.time_unit] * table.numbers([columns.time])[0, 0]
+    last = float(_times(table, columns)[-1])
+    sent = sent - first
+    if sent[0] > last or sent[-1] < -last:  # a command long before may hold throughout, but is likelier another clock's
+        raise InputError(
+            f"commands were sent from {sent[0]:.6g} to {sent[-1]:.6g} s, and {last:.6g} s were recorded from 0 s on",
+            where=f"{table.path} with {source.path}",
+            remedy="correct command_offset, or pair the files that were recorded together",
+        )
+    return sent
 
 
 def _commands(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows cable"]:
     values = COMMAND_UNITS[columns.command_unit][1] * source.numbers(columns.commands)
-    if len(values) not in (len(table), len(table) - 1):
+    if columns.command_time is None and len(values) not in (len(table), len(table) - 1):
         raise InputError(
             f"{len(table)} observations do not fit {len(values)} commands: give as many, or one fewer",
             where=f"{table.path} with {source.path}",
-            remedy="pair the files that were recorded together",
+            remedy="pair the files that were recorded together, or name the commands' own times: command_time",
         )
     return values
 

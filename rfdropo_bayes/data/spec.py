@@ -9,18 +9,19 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from rfdropo_bayes.data import lerobot
 from rfdropo_bayes.data.asl_csv import NO_COMMANDS, read_asl_csv
 from rfdropo_bayes.data.first_command import begun_from
+from rfdropo_bayes.data.mapped_formats import FOLDERS, MAPPED, read_mapped
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
-from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
+from rfdropo_bayes.data.plain_csv import CsvColumns
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import find_files
 from rfdropo_bayes.tables import parse_table
 
-Format = Literal["sofa-csv", "optitrack-csv", "asl-csv", "csv", "netcdf"]
-
+Format = Literal["sofa-csv", "optitrack-csv", "asl-csv", "csv", "motive-csv", "rosbag", "lerobot", "netcdf"]
 
 InitialCommand = Literal["first", "zero"] | list[float] | None
 
@@ -30,12 +31,15 @@ class RecordingEntry(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    observations: str = Field(description="file, or several by wildcards")
+    observations: str = Field(description="file, or several by wildcards; a folder for a ROS 2 bag or LeRobotDataset")
     commands: str | None = Field(
         default=None, description='file of the commands, where they have one of their own; "none": zero commands'
     )
     rows: tuple[int, int] | None = Field(
         default=None, description="keep observation rows first to last only, both included, counted from 0"
+    )
+    episodes: list[int] | None = Field(
+        default=None, description="numbers of a LeRobotDataset's episodes; all by default"
     )
     initial_command: InitialCommand = Field(default=None, description="as in [data], for this entry")
 
@@ -48,7 +52,10 @@ class DataSpec(BaseModel):
     format: Format = Field(description="how the files are written")
     fit: list[RecordingEntry] = Field(min_length=1, description="recordings that a fit may see")
     test: list[RecordingEntry] = Field([], description="recordings that no fit sees")
-    columns: CsvColumns | None = Field(default=None, description='what the columns are, for format "csv"')
+    columns: CsvColumns | None = Field(
+        default=None,
+        description="what the columns are, for formats that have them in any order: csv, motive-csv, rosbag, lerobot",
+    )
     resample: float | None = Field(
         default=None, gt=0, description="sample time to bring every recording to [s]; as recorded by default"
     )
@@ -77,14 +84,20 @@ class DataSpec(BaseModel):
 
     @model_validator(mode="after")
     def _columns_fit(self) -> DataSpec:
-        if (self.format == "csv") != (self.columns is not None):
-            raise ValueError("format 'csv' needs a [data.columns] table, and no other format takes one")
+        if (self.format in MAPPED) != (self.columns is not None):
+            takes = "needs a" if self.format in MAPPED else "takes no"
+            raise ValueError(f"format {self.format!r} {takes} [data.columns] table")
         return self
 
     def piece(self, whole: Trajectory, rows: tuple[int, int] | None) -> Trajectory:
-        """Rows first to last of a recording, with the commands of `lead_in`; all of it without rows."""
-        if rows is None:
+        """Rows first to last of a recording, with the commands of `lead_in`; all of it without rows.
+
+        Commands with a clock of their own may begin long before the recording does.
+        """
+        if rows is None and whole.command_time[0] >= -self.lead_in:
             return whole
+        if rows is None:
+            return self.piece(whole, (0, len(whole.time) - 1)).with_attributes(name=whole.name)
         return whole.slice_rows(*rows, self.lead_in if whole.object_pose is None else 0.0)
 
     @classmethod
@@ -103,6 +116,12 @@ class _Source(NamedTuple):
     zero_command: bool
     rows: tuple[int, int] | None
     initial_command: InitialCommand
+    episode: int | None
+
+    @property
+    def recording(self) -> tuple[Path, int | None]:
+        """What was recorded, whichever rows of it are meant."""
+        return self.observations.resolve(), self.episode
 
 
 def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "fit") -> list[Trajectory]:
@@ -116,13 +135,14 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
     Raises:
         InputError: if a file is missing or bad, a glob matches nothing, or a test recording shares rows with a fit one.
     """
-    sources = list(_sources(spec.fit if role == "fit" else spec.test, base))
-    _check_split(list(_sources(spec.fit, base)), list(_sources(spec.test, base)))
-    loaded: dict[tuple[Path, Path | None, str], Trajectory] = {}
+    fit, test = list(_sources(spec, spec.fit, base)), list(_sources(spec, spec.test, base))
+    sources = fit if role == "fit" else test
+    _check_split(fit, test)
+    loaded: dict[tuple[Path, int | None, Path | None, str], Trajectory] = {}
     recordings = []
     for source in sources:
         rule = spec.initial_command if source.initial_command is None else source.initial_command
-        key = (source.observations, source.commands, str(rule))
+        key = (source.observations, source.episode, source.commands, str(rule))
         if key not in loaded:
             loaded[key] = begun_from(_read(spec, source), rule)
             said = loaded[key].name, loaded[key].first_command
@@ -141,14 +161,24 @@ def find_data_file(name: str | Path, base: Path) -> Path:
     return find_files(str(name), base)[0]
 
 
-def _sources(entries: list[RecordingEntry], base: Path) -> Iterator[_Source]:
+def _sources(spec: DataSpec, entries: list[RecordingEntry], base: Path) -> Iterator[_Source]:
     for entry in entries:
         commands = None
         if entry.commands not in (None, NO_COMMANDS):
             commands = find_files(str(entry.commands), base)[0]
-        for match in find_files(entry.observations, base):
+        for match in find_files(entry.observations, base, folders=spec.format in FOLDERS):
             zero = entry.commands == NO_COMMANDS
-            yield _Source(match, commands, zero, entry.rows, entry.initial_command)
+            for episode in _episodes(spec, entry, match):
+                yield _Source(match, commands, zero, entry.rows, entry.initial_command, episode)
+
+
+def _episodes(spec: DataSpec, entry: RecordingEntry, path: Path) -> list[int] | list[None]:
+    """The episodes of a file that an entry means; None where it is a single recording."""
+    if spec.format == lerobot.FORMAT:
+        return lerobot.episode_numbers(path) if entry.episodes is None else entry.episodes
+    if entry.episodes is not None:
+        raise InputError(f"format {spec.format!r} has no episodes", where=entry.observations, remedy="drop the key")
+    return [None]
 
 
 def _read(spec: DataSpec, source: _Source) -> Trajectory:
@@ -170,15 +200,17 @@ def _read(spec: DataSpec, source: _Source) -> Trajectory:
                 "commands = 'none' where nothing was commanded",
             )
         return read_asl_csv(source.observations, source.commands, mask_missing=mask_missing)
-    if spec.format == "csv" and spec.columns is not None:
-        return read_plain_csv(source.observations, spec.columns, source.commands, mask_missing=mask_missing)
+    if spec.columns is not None:
+        return read_mapped(
+            spec.format, source.observations, spec.columns, source.commands, source.episode, mask_missing=mask_missing
+        )
     return Trajectory.load(source.observations)
 
 
 def _check_split(fit: list[_Source], test: list[_Source]) -> None:
     for tested in test:
         for fitted in fit:
-            if tested.observations.resolve() == fitted.observations.resolve():
+            if tested.recording == fitted.recording:
                 first, last = tested.rows or (0, float("inf"))
                 start, end = fitted.rows or (0, float("inf"))
                 if first <= end and start <= last:

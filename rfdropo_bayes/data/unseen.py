@@ -13,10 +13,13 @@ import xarray as xr
 
 from rfdropo_bayes.data.asl_csv import read_asl_start
 from rfdropo_bayes.data.first_command import MEASURED, UNTOLD, angle_at_first, begun_from
+from rfdropo_bayes.data.mapped_formats import FOLDERS, observed_table, recognised_format
+from rfdropo_bayes.data.plain_csv import FORMAT as CSV
 from rfdropo_bayes.data.plain_csv import holds_commands_alone, read_csv_start
 from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, load_recordings
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import find_files
 
 
 def load_unseen(
@@ -30,7 +33,8 @@ def load_unseen(
     """The commands of a file in the format of an experiment, and its start pose.
 
     Formats that keep commands and observations in one file take the start pose from its first row. "asl-csv", and
-    "csv" with a file of commands alone, take it from the first row of ``start``, or start from an unknown pose.
+    formats whose columns [data.columns] names with a CSV of commands alone, take it from the first row of ``start``, or
+    start from an unknown pose.
 
     Args:
         spec: the [data] table of the experiment; its recordings are not read.
@@ -48,13 +52,15 @@ def load_unseen(
         observations = None if start is None else find_data_file(start, base)
         whole = read_asl_start(find_data_file(commands, base), observations, rows[0] if rows else 0)
         return first_row_only(spec.piece(_begun(whole, spec, begun), rows))
-    if spec.format == "csv" and spec.columns is not None:
-        path = find_data_file(commands, base)
-        if holds_commands_alone(path, spec.columns):
-            observations = None if start is None else find_data_file(start, base)
-            whole = read_csv_start(path, spec.columns, observations, rows[0] if rows else 0)
+    if spec.columns is not None:
+        path = find_files(commands, base, folders=spec.format in FOLDERS)[0]
+        if recognised_format(path) == CSV and holds_commands_alone(path, spec.columns):
+            observations = None if start is None else find_files(start, base, folders=spec.format in FOLDERS)[0]
+            known = None if observations is None else observed_table(spec.format, observations, spec.columns)
+            columns = spec.columns if known is None else known.columns
+            whole = read_csv_start(path, columns, None if known is None else known.table, rows[0] if rows else 0)
             return spec.piece(_begun(whole, spec, begun), rows)
-    if spec.format == "csv" and start is not None:
+    if spec.columns is not None and start is not None:
         entry = RecordingEntry(observations=start, commands=commands)
     elif start is not None:
         raise InputError(

@@ -1,4 +1,4 @@
-"""What the columns of a CSV are, guessed from their names and sizes: for a first experiment file, to be looked over."""
+"""What the columns of a recording are, guessed from their names and sizes, for a first experiment file to look over."""
 
 from __future__ import annotations
 
@@ -9,17 +9,36 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from rfdropo_bayes.data import lerobot, motive_csv, plain_csv, rosbag
 from rfdropo_bayes.data.csv_table import CsvTable
+from rfdropo_bayes.data.mapped_formats import recognised_format
+from rfdropo_bayes.data.streams import side_by_side
 from rfdropo_bayes.errors import InputError
 
 TIME = re.compile(r"^(t|time|timestamp|stamp|secs?|seconds|clock)(?![a-z])", re.IGNORECASE)
 AXIS = re.compile(r"(?<![a-z])[xyz](?![a-z])", re.IGNORECASE)
 FORCE = re.compile(r"force|tension|load|(?<![a-z])[fn]\d", re.IGNORECASE)
-MEASURED = re.compile(r"meas|actual|encoder|enc(?![a-z])|feedback|(?<![a-z])fb", re.IGNORECASE)
+MEASURED = re.compile(
+    r"meas|actual|encoder|enc(?![a-z])|feedback|(?<![a-z])fb|joint_?states?|observation", re.IGNORECASE
+)
+SENT = re.compile(r"cmd|command|action|setpoint", re.IGNORECASE)
+"""Where any columns are called so, they alone are commands."""
 COMMAND = re.compile(
     r"cmd|command|motor|servo|pull|cable|tendon|action|target|ref|theta|angle|(?<![a-z])[aucqm]_?\d", re.IGNORECASE
 )
-ANGLE = re.compile(r"motor|servo|theta|angle|(?<![a-z])q_?\d", re.IGNORECASE)
+ANGLE = re.compile(r"motor|servo|joint|theta|angle|(?<![a-z])q_?\d", re.IGNORECASE)
+NO_PLACE = re.compile(r"orient|quat|rotat|euler|angular|twist|veloc|accel|gyro|magnet|wrench|torque|force", re.I)
+"""Columns in x, y and z that are no positions."""
+RATE = re.compile(r"veloc|effort|accel", re.IGNORECASE)
+BODY = re.compile(r"^Rigid Body\.|\.rigidbodies\[[^]]*\]\.pose", re.IGNORECASE)
+"""Solved poses of bodies: where there are any, the markers that they were solved from are not used as well."""
+MARKER = re.compile(r"^Marker\.(?!Unlabeled)", re.IGNORECASE)
+"""Markers that Motive measured and somebody named."""
+STRUCTURE = re.compile(
+    r"(rigid|body|bodies|rigidbodies|markers?|position|poses?|point|transforms?|translation|tf|static|mocap|vrpn|"
+    r"optitrack|vicon|qualisys|natnet|observation|state)"
+)
+"""Words that formats put around the name of a marker."""
 WORD = re.compile(r"[a-z0-9]+")
 UNITS = {"mm", "cm", "m", "deg", "rad"}
 LOOKED_AT = 2000
@@ -38,6 +57,8 @@ class Guess(NamedTuple):
         markers: a name for each marker, made of its columns'; numbered where they tell none.
         tensions, motor_angles: columns of measured forces and angles, as many as commands; else empty.
         left: columns that are nothing of these.
+        format: of the file, one of `mapped_formats.MAPPED`.
+        command_time, command_time_unit: column and unit of the commands' own times; None without one.
     """
 
     time: str | None
@@ -50,42 +71,92 @@ class Guess(NamedTuple):
     tensions: list[str]
     motor_angles: list[str]
     left: list[str]
+    format: str = plain_csv.FORMAT
+    command_time: str | None = None
+    command_time_unit: str = "s"
 
 
-def guess_columns(path: Path) -> Guess:
-    """Guess what the columns of a CSV are.
+def guess_columns(path: Path, sent: Path | None = None) -> Guess:
+    """Guess what the columns of a recording are.
+
+    Args:
+        path: a CSV, an export of Motive's, a bag or a LeRobotDataset.
+        sent: a CSV with the commands, where they have a file of their own.
 
     Raises:
         InputError: a file that cannot be read, or in which no positions or commands are found.
     """
-    table = CsvTable(path, (), machine_written=False).numeric().head(LOOKED_AT)
+    format = recognised_format(path)
+    table, unit = _measured(format, path)
     names = [str(name) for name in table.columns]
-    time = next((name for name in names if TIME.search(name)), None)
-    triples = _triples([name for name in names if name != time])
+    time = "header" if format == rosbag.FORMAT else next((name for name in names if TIME.search(name)), None)
+    triples = _markers(_triples([name for name in names if name != time]))
     positions = list(triples.values())
     rest = [name for name in names if name != time and not any(name in triple for triple in positions)]
     tensions = [name for name in rest if FORCE.search(name)]
     angles = [name for name in rest if MEASURED.search(name) and name not in tensions]
-    free = [name for name in rest if name not in (*tensions, *angles)]
-    commands = [name for name in free if COMMAND.search(name)] or free
+    source, clock, free = table, None, [name for name in rest if name not in (*tensions, *angles)]
+    if sent is not None:
+        source = CsvTable(sent, (), machine_written=False).numeric().head(LOOKED_AT)
+        columns = [str(name) for name in source.columns]
+        clock = next((name for name in columns if TIME.search(name)), None)
+        commands = _commands([name for name in columns if name != clock], any_name=True)
+    else:
+        commands = _commands(free, any_name=format == plain_csv.FORMAT)
     for what, found in (("positions (columns in x, y and z)", positions), ("commands", commands)):
         if not found:
             raise InputError(
                 f"found no {what} among the columns {', '.join(names)}",
                 where=str(path),
-                remedy="leave the recording out, and write [data.columns] as docs/reference/experiment.md says",
+                remedy="give the CSV of the commands with --commands"
+                if format == motive_csv.FORMAT and positions
+                else "leave the recording out, and write [data.columns] as docs/reference/experiment.md says",
             )
     return Guess(
         time,
-        _time_unit(table, time),
+        "s" if format == rosbag.FORMAT else _time_unit(table, time),
         commands,
-        _command_unit(table, commands),
+        _command_unit(source, commands),
         positions,
-        _written_unit(names_of(positions)) or _length_unit(table[names_of(positions)]),
-        _marker_names(list(triples)),
+        unit or _written_unit(names_of(positions)) or _length_unit(table[names_of(positions)]),
+        _marker_names(list(triples), None if format == plain_csv.FORMAT else STRUCTURE),
         tensions if len(tensions) == len(commands) else [],
         angles if len(angles) == len(commands) else [],
         [name for name in free if name not in commands],
+        format,
+        clock,
+        _time_unit(source, clock),
+    )
+
+
+def _measured(format: str, path: Path) -> tuple[pd.DataFrame, str | None]:
+    """The numbers of a recording, and the unit of lengths where the file tells it."""
+    if format == rosbag.FORMAT:
+        return side_by_side(rosbag.read_streams(path)), "m"
+    if format == lerobot.FORMAT:
+        return lerobot.read_episode(path, lerobot.episode_numbers(path)[0]), None
+    if format == motive_csv.FORMAT:
+        file = motive_csv.read_motive(path)
+        return file.table.numeric(), file.length_unit
+    return CsvTable(path, (), machine_written=False).numeric().head(LOOKED_AT), None
+
+
+def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
+    """Those of the columns in x, y and z that are places of markers."""
+    places = {common: names for common, names in triples.items() if not NO_PLACE.search(common)}
+    for chosen in (BODY, MARKER):
+        found = {common: names for common, names in places.items() if chosen.search(common)}
+        if found:
+            return found
+    return places
+
+
+def _commands(names: list[str], *, any_name: bool) -> list[str]:
+    """Those of the columns that are commands; where none is called so, all of them in files of one's own."""
+    return (
+        [name for name in names if SENT.search(name) and not RATE.search(name)]
+        or [name for name in names if COMMAND.search(name)]
+        or (names if any_name else [])
     )
 
 
@@ -104,11 +175,12 @@ def _triples(names: list[str]) -> dict[str, list[str]]:
     return {common: [axes[a] for a in "xyz"] for common, axes in found.items() if set(axes) == set("xyz")}
 
 
-def _marker_names(commons: list[str]) -> list[str]:
-    """Names that robot files allow, made of what the columns of each marker have in common."""
+def _marker_names(commons: list[str], structure: re.Pattern[str] | None) -> list[str]:
+    """Names that robot files allow, made of what the columns of each marker have in common, without some words."""
     names = []
     for number, common in enumerate(commons, start=1):
-        name = "_".join(word for word in WORD.findall(common) if word not in UNITS)
+        words = [word for word in WORD.findall(common) if word not in UNITS]
+        name = "_".join(word for word in words if structure is None or not structure.fullmatch(word))
         names.append(name if re.match(r"[a-z]", name) else f"m{name or number}")
     return names if len(set(names)) == len(names) else [f"m{k}" for k in range(1, len(names) + 1)]
 

@@ -167,7 +167,7 @@ def test_a_plain_csv_needs_the_columns_its_mapping_names(tmp_path):
         ({"fits": []}, r"\[data\]: unknown key 'fits'; did you mean 'fit'\?"),
         (
             {"format": "sofa_csv"},
-            "'sofa_csv': Input should be 'sofa-csv', 'optitrack-csv', 'asl-csv', 'csv' or 'netcdf'",
+            "'sofa_csv': Input should be 'sofa-csv', 'optitrack-csv', .* or 'netcdf'",
         ),
         ({"fit": []}, "at least 1 item"),
         ({"resample": -0.1}, "greater than 0"),

@@ -1,0 +1,122 @@
+"""Formats whose columns may be anything, so that the table [data.columns] says what each is; and what a file is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from rfdropo_bayes.data import lerobot, motive_csv, plain_csv, rosbag
+from rfdropo_bayes.data.csv_table import MOTIVE, CsvTable
+from rfdropo_bayes.data.plain_csv import CsvColumns, command_table, coordinates, read_tables
+from rfdropo_bayes.data.trajectory import Trajectory
+from rfdropo_bayes.errors import InputError
+
+MAPPED = (plain_csv.FORMAT, motive_csv.FORMAT, rosbag.FORMAT, lerobot.FORMAT)
+FOLDERS = (rosbag.FORMAT, lerobot.FORMAT)
+"""Formats in which a recording, or several, may be a folder."""
+_MAGIC = {b"#ROSBAG": rosbag.FORMAT, b"\x89MCAP0": rosbag.FORMAT, b"SQLite format 3\x00": rosbag.FORMAT}
+
+
+class Observed(NamedTuple):
+    """A table of observations, and its columns with what the file itself tells of them."""
+
+    table: CsvTable
+    columns: CsvColumns
+
+
+def recognised_format(path: Path) -> str:
+    """Which of `MAPPED` a file or folder is, by its content; "csv" for a file that is none of the others.
+
+    Raises:
+        InputError: a folder that is neither a bag nor a LeRobotDataset, or a path that is not there.
+    """
+    if path.is_dir():
+        if (path / lerobot.INFO).is_file():
+            return lerobot.FORMAT
+        if (path / rosbag.METADATA).is_file() or any(file.suffix in rosbag.STORAGE for file in path.iterdir()):
+            return rosbag.FORMAT
+        raise InputError(
+            "is a folder, but neither a ROS 2 bag nor a LeRobotDataset",
+            where=str(path),
+            remedy=f'name its files, e.g. "{path.name}/*.csv"',
+        )
+    try:
+        with path.open("rb") as file:
+            first = file.read(64)
+    except OSError as error:
+        remedy = "correct the path"
+        raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None
+    for magic, format in _MAGIC.items():
+        if first.startswith(magic):
+            return format
+    return motive_csv.FORMAT if first.removeprefix(b"\xef\xbb\xbf").startswith(MOTIVE.encode()) else plain_csv.FORMAT
+
+
+def observed_table(format: str, path: Path, columns: CsvColumns, episode: int | None = None) -> Observed:
+    """The observations of a recording in one of the formats `MAPPED`.
+
+    Raises:
+        InputError: a file of another format, a damaged one, or a column that is not there.
+    """
+    found = recognised_format(path)
+    if found != format:
+        raise InputError(f"is of the format {found!r}, not {format!r}", where=str(path), remedy=f'use "{found}"')
+    places = coordinates(columns)
+    if format == rosbag.FORMAT:
+        return Observed(rosbag.read_observations(path, columns), columns)
+    if format == lerobot.FORMAT:
+        number = lerobot.episode_numbers(path)[0] if episode is None else episode
+        frame = lerobot.read_episode(path, number)
+        return Observed(CsvTable.of_frame(frame, f"{path}, episode {number}", places), columns)
+    if format == motive_csv.FORMAT:
+        file = motive_csv.read_motive(path)
+        file.table.require(places)
+        unit = file.length_unit or columns.position_unit
+        return Observed(file.table, columns.model_copy(update={"position_unit": unit}))
+    return Observed(CsvTable(path, places, machine_written=False), columns)
+
+
+def read_mapped(
+    format: str,
+    path: Path,
+    columns: CsvColumns,
+    commands: Path | None = None,
+    episode: int | None = None,
+    *,
+    mask_missing: bool = False,
+) -> Trajectory:
+    """One recording.
+
+    Args:
+        format: one of `MAPPED`.
+        path: file or folder with the observations, and the commands unless they have a file of their own.
+        columns: what each column is.
+        commands: a CSV of the commands.
+        episode: of a LeRobotDataset.
+        mask_missing: mask lost marker positions instead of rejecting the file.
+
+    Raises:
+        InputError: on a damaged file, a column that is not there, or files that do not fit together.
+    """
+    table, columns = observed_table(format, path, columns, episode)
+    source = command_table(commands, columns)
+    name = path.name.removesuffix(".gz")
+    if format == rosbag.FORMAT and source is None:
+        source, columns = rosbag.read_commands(path, columns), columns.model_copy(update={"command_time": columns.time})
+    if format == motive_csv.FORMAT and source is None:
+        raise InputError(
+            "has no commands: Motive records none",
+            where=str(path),
+            remedy="give {observations = ..., commands = ...}, the latter a CSV with times of its own (command_time)",
+        )
+    for ending in (".csv", *rosbag.STORAGE):
+        name = name.removesuffix(ending)
+    return read_tables(
+        table,
+        source or table,
+        columns,
+        mask_missing=mask_missing,
+        format=format,
+        name=name if episode is None else f"{name}_{episode}",
+        provenance=path.name,
+    )
