@@ -108,8 +108,8 @@ def adapt(
 
 
 def _from_here(name: str) -> str:
-    """A path that counts from the current folder, where it has such a file; else as it is, for the experiment's."""
-    return str(Path(name).resolve()) if Path(name).is_file() else name
+    """A path that counts from the current folder, where there is such a recording; else as the experiment has it."""
+    return str(Path(name).resolve()) if Path(name).exists() else name
 
 
 def _window(rows: str | None) -> tuple[int, int] | None:

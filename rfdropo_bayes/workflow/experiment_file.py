@@ -91,7 +91,7 @@ def look_through(path: Path, overrides: Sequence[str] = ()) -> None:
             "no such robot file", where=str(folder / robot), remedy="correct robot = ... in the experiment"
         )
     for name in _recordings(tables):
-        find_files(name, folder)
+        find_files(name, folder, folders=True)
 
 
 def _recordings(tables: Mapping[str, Any]) -> Iterator[str]:
@@ -141,7 +141,7 @@ def _placed(entry: Any, folder: Path) -> Any:
     if isinstance(entry, dict):
         return {k: _placed(v, folder) if k in FILE_KEYS else v for k, v in entry.items()}
     try:
-        beside = find_files(str(entry), folder)[0].is_relative_to(folder)
+        beside = find_files(str(entry), folder, folders=True)[0].is_relative_to(folder)
     except InputError:
         return entry
     return str(folder / str(entry)) if beside else entry

@@ -172,7 +172,12 @@ def _joint_state(store, motion: Motion):
     names = [f"cable{channel}" for channel in range(1, motion.command.shape[1] + 1)]
     for moment, values in zip(motion.command_time, motion.command, strict=True):
         velocity = np.zeros(len(names))
-        yield "/joint_command", message, moment, message(_header(store, moment), names, values, velocity, velocity)
+        yield (
+            "/joint_command",
+            message,
+            moment,
+            message(_header(store, moment), names, values.copy(), velocity, velocity),
+        )
 
 
 def _single(store, motion: Motion):
