@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
+import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,6 +46,9 @@ def recognised_format(path: Path) -> str:
     try:
         with path.open("rb") as file:
             first = file.read(64)
+        if first.startswith(b"\x1f\x8b"):
+            with gzip.open(path) as file, suppress(EOFError, gzip.BadGzipFile, zlib.error):  # said when it is read
+                first = file.read(64)
     except OSError as error:
         remedy = "correct the path"
         raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None

@@ -313,7 +313,8 @@ def _command_times(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Fl
         raise InputError(
             f"commands were sent from {sent[0]:.6g} to {sent[-1]:.6g} s, and {last:.6g} s were recorded from 0 s on",
             where=f"{table.path} with {source.path}",
-            remedy="correct command_offset, or pair the files that were recorded together",
+            remedy="correct command_offset, or pair what was recorded together; for a bag whose stamps are of several "
+            'clocks write time = "log"',
         )
     return sent
 

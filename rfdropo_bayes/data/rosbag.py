@@ -200,7 +200,7 @@ def _readings(message: Any, topic: str) -> Iterator[_Reading]:
 def _gather(message: Any, prefix: str, values: dict[str, float], apart: list[tuple[str, Any]]) -> None:
     """Put a message's numbers into ``values``, by their paths, and elements with a header of their own ``apart``."""
     fields = {field.name: getattr(message, field.name) for field in dataclasses.fields(message)}
-    names = next((fields[key] for key in LISTS_OF_NAMES if isinstance(fields.get(key), list)), [])
+    names: list[str] = next((fields[key] for key in LISTS_OF_NAMES if isinstance(fields.get(key), list)), [])
     for key, value in fields.items():
         if key in PASSED_OVER or isinstance(value, str):
             continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import builtins
+import gzip
 import re
 import shutil
 import sys
@@ -131,6 +132,14 @@ def test_a_motive_export_is_told_from_other_files(tmp_path):
     commands_csv(MOTION, tmp_path / "sent.csv")
     assert recognised_format(tmp_path / "take.csv") == "motive-csv"
     assert recognised_format(tmp_path / "sent.csv") == "csv"
+    packed = gzip.compress((tmp_path / "take.csv").read_bytes())
+    (tmp_path / "packed.csv.gz").write_bytes(packed)
+    entry = {"observations": "packed.csv.gz", "commands": "sent.csv"}
+    (recording,) = load(tmp_path, "motive-csv", entry, motive_columns())
+    check_motion(recording, MOTION)
+    assert recording.name == "packed"
+    (tmp_path / "cut.csv.gz").write_bytes(packed[: len(packed) // 50])
+    assert recognised_format(tmp_path / "cut.csv.gz") in ("csv", "motive-csv")
     with fails("is of the format 'motive-csv', not 'csv'"):
         load(tmp_path, "csv", "take.csv", motive_columns())
     with fails("Motive's own export"):
