@@ -6,6 +6,7 @@ import builtins
 import gzip
 import re
 import shutil
+import sqlite3
 import sys
 
 import numpy as np
@@ -28,6 +29,7 @@ PLACES = {
     "tf": "/tf.transforms[{0}].transform.translation.{1}",
     "array": "/poses.poses[{2}].position.{1}",
     "mocap": "/rigid_bodies.rigidbodies[{0}].pose.position.{1}",
+    "markers": "/markers.markers[{3}].translation.{1}",
 }
 SENT = {
     "array": "/commands.data[{1}]",
@@ -45,7 +47,7 @@ def motive_columns(**changes):
 
 
 def bag_columns(poses="stamped", commands="array", **changes):
-    places = [[PLACES[poses].format(name, axis, k) for axis in "xyz"] for k, name in MOTION.named]
+    places = [[PLACES[poses].format(name, axis, k, k + 3) for axis in "xyz"] for k, name in MOTION.named]
     sent = [SENT[commands].format(channel + 1, channel) for channel in range(4)]
     return {"time": "header", "commands": sent, "positions": places} | PULLS | changes
 
@@ -173,16 +175,30 @@ def test_damaged_motive_exports_are_refused(tmp_path, cut):
 
 
 @pytest.mark.parametrize("storage", ["db3", "mcap", "bag"])
-@pytest.mark.parametrize("poses", ["stamped", "tf", "array", "mocap"])
+@pytest.mark.parametrize("poses", [*PLACES])
 def test_bags_of_all_kinds_of_poses_are_read(tmp_path, storage, poses):
     name = "run.bag" if storage == "bag" else "run"
-    if storage == "bag" and poses == "mocap":
-        poses = "stamped"  # these messages are of ROS 2
+    if storage == "bag" and poses in ("mocap", "markers"):
+        pytest.skip("messages of ROS 2")
     rosbag(MOTION, tmp_path / name, poses=poses, storage=storage)
     assert recognised_format(tmp_path / name) == "rosbag"
     (recording,) = load(tmp_path, "rosbag", name, bag_columns(poses))
     check_motion(recording, MOTION)
     assert recording.name == "run"
+
+
+def test_a_bag_without_definitions_is_read_as_far_as_its_messages_are_common(tmp_path):
+    """Recorders of ROS 2 before Iron wrote none."""
+    for name, poses in (("common", "stamped"), ("other", "mocap")):
+        (file,) = rosbag(MOTION, tmp_path / name, poses=poses).glob("*.db3")
+        with sqlite3.connect(file) as database:
+            database.execute("drop table message_definitions")
+            database.execute("update schema set schema_version = 3")
+        database.close()
+    (recording,) = load(tmp_path, "rosbag", "common", bag_columns())
+    check_motion(recording, MOTION)
+    with fails("does not define the message mocap4r2_msgs/msg/RigidBodies of /rigid_bodies"):
+        load(tmp_path, "rosbag", "other", bag_columns("mocap"))
 
 
 @pytest.mark.parametrize("commands", ["array", "joint"])

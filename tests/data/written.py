@@ -25,6 +25,7 @@ MOCAP = {
     "mocap4r2_msgs/msg/RigidBody": "string rigid_body_name\nmocap4r2_msgs/Marker[] markers\ngeometry_msgs/Pose pose",
     "mocap4r2_msgs/msg/RigidBodies": "std_msgs/Header header\nuint32 frame_number\n"
     "mocap4r2_msgs/RigidBody[] rigidbodies",
+    "mocap4r2_msgs/msg/Markers": "std_msgs/Header header\nuint32 frame_number\nmocap4r2_msgs/Marker[] markers",
 }
 
 
@@ -160,6 +161,17 @@ def _bodies(store, motion: Motion, frames: tuple[str, ...]):
         yield "/rigid_bodies", many, moment, many(_header(store, moment), row, bodies)
 
 
+def _numbered(store, motion: Motion, frames: tuple[str, ...]):
+    """mocap4r2_msgs/Markers, which have numbers from 3 on, the last one first."""
+    for name, definition in MOCAP.items():
+        store.register(get_types_from_msg(definition, name))
+    many, one = store.types["mocap4r2_msgs/msg/Markers"], store.types["mocap4r2_msgs/msg/Marker"]
+    point = store.types["geometry_msgs/msg/Point"]
+    for row, moment in enumerate(motion.time):
+        markers = [one(1, 3 + k, "", point(*motion.position[row, k])) for k, _ in reversed(motion.named)]
+        yield "/markers", many, moment, many(_header(store, moment), row, markers)
+
+
 def _multi_array(store, motion: Motion):
     """Float64MultiArray: without a header, so that the recorder's times count."""
     message = store.types["std_msgs/msg/Float64MultiArray"]
@@ -188,7 +200,7 @@ def _single(store, motion: Motion):
             yield f"/cable{channel + 1}/command", message, moment + 1e-4 * channel - LATENCY, message(value)
 
 
-POSES = {"stamped": _stamped, "tf": _transforms, "array": _pose_array, "mocap": _bodies}
+POSES = {"stamped": _stamped, "tf": _transforms, "array": _pose_array, "mocap": _bodies, "markers": _numbered}
 COMMANDS = {"array": _multi_array, "joint": _joint_state, "single": _single}
 
 
