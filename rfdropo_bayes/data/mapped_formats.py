@@ -47,8 +47,8 @@ def recognised_format(path: Path) -> str:
         with path.open("rb") as file:
             first = file.read(64)
         if first.startswith(b"\x1f\x8b"):
-            with gzip.open(path) as file, suppress(EOFError, gzip.BadGzipFile, zlib.error):  # said when it is read
-                first = file.read(64)
+            with gzip.open(path) as inner, suppress(EOFError, gzip.BadGzipFile, zlib.error):  # said when it is read
+                first = inner.read(64)
     except OSError as error:
         remedy = "correct the path"
         raise InputError(f"cannot be read ({error.strerror})", where=str(path), remedy=remedy) from None
