@@ -120,6 +120,11 @@ class Answer:
         return sum(self.profile.values())
 
     @property
+    def fitted(self) -> bool:
+        """Whether the base fit came to an end; where it did not, its parameters are where the search had come to."""
+        return self.base.converged or not self.stopped
+
+    @property
     def extended(self) -> Fit:
         """The last model."""
         return self.steps[-1].fit if self.steps else self.base
@@ -150,12 +155,15 @@ def audit(
     """
     deadline = deadline or Deadline(question.rules.minutes)
     with deadline.stage("base model"):
-        target, base = base_model(question, question.seed, journal, report, deadline)
+        target, base = _fitted_or_not(question, journal, report, deadline)
+    fitted = not deadline.reached
     question = _with_differences_of(question, target)
-    noise = target.measured.noise.first
-    shared = "" if noise.correlation is None else ", shared between coordinates"
-    report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}{_far_off(target, base)}")
-    finer = None if question.finer is None else _forward(question, True, target.measurements, deadline)
+    if fitted:
+        noise = target.measured.noise.first
+        shared = "" if noise.correlation is None else ", shared between coordinates"
+        report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}{_far_off(target, base)}")
+    has_finer = fitted and question.finer is not None
+    finer = _forward(question, True, target.measurements, deadline) if has_finer else None
     judge, inquiry = target, Inquiry(target, question.candidates, question.rules, question.seed, finer, report)
     inquiry, base, steps, last = _inquired(inquiry, base)
     judge = judge if judge.known is not None else inquiry.target.on(judge.forward)
@@ -315,19 +323,56 @@ def base_model(
     Raises:
         InputError: the time was up before the base model was fitted.
     """
-    journal = journal or Journal()
-    target = first_target(question, journal, deadline)
-    known = target.noise.source != RESIDUALS
+    target = first_target(question, journal or Journal(), deadline)
     try:
-        _announce(target, question.start, report)
-        target, fit = _base_fit(target, question.start, seed, report)
-        return (target, fit) if known else _under_residual_noise(target, fit)
+        return _fitted(target, question.start, seed, report, [])
     except OutOfTime:
         raise InputError(
             "the time was up before the base model was fitted",
             where=(deadline or Deadline()).where,
             remedy="raise it, fit fewer or shorter recordings, or start from a calibration (--base)",
         ) from None
+
+
+def _fitted(
+    target: Target,
+    start: dict[str, float] | None,
+    seed: int,
+    report: Callable[[str], None],
+    reached: list[tuple[Target, Float[np.ndarray, " d"]]],
+) -> tuple[Target, Fit]:
+    """The base model's noise and fit; ``reached`` gets the points that the search has come to."""
+    _announce(target, start, report)
+    known = target.noise.source != RESIDUALS
+    target, fit = _base_fit(target, start, seed, report, reached)
+    return (target, fit) if known else _under_residual_noise(target, fit)
+
+
+def _fitted_or_not(
+    question: Question, journal: Journal | None, report: Callable[[str], None], deadline: Deadline
+) -> tuple[Target, Fit]:
+    """The base model's noise and fit; where the time is up before, the last point that the search has come to, which
+    counts as not converged. The deadline is lifted then: what is left is a rollout of each recording."""
+    target = first_target(question, journal or Journal(), deadline)
+    coordinates = target.forward.coordinates
+    reached = [(target, coordinates.null if question.start is None else coordinates.encode(question.start))]
+    try:
+        return _fitted(target, question.start, question.seed, report, reached)
+    except OutOfTime:
+        report("the time was up before the base model was fitted")
+        deadline.lift()
+        target, fit = _unfitted(*reached[-1])
+    if target.noise.source == RESIDUALS:  # a first guess
+        target, fit = _unfitted(replace(target, noise=residual_noise(target, fit)), fit.x)
+    return target, fit
+
+
+def _unfitted(target: Target, x: Float[np.ndarray, " d"]) -> tuple[Target, Fit]:
+    """A point that no fit has ended at: of the base parameters no more is known than their prior."""
+    free = np.arange(target.forward.coordinates.base)
+    residual = target.residual(x[None])[0]
+    covariance = np.diag(target.forward.coordinates.prior_sd[free] ** 2)
+    return target, Fit(x, free, residual, np.zeros((len(residual), len(free))), covariance, -np.inf, np.inf)
 
 
 def _announce(target: Target, start: dict[str, float] | None, report: Callable[[str], None]) -> None:
@@ -363,18 +408,24 @@ def measurements_of(question: Question, chosen: Sequence[int], repeats: Sequence
 
 
 def _base_fit(
-    target: Target, start: dict[str, float] | None, seed: int, report: Callable[[str], None]
+    target: Target,
+    start: dict[str, float] | None,
+    seed: int,
+    report: Callable[[str], None],
+    reached: list[tuple[Target, Float[np.ndarray, " d"]]],
 ) -> tuple[Target, Fit]:
     """Posterior mode of the base model, from a given start or from where `calibrate`'s search leads; climbed on while
     rollouts beside it are better."""
     coordinates = target.forward.coordinates
     free = np.arange(coordinates.base)
     first = search(target, jax.random.key(seed)) if start is None else coordinates.encode(start)
+    reached.append((target, first))
     usual, target = target.forward.lanes.difference, with_usable_differences(target, first)
     if target.forward.lanes.difference != usual:
         report(f"motion is rough: derivatives over relative steps of {target.forward.lanes.difference:g}")
     target, fit = judged(target, first, free)
     for _ in range(AGAIN):
+        reached.append((target, fit.x))
         better = better_nearby(target, fit)
         if better is None:  # of a motion that bends, as where cables go slack, slopes promise what is not there
             return target, replace(fit, promise=0.0) if fit.promise < WITHIN else fit

@@ -109,6 +109,8 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
     apart = next((step for step in answer.steps if len(step.members) > 1), None)
     if answer.verdict == NO_DISCREPANCY:
         words = "Nothing is to be mended for commands like these; record larger and faster ones, and audit them."
+    elif not answer.fitted:
+        words = "Nothing yet: raise [audit] minutes and go on with --resume, or start anew from a calibration (--base)."
     elif not answer.base.converged:
         words = "Run `rfdropo calibrate`, look at its fit, and start the audit from it with --base."
     elif answer.suspected is not None:

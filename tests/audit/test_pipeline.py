@@ -253,10 +253,34 @@ def test_an_audit_whose_time_is_up_finishes_with_what_it_knows(monkeypatch, shar
     assert content["verdict"] == ("no_verdict" if not named else whole.verdict)
 
 
-def test_an_audit_without_the_time_for_a_base_fit_says_so():
+def test_a_base_model_without_the_time_for_its_fit_is_refused():
     asked = question(TRUTH, 1)
     with pytest.raises(InputError, match=r"\[audit\] minutes: the time was up before the base model was fitted"):
-        audit(replace(asked, rules=replace(asked.rules, minutes=1e-6)))
+        base_model(asked, asked.seed, deadline=Deadline(1e-6))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
+@pytest.mark.parametrize("stated", [True, False])
+def test_an_audit_without_the_time_for_a_base_fit_has_no_verdict_and_goes_on(tmp_path, share, stated):
+    """The time is up at the start, in the search and in the last climb; with and without a noise that is known."""
+    asked = question({**TRUTH, "play": 1.0}, 1)
+    if not stated:
+        asked = asked_of(asked, recordings({**TRUTH, "play": 1.0}, 1)[2:6], 2)
+    clock = Hurried(10**9)
+    base_model(asked, asked.seed, deadline=clock)
+    clock = Hurried(int(share * (10**9 - clock.looks)))
+    answer = audit(asked, journal=Journal(tmp_path), deadline=clock)
+    content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+    assert (content["verdict"], content["out_of_time"], content["findings"]) == ("no_verdict", True, [])
+    assert not content["base_fit_converged"]
+    assert "fit of the base model is not done" in content["sentence"]
+    assert "--resume" in content["sentence"]
+    assert "--resume" in content["next_experiment"]["sentence"]
+    assert "no_verdict" in render_audit(shown(answer), content, "", "").replace(" ", "_")
+    if stated and share > 0.5:
+        resumed = audit(asked, journal=Journal(tmp_path, resume=True))
+        assert resumed.verdict == "explained"
 
 
 class Rough(Toy):
