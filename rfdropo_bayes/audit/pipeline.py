@@ -15,7 +15,7 @@ from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.deadline import Deadline, OutOfTime, about
 from rfdropo_bayes.audit.differences import Groups
-from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step
+from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step, numerical_shift
 from rfdropo_bayes.audit.fit import Fit, Target, climb, climb_rollouts, widened
 from rfdropo_bayes.audit.forward import Forward, Lanes
 from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
@@ -203,7 +203,7 @@ def audit(
         sizes.draws(np.random.default_rng([question.seed, 5]), 1000, low, high),
         suspected,
         target.measurements.shift,
-        None if DISCRETISATION in asked else _numerical(target, finer, extended),
+        None if DISCRETISATION in asked or finer is None else numerical_shift(target, finer, extended),
         stopped,
         judge.forward.rollouts + (finer.rollouts if finer else 0),
         deadline.profile,
@@ -221,19 +221,6 @@ def _supported(
     last = steps[kept].before if kept < len(steps) else last
     steps, held_out = _without_carried(question, judge, inquiry, base, steps[:kept], held_out.after(kept))
     return steps, last if len(steps) == kept else inquiry.tested(steps[-1].fit, len(steps)), held_out
-
-
-def _numerical(target: Target, finer: Forward | None, fit: Fit) -> float | None:
-    """Root mean square distance [m] by which a finer mesh and time step move the markers where they are measured; None
-    where there is no finer simulator, or its rollouts do not end well."""
-    if finer is None:
-        return None
-    seen, fine = finer.observe(fit.x[None])
-    if not fine[0]:
-        return None
-    moved = target.forward.observe_one(fit.x)["position"] - seen["position"][0]
-    measured = target.measurements.channels[0].valid
-    return float(np.sqrt(3.0 * np.mean(moved.reshape(measured.shape)[measured] ** 2)))
 
 
 def _far_off(target: Target, fit: Fit) -> str:
