@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -24,7 +25,14 @@ from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Look, look
-from rfdropo_bayes.audit.search import WITHIN, better_nearby, search, with_usable_differences
+from rfdropo_bayes.audit.search import (
+    WITHIN,
+    better_nearby,
+    poll_rollouts,
+    search,
+    search_rollouts,
+    with_usable_differences,
+)
 from rfdropo_bayes.audit.verdict import NO_VERDICT, PARTLY, UNEXPLAINED, decide
 from rfdropo_bayes.bayes.channels import ObjectPose, Series
 from rfdropo_bayes.bayes.model import TrajectoryModel
@@ -36,7 +44,6 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
 
 DRAWS = 60
-SEARCH = 4  # climbs that the search for a base model is worth, over all horizons
 AGAIN = 3  # times that a base fit is climbed on from a better point beside it, before it counts as not converged
 # White noise of each channel in its own unit, until something better is known: millimetres, and the medians of priors.
 GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3}
@@ -363,14 +370,21 @@ def _unfitted(target: Target, x: Float[np.ndarray, " d"]) -> tuple[Target, Fit]:
 
 
 def _announce(target: Target, start: dict[str, float] | None, report: Callable[[str], None]) -> None:
-    """Say what is fitted first, and how long it may take."""
-    forward, free = target.forward, target.forward.coordinates.base
+    """Say what is fitted first, and how long it may take: rollouts at the pace of different ones that fill a call, and
+    derivatives, which take as long to compile as rollouts did."""
+    forward, own = target.forward, target.forward.coordinates
     counted = f"{forward.count} recording{'s' if forward.count > 1 else ''}, repeats taken together"
+    points = np.repeat(own.null[None], -(-forward.lanes.width // forward.count), axis=0)
+    points[:, : own.base] += np.linspace(-0.5, 0.5, len(points))[:, None] * own.prior_sd[: own.base]
+    took = []
     for _ in range(2):  # the first one compiles
-        forward.observe(forward.coordinates.null[None])
-    rollouts = (1 if start is not None else SEARCH) * climb_rollouts(target, free)
-    words = about(rollouts * forward.pace)
-    report(f"fitting the base model: {free} parameters, {counted}; up to {rollouts} rollouts, {words}")
+        began = time.monotonic()
+        forward.observe(np.clip(points, *own.bounds))
+        took.append(time.monotonic() - began)
+    rollouts = climb_rollouts(target, own.base) + poll_rollouts(target)
+    rollouts += search_rollouts(target) if start is None else 0
+    words = about(rollouts * forward.pace + max(took[0] - took[1], 0.0))
+    report(f"fitting the base model: {own.base} parameters, {counted}; about {rollouts} rollouts, {words}")
 
 
 def first_target(question: Question, journal: Journal, deadline: Deadline | None = None) -> Target:

@@ -87,7 +87,7 @@ def _through(table: dict[str, Any], transform: transforms.Transform, where: str)
         return None
     shift, factor = _plain(transform.loc, "loc", where), _plain(transform.scale, "scale", where)
     if family.startswith("Log"):  # what is shifted is log-normal no more
-        sized = {name: factor * table[name] for name in ("median", "low", "high") if name in table}
+        sized: dict[str, float] = {name: factor * table[name] for name in ("median", "low", "high") if name in table}
         return {**table, **sized} if shift == 0.0 and factor > 0.0 else None
     if family == "HalfNormal":
         if shift == 0.0 and factor > 0.0:

@@ -282,6 +282,29 @@ def test_an_audit_whose_time_is_up_finishes_with_what_it_knows(monkeypatch, shar
     assert content["verdict"] == ("no_verdict" if not named else whole.verdict)
 
 
+@pytest.mark.parametrize("start", [None, {"gain": 1.0, "bend": 0.0}])
+def test_the_rollouts_that_are_announced_for_the_base_model_are_about_those_it_takes(start):
+    lines: list[str] = []
+    target, _ = base_model(replace(question(TRUTH, 1), start=start), 1, report=lines.append)
+    (announced,) = [int(found[1]) for line in lines if (found := re.search(r"about (\d+) rollouts", line))]
+    assert 0.5 < announced / target.forward.rollouts < 2.0
+
+
+def test_the_pace_is_that_of_different_rollouts_that_fill_a_call():
+    """A call of few is filled with copies, which a compiled engine simulates for nothing."""
+    asked = question(TRUTH, 1)
+    forward = pipeline.first_target(asked, Journal()).forward
+    null = forward.coordinates.null
+    forward.observe(null[None])
+    assert forward.pace == 0.0
+    many = np.repeat(null[None], forward.lanes.width, axis=0)
+    many[:, 0] += np.linspace(-0.1, 0.1, len(many))
+    forward.observe(many, 3)
+    assert forward.pace == 0.0  # of the first rows only
+    forward.observe(many)
+    assert forward.pace > 0.0
+
+
 def test_a_base_model_without_the_time_for_its_fit_is_refused():
     asked = question(TRUTH, 1)
     with pytest.raises(InputError, match=r"\[audit\] minutes: the time was up before the base model was fitted"):
