@@ -169,8 +169,7 @@ def audit(
         noise = target.measured.noise.first
         shared = "" if noise.correlation is None else ", shared between coordinates"
         report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}{_far_off(target, base)}")
-    has_finer = fitted and question.finer is not None
-    finer = _forward(question, True, target.measurements, deadline) if has_finer else None
+    finer = _forward(question, True, target.measurements, deadline) if fitted and question.finer else None
     judge, inquiry = target, Inquiry(target, question.candidates, question.rules, question.seed, finer, report)
     inquiry, base, steps, last = _inquired(inquiry, base)
     judge = judge if judge.known is not None else inquiry.target.on(judge.forward)
