@@ -22,7 +22,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from rfdropo_bayes.bayes.priors import FAMILIES
+from rfdropo_bayes.bayes.priors import FAMILIES, OPTIONAL
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.mechanisms.registry import REGISTRY
@@ -72,7 +72,7 @@ def experiment_page() -> str:
         "## Priors",
         "`[model.priors]` has `parameter = { distribution = NAME, ... }`; every prior is confined to the parameter's "
         "hard bounds. `sigma` of a LogNormal is the standard deviation of the logarithm.",
-        table(("Distribution", "Arguments"), [(name, ", ".join(names)) for name, (_, names) in FAMILIES.items()]),
+        table(("Distribution", "Arguments", "Optional"), prior_rows()),
         "## Parameters of what is measured",
         "They stand in `[model.priors]` or `[model.fixed]` like those of the robot and of mechanisms.",
         parameter_table([(spec, needs) for spec, needs in measured_parameters()], "With"),
@@ -80,6 +80,11 @@ def experiment_page() -> str:
         table(("`[data] format`", "Files"), [(code(row["format"]), row["description"]) for row in format_rows()]),
     ]
     return page("The experiment file", parts)
+
+
+def prior_rows() -> list[tuple[str, str, str]]:
+    """Distributions with their arguments."""
+    return [(name, ", ".join(names), ", ".join(OPTIONAL.get(name, ()))) for name, (_, names) in FAMILIES.items()]
 
 
 def robot_page() -> str:

@@ -23,9 +23,10 @@ from rfdropo_bayes.audit.candidates import (
 from rfdropo_bayes.audit.deadline import OutOfTime, about
 from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb, climb_rollouts, heights
 from rfdropo_bayes.audit.forward import Forward
+from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.inadequacy import as_measured, far_off, judged
 from rfdropo_bayes.audit.omnibus import Omnibus
-from rfdropo_bayes.audit.score import joint_statistic, likeness, span
+from rfdropo_bayes.audit.score import joint_statistic, likeness, project_out, span
 from rfdropo_bayes.audit.screen import Look, Row, look
 
 DISCRETISATION = "discretisation"
@@ -117,7 +118,8 @@ class Inquiry:
         """Test a fit and screen the candidates that are not in it.
 
         An error of the mesh or time step that is too small to be named is no discrepancy either: where the residuals
-        of the finer simulator pass more easily, it is they that count.
+        of the finer simulator pass more easily, it is they that count. Too small is one that the screen does not see,
+        or that moves the markers by no more than the noise: see `_below_the_noise`.
         """
         # Of a family of parameters, some may be in the model by themselves.
         left = [replace(c, indices=tuple(i for i in c.indices if i not in fit.free)) for c in self.candidates]
@@ -143,9 +145,26 @@ class Inquiry:
             found = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer)
             if self.target.known is not None:  # whether anything is wrong, the noise of the measurement says
                 return replace(found, omnibus=self._tested(fit, len(without)), finer=None), probes
-        if found.finer is not None and found.row(DISCRETISATION).adjusted_p > self.rules.family:
+            if found.finer is None:
+                return found, probes
+            seen = found.row(DISCRETISATION).adjusted_p <= self.rules.family
+            if seen and self._below_the_noise(fit):
+                exact = _without_numerical_error(fit, probes[-1])
+                again = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, exact)
+                found, seen = replace(found, finer=again.finer), False
+        if not seen and found.finer is not None:
             found = replace(found, omnibus=max(found.omnibus, found.finer, key=lambda test: test.p))
         return found, probes
+
+    def _below_the_noise(self, fit: Fit) -> bool:
+        """Whether a finer mesh and time step move the markers by no more than the noise of one measurement.
+
+        Many rows and repeats make any such shift significant, and no data set with this noise is worth a finer mesh.
+        """
+        if self.finer is None:
+            return False
+        shift = numerical_shift(self.target, self.finer, fit)
+        return shift is not None and shift <= noise_distance(self.target.measured.noise.first)
 
     def tested(self, fit: Fit, number: int) -> Look:
         """The joint test of a model, which screens no candidates and takes no rollouts."""
@@ -229,6 +248,8 @@ class Inquiry:
     def _extend(self, found: Look, named: Sequence[str]) -> Step | None:
         """Refit the leading classes and add the best of them, if it is worth it."""
         significant = [row for row in found.rows if row.adjusted_p <= self.rules.family and row.probe is not None]
+        if any(row.name == DISCRETISATION for row in significant) and self._below_the_noise(found.fit):
+            significant = [row for row in significant if row.name != DISCRETISATION]
         refits: dict[str, float] = {}
         fits: dict[str, Fit] = {}
         leads = {row.name: self._lead(found.fit, row) for row in significant}
@@ -463,6 +484,29 @@ class Inquiry:
         gained = alone.log_evidence - plain.log_evidence
         renewed = replace(last, before=first.before, fit=alone, log_bayes_factor=gained)
         return [renewed, again]
+
+
+def numerical_shift(target: Target, finer: Forward, fit: Fit) -> float | None:
+    """Root mean square distance [m] by which a finer mesh and time step move the markers where they are measured; None
+    where the finer rollouts do not end well."""
+    seen, fine = finer.observe(fit.x[None])
+    if not fine[0]:
+        return None
+    moved = target.forward.observe_one(fit.x)["position"] - seen["position"][0]
+    measured = target.measurements.channels[0].valid
+    return float(np.sqrt(3.0 * np.mean(moved.reshape(measured.shape)[measured] ** 2)))
+
+
+def _without_numerical_error(fit: Fit, probe: Probe) -> Float[np.ndarray, " n"]:
+    """Residuals of the simulation without its error in space and time, as two resolutions tell it.
+
+    What halving the steps changes is a part of the error: half of it at the first order of the time steps, three
+    quarters at the second order of the mesh. So the whole is once to twice the change; the data say how much.
+    """
+    base = span(fit.jacobian)
+    change, left = project_out(base, probe.columns)[:, 0], project_out(base, fit.residual[:, None])[:, 0]
+    share = np.clip(float(change @ left) / max(float(change @ change), 1e-300), 1.0, 2.0)
+    return fit.residual - share * probe.columns[:, 0]
 
 
 def _nats_to(fit: Fit, point: Float[np.ndarray, " d"], moved: Int[np.ndarray, " moved"]) -> float:

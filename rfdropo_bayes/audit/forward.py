@@ -251,7 +251,7 @@ class Forward:
         self.count = len(chosen)
         self.start = np.zeros((self.count, 7)) if start is None else start
         self.rollouts = 0
-        self.pace = 0.0  # seconds that a rollout took last, of those that run at once
+        self.pace = 0.0  # seconds that a whole rollout took last, of different ones that fill a call
 
     @cached_property
     def identity(self) -> str:
@@ -295,8 +295,9 @@ class Forward:
         every = self.commands.step.shape[1]
         steps = None if rows is None else min(int(self.commands.sample_step[:, :rows].max()) + 1, every)
         found, status = self.lanes.roll(flat[once], start[once], commands.of(once), self.deadline.check, steps)
-        lanes = -(-len(status) // self.lanes.width) * self.lanes.width  # of a call that is not full, all run
-        self.pace = (time.monotonic() - began) / lanes
+        # A call that is not full is filled with copies, which cost one engine nothing and the other as much as ever.
+        if steps is None and len(status) >= self.lanes.width:
+            self.pace = (time.monotonic() - began) / (-(-len(status) // self.lanes.width) * self.lanes.width)
         self.rollouts += len(status)
         status, found = status[again], {name: part[again] for name, part in found.items()}
         fine = status == Result.OK

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -15,7 +16,7 @@ from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.deadline import Deadline, OutOfTime, about
 from rfdropo_bayes.audit.differences import Groups
-from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step
+from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step, numerical_shift
 from rfdropo_bayes.audit.fit import Fit, Target, climb, climb_rollouts, widened
 from rfdropo_bayes.audit.forward import Forward, Lanes
 from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
@@ -24,7 +25,14 @@ from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Look, look
-from rfdropo_bayes.audit.search import WITHIN, better_nearby, search, with_usable_differences
+from rfdropo_bayes.audit.search import (
+    WITHIN,
+    better_nearby,
+    poll_rollouts,
+    search,
+    search_rollouts,
+    with_usable_differences,
+)
 from rfdropo_bayes.audit.verdict import NO_VERDICT, PARTLY, UNEXPLAINED, decide
 from rfdropo_bayes.bayes.channels import ObjectPose, Series
 from rfdropo_bayes.bayes.model import TrajectoryModel
@@ -36,7 +44,6 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
 
 DRAWS = 60
-SEARCH = 4  # climbs that the search for a base model is worth, over all horizons
 AGAIN = 3  # times that a base fit is climbed on from a better point beside it, before it counts as not converged
 # White noise of each channel in its own unit, until something better is known: millimetres, and the medians of priors.
 GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3}
@@ -120,6 +127,11 @@ class Answer:
         return sum(self.profile.values())
 
     @property
+    def fitted(self) -> bool:
+        """Whether the base fit came to an end; where it did not, its parameters are where the search had come to."""
+        return self.base.converged or not self.stopped
+
+    @property
     def extended(self) -> Fit:
         """The last model."""
         return self.steps[-1].fit if self.steps else self.base
@@ -150,12 +162,14 @@ def audit(
     """
     deadline = deadline or Deadline(question.rules.minutes)
     with deadline.stage("base model"):
-        target, base = base_model(question, question.seed, journal, report, deadline)
+        target, base = _fitted_or_not(question, journal, report, deadline)
+    fitted = not deadline.reached
     question = _with_differences_of(question, target)
-    noise = target.measured.noise.first
-    shared = "" if noise.correlation is None else ", shared between coordinates"
-    report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}{_far_off(target, base)}")
-    finer = None if question.finer is None else _forward(question, True, target.measurements, deadline)
+    if fitted:
+        noise = target.measured.noise.first
+        shared = "" if noise.correlation is None else ", shared between coordinates"
+        report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}{_far_off(target, base)}")
+    finer = _forward(question, True, target.measurements, deadline) if fitted and question.finer else None
     judge, inquiry = target, Inquiry(target, question.candidates, question.rules, question.seed, finer, report)
     inquiry, base, steps, last = _inquired(inquiry, base)
     judge = judge if judge.known is not None else inquiry.target.on(judge.forward)
@@ -195,7 +209,7 @@ def audit(
         sizes.draws(np.random.default_rng([question.seed, 5]), 1000, low, high),
         suspected,
         target.measurements.shift,
-        None if DISCRETISATION in asked else _numerical(target, finer, extended),
+        None if DISCRETISATION in asked or finer is None else numerical_shift(target, finer, extended),
         stopped,
         judge.forward.rollouts + (finer.rollouts if finer else 0),
         deadline.profile,
@@ -213,19 +227,6 @@ def _supported(
     last = steps[kept].before if kept < len(steps) else last
     steps, held_out = _without_carried(question, judge, inquiry, base, steps[:kept], held_out.after(kept))
     return steps, last if len(steps) == kept else inquiry.tested(steps[-1].fit, len(steps)), held_out
-
-
-def _numerical(target: Target, finer: Forward | None, fit: Fit) -> float | None:
-    """Root mean square distance [m] by which a finer mesh and time step move the markers where they are measured; None
-    where there is no finer simulator, or its rollouts do not end well."""
-    if finer is None:
-        return None
-    seen, fine = finer.observe(fit.x[None])
-    if not fine[0]:
-        return None
-    moved = target.forward.observe_one(fit.x)["position"] - seen["position"][0]
-    measured = target.measurements.channels[0].valid
-    return float(np.sqrt(3.0 * np.mean(moved.reshape(measured.shape)[measured] ** 2)))
 
 
 def _far_off(target: Target, fit: Fit) -> str:
@@ -315,13 +316,9 @@ def base_model(
     Raises:
         InputError: the time was up before the base model was fitted.
     """
-    journal = journal or Journal()
-    target = first_target(question, journal, deadline)
-    known = target.noise.source != RESIDUALS
+    target = first_target(question, journal or Journal(), deadline)
     try:
-        _announce(target, question.start, report)
-        target, fit = _base_fit(target, question.start, seed, report)
-        return (target, fit) if known else _under_residual_noise(target, fit)
+        return _fitted(target, question.start, seed, report, [])
     except OutOfTime:
         raise InputError(
             "the time was up before the base model was fitted",
@@ -330,15 +327,63 @@ def base_model(
         ) from None
 
 
+def _fitted(
+    target: Target,
+    start: dict[str, float] | None,
+    seed: int,
+    report: Callable[[str], None],
+    reached: list[tuple[Target, Float[np.ndarray, " d"]]],
+) -> tuple[Target, Fit]:
+    """The base model's noise and fit; ``reached`` gets the points that the search has come to."""
+    _announce(target, start, report)
+    known = target.noise.source != RESIDUALS
+    target, fit = _base_fit(target, start, seed, report, reached)
+    return (target, fit) if known else _under_residual_noise(target, fit)
+
+
+def _fitted_or_not(
+    question: Question, journal: Journal | None, report: Callable[[str], None], deadline: Deadline
+) -> tuple[Target, Fit]:
+    """The base model's noise and fit; where the time is up before, the last point that the search has come to, which
+    counts as not converged. The deadline is lifted then: what is left is a rollout of each recording."""
+    target = first_target(question, journal or Journal(), deadline)
+    coordinates = target.forward.coordinates
+    reached = [(target, coordinates.null if question.start is None else coordinates.encode(question.start))]
+    try:
+        return _fitted(target, question.start, question.seed, report, reached)
+    except OutOfTime:
+        report("the time was up before the base model was fitted")
+        deadline.lift()
+        target, fit = _unfitted(*reached[-1])
+    if target.noise.source == RESIDUALS:  # a first guess
+        target, fit = _unfitted(replace(target, noise=residual_noise(target, fit)), fit.x)
+    return target, fit
+
+
+def _unfitted(target: Target, x: Float[np.ndarray, " d"]) -> tuple[Target, Fit]:
+    """A point that no fit has ended at: of the base parameters no more is known than their prior."""
+    free = np.arange(target.forward.coordinates.base)
+    residual = target.residual(x[None])[0]
+    covariance = np.diag(target.forward.coordinates.prior_sd[free] ** 2)
+    return target, Fit(x, free, residual, np.zeros((len(residual), len(free))), covariance, -np.inf, np.inf)
+
+
 def _announce(target: Target, start: dict[str, float] | None, report: Callable[[str], None]) -> None:
-    """Say what is fitted first, and how long it may take."""
-    forward, free = target.forward, target.forward.coordinates.base
+    """Say what is fitted first, and how long it may take: rollouts at the pace of different ones that fill a call, and
+    derivatives, which take as long to compile as rollouts did."""
+    forward, own = target.forward, target.forward.coordinates
     counted = f"{forward.count} recording{'s' if forward.count > 1 else ''}, repeats taken together"
+    points = np.repeat(own.null[None], -(-forward.lanes.width // forward.count), axis=0)
+    points[:, : own.base] += np.linspace(-0.5, 0.5, len(points))[:, None] * own.prior_sd[: own.base]
+    took = []
     for _ in range(2):  # the first one compiles
-        forward.observe(forward.coordinates.null[None])
-    rollouts = (1 if start is not None else SEARCH) * climb_rollouts(target, free)
-    words = about(rollouts * forward.pace)
-    report(f"fitting the base model: {free} parameters, {counted}; up to {rollouts} rollouts, {words}")
+        began = time.monotonic()
+        forward.observe(np.clip(points, *own.bounds))
+        took.append(time.monotonic() - began)
+    rollouts = climb_rollouts(target, own.base) + poll_rollouts(target)
+    rollouts += search_rollouts(target) if start is None else 0
+    words = about(rollouts * forward.pace + max(took[0] - took[1], 0.0))
+    report(f"fitting the base model: {own.base} parameters, {counted}; about {rollouts} rollouts, {words}")
 
 
 def first_target(question: Question, journal: Journal, deadline: Deadline | None = None) -> Target:
@@ -363,18 +408,24 @@ def measurements_of(question: Question, chosen: Sequence[int], repeats: Sequence
 
 
 def _base_fit(
-    target: Target, start: dict[str, float] | None, seed: int, report: Callable[[str], None]
+    target: Target,
+    start: dict[str, float] | None,
+    seed: int,
+    report: Callable[[str], None],
+    reached: list[tuple[Target, Float[np.ndarray, " d"]]],
 ) -> tuple[Target, Fit]:
     """Posterior mode of the base model, from a given start or from where `calibrate`'s search leads; climbed on while
     rollouts beside it are better."""
     coordinates = target.forward.coordinates
     free = np.arange(coordinates.base)
     first = search(target, jax.random.key(seed)) if start is None else coordinates.encode(start)
+    reached.append((target, first))
     usual, target = target.forward.lanes.difference, with_usable_differences(target, first)
     if target.forward.lanes.difference != usual:
         report(f"motion is rough: derivatives over relative steps of {target.forward.lanes.difference:g}")
     target, fit = judged(target, first, free)
     for _ in range(AGAIN):
+        reached.append((target, fit.x))
         better = better_nearby(target, fit)
         if better is None:  # of a motion that bends, as where cables go slack, slopes promise what is not there
             return target, replace(fit, promise=0.0) if fit.promise < WITHIN else fit

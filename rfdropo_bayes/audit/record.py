@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rfdropo_bayes.audit.candidates import spoken
-from rfdropo_bayes.audit.extension import Step
+from rfdropo_bayes.audit.extension import DISCRETISATION, Step
 from rfdropo_bayes.audit.gain import LEVELS, noise_distance
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.prequential import in_words, prequential
@@ -25,6 +25,7 @@ MILLIMETRES = 1e3
 STIFFNESS = "young_modulus"
 MORE_TESTS = 6  # recordings: all must favour a model by chance in one case of 64 only
 REFINE = "raise [simulator] refine and shorten its time_step"
+SHORTEN = "shorten [simulator] time_step"  # of a mesh, whose finer simulation has the same elements
 
 
 def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_experiment: Any) -> dict[str, Any]:
@@ -109,6 +110,8 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
     apart = next((step for step in answer.steps if len(step.members) > 1), None)
     if answer.verdict == NO_DISCREPANCY:
         words = "Nothing is to be mended for commands like these; record larger and faster ones, and audit them."
+    elif not answer.fitted:
+        words = "Nothing yet: raise [audit] minutes and go on with --resume, or start anew from a calibration (--base)."
     elif not answer.base.converged:
         words = "Run `rfdropo calibrate`, look at its fit, and start the audit from it with --base."
     elif answer.suspected is not None:
@@ -132,7 +135,8 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
     else:
         name, share = _largest(answer)
         most = f", {100 * share:.0f} % of what is wrong" if share and len(answer.steps) > 1 else ""
-        words = f"Check {spoken(name)} on the robot{most}: {_remedy(answer, name)}."
+        where = "Refine the simulation" if name == DISCRETISATION else f"Check {spoken(name)} on the robot"
+        words = f"{where}{most}: {_remedy(answer, name)}."
         if not answer.adopted:
             words = f"{words[:-1]}; and {_doubt(answer)}."
         return {"sentence": words, "separates": [name]}
@@ -156,7 +160,10 @@ def _largest(answer: Answer) -> tuple[str, float | None]:
 
 def _remedy(answer: Answer, name: str) -> str:
     candidate = answer.question.candidate(name)
-    return candidate.mechanism.remedy if candidate else REFINE
+    if candidate is not None:
+        return candidate.mechanism.remedy
+    layered = "layers" in answer.question.lanes.simulator.description
+    return REFINE if layered else SHORTEN
 
 
 def _watch(answer: Answer) -> str:
@@ -207,7 +214,7 @@ def _finding(answer: Answer, step: Step, share: float | None) -> dict[str, Any]:
         "parameters": parameters,
         "relative": relative,
         "cause": getattr(mechanism, "cause", "the mesh or the time step of the simulator is too coarse"),
-        "remedy": mechanism.remedy if mechanism else REFINE,
+        "remedy": _remedy(answer, step.name),
         "explained_fraction": share,
         "explained_fraction_interval": list(answer.gain.interval) if only and answer.gain else None,
         "adjusted_p": row.adjusted_p,

@@ -18,9 +18,10 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.audit.fit import CLOSE, Fit, Target, heights
 from rfdropo_bayes.bayes.space import ParameterSpace
-from rfdropo_bayes.inference import LaplaceConfig, find_modes
+from rfdropo_bayes.inference import LaplaceConfig, climb_cost, find_modes
 from rfdropo_bayes.simulators.differences import usable_difference
 
+USUAL = 3  # steps of each of these climbs: of a linear model one or two, of the demonstration's arm five
 CLIMBED = 0.1  # nats that a step of these climbs promises at their end; the audit's own climb goes on from there
 POLLED = (0.3, 0.03, 0.003)  # prior deviations to each side of a summit that are tried
 ALONG = (4.0, 2.0, 1.0, 0.3)  # deviations of the posterior along its principal axes, likewise
@@ -143,6 +144,20 @@ def search(target: Target, key: PRNGKeyArray) -> Float[np.ndarray, " d"]:
         return {"x": problem._points(mode.mean[None])[0]}
 
     return target.recall("search", [np.asarray(jax.random.key_data(key))], compute)["x"]
+
+
+def search_rollouts(target: Target) -> int:
+    """Rollouts that `search` usually takes: draws that are screened, at each horizon, and climbs, of which the better
+    half goes on to the next."""
+    config, own = LaplaceConfig(), target.forward.coordinates
+    beginning, step = climb_cost(own.base, 0)
+    climbs = sum(max(config.starts >> level, 1) for level in range(config.blocks))
+    return target.forward.count * int(config.blocks * config.screen + climbs * (beginning + USUAL * step))
+
+
+def poll_rollouts(target: Target) -> int:
+    """Rollouts that `better_nearby` takes."""
+    return target.forward.count * (1 + 2 * (len(POLLED) + len(ALONG)) * target.forward.coordinates.base)
 
 
 def with_usable_differences(target: Target, x: Float[np.ndarray, " d"]) -> Target:

@@ -96,6 +96,8 @@ def _numerical(answer: Answer) -> str:
 
 
 def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
+    if not answer.fitted:
+        return "No verdict: the fit of the base model is not done."
     if not answer.base.converged:
         left = answer.base.residual
         return (

@@ -1,4 +1,5 @@
-"""Prior distributions from the tables of an experiment file, confined to a parameter's hard bounds."""
+"""Prior distributions from the tables of an experiment file, confined to a parameter's hard bounds; the tables of
+distributions of numpyro are in `numpyro_priors`."""
 
 from __future__ import annotations
 
@@ -70,13 +71,15 @@ FAMILIES: dict[str, tuple[Callable[..., dist.Distribution], tuple[str, ...]]] = 
     "Uniform": (_uniform, ("low", "high")),
     "LogUniform": (_log_uniform, ("low", "high")),
 }
+OPTIONAL = {"TruncatedNormal": ("low", "high")}
+"""Arguments that may be left out: a normal that ends before the hard bounds do."""
 
 
 def prior_from_table(spec: ParameterSpec, table: Mapping[str, Any], *, where: str) -> dist.Distribution:
     """Build the prior of one parameter.
 
-    Normal, HalfNormal and LogNormal priors are truncated to the hard bounds; Uniform and LogUniform ranges must lie
-    inside them.
+    Normal, HalfNormal and LogNormal priors are truncated to the hard bounds, a TruncatedNormal to its own ends, too;
+    Uniform and LogUniform ranges must lie inside them.
 
     Args:
         spec: the parameter, with its unit and bounds.
@@ -91,15 +94,24 @@ def prior_from_table(spec: ParameterSpec, table: Mapping[str, Any], *, where: st
     if family not in FAMILIES:
         raise InputError(f"unknown distribution {family!r}", where=where, remedy=nearest(str(family), FAMILIES))
     build, names = FAMILIES[family]
+    known = (*names, *OPTIONAL.get(family, ()))
     for name in arguments:
-        if name not in names:
-            raise InputError(f"{family} takes no argument {name!r}", where=where, remedy=nearest(name, names))
+        if name not in known:
+            raise InputError(f"{family} takes no argument {name!r}", where=where, remedy=nearest(name, known))
     missing = [name for name in names if name not in arguments]
     if missing:
         raise InputError(f"{family} lacks {', '.join(missing)}", where=where, remedy=f"it takes {', '.join(names)}")
-    numbers = {name: _number(name, arguments[name], where) for name in names}
+    numbers = {name: _number(name, value, where) for name, value in arguments.items()}
     _check_inside(spec, family, numbers, where)
-    return build(spec, **numbers)
+    return build(confined(spec, table), **{name: numbers[name] for name in names})
+
+
+def confined(spec: ParameterSpec, table: Mapping[str, Any]) -> ParameterSpec:
+    """The parameter within the ends that a TruncatedNormal has beside the hard bounds; else as it is."""
+    if table.get("distribution") not in OPTIONAL:
+        return spec
+    low, high = table.get("low", -math.inf), table.get("high", math.inf)
+    return spec._replace(low=max(spec.low, low), high=min(spec.high, high))
 
 
 def log_density(spec: ParameterSpec, table: Mapping[str, Any], values: np.ndarray) -> np.ndarray:
@@ -109,6 +121,7 @@ def log_density(spec: ParameterSpec, table: Mapping[str, Any], values: np.ndarra
         return np.full(np.shape(values), -math.log(table["high"] - table["low"]))
     if family == "LogUniform":
         return -np.log(values) - math.log(math.log(table["high"] / table["low"]))
+    spec = confined(spec, table)
     low, high, scale, at = spec.low, spec.high, table.get("scale", table.get("sigma")), values
     middle = table.get("loc", 0.0)
     if family == "HalfNormal":
@@ -132,10 +145,10 @@ def _number(name: str, value: Any, where: str) -> float:
 def _check_inside(spec: ParameterSpec, family: str, numbers: Mapping[str, float], where: str) -> None:
     """A range must lie inside the hard bounds; a bell must have at least half of its mass there."""
     bounds = f"the hard bounds of {spec.name} are [{spec.low:g}, {spec.high:g}] {spec.unit}"
+    low, high = numbers.get("low", -math.inf), numbers.get("high", math.inf)
+    if low >= high:
+        raise InputError(f"low = {low:g} is not below high = {high:g}", where=where, remedy="swap them")
     if family in ("Uniform", "LogUniform"):
-        low, high = numbers["low"], numbers["high"]
-        if low >= high:
-            raise InputError(f"low = {low:g} is not below high = {high:g}", where=where, remedy="swap them")
         if low < spec.low or high > spec.high or (family == "LogUniform" and low <= 0):
             raise InputError(f"the prior [{low:g}, {high:g}] reaches outside the bounds", where=where, remedy=bounds)
         return
@@ -147,38 +160,8 @@ def _check_inside(spec: ParameterSpec, family: str, numbers: Mapping[str, float]
         bell = stats.lognorm(numbers["sigma"], scale=numbers["median"])
         inside = bell.cdf(spec.high) - bell.cdf(max(spec.low, 0.0))
     else:
-        bell = stats.norm(numbers["loc"], numbers["scale"])
+        ends = (np.array([low, high]) - numbers["loc"]) / numbers["scale"]
+        bell = stats.truncnorm(*ends, loc=numbers["loc"], scale=numbers["scale"])
         inside = bell.cdf(spec.high) - bell.cdf(spec.low)
     if inside < 0.5:
         raise InputError(f"only {100 * inside:.0f} % of the prior lies within the bounds", where=where, remedy=bounds)
-
-
-def table_of(prior: Any, *, where: str) -> dict[str, Any]:
-    """The table of a prior that is given as one, or as a distribution of numpyro; None asks for the default, ``{}``.
-
-    Raises:
-        InputError: neither, or a distribution of another family.
-    """
-    if prior is None or isinstance(prior, Mapping):
-        return dict(prior or {})
-    for family, kind in KINDS.items():
-        if type(prior) is kind:
-            found = {name: float(getattr(prior, name)) for name in kind.arg_constraints if hasattr(prior, name)}
-            if family == "LogNormal":
-                found = {"median": math.exp(found["loc"]), "sigma": found["scale"]}
-            return {"distribution": family, **{name: found[name] for name in FAMILIES[family][1]}}
-    raise InputError(
-        f"{type(prior).__name__} cannot be a prior",
-        where=where,
-        remedy=f"give a scalar {', '.join(FAMILIES)}, or a table; priors end at the hard bounds by themselves",
-    )
-
-
-KINDS: dict[str, type] = {
-    "Normal": dist.Normal,
-    "HalfNormal": dist.HalfNormal,
-    "LogNormal": dist.LogNormal,
-    "Uniform": dist.Uniform,
-    "LogUniform": dist.LogUniform,
-}
-"""Distributions of numpyro that say the same as a table."""

@@ -14,7 +14,7 @@ import numpyro.distributions as dist
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.pooling import Pooled, deviation_spec, spread_spec
-from rfdropo_bayes.bayes.priors import prior_from_table
+from rfdropo_bayes.bayes.priors import confined, prior_from_table
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import SPREAD
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
@@ -229,7 +229,7 @@ def build_space(
                     where="[model.per_recording]",
                     remedy=f"recordings: {', '.join(recordings)}",
                 )
-            parameters.append(Parameter(spec, prior, recording, chosen))
+            parameters.append(Parameter(confined(spec, chosen), prior, recording, chosen))
         if name in pooled:
             spread = spread_of(spec, pooled[name])
             known = [parameter.name for parameter in parameters]

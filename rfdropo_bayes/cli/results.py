@@ -49,7 +49,7 @@ def show_calibration(found: Calibration, *, quiet: bool, as_json: bool) -> None:
         chosen = {key: summary[key] for key in CALIBRATED if key in summary}
         say({**chosen, "folder": str(folder), "report": str(report)}, quiet=quiet, as_json=as_json)
         return
-    console = Console(highlight=False)
+    console = _console()
     for sentence in summary["headline"]:
         style = COLOURS[found.verdict] if sentence == found.sentence else ""
         console.print(Text(sentence, style=style), soft_wrap=True)
@@ -75,7 +75,7 @@ def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: 
     if as_json or quiet:
         say({**{key: found[key] for key in AUDITED if key in found}, **files}, quiet=quiet, as_json=as_json)
         return
-    console = Console(highlight=False)
+    console = _console()
     verdict = Text(found["verdict"], style=f"bold {COLOURS.get(found['verdict'], '')}")
     console.print(verdict + Text(f": {found['sentence']}", style="not bold"), soft_wrap=True)
     rows = [
@@ -118,6 +118,11 @@ def show_prediction(facts: Mapping[str, Any], *, quiet: bool, as_json: bool) -> 
     lines += [f"caution: {caution['sentence']}" for caution in facts["cautions"]]
     lines += ["mean, 50 and 90 % bands in m:", *(f"  {file}" for file in facts["files"])]
     say(facts, *lines, quiet=quiet, as_json=as_json)
+
+
+def _console() -> Console:
+    """A terminal that shows text as it is: "[simulator] refine" is a table of a file, not a style."""
+    return Console(highlight=False, markup=False, emoji=False)
 
 
 def _parameters(rows: Iterable[tuple[str, Mapping[str, Any], str]]) -> Table:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.methods import make_config as make_config
     from rfdropo_bayes.inference.methods import method_named as method_named
     from rfdropo_bayes.inference.modes.climb import LevenbergState as LevenbergState
+    from rfdropo_bayes.inference.modes.climb import climb_cost as climb_cost
     from rfdropo_bayes.inference.modes.climb import maximise as maximise
     from rfdropo_bayes.inference.modes.climb import normal_at as normal_at
     from rfdropo_bayes.inference.modes.lasting import lasting_series as lasting_series
@@ -49,6 +50,7 @@ PUBLIC = {
     "make_config": "methods",
     "method_named": "methods",
     "LevenbergState": "modes.climb",
+    "climb_cost": "modes.climb",
     "maximise": "modes.climb",
     "normal_at": "modes.climb",
     "lasting_series": "modes.lasting",

@@ -60,11 +60,11 @@ class Progress:
         self._first: tuple[float, float] | None = None  # time and share of the first report: compiling came before it
         self._prints = show is None and not sys.stderr.isatty()
         self._bar = Bar(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             TextColumn("{task.percentage:3.0f} %"),
             TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}  {task.fields[words]}"),
+            TextColumn("{task.fields[left]}  {task.fields[words]}", markup=False),
             console=Console(stderr=True),
             disable=show is False or self._prints,
             transient=False,

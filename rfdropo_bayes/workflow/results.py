@@ -16,10 +16,13 @@ from rfdropo_bayes.workflow.experiment_file import read_tables
 from rfdropo_bayes.workflow.model import Model
 
 
-def load(folder: Path | str) -> Calibration | Audit:
+def load(folder: Path | str, model: Model | None = None) -> Calibration | Audit:
     """Read the folder of a calibration or of an audit.
 
-    A calibration of a robot or black box that was made in Python has no model: give predictions the one that made it.
+    Args:
+        folder: that the run wrote.
+        model: that was calibrated, for predictions; that of the folder's config.toml by default. No file describes a
+            black box, or a mechanism, that was made in Python.
 
     Raises:
         InputError: the folder holds neither, or a damaged file.
@@ -34,7 +37,7 @@ def load(folder: Path | str) -> Calibration | Audit:
     config = folder / CONFIG
     text = config.read_text(encoding="utf-8") if config.is_file() else ""
     record, content = PosteriorRecord.load(folder / POSTERIOR), read_summary(folder / SUMMARY)
-    return Calibration(record, content, text, _model(config), folder)
+    return Calibration(record, content, text, _model(config) if model is None else model, folder)
 
 
 def _model(config: Path) -> Model | None:

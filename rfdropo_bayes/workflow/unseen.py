@@ -39,7 +39,7 @@ from rfdropo_bayes.prediction.predictive import (
     predict_new,
     thin,
 )
-from rfdropo_bayes.report.run_folder import POSTERIOR
+from rfdropo_bayes.report.run_folder import CONFIG, POSTERIOR
 from rfdropo_bayes.report.trajectory_figures import draw_band
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -173,9 +173,19 @@ def model_of(fit: Calibration) -> Model:
     Raises:
         InputError: it was read from files that do not say which.
     """
-    if fit.model is None:
-        raise InputError("the calibration has no model", where="predict", remedy="give the one that calibrate returned")
-    return fit.model
+    if fit.model is not None:
+        return fit.model
+    why = "no config.toml says which"
+    if fit.folder is not None and (fit.folder / CONFIG).is_file():
+        try:
+            return Model.read(fit.folder / CONFIG)[0]
+        except InputError as error:
+            why = error.what
+    raise InputError(
+        f"the calibration has no model: {why}",
+        where=str(fit.folder or "predict"),
+        remedy="give the one that was calibrated: rb.load(folder, model=model)",
+    )
 
 
 def fitted_parts(fit: Calibration) -> tuple[dict[str, float], ParameterSpace]:

@@ -118,17 +118,24 @@ def test_a_cause_outside_the_library_is_not_called_explained_and_a_gain_is_invis
 
 
 class Coarse(Toy):
-    """An error of the audit's own simulator, which a finer one lacks."""
+    """An error of the audit's own simulator, which a finer one lacks: a share of the square of positions [1/m]."""
+
+    def __init__(self, error: float) -> None:
+        self.error = error
 
     def rollout(self, parameters, commands, steps=None):
         found = super().rollout(parameters, commands, steps)
-        return found._replace(position=found.position * (1.0 + 3.0 * found.position))
+        return found._replace(position=found.position * (1.0 + self.error * found.position))
 
 
-def on_a_coarse_mesh(asked):
-    """A question whose simulator is the finer one of a coarse one."""
-    finer = (asked.lanes, asked.model.recordings.commands)
-    return replace(asked, lanes=Lanes(Coarse(), np.arange(4)), finer=finer)
+LARGE, SMALL = 12.0, 3.0  # of which the first moves the markers by more than the noise, the second by a third of it
+
+
+def on_a_coarse_mesh(asked, error=LARGE, left=0.0):
+    """A question whose simulator is coarse; the error ``left`` stays on the finer one."""
+    finer = Lanes(Coarse(left), np.arange(4)) if left else asked.lanes
+    commands = asked.model.recordings.commands
+    return replace(asked, lanes=Lanes(Coarse(error), np.arange(4)), finer=(finer, commands))
 
 
 def test_what_an_error_of_the_mesh_hides_is_found_on_the_finer_one():
@@ -142,10 +149,10 @@ def test_what_an_error_of_the_mesh_hides_is_found_on_the_finer_one():
     assert abs(sizes.mean() - 0.15) < 4 * sizes.std()
 
 
-@pytest.mark.parametrize(("family", "named"), [(0.02, ["discretisation"]), (0.0, [])])
-def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(family, named):
+@pytest.mark.parametrize(("error", "family", "named"), [(LARGE, 0.02, ["discretisation"]), (SMALL, 0.0, [])])
+def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(error, family, named):
     """Where nothing may be named, an error of the mesh is let pass."""
-    asked = on_a_coarse_mesh(question(TRUTH, 102))
+    asked = on_a_coarse_mesh(question(TRUTH, 102), error)
     answer = audit(replace(asked, rules=replace(asked.rules, family=family)))
     assert [step.name for step in answer.steps] == named
     assert answer.verdict == ("explained" if named else "no_discrepancy")
@@ -158,8 +165,30 @@ def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(family, named):
     coarse = answer.target.forward.observe_one(answer.extended.x)["position"]
     moved = coarse - (np.sqrt(1.0 + 12.0 * coarse) - 1.0) / 6.0  # the finer position p solves p (1 + 3 p) = coarse
     assert content["numerical_error_mm"] == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(moved**2, axis=-1))), rel=1e-4)
-    larger = content["numerical_error_mm"] > content["noise_floor_mm"]
-    assert ("shorten [simulator] time_step" in content["sentence"]) == larger
+
+
+@pytest.mark.parametrize("left", [0.0, SMALL / 2])
+def test_an_error_of_the_mesh_below_the_noise_is_no_finding_however_sure_it_is(left):
+    """Also where the finer simulator has half of the error itself, as with time steps of first order."""
+    answer = audit(on_a_coarse_mesh(question(TRUTH, 102), SMALL, left))
+    assert answer.looks[0].row("discretisation").adjusted_p < 0.02
+    assert answer.steps == []
+    assert answer.verdict == "no_discrepancy"
+    content = record(answer, versions={}, data_sha256="", next_experiment=None)
+    assert content["numerical_error_mm"] < content["noise_floor_mm"]
+    assert "shorten [simulator] time_step" not in content["sentence"]
+
+
+def test_beside_an_error_of_the_mesh_below_the_noise_causes_are_named():
+    answer = audit(on_a_coarse_mesh(question({**TRUTH, "play": 1.0}, 102), SMALL))
+    assert [step.name for step in answer.steps] == ["play"]
+
+
+def test_the_next_step_about_the_mesh_is_at_the_simulation():
+    answer = audit(on_a_coarse_mesh(question(TRUTH, 102)))
+    words = next_experiment(answer)["sentence"]
+    assert words.startswith("Refine the simulation: shorten [simulator] time_step")
+    assert "robot" not in words
 
 
 def test_the_same_seed_gives_the_same_audit():
@@ -253,10 +282,57 @@ def test_an_audit_whose_time_is_up_finishes_with_what_it_knows(monkeypatch, shar
     assert content["verdict"] == ("no_verdict" if not named else whole.verdict)
 
 
-def test_an_audit_without_the_time_for_a_base_fit_says_so():
+@pytest.mark.parametrize("start", [None, {"gain": 1.0, "bend": 0.0}])
+def test_the_rollouts_that_are_announced_for_the_base_model_are_about_those_it_takes(start):
+    lines: list[str] = []
+    target, _ = base_model(replace(question(TRUTH, 1), start=start), 1, report=lines.append)
+    (announced,) = [int(found[1]) for line in lines if (found := re.search(r"about (\d+) rollouts", line))]
+    assert 0.5 < announced / target.forward.rollouts < 2.0
+
+
+def test_the_pace_is_that_of_different_rollouts_that_fill_a_call():
+    """A call of few is filled with copies, which a compiled engine simulates for nothing."""
+    asked = question(TRUTH, 1)
+    forward = pipeline.first_target(asked, Journal()).forward
+    null = forward.coordinates.null
+    forward.observe(null[None])
+    assert forward.pace == 0.0
+    many = np.repeat(null[None], forward.lanes.width, axis=0)
+    many[:, 0] += np.linspace(-0.1, 0.1, len(many))
+    forward.observe(many, 3)
+    assert forward.pace == 0.0  # of the first rows only
+    forward.observe(many)
+    assert forward.pace > 0.0
+
+
+def test_a_base_model_without_the_time_for_its_fit_is_refused():
     asked = question(TRUTH, 1)
     with pytest.raises(InputError, match=r"\[audit\] minutes: the time was up before the base model was fitted"):
-        audit(replace(asked, rules=replace(asked.rules, minutes=1e-6)))
+        base_model(asked, asked.seed, deadline=Deadline(1e-6))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
+@pytest.mark.parametrize("stated", [True, False])
+def test_an_audit_without_the_time_for_a_base_fit_has_no_verdict_and_goes_on(tmp_path, share, stated):
+    """The time is up at the start, in the search and in the last climb; with and without a noise that is known."""
+    asked = question({**TRUTH, "play": 1.0}, 1)
+    if not stated:
+        asked = asked_of(asked, recordings({**TRUTH, "play": 1.0}, 1)[2:6], 2)
+    clock = Hurried(10**9)
+    base_model(asked, asked.seed, deadline=clock)
+    clock = Hurried(int(share * (10**9 - clock.looks)))
+    answer = audit(asked, journal=Journal(tmp_path), deadline=clock)
+    content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+    assert (content["verdict"], content["out_of_time"], content["findings"]) == ("no_verdict", True, [])
+    assert not content["base_fit_converged"]
+    assert "fit of the base model is not done" in content["sentence"]
+    assert "--resume" in content["sentence"]
+    assert "--resume" in content["next_experiment"]["sentence"]
+    assert "no_verdict" in render_audit(shown(answer), content, "", "").replace(" ", "_")
+    if stated and share > 0.5:
+        resumed = audit(asked, journal=Journal(tmp_path, resume=True))
+        assert resumed.verdict == "explained"
 
 
 class Rough(Toy):

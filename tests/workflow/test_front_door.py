@@ -13,7 +13,6 @@ import pytest
 from matplotlib.figure import Figure
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.bayes.priors import table_of
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.workflow.unseen import fitted_parts
 
@@ -63,21 +62,6 @@ def test_every_name_leads_somewhere():
         rb.calibrat  # noqa: B018
 
 
-@pytest.mark.parametrize(
-    ("prior", "table"),
-    [
-        (dist.LogNormal(0.0, 0.5), {"distribution": "LogNormal", "median": 1.0, "sigma": 0.5}),
-        (dist.Normal(1.0, 2.0), {"distribution": "Normal", "loc": 1.0, "scale": 2.0}),
-        (dist.HalfNormal(2.0), {"distribution": "HalfNormal", "scale": 2.0}),
-        (dist.Uniform(1.0, 3.0), {"distribution": "Uniform", "low": 1.0, "high": 3.0}),
-        (dist.LogUniform(1.0, 3.0), {"distribution": "LogUniform", "low": 1.0, "high": 3.0}),
-        (None, {}),
-    ],
-)
-def test_a_distribution_of_numpyro_is_a_prior(prior, table):
-    assert table_of(prior, where="") == pytest.approx(table)
-
-
 def test_what_is_no_model_is_told_so():
     with pytest.raises(rb.InputError, match="did you mean 'noise'"):
         rb.Model("smooth_arm", noize="white")
@@ -89,11 +73,18 @@ def test_what_is_no_model_is_told_so():
         rb.load(REPOSITORY / "docs")
 
 
-@pytest.mark.parametrize("name", ["asl_trunk", "sim2real_trunk"])
-def test_a_report_that_holds_an_audit_s_answer_too_is_a_calibration_for_other_days(name):
-    fit = rb.load(REPOSITORY / "reports" / name)
+REPORTS = sorted(path.parent for path in (REPOSITORY / "reports").rglob("posterior.nc"))
+
+
+@pytest.mark.parametrize("folder", [pytest.param(f, id=str(f.relative_to(REPOSITORY / "reports"))) for f in REPORTS])
+def test_every_calibration_among_the_reports_predicts_commands(folder):
+    """An audit's answer that lies beside it changes nothing."""
+    fit = rb.load(folder)
     assert isinstance(fit, rb.Calibration)
     assert set(fitted_parts(fit)[1].names) == {info.name for info in fit.record.free}
+    rest = np.zeros((3, len(fit.model.simulator.channel_names)))
+    ahead = rb.predict(fit, (0.1 * np.arange(3), rest), draws=2)
+    assert np.isfinite(ahead.bands["mean"]).all()
 
 
 def test_a_robot_from_answers_goes_through_its_tables():
@@ -165,8 +156,11 @@ def test_a_calibration_shows_itself_and_comes_back(fit, tmp_path):
     assert "<img" in shown
     assert fit.report(tmp_path / "page.html").read_text().startswith("<!DOCTYPE html>")
     back = rb.load(fit.folder)
-    assert back.model is None  # no file describes a function
     np.testing.assert_array_equal(back.posterior.posterior["gain"], fit.posterior.posterior["gain"])
+    with pytest.raises(InputError, match=r"has no model: .*'lag'.*rb.load\(folder, model=model\)"):
+        fitted_parts(back)  # no file describes a function
+    back = rb.load(fit.folder, model=fit.model)
+    assert set(fitted_parts(back)[1].names) == {"gain", "time_constant"}
 
 
 @pytest.mark.slow
