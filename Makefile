@@ -17,7 +17,7 @@ ALL     = $(VENV)/all.stamp
 export OPENBLAS_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all matrix lint format bench validate notebooks notebook-outputs reference demo-data clean
+.PHONY: help demo test test-all test-compiler matrix lint format bench validate notebooks notebook-outputs reference demo-data clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-16s%s\n", $$1, $$2 }'
@@ -34,6 +34,9 @@ test-all: $(ALL) ## every test, the slow ones, the notebooks and those of option
 
 matrix: $(DEV) ## every method and every command, on the demo, an own robot and a mesh body (minutes)
 	$(PYTEST) -n $(WORKERS) --dist loadgroup tests/workflow/test_matrix.py tests/workflow/test_commands_matrix.py
+
+test-compiler: $(DEV) ## the layered engine, its kernels compiled by Numba's own compilers (docs/native.md)
+	RFDROPO_COMPILER=numba $(PYTEST) -n $(WORKERS) tests/fem/test_native_layered.py tests/fem/test_native_session.py tests/fem/test_compilers.py
 
 lint: $(DEV) ## ruff, its formatter, and mypy
 	$(BIN)/ruff check .

@@ -5,31 +5,21 @@ Numba by itself optimises and compiles every function with all that it calls, an
 kernel at the top, links all of them, each once, and optimises in one pass. The pass looks for no loops to vectorise,
 because kernels work on vectors. Meshes are compiled Numba's way: as one program they ran at half the rate (17 for 36
 rollouts a second).
-
-Numba's cache of what was compiled looks at one source file only, and fails where a module that an earlier kernel knew
-is gone: each version of a kernel has a cache of its own, named by a digest of all the files that it is made of.
 """
 
 from __future__ import annotations
 
-import hashlib
-import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
+import numba
+from numba import types
 from numba.core.codegen import CPUCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
 from numba.core.typed_passes import NativeLowering, NopythonRewrites
 from numba.core.untyped_passes import InlineClosureLikes
 
-PACKAGE = Path(__file__).resolve().parents[2]
-OWN = __package__.rpartition(".")[0]
-"""The package that holds this folder."""
-KERNELS = b"rfdropo_bayes.fem.native.simd import"
-"""What a module of kernels contains."""
-IMPORT = re.compile(rb"^from (\S+) import", re.MULTILINE)
 NEEDLESS = (NopythonRewrites, InlineClosureLikes)
 """Passes for expressions of arrays and for functions within functions, of which kernels have none."""
 
@@ -129,28 +119,15 @@ class WholeCompiler(DeferredCompiler):
     lowering = WholeLowering
 
 
-def kernel_sources(module: str) -> str:
-    """Digest of a module of kernels, of all modules of kernels that it imports, directly or not, and of the modules
-    that these take their constants from."""
-    found: dict[str, bytes] = {}
-    waiting = [f"{__package__}.{module}"]
-    while waiting:
-        name = waiting.pop()
-        path = PACKAGE.joinpath(*name.split(".")[1:]).with_suffix(".py")
-        if name in found or not path.is_file():
-            continue
-        found[name] = path.read_bytes()
-        if KERNELS not in found[name]:
-            continue
-        waiting.extend(module for match in IMPORT.findall(found[name]) if (module := match.decode()).startswith(OWN))
-    return hashlib.sha256(b"".join(found[name] for name in sorted(found))).hexdigest()
+def deferred(function: Callable, **options: bool) -> Callable:
+    """A function that only kernels call, compiled once for every type and not for every number in a call."""
+    dispatcher = numba.njit(no_cfunc_wrapper=True, _nrt=False, pipeline_class=DeferredCompiler, **options)(function)
+    overloads, resolve = dispatcher.overloads, dispatcher.get_call_template
+    dispatcher.add_overload = lambda result: overloads.update({tuple(result.signature.args): result})
+    dispatcher.get_call_template = lambda arguments, named: resolve(tuple(map(types.unliteral, arguments)), named)
+    return dispatcher
 
 
-def named_by(sources: str) -> Callable[[Callable], Callable]:
-    """Decorator that puts a digest of sources into a function's name, and so into that of its cache."""
-
-    def rename(function: Callable) -> Callable:
-        function.__qualname__ += f"_{sources[:16]}"
-        return function
-
-    return rename
+def whole(function: Callable, **options: Any) -> Callable:
+    """The kernel at the top, which Python calls."""
+    return numba.njit(pipeline_class=WholeCompiler, **options)(function)

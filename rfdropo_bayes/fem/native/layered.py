@@ -21,7 +21,6 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
 from rfdropo_bayes.fem.equilibrium import ITERATIONS
 from rfdropo_bayes.fem.layered import PointMap
-from rfdropo_bayes.fem.native.compilation import kernel_sources
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
 from rfdropo_bayes.fem.native.contact_records import (
     MISSED,
@@ -34,6 +33,7 @@ from rfdropo_bayes.fem.native.contact_records import (
     touch_storage,
 )
 from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, law_rows
+from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.layered_records import KINDS, Factors, Friction, Samples, Work, friction_storage, runs_of
 from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, compile_rollout, storage

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from rfdropo_bayes.fem.native.compilation import named_by
 from rfdropo_bayes.fem.native.cube_motion import record_cubes, start_cubes
 from rfdropo_bayes.fem.native.fields import clear, fill_lanes, point
+from rfdropo_bayes.fem.native.kernel_cache import named_by
 from rfdropo_bayes.fem.native.layered_assembly import add_branch, layer_frame
 from rfdropo_bayes.fem.native.layered_constraints import constrained_step
 from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, GAIN, GIVE, LAW, SHARE

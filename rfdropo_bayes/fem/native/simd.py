@@ -27,7 +27,7 @@ from numba.core.registry import cpu_target
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-from rfdropo_bayes.fem.native.compilation import DeferredCompiler, WholeCompiler
+from rfdropo_bayes.fem.native.compilers import COMPILERS
 
 ALIGNMENT = 64
 """Bytes to which work arrays are aligned: one cache line, and the widest vector register."""
@@ -36,28 +36,16 @@ ALIGNMENT = 64
 def kernel(function: Callable, **options: bool) -> Callable:
     """Decorator of functions that only kernels call.
 
-    They have no wrappers for calls from Python, are compiled once for every type (Numba on its own compiles a function
-    anew for every number that stands in a call), and become machine code only in the `whole` that they are part of.
+    They have no wrappers for calls from Python. With our compilers they become machine code only in the `whole` that
+    they are part of.
     """
-    dispatcher = numba.njit(
-        nogil=True,
-        error_model="numpy",
-        no_cpython_wrapper=True,
-        no_cfunc_wrapper=True,
-        _nrt=False,
-        pipeline_class=DeferredCompiler,
-        **options,
-    )(function)
-    overloads, resolve = dispatcher.overloads, dispatcher.get_call_template
-    dispatcher.add_overload = lambda result: overloads.update({tuple(result.signature.args): result})
-    dispatcher.get_call_template = lambda arguments, named: resolve(tuple(map(types.unliteral, arguments)), named)
-    return dispatcher
+    return COMPILERS.part(function, nogil=True, error_model="numpy", no_cpython_wrapper=True, **options)
 
 
 inlined = partial(kernel, forceinline=True)
 """Decorator of kernels that are compiled into their callers, whatever their size: they return many values."""
 
-whole = numba.njit(nogil=True, cache=True, error_model="numpy", pipeline_class=WholeCompiler)
+whole = partial(COMPILERS.whole, nogil=True, cache=True, error_model="numpy")
 """Decorator of the kernel at the top, which Python calls."""
 
 # Numba's own way, each function optimised by itself, for meshes (see `compilation`): parts of a kernel, those that it

@@ -16,9 +16,9 @@ from rfdropo_bayes.fem.dynamics import LOST, POISSON_LIMIT
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
-from rfdropo_bayes.fem.native.compilation import kernel_sources
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
 from rfdropo_bayes.fem.native.contact_records import PushOutput, Touch, cube_rows, pairs_of, scene_tables, touch_storage
+from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
 from rfdropo_bayes.fem.native.layered import available_threads, in_blocks
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes

@@ -19,8 +19,8 @@ from rfdropo_bayes.fem.native.block_cholesky import (
     factor,
     forward_substitute,
 )
-from rfdropo_bayes.fem.native.compilation import named_by
 from rfdropo_bayes.fem.native.cube_motion import record_cubes, remember_impulses, start_cubes, take_cube_step
+from rfdropo_bayes.fem.native.kernel_cache import named_by
 from rfdropo_bayes.fem.native.simd import (
     addresses,
     fill,
