@@ -21,7 +21,7 @@ from rfdropo_bayes import __version__
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork, open_bus
 from rfdropo_bayes.deployment.causes import Cause, Stop
-from rfdropo_bayes.deployment.clock import schedule_fifo, steady_interpreter
+from rfdropo_bayes.deployment.clock import real_time, steady_interpreter
 from rfdropo_bayes.deployment.display import session_table
 from rfdropo_bayes.deployment.drives import Drive, Drives
 from rfdropo_bayes.deployment.emergency import EmergencyStop, Hook, StopSignals, file_hook
@@ -182,9 +182,8 @@ class _Session:
         opened = open_bus(bus_table) if bus is None else bus
         self.network = LoggedNetwork(opened, self.log.frames)
         self._stack.callback(self._leave)
-        for thread in self.network.receivers:
-            if thread.native_id is not None:
-                schedule_fifo(thread.native_id)
+        receivers = [thread.native_id for thread in self.network.receivers if thread.native_id is not None]
+        self._stack.enter_context(real_time(threads=receivers))
         guards = settings.safety.guards()
         motors = self._motors()
         drives = [
@@ -258,9 +257,10 @@ class _Session:
         ended: list[Stop] = []
 
         def body() -> None:
-            if not schedule_fifo():
-                self.log.event("note", "no real-time scheduling: the system does not permit SCHED_FIFO")
-            ended.append(loop.run(phases))
+            with real_time() as granted:
+                if not granted:
+                    self.log.event("note", "no real-time scheduling: the system does not permit SCHED_FIFO")
+                ended.append(loop.run(phases))
 
         patience = (safety.misses + 1.5) * self.period
         with steady_interpreter(), EmergencyStop(press, hooks, lambda: loop.pulse, patience, keyboard):
