@@ -19,7 +19,7 @@ from rfdropo_bayes.deployment.sensors import SimulatedMarkers
 from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, HomingTable, SafetyTable, load_deployment
 from rfdropo_bayes.deployment.simulation import SimulationTable, simulated_drives
-from rfdropo_bayes.deployment.vendors import WITHOUT, Units, told_counts
+from rfdropo_bayes.deployment.vendors import STANDARD, WITHOUT, Units, told_counts
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Motor, load_robot
 
@@ -84,7 +84,7 @@ def rigs(hub: str) -> Iterator[Callable[..., Rig]]:
         rig.close()
 
 
-def masters(rig: Rig, eds: str, units: Units = Units(), unguarded: tuple[int, ...] = ()) -> Drives:  # noqa: B008
+def masters(rig: Rig, eds: str, units: Units = STANDARD, unguarded: tuple[int, ...] = ()) -> Drives:
     """The master's side."""
     made = [Drive(rig.network, m, eds, m.offset_counts, 1.0, units, unguarded) for m in rig.robot.motors]
     return Drives(rig.network, made, Guards(master_timeout_s=5.0))
