@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from rfdropo_bayes.deployment.settings import Deployment
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.robots import Robot
@@ -23,7 +24,7 @@ reference = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(reference)
 
 PAGES = reference.pages()
-ROOTS = (Experiment, Robot, SectionedBody, *SHAPES)
+ROOTS = (Experiment, Robot, Deployment, SectionedBody, *SHAPES)
 TABLES = {schema for root in ROOTS for _, schema in reference.tables_of(root, "")}
 
 
@@ -35,7 +36,7 @@ def test_a_page_is_what_the_code_says(name):
 
 @pytest.mark.parametrize("schema", sorted(TABLES, key=lambda table: table.__name__), ids=lambda table: table.__name__)
 def test_every_key_says_what_it_means(schema: type[BaseModel]):
-    silent = [name for name, field in schema.model_fields.items() if not field.description]
+    silent = [name for name in schema.model_fields if not reference.meaning_of(schema, name)]
     assert not silent, f"{schema.__name__}: {silent} have no description"
 
 

@@ -24,6 +24,8 @@ from pydantic_core import PydanticUndefined
 
 from rfdropo_bayes.bayes.priors import FAMILIES, OPTIONAL
 from rfdropo_bayes.cli.main import app
+from rfdropo_bayes.deployment.objects import SIMULATED_EDS
+from rfdropo_bayes.deployment.settings import Deployment
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.robots import Robot
@@ -46,6 +48,7 @@ def pages() -> dict[str, str]:
         "README.md": index_page(),
         "experiment.md": experiment_page(),
         "robot.md": robot_page(),
+        "deployment.md": deployment_page(),
         "mechanisms.md": mechanisms_page(),
         "methods.md": methods_page(),
         "commands.md": commands_page(),
@@ -57,6 +60,10 @@ def index_page() -> str:
     rows = [
         ("[experiment.md](experiment.md)", "every key of the experiment file, priors, parameters of what is measured"),
         ("[robot.md](robot.md)", "every key of a robot file, and the robots that come with the package"),
+        (
+            "[deployment.md](deployment.md)",
+            "every key of a deployment file, for sessions on motors",
+        ),
         ("[mechanisms.md](mechanisms.md)", "every mechanism: cause, remedy, parameters, default priors, where it runs"),
         ("[methods.md](methods.md)", "every method of inference and its options"),
         ("[commands.md](commands.md)", "every command of `rfdropo` and its options"),
@@ -102,6 +109,16 @@ def robot_page() -> str:
         table(("Robot", "Cables", "Commands", "Markers", "What"), [tuple(row.values()) for row in robot_rows()]),
     ]
     return page("The robot file", parts)
+
+
+def deployment_page() -> str:
+    """Keys of a deployment file."""
+    parts = [
+        "A deployment is one TOML file, in SI units unless a key says otherwise. Paths are relative to it. "
+        "[docs/deployment.md](../deployment.md) says what the keys are for.",
+        *(text for title, schema in tables_of(Deployment, "") for text in key_table(title, schema)),
+    ]
+    return page("The deployment file", parts)
 
 
 def mechanisms_page() -> str:
@@ -207,10 +224,15 @@ def key_table(title: str, schema: type[BaseModel]) -> list[str]:
 def keys(schema: type[BaseModel]) -> str:
     """The keys of one table with type, default and meaning."""
     rows = [
-        (code(name), type_text(field.annotation), default_text(field), limits(field) + (field.description or ""))
+        (code(name), type_text(field.annotation), default_text(field), limits(field) + meaning_of(schema, name))
         for name, field in schema.model_fields.items()
     ]
     return table(("Key", "Type", "Default", "Meaning"), rows)
+
+
+def meaning_of(schema: type[BaseModel], name: str) -> str:
+    """What a key means: by its description, else by the docstring of its table."""
+    return schema.model_fields[name].description or attributes_of(schema).get(name, "").rstrip(".")
 
 
 def type_text(annotation: Any) -> str:
@@ -239,6 +261,8 @@ def default_text(field: FieldInfo) -> str:
     """Default of a key; empty where it may be left out and then has none."""
     if field.is_required():
         return "required"
+    if isinstance(field.default, BaseModel) or field.default == str(SIMULATED_EDS):  # what its meaning says
+        return ""
     return literal(None if field.default is PydanticUndefined else field.default)
 
 
@@ -301,7 +325,7 @@ def attributes_of(kind: type) -> dict[str, str]:
     found: dict[str, str] = {}
     names: list[str] = []
     for line in section.splitlines():
-        entry = re.match(r" {8}([a-z_]+(?:, [a-z_]+)*): (.*)", line)
+        entry = re.match(r" {8}([a-z0-9_]+(?:, [a-z0-9_]+)*): (.*)", line)
         if entry:
             names = entry[1].split(", ")
             found |= dict.fromkeys(names, entry[2])

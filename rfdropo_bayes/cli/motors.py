@@ -46,6 +46,9 @@ def deploy(
     outcome = run_session(deployment, mode, folder, simulated=simulated, recording=recording, show=show, keyboard=True)
     for channel, found in outcome.drives.items() if mode == "check" else ():
         typer.echo(f"{channel}: " + ", ".join(f"{name} {value:#x}" for name, value in found.items()))
+    for channel, lacking in outcome.without.items() if mode == "check" else ():
+        for line in lacking:
+            typer.echo(f"{channel} is without {line}")
     typer.echo(f"{outcome.cause.word}{': ' if outcome.detail else ''}{outcome.detail}")
     for line in _figures(outcome.figures):
         typer.echo(line)

@@ -10,7 +10,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -55,13 +55,31 @@ class CycleClock:
         return Tick(self._number, due + missed * self.period, lateness, missed)
 
 
-def schedule_fifo(thread: int = 0, priority: int = PRIORITY) -> bool:
-    """Give a thread (this one by default) real-time priority; False where the system does not permit it."""
+@contextlib.contextmanager
+def real_time(priority: int = PRIORITY, threads: Iterable[int] = (0,)) -> Iterator[bool]:
+    """Give threads real-time priority (SCHED_FIFO) for a while; yields False where the system does not permit it.
+
+    The block must sleep between its beats. It must not wait for the end of a process: Linux then clears that process
+    out of /proc, in a loop without sleep, until threads of it have done their share. Where these have a lower priority
+    on the same processor, they never run, and the loop never ends. For the same reason the block gives the priority
+    back: a thread must not end with it.
+
+    Args:
+        priority: of the threads; the higher one runs first.
+        threads: their numbers in the system; 0 is the calling one.
+    """
+    before = []
+    for thread in threads:
+        with contextlib.suppress(OSError, AttributeError):  # not permitted, not known to the system, or ended
+            was = os.sched_getscheduler(thread), os.sched_getparam(thread)
+            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+            before.append((thread, was))
     try:
-        os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
-    except (OSError, AttributeError):
-        return False
-    return True
+        yield bool(before)
+    finally:
+        for thread, (policy, parameters) in before:
+            with contextlib.suppress(ProcessLookupError):  # the thread has ended
+                os.sched_setscheduler(thread, policy, parameters)
 
 
 def lock_memory(locked: bool) -> bool:
@@ -112,9 +130,9 @@ def measure_jitter(period: float, seconds: float, fifo: bool = True) -> Jitter:
     found: list[Jitter] = []
 
     def loop() -> None:
-        granted = schedule_fifo() if fifo else False
-        clock = CycleClock(period)
-        ticks = [clock.wait() for _ in range(max(2, round(seconds / period)))]
+        with real_time() if fifo else contextlib.nullcontext(False) as granted:
+            clock = CycleClock(period)
+            ticks = [clock.wait() for _ in range(max(2, round(seconds / period)))]
         found.append(Jitter(granted, np.array([tick.lateness for tick in ticks]), sum(tick.missed for tick in ticks)))
 
     with steady_interpreter():

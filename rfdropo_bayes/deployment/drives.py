@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 import can
@@ -21,6 +21,16 @@ from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bus import LoggedNetwork
 from rfdropo_bayes.deployment.cia402 import CYCLIC_SYNCHRONOUS_POSITION, Command, State, controlword_towards, state_of
 from rfdropo_bayes.deployment.objects import Nmt, NmtState, Object
+from rfdropo_bayes.deployment.vendors import (
+    LEFT_OUT,
+    STANDARD,
+    STRICTER_BELOW,
+    Units,
+    acceleration_counts,
+    check_guards,
+    check_rated_torque,
+    speed_counts,
+)
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Motor
 
@@ -61,11 +71,22 @@ class Drive:
         eds: path of its electronic data sheet.
         offset: counts at length zero.
         answer: how long it has to answer an SDO request [s].
+        units: of its objects, where vendors differ.
+        unguarded: guards that it may be without, by index.
     """
 
-    def __init__(self, network: LoggedNetwork, motor: Motor, eds: str, offset: float, answer: float = 0.3) -> None:
+    def __init__(
+        self,
+        network: LoggedNetwork,
+        motor: Motor,
+        eds: str,
+        offset: float,
+        answer: float = 0.3,
+        units: Units = STANDARD,
+        unguarded: Collection[int] = (),
+    ) -> None:
         self.motor, self.offset = motor, offset
-        self.network = network
+        self.network, self.units, self.unguarded = network, units, unguarded
         try:
             self.node = canopen.RemoteNode(motor.node, eds)
         except Exception as error:  # configparser and canopen raise many types on damaged data sheets
@@ -141,8 +162,15 @@ class Drive:
         if variable is None:
             raise InputError("is not in its data sheet", where=where, remedy=_EDS_REMEDY)
         try:
+            data = variable.encode_raw(value)
+        except ValueError:
+            bits = f"does not fit into {len(variable)} bits"
+            raise InputError(
+                f"{value} {bits}", where=where, remedy="correct the motor's limits, or its units"
+            ) from None
+        try:
             with self._sdo:
-                self.node.sdo.download(index, subindex, variable.encode_raw(value))
+                self.node.sdo.download(index, subindex, data)
         except (SdoError, can.CanError, OSError) as error:
             raise InputError(f"does not take {value} ({error})", where=where, remedy=_SDO_REMEDY) from None
         if read_back and variable.readable and (kept := self.read(index, subindex)) != value:
@@ -161,7 +189,8 @@ class Drive:
             Its identity, statusword, position, supported modes and rated torque.
 
         Raises:
-            InputError: on silence, a wrong identity or type, no cyclic synchronous position, another rated torque.
+            InputError: on silence, a wrong identity or type, no cyclic synchronous position, another rated torque or
+                unit, or a guard that it lacks.
         """
         self._check_layout()
         kind = self.read(Object.DEVICE_TYPE)
@@ -174,18 +203,39 @@ class Drive:
             found["modes"] = self.read(Object.SUPPORTED_MODES)
             if not found["modes"] & objects.CSP_BIT:
                 raise InputError("has no cyclic synchronous position mode", where=self.name, remedy="use another drive")
+        check_guards(self.lacking(), self.unguarded, where=f"{self.name}, data sheet")
         if self.knows(Object.RATED_TORQUE):
             found["rated_torque"] = self.read(Object.RATED_TORQUE)
-            expected = 1e3 * self.motor.rated_torque_n_m
-            if abs(found["rated_torque"] - expected) > 0.02 * expected + 1:
-                raise InputError(
-                    f"its rated torque is {found['rated_torque']} mN m, that of the robot file {expected:g}",
-                    where=f"{self.name}, object 0x6076",
-                    remedy="correct rated_torque_n_m: tensions are computed from it",
-                )
+            where = f"{self.name}, object 0x6076"
+            check_rated_torque(found["rated_torque"], self.motor.rated_torque_n_m, self.units.torque, where)
+        self._factors()
         found["statusword"] = self.read(Object.STATUSWORD)
         found["position"] = self.read(Object.POSITION)
         return found
+
+    def lacking(self) -> list[int]:
+        """Objects that would be set or asked, and that its data sheet does not have, or lets nobody write."""
+        found = []
+        for index, subindexes in _SET.items():
+            variables = [self.node.object_dictionary.get_variable(index, subindex) for subindex in subindexes]
+            if not all(variable is not None and variable.writable for variable in variables):
+                found.append(int(index))
+        return found if self.knows(Object.RATED_TORQUE) else [*found, int(Object.RATED_TORQUE)]
+
+    def _factors(self) -> tuple[float, float]:
+        """Counts per second in one of the unit of 0x6080, and per second squared in one of that of 0x6085.
+
+        Raises:
+            InputError: where the units are not known, or contradict what the drive tells.
+        """
+        told = [self.read(i) if self.knows(i) else 0 for i in (Object.VELOCITY_UNIT, Object.ACCELERATION_UNIT)]
+        turn = self.motor.counts_per_turn
+        speed = acceleration = 1.0
+        if self.knows(Object.MAX_MOTOR_SPEED):
+            speed = speed_counts(self.units.speed, told[0], turn, self.name)
+        if self.knows(Object.QUICK_STOP_DECELERATION):
+            acceleration = acceleration_counts(self.units.acceleration, told[1], turn, self.name)
+        return speed, acceleration
 
     def _check_layout(self) -> None:
         """A data sheet in which the process data have other sizes is another drive's."""
@@ -205,6 +255,12 @@ class Drive:
         found = {}
         for subindex, (key, expected) in enumerate(identity._asdict().items(), start=1):
             if not self.knows(Object.IDENTITY, subindex):
+                if expected is not None:
+                    raise InputError(
+                        f"is not in the data sheet: its {key} cannot be asked",
+                        where=f"{self.name}, object 0x1018:{subindex}",
+                        remedy=f"{_EDS_REMEDY}, or leave [drives] {key} out",
+                    )
                 continue
             found[key] = self.read(Object.IDENTITY, subindex)
             where = f"{self.name}, object 0x1018:{subindex}"
@@ -238,15 +294,24 @@ class Drive:
             "stays powered", where=self.name, remedy="switch it off, and find out which other master commands it"
         )
 
-    def configure(self, period: float, guards: Guards) -> None:
+    def configure(self, period: float, guards: Guards, say: Callable[[str], None]) -> None:
         """Set mode, limits and guards, and map the process data; the node must be PRE-OPERATIONAL.
 
+        Args:
+            period: of the set-points [s].
+            guards: see there.
+            say: takes a line for every object that is left out, or set to less than was asked.
+
         Raises:
-            InputError: where the drive does not keep what is written.
+            InputError: where the drive does not keep what is written, or lacks a guard that it must have.
         """
+        lacking = self.lacking()
+        check_guards(lacking, self.unguarded, where=f"{self.name}, data sheet")
+        for index in lacking:
+            say(f"{self.name} is without 0x{index:04X}: {LEFT_OUT[index]}")
         for index, subindex, value in self._settings(period, guards):
-            if self.knows(index, subindex):
-                self.write(index, value, subindex)
+            if index not in lacking:
+                self.write(index, self._within(index, subindex, value, say), subindex)
         end = time.monotonic() + _MODE_TIME
         while (mode := self.read(Object.MODE_DISPLAY)) != CYCLIC_SYNCHRONOUS_POSITION and time.monotonic() < end:
             time.sleep(0.005)
@@ -272,12 +337,22 @@ class Drive:
         self.target = self.read(Object.POSITION)
         self.controlword = int(Command.DISABLE_VOLTAGE)
 
+    def _within(self, index: int, subindex: int, value: int, say: Callable[[str], None]) -> int:
+        """The value, or the drive's largest where that is less and stricter."""
+        variable = self.node.object_dictionary.get_variable(index, subindex)
+        largest = None if variable is None else variable.max
+        if index not in STRICTER_BELOW or largest is None or value <= largest:
+            return value
+        say(f"{self.name} takes no more than {largest} for 0x{index:04X}, where {value} was meant")
+        return int(largest)
+
     def _settings(self, period: float, guards: Guards) -> list[tuple[int, int, int]]:
-        """Index, subindex and value of everything that is set, where the drive's data sheet has it."""
+        """Index, subindex and value of everything that is set, in the drive's own units."""
         motor = self.motor
         ends = sorted(motor.counts(length, self.offset) for length in motor.length_limit_m)
         fastest = motor.rate_limit_m_s * motor.counts_per_metre
-        turns = 60.0 * 1.5 * fastest / motor.counts_per_turn  # half as much again: it must not cut into the set-points
+        speed, acceleration = self._factors()
+        braking = motor.acceleration_limit_m_s2 * motor.counts_per_metre
         greatest = motor.per_mille(motor.tension_limit_n[1])
         return [
             (Object.MODE, 0, CYCLIC_SYNCHRONOUS_POSITION),
@@ -287,9 +362,10 @@ class Drive:
             (Object.POSITION_LIMIT, 2, ends[1]),
             (Object.FOLLOWING_WINDOW, 0, round(guards.following_error_m * motor.counts_per_metre)),
             (Object.FOLLOWING_TIMEOUT, 0, round(1e3 * guards.following_time_s)),
-            (Object.MAX_TORQUE, 0, round(1.2 * greatest)),
-            (Object.MAX_MOTOR_SPEED, 0, max(1, round(turns))),
-            (Object.QUICK_STOP_DECELERATION, 0, round(motor.acceleration_limit_m_s2 * motor.counts_per_metre)),
+            (Object.MAX_TORQUE, 0, max(1, round(1.2 * greatest))),
+            # Half as much again: it must not cut into the set-points.
+            (Object.MAX_MOTOR_SPEED, 0, max(1, round(1.5 * fastest / speed))),
+            (Object.QUICK_STOP_DECELERATION, 0, max(1, round(braking / acceleration))),
             (Object.QUICK_STOP_OPTION, 0, 6),  # slow down on the quick stop ramp, and hold
             (Object.ABORT_CONNECTION, 0, 3),  # quick stop where the master is lost
             (Object.CONSUMER_HEARTBEAT, 1, guards.master_node << 16 | round(1e3 * guards.master_timeout_s)),
@@ -400,7 +476,7 @@ class Drives:
                 say(f"{drive.name} was found powered, and has been switched off")
         self.manage(Nmt.PRE_OPERATIONAL)
         for drive in self.all:
-            drive.configure(period, self.guards)
+            drive.configure(period, self.guards, say)
         self.manage(Nmt.START)
         end = time.monotonic() + 1.0
         while waiting := [drive for drive in self.all if drive.nmt != NmtState.OPERATIONAL]:
@@ -494,6 +570,22 @@ class Drives:
         channel = self._names.get(identifier - objects.EMCY, "?")
         self.emergencies.append(Emergency(time.monotonic(), channel, code, register))
 
+
+_SET: dict[Object, tuple[int, ...]] = {
+    Object.MODE: (0,),
+    Object.INTERPOLATION_TIME: (1, 2),
+    Object.POSITION_LIMIT: (1, 2),
+    Object.FOLLOWING_WINDOW: (0,),
+    Object.FOLLOWING_TIMEOUT: (0,),
+    Object.MAX_TORQUE: (0,),
+    Object.MAX_MOTOR_SPEED: (0,),
+    Object.QUICK_STOP_DECELERATION: (0,),
+    Object.QUICK_STOP_OPTION: (0,),
+    Object.ABORT_CONNECTION: (0,),
+    Object.CONSUMER_HEARTBEAT: (1,),
+    Object.PRODUCER_HEARTBEAT: (0,),
+}
+"""Objects that `Drive.configure` writes, with their subindexes."""
 
 _MODE_TIME = 0.2  # [s]: a drive may take some cycles of its own to change its mode
 _EDS_REMEDY = "give the data sheet that came with this drive"

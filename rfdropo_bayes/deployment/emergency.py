@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from rfdropo_bayes.deployment.clock import schedule_fifo
+from rfdropo_bayes.deployment.clock import real_time
 
 SIGNALS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 POLL = 0.005  # [s]
@@ -121,8 +121,7 @@ class EmergencyStop:
             self._stop(what, silence)
 
     def _run(self) -> None:
-        schedule_fifo()
-        with self._raw_terminal():
+        with real_time(), self._raw_terminal():
             while not self._done.is_set():
                 if what := self._look():
                     self.press(what)

@@ -39,12 +39,14 @@ class Object(IntEnum):
     FOLLOWING_TIMEOUT = 0x6066  # [ms]
     VELOCITY = 0x606C
     MAX_TORQUE = 0x6072  # [per mille of rated]
-    RATED_TORQUE = 0x6076  # [mN m]
+    RATED_TORQUE = 0x6076  # [mN m]; vendors differ
     TORQUE = 0x6077  # [per mille of rated]
     TARGET_POSITION = 0x607A
     POSITION_LIMIT = 0x607D
-    MAX_MOTOR_SPEED = 0x6080  # [1/min]
-    QUICK_STOP_DECELERATION = 0x6085
+    MAX_MOTOR_SPEED = 0x6080  # [1/min]; vendors differ
+    QUICK_STOP_DECELERATION = 0x6085  # vendors differ
+    VELOCITY_UNIT = 0x60A9  # of the drive's velocities, in a code
+    ACCELERATION_UNIT = 0x60AA
     INTERPOLATION_TIME = 0x60C2
     FOLLOWING_ERROR = 0x60F4
     SUPPORTED_MODES = 0x6502

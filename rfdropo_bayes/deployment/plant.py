@@ -13,11 +13,12 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.deployment.clock import PLANT_PRIORITY, schedule_fifo, steady_interpreter
+from rfdropo_bayes.deployment.clock import PLANT_PRIORITY, real_time, steady_interpreter
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 
 START = 300.0  # [s]: a plant may compile itself first
+_END = 5.0  # [s]: for the step that it is at, and for what its libraries tidy up
 
 
 class PlantState(NamedTuple):
@@ -159,10 +160,11 @@ class PlantProcess:
         return self._sent - self._answered
 
     def close(self) -> None:
-        """End the process."""
+        """End the process: it leaves by itself once nobody asks, and is ended where it does not."""
         self._pipe.close()
+        self._process.join(_END)
         self._process.terminate()
-        self._process.join(5.0)
+        self._process.join(_END)
 
     def _receive(self) -> None:
         try:
@@ -182,11 +184,11 @@ def _serve(pipe: Connection, name: str, robot: dict[str, Any], settings: dict[st
         plant = build_plant(name, Robot.model_validate(robot), settings)
         length = np.zeros(len(robot["channels"]["names"]))
         state = plant.advance(length, 0.0)
-        for thread in os.listdir("/proc/self/task") if sys.platform == "linux" else ():  # numerical libraries have some
-            schedule_fifo(int(thread), PLANT_PRIORITY)
-        pipe.send((0.0, state))
-        reached = 0.0
-        with steady_interpreter():
+        # Numerical libraries have threads of their own.
+        threads = map(int, os.listdir("/proc/self/task")) if sys.platform == "linux" else ()
+        with real_time(PLANT_PRIORITY, threads), steady_interpreter():
+            pipe.send((0.0, state))
+            reached = 0.0
             while True:
                 instant, length = pipe.recv()
                 while pipe.poll():

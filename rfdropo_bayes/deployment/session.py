@@ -21,7 +21,7 @@ from rfdropo_bayes import __version__
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork, open_bus
 from rfdropo_bayes.deployment.causes import Cause, Stop
-from rfdropo_bayes.deployment.clock import schedule_fifo, steady_interpreter
+from rfdropo_bayes.deployment.clock import real_time, steady_interpreter
 from rfdropo_bayes.deployment.display import session_table
 from rfdropo_bayes.deployment.drives import Drive, Drives
 from rfdropo_bayes.deployment.emergency import EmergencyStop, Hook, StopSignals, file_hook
@@ -32,6 +32,7 @@ from rfdropo_bayes.deployment.policy import CommandSource, OnnxPolicy, RecordedC
 from rfdropo_bayes.deployment.sensors import MarkerSensor, MarkerView, SimulatedMarkers, open_sensor
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, load_deployment
 from rfdropo_bayes.deployment.simulation import SimulationTable, simulated_drives
+from rfdropo_bayes.deployment.vendors import LEFT_OUT
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Motor, Robot, load_robot
 
@@ -59,6 +60,7 @@ class Outcome(NamedTuple):
         folder: what it wrote.
         figures: lateness, misses, the policy's time, the time to a stop; as in summary.json.
         drives: what each drive said of itself when it was checked.
+        without: what each drive lacks of what would be set or asked, and what that costs.
     """
 
     cause: Cause
@@ -66,6 +68,7 @@ class Outcome(NamedTuple):
     folder: Path
     figures: dict[str, Any]
     drives: dict[str, dict[str, int]]
+    without: dict[str, list[str]]
 
     @property
     def finished(self) -> bool:
@@ -142,6 +145,7 @@ class _Session:
         self.period = 1.0 / settings.rate_hz
         self._facts: dict[str, Any] = {"mode": mode.value, "simulated": simulated, "rate_hz": settings.rate_hz}
         self.found: dict[str, dict[str, int]] = {}
+        self.without: dict[str, list[str]] = {}
         self.source: CommandSource | None = None
         self._load_policy()
         self.offsets = self._offsets()
@@ -182,19 +186,19 @@ class _Session:
         opened = open_bus(bus_table) if bus is None else bus
         self.network = LoggedNetwork(opened, self.log.frames)
         self._stack.callback(self._leave)
-        for thread in self.network.receivers:
-            if thread.native_id is not None:
-                schedule_fifo(thread.native_id)
+        receivers = [thread.native_id for thread in self.network.receivers if thread.native_id is not None]
+        self._stack.enter_context(real_time(threads=receivers))
         guards = settings.safety.guards()
         motors = self._motors()
         drives = [
-            Drive(self.network, motor, identity.eds, offset, identity.answer_s)
+            Drive(self.network, motor, identity.eds, offset, identity.answer_s, identity.units, identity.unguarded)
             for motor, offset in zip(motors, self.offsets, strict=True)
         ]
         self.drives = Drives(self.network, drives, guards)
         for drive in drives:
             self.found[drive.motor.channel] = drive.check(identity.identity(drive.motor.channel), identity.check_eds)
             self.log.event("checked", drive.name, **self.found[drive.motor.channel])
+            self.without[drive.motor.channel] = [f"0x{index:04X}: {LEFT_OUT[index]}" for index in drive.lacking()]
         if self.mode is Mode.HOME:
             for drive in drives:
                 drive.offset = float(self.found[drive.motor.channel]["position"])
@@ -258,9 +262,10 @@ class _Session:
         ended: list[Stop] = []
 
         def body() -> None:
-            if not schedule_fifo():
-                self.log.event("note", "no real-time scheduling: the system does not permit SCHED_FIFO")
-            ended.append(loop.run(phases))
+            with real_time() as granted:
+                if not granted:
+                    self.log.event("note", "no real-time scheduling: the system does not permit SCHED_FIFO")
+                ended.append(loop.run(phases))
 
         patience = (safety.misses + 1.5) * self.period
         with steady_interpreter(), EmergencyStop(press, hooks, lambda: loop.pulse, patience, keyboard):
@@ -303,7 +308,7 @@ class _Session:
         if loop is not None:
             self._write_recording(stop)
         self.summarise(stop.cause.word, stop.detail, figures)
-        return Outcome(stop.cause, stop.detail, self.out, figures, self.found)
+        return Outcome(stop.cause, stop.detail, self.out, figures, self.found, self.without)
 
     def _write_recording(self, stop: Stop) -> None:
         running = (Phase.RUNNING, Phase.STOPPING, Phase.HOLDING, Phase.BRAKED, Phase.SHADOW)
@@ -324,6 +329,7 @@ class _Session:
             "facts": self._facts,
             "figures": dict(figures),
             "drives": self.found,
+            "without": self.without,
             "versions": {"rfdropo_bayes": __version__, "python": platform.python_version()}
             | {name: metadata.version(name) for name in names},
             "schema_version": SCHEMA_VERSION,

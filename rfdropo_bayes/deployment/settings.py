@@ -6,12 +6,13 @@ import tomllib
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from rfdropo_bayes.deployment.bus import BusTable
 from rfdropo_bayes.deployment.drives import Guards, Identity
 from rfdropo_bayes.deployment.objects import SIMULATED_EDS
 from rfdropo_bayes.deployment.sensors import SensorTable
+from rfdropo_bayes.deployment.vendors import WITHOUT, AccelerationUnit, SpeedUnit, TorqueUnit, Units
 from rfdropo_bayes.deployment.watch import Patience
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.tables import parse_table
@@ -22,7 +23,7 @@ class _Table(BaseModel):
 
 
 class DrivesTable(_Table):
-    """Who the drives are.
+    """Who the drives are, in which units they speak, and what they may be without.
 
     Attributes:
         eds: their electronic data sheet; that of the simulated drive by default.
@@ -31,6 +32,11 @@ class DrivesTable(_Table):
         check_eds: whether vendor and product in the data sheet must be those that the drive says; some makers leave
             them out of step.
         answer_s: a drive has this long to answer an SDO request; more for drives that write to slow memory.
+        torque_unit: of the rated torque, object 0x6076; "uN m" for maxon's EPOS4.
+        speed_unit: of the greatest motor speed, object 0x6080; rpm where left out, as the standard has it.
+        acceleration_unit: of the quick stop's deceleration, object 0x6085; where left out, what object 0x60AA tells,
+            else counts/s2.
+        unguarded: guards that the drives may be without, by index; `check` says which they lack, and what that costs.
     """
 
     eds: str = str(SIMULATED_EDS)
@@ -40,6 +46,24 @@ class DrivesTable(_Table):
     serial: dict[str, int] = {}
     check_eds: bool = True
     answer_s: float = Field(default=0.3, gt=0.0)
+    torque_unit: TorqueUnit = "mN m"
+    speed_unit: SpeedUnit | None = None
+    acceleration_unit: AccelerationUnit | None = None
+    unguarded: tuple[int, ...] = ()
+
+    @field_validator("unguarded")
+    @classmethod
+    def _guards(cls, indexes: tuple[int, ...]) -> tuple[int, ...]:
+        for index in indexes:
+            if index not in WITHOUT:
+                known = ", ".join(f"0x{guard:04X}" for guard in sorted(WITHOUT))
+                raise ValueError(f"0x{index:04X} is no guard that a drive may be without; those are {known}")
+        return indexes
+
+    @property
+    def units(self) -> Units:
+        """For the drives."""
+        return Units(self.torque_unit, self.speed_unit, self.acceleration_unit)
 
     def identity(self, channel: str) -> Identity:
         """What the drive of a channel must say of itself."""

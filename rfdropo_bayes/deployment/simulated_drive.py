@@ -27,6 +27,7 @@ from rfdropo_bayes.deployment.cia402 import (
 )
 from rfdropo_bayes.deployment.objects import EmergencyCode, Nmt, NmtState, Object
 from rfdropo_bayes.deployment.sdo_server import StrictNode
+from rfdropo_bayes.deployment.vendors import told_counts
 
 
 class SimulatedFault(IntEnum):
@@ -149,8 +150,10 @@ class SimulatedDrive:
         """A setting in the object dictionary; kept until the next SDO, since a lookup takes ten microseconds."""
         key = (int(index), subindex)
         if key not in self._settings:
-            data = self.local.get_data(*key)
-            self._settings[key] = int(self._variable(*key).decode_raw(data))
+            if key in _ABSENT and self.local.object_dictionary.get_variable(*key) is None:
+                self._settings[key] = _ABSENT[key]
+            else:
+                self._settings[key] = int(self._variable(*key).decode_raw(self.local.get_data(*key)))
         return self._settings[key]
 
     def _variable(self, index: int, subindex: int) -> canopen.objectdictionary.ODVariable:
@@ -444,7 +447,8 @@ class SimulatedDrive:
     """Of the encoder, per turn of the motor; the speed limit 0x6080 is in turns."""
 
     def _slow_down(self, duration: float) -> None:
-        change = self.value(Object.QUICK_STOP_DECELERATION) * duration
+        unit = told_counts(self.value(Object.ACCELERATION_UNIT), self.counts_per_turn) or 1.0
+        change = self.value(Object.QUICK_STOP_DECELERATION) * unit * duration
         before = self.velocity
         self.velocity = math.copysign(max(0.0, abs(before) - change), before)
         self.position += 0.5 * (before + self.velocity) * duration if self.velocity else 0.0
@@ -453,6 +457,25 @@ class SimulatedDrive:
         if stops and self.value(Object.QUICK_STOP_OPTION) < 5:  # options 1 to 4 end in SWITCH ON DISABLED
             self.state = State.SWITCH_ON_DISABLED
 
+
+_ABSENT: dict[tuple[int, int], int] = {
+    (Object.CYCLE_PERIOD, 0): 0,
+    (Object.CONSUMER_HEARTBEAT, 1): 0,
+    (Object.PRODUCER_HEARTBEAT, 0): 0,
+    (Object.ERROR_BEHAVIOUR, 1): 0,
+    (Object.ABORT_CONNECTION, 0): 0,
+    (Object.QUICK_STOP_OPTION, 0): 2,
+    (Object.QUICK_STOP_DECELERATION, 0): 1_000_000,
+    (Object.POSITION_LIMIT, 1): -(2**31),
+    (Object.POSITION_LIMIT, 2): 2**31 - 1,
+    (Object.FOLLOWING_WINDOW, 0): 2**32 - 1,
+    (Object.FOLLOWING_TIMEOUT, 0): 0,
+    (Object.MAX_MOTOR_SPEED, 0): 10_000,
+    (Object.INTERPOLATION_TIME, 1): 0,
+    (Object.INTERPOLATION_TIME, 2): 0,
+    (Object.ACCELERATION_UNIT, 0): 0,
+}
+"""What a drive does whose data sheet lacks an object: no guard, or its maker's own value."""
 
 _LIVE: dict[int, Callable[[SimulatedDrive], int]] = {
     Object.STATUSWORD: SimulatedDrive.statusword,

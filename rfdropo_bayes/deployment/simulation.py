@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import select
 import signal
@@ -23,7 +24,7 @@ import numpy as np
 
 from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bus import BusTable, open_bus
-from rfdropo_bayes.deployment.clock import schedule_fifo, steady_interpreter
+from rfdropo_bayes.deployment.clock import real_time, steady_interpreter
 from rfdropo_bayes.deployment.hub import Hub
 from rfdropo_bayes.deployment.objects import Object
 from rfdropo_bayes.deployment.plant import START, PlantHere, PlantProcess, build_plant
@@ -100,7 +101,11 @@ class SimulatedDrives:
         self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
 
     def run(self, stop: threading.Event) -> None:
-        """Serve until told to stop, or the bus goes."""
+        """Serve until told to stop, or the bus goes.
+
+        Ticks that a slow plant has cost are left out, so that the next one lies ahead: the thread sleeps until then,
+        and the hub, of the same priority, has its turn on the same processor.
+        """
         due = time.monotonic()
         while not stop.is_set():
             now = time.monotonic()
@@ -117,8 +122,8 @@ class SimulatedDrives:
                     self._next_plant = now + 2.5 * period
                     self._request(now, period)
             if now >= due:
-                due = max(due + TICK, now)
                 self.tick(now)
+                due += TICK * max(1, math.ceil((time.monotonic() - due) / TICK))
 
     def tick(self, now: float) -> None:
         """Let time pass for the drives, and for the plant where no SYNC leads it."""
@@ -189,12 +194,11 @@ def serve(table: SimulationTable, ready: Path | None = None) -> None:
         else:
             plant = PlantHere(build_plant(table.plant, robot, table.settings))
         drives = SimulatedDrives(robot, table, bus, plant)
-        schedule_fifo()
-        stack.enter_context(steady_interpreter())
-        if ready is not None:  # last of all: making the interpreter steady takes longer than an SDO client waits
-            ready.write_text(bus_table.channel, encoding="utf-8")
-        with contextlib.suppress(can.CanError):  # the bus has gone, and the drives with it
-            drives.run(stop)
+        with real_time(), steady_interpreter():  # left before the processes of plant and hub are waited for
+            if ready is not None:  # last of all: making the interpreter steady takes longer than an SDO client waits
+                ready.write_text(bus_table.channel, encoding="utf-8")
+            with contextlib.suppress(can.CanError):  # the bus has gone, and the drives with it
+                drives.run(stop)
 
 
 @contextlib.contextmanager
@@ -219,8 +223,7 @@ def run_hub(channel: str) -> None:
     """Body of the hub's process: says where it listens, and ends when its parent does."""
     hub, parent = Hub(channel), os.getppid()
     print(hub.channel, flush=True)
-    schedule_fifo()
-    with steady_interpreter():
+    with real_time(), steady_interpreter():
         hub.serve(stop=lambda: os.getppid() != parent)
 
 

@@ -8,6 +8,8 @@ from pydantic import Field, model_validator
 
 from rfdropo_bayes.robots.table import Name, Pair, Positive, Table
 
+_LEAST_LIMIT = 10.0  # [per mille]: drives tell and limit torque in whole per mille, a tenth of such a limit
+
 
 class Motor(Table):
     """The drive of one command channel: a motor with encoder, gear and drum, and its limits.
@@ -45,6 +47,11 @@ class Motor(Table):
             raise ValueError(f"homing_tension_n of {self.channel} is outside its tension_limit_n")
         if self.per_mille(self.tension_limit_n[1]) > 5000:
             raise ValueError(f"the greatest tension of {self.channel} is more than five times the rated torque")
+        if self.per_mille(self.tension_limit_n[1]) < _LEAST_LIMIT:
+            raise ValueError(
+                f"the greatest tension of {self.channel} is {self.per_mille(self.tension_limit_n[1]):.2g} per mille of "
+                "the rated torque: write rated_torque_n_m in N m (drives state it in mN m or uN m)"
+            )
         if max(abs(low), abs(high)) * self.counts_per_metre > 2**30:
             raise ValueError(f"length_limit_m of {self.channel} does not fit into 32-bit counts")
         return self

@@ -1,0 +1,210 @@
+"""Where vendors of CiA 402 drives differ: the units of their objects, and the guards that they lack."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from typing import Literal, NamedTuple
+
+from rfdropo_bayes.deployment.objects import Object
+from rfdropo_bayes.errors import InputError
+
+TorqueUnit = Literal["mN m", "uN m"]
+SpeedUnit = Literal["rpm", "mrpm", "counts/s"]
+AccelerationUnit = Literal["counts/s2", "rpm/s", "mrpm/s"]
+
+_TORQUE: dict[TorqueUnit, float] = {"mN m": 1e-3, "uN m": 1e-6}  # [N m]
+_TURNS = {"rpm": 1.0 / 60.0, "mrpm": 1e-3 / 60.0, "rpm/s": 1.0 / 60.0, "mrpm/s": 1e-3 / 60.0}  # [1/s], [1/s2]
+_COUNTS = ("counts/s", "counts/s2")
+
+
+class Units(NamedTuple):
+    """Units of a drive's objects, as its owner states them; None leaves them to the drive, then to the standard.
+
+    Attributes:
+        torque: of 0x6076, the rated torque.
+        speed: of 0x6080, the greatest speed; rpm by the standard.
+        acceleration: of 0x6085, the deceleration of a quick stop; what 0x60AA says, else counts/s2.
+    """
+
+    torque: TorqueUnit = "mN m"
+    speed: SpeedUnit | None = None
+    acceleration: AccelerationUnit | None = None
+
+
+STANDARD = Units()
+
+
+def counts_of(unit: SpeedUnit | AccelerationUnit, counts_per_turn: float) -> float:
+    """Counts (per second, or per second squared) in one of a unit."""
+    return 1.0 if unit in _COUNTS else counts_per_turn * _TURNS[unit]
+
+
+_TOLD_TURNS = {
+    (0xB4, 0x03): 1.0,  # revolutions per second
+    (0xB4, 0x47): 1.0 / 60.0,  # per minute
+    (0xB4, 0x57): 1.0,  # per second squared
+    (0xC0, 0x03): 1.0 / 60.0,  # rpm per second
+}
+_TOLD_COUNTS = {(0xB5, 0x03), (0xB5, 0x57)}
+
+
+def told_counts(word: int, counts_per_turn: float) -> float | None:
+    """Counts in one of the unit that an object 0x60A9 or 0x60AA tells; None for a unit that is not known here.
+
+    The word is, from its highest byte: a power of ten, numerator, denominator, 0 (CiA 402-2; codes of CiA 303-2, as
+    real data sheets have them: 0xB4 revolutions, 0xB5 counts, 0xC0 rpm, 0x03 s, 0x47 min, 0x57 s2).
+    """
+    power, unit = (word >> 24 ^ 0x80) - 0x80, (word >> 16 & 0xFF, word >> 8 & 0xFF)
+    if unit in _TOLD_COUNTS:
+        return 10.0**power
+    return 10.0**power * counts_per_turn * _TOLD_TURNS[unit] if unit in _TOLD_TURNS else None
+
+
+def speed_counts(stated: SpeedUnit | None, word: int, counts_per_turn: float, where: str) -> float:
+    """Counts per second in one of the unit of 0x6080.
+
+    Args:
+        stated: by the owner of the drive.
+        word: what 0x60A9 tells; 0 where it tells nothing.
+        counts_per_turn: of the motor.
+        where: for messages.
+
+    Raises:
+        InputError: if nothing is stated and the drive's velocities are not in rpm: the standard has 0x6080 in rpm all
+            the same, some drives have not.
+    """
+    rpm = counts_of("rpm", counts_per_turn)
+    if stated is not None:
+        return counts_of(stated, counts_per_turn)
+    told = told_counts(word, counts_per_turn) if word else rpm
+    if told is None or not math.isclose(told, rpm):
+        raise InputError(
+            f"its velocities are not in rpm (0x60A9 is 0x{word:08X}), and its greatest speed 0x6080 need not be",
+            where=where,
+            remedy='look into its manual, and state [drives] speed_unit, "rpm", "mrpm" or "counts/s"',
+        )
+    return rpm
+
+
+def acceleration_counts(stated: AccelerationUnit | None, word: int, counts_per_turn: float, where: str) -> float:
+    """Counts per second squared in one of the unit of 0x6085.
+
+    Args:
+        stated: by the owner of the drive.
+        word: what 0x60AA tells; 0 where it tells nothing.
+        counts_per_turn: of the motor.
+        where: for messages.
+
+    Raises:
+        InputError: if the drive tells another unit than is stated, or one that is not known here and none is stated.
+    """
+    told = told_counts(word, counts_per_turn) if word else None
+    if stated is None and not word:
+        return counts_of("counts/s2", counts_per_turn)
+    if stated is None:
+        if told is None:
+            raise InputError(
+                f"tells its accelerations in a unit that is not known here (0x60AA is 0x{word:08X})",
+                where=where,
+                remedy='look into its manual, and state [drives] acceleration_unit, "counts/s2" or "rpm/s"',
+            )
+        return told
+    found = counts_of(stated, counts_per_turn)
+    if told is not None and not math.isclose(told, found):
+        raise InputError(
+            f"tells another unit of accelerations (0x60AA is 0x{word:08X}) than {stated}",
+            where=where,
+            remedy="leave [drives] acceleration_unit out, or correct it",
+        )
+    return found
+
+
+def check_rated_torque(found: int, torque_n_m: float, unit: TorqueUnit, where: str) -> None:
+    """Compare a drive's rated torque with that of the robot file: a unit is told from another motor.
+
+    Args:
+        found: what 0x6076 says.
+        torque_n_m: of the robot file [N m].
+        unit: of ``found``.
+        where: for messages.
+
+    Raises:
+        InputError: if they are more than two per cent apart; says which unit would make them agree.
+    """
+    expected = torque_n_m / _TORQUE[unit]
+    if _agree(found, expected):
+        return
+    what = f"its rated torque is {found} {unit}, that of the robot file {expected:.9g} {unit}"
+    if found == 0:
+        raise InputError(what, where=where, remedy="tell the drive which motor it has, with the vendor's own program")
+    power = 3 * round(math.log10(found / expected) / 3.0)
+    if power == 0 or not _agree(found, expected * 10.0**power):
+        raise InputError(
+            what,
+            where=where,
+            remedy="this is another motor, or rated_torque_n_m is wrong: tensions are computed from it",
+        )
+    times = f"{10 ** abs(power):,} times {'too large' if power > 0 else 'too small'}"
+    fitting = [name for name, size in _TORQUE.items() if _agree(found, torque_n_m / size)]
+    remedy = (
+        f'state [drives] torque_unit = "{fitting[0]}" if rated_torque_n_m = {torque_n_m:.9g} N m is that of the motor'
+        if fitting
+        else f"write rated_torque_n_m in N m (it says {torque_n_m:.9g}), and the drive's unit in [drives] torque_unit"
+    )
+    raise InputError(f"{what}: {times}, which is another unit, not another motor", where=where, remedy=remedy)
+
+
+def _agree(found: float, expected: float) -> bool:
+    return abs(found - expected) <= 0.02 * expected + 1.0  # drives round to whole units
+
+
+WITHOUT: dict[int, str] = {
+    Object.CONSUMER_HEARTBEAT: "it does not notice that the computer has died",
+    Object.ABORT_CONNECTION: "it does not stop where it has noticed that the computer has died",
+    Object.QUICK_STOP_OPTION: "it may let the cables go after a quick stop",
+    Object.QUICK_STOP_DECELERATION: "its quick stop brakes as it was set by somebody else",
+    Object.POSITION_LIMIT: "it follows set-points beyond the ends of the travel",
+    Object.FOLLOWING_WINDOW: "it does not notice that it lags behind its set-points",
+    Object.FOLLOWING_TIMEOUT: "it bears a lag behind its set-points for as long as was set by somebody else",
+    Object.MAX_TORQUE: "it does not limit its torque, on which homing relies",
+    Object.MAX_MOTOR_SPEED: "it does not limit its speed",
+    Object.RATED_TORQUE: "nobody notices a torque in another unit, or another motor",
+}
+"""Guards that a drive may be without if its owner says so, and what that costs."""
+
+LEFT_OUT: dict[int, str] = WITHOUT | {
+    Object.PRODUCER_HEARTBEAT: "the computer does not notice that it has died",
+    Object.INTERPOLATION_TIME: "it does not know how far apart set-points are",
+    Object.MODE: "its mode cannot be set",
+}
+"""What is lost where an object that is set or asked is not there."""
+
+STRICTER_BELOW = {Object.FOLLOWING_WINDOW, Object.FOLLOWING_TIMEOUT, Object.MAX_TORQUE, Object.MAX_MOTOR_SPEED}
+"""Guards that a smaller value makes stricter: a drive that does not take so large a value gets its largest."""
+
+
+def check_guards(lacking: Collection[int], unguarded: Collection[int], where: str) -> None:
+    """Refuse a drive without a guard, unless its owner bears that.
+
+    Args:
+        lacking: objects that cannot be set or asked.
+        unguarded: objects that the owner has named.
+        where: for messages.
+
+    Raises:
+        InputError: with every guard that is missed, and what happens without it.
+    """
+    if Object.PRODUCER_HEARTBEAT in lacking:
+        raise InputError(
+            f"lacks 0x1017: {LEFT_OUT[Object.PRODUCER_HEARTBEAT]}", where=where, remedy="use a drive that has it"
+        )
+    missed = sorted(index for index in WITHOUT if index in lacking and index not in unguarded)
+    if missed:
+        listed = "; ".join(f"0x{index:04X}: {WITHOUT[index]}" for index in missed)
+        named = ", ".join(f"0x{index:04X}" for index in sorted({*missed, *unguarded}))
+        raise InputError(
+            f"lacks {listed}",
+            where=where,
+            remedy=f"use a drive that has it, or state [drives] unguarded = [{named}] if something else guards",
+        )
