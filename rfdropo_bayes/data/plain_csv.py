@@ -17,6 +17,7 @@ from jaxtyping import Float
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import Rotation
 
+from rfdropo_bayes.data.clock import PER_SECOND, TimeUnit
 from rfdropo_bayes.data.commands_alone import commands_alone
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import fill_missing, find_faults
@@ -55,10 +56,14 @@ class CsvColumns(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    time: str | None = Field(default=None, description="column of the times; or give sample_time")
-    time_unit: Literal["s", "ms"] = Field(default="s", description="unit of the times")
+    time: str | None = Field(
+        default=None, description="column of the times: numbers in time_unit, or dates (ISO 8601); or give sample_time"
+    )
+    time_unit: TimeUnit = Field(default="s", description="unit of the times; dates and durations need none")
     sample_time: float | None = Field(
-        default=None, gt=0, description="time between rows [s], where no column holds times"
+        default=None,
+        gt=0,
+        description="time between rows [s], where no column holds times, or one holds those of arrival",
     )
     commands: list[str] = Field(
         min_length=1,
@@ -177,7 +182,8 @@ def _coordinates(columns: CsvColumns) -> list[str]:
 def _recording(table: CsvTable, source: CsvTable, columns: CsvColumns, mask_missing: bool) -> Trajectory:
     """The recording in a table, whose commands are in ``source``."""
     position, time = _points(table, columns, mask_missing=mask_missing), _times(table, columns)
-    faults = find_faults(time, position)
+    facts = _facts(table, columns)
+    faults = find_faults(time, position, where=str(table.path), names=facts["marker_names"])
     command = _commands(table, source, columns)
     angle = None
     if columns.motor_angles is not None:
@@ -193,8 +199,8 @@ def _recording(table: CsvTable, source: CsvTable, columns: CsvColumns, mask_miss
         tension=None if columns.tensions is None else table.numbers(columns.tensions, allow_missing=True),
         motor_angle=angle,
         object_pose=_pose(table, columns),
-        settings={"faults": faults.counts} | ({} if angle is None else {"motor_angle_hold": hold_time(time, angle)}),
-        **_facts(table, columns),
+        settings=faults.settings | ({} if angle is None else {"motor_angle_hold": hold_time(time, angle)}),
+        **facts,
     )
 
 
@@ -242,7 +248,7 @@ def command_columns(
     columns: CsvColumns, time: Float[np.ndarray, " rows"], command: Float[np.ndarray, "rows cable"]
 ) -> dict[str, Float[np.ndarray, " rows"]]:
     """Times [s] and commands [m or rad] as the columns of a file that this table describes."""
-    stamped = {} if columns.time is None else {columns.time: time * (1e3 if columns.time_unit == "ms" else 1.0)}
+    stamped = {} if columns.time is None else {columns.time: time * PER_SECOND[columns.time_unit]}
     return stamped | dict(zip(columns.commands, command.T / COMMAND_UNITS[columns.command_unit][1], strict=True))
 
 
@@ -256,8 +262,8 @@ def holds_commands_alone(path: Path, columns: CsvColumns) -> bool:
 def _times(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " rows"]:
     if columns.time is None:
         return float(columns.sample_time or 0.0) * np.arange(len(table))
-    time = table.numbers([columns.time])[:, 0] * (1e-3 if columns.time_unit == "ms" else 1.0)
-    return time - time[0]
+    stamps = table.stamps(columns.time, columns.time_unit)
+    return stamps.since(stamps, str(table.path))
 
 
 def _commands(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows cable"]:

@@ -125,6 +125,7 @@ def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Robot
     gaps = np.diff(trajectory.time)
     step = float(np.median(gaps))
     rows = f"{len(trajectory.time)} rows over {trajectory.time[-1]:.4g} s, one every {1e3 * step:.4g} ms"
+    found.notes += [f"{trajectory.name}: {note}" for note in trajectory.notes]
     if gaps.max() > IRREGULAR * step:
         rows += f"; the longest gap is {1e3 * gaps.max():.4g} ms, at {trajectory.time[np.argmax(gaps)]:.4g} s"
     found.lines.append((f"{role}: {trajectory.name}", rows))
