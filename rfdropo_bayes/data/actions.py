@@ -19,8 +19,8 @@ SETTINGS = {"displacement_per_action": DISPLACEMENT, "updates_per_action": 5, "d
 def cumulative_displacement(actions: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 8"]:
     """Commanded displacement [m] of each cable after each action, pull > 0, without any limit.
 
-    Action a moves cable a % 8: pulled if a < 8, released otherwise; the initial one moves none. How the 5 mm are spread over the action, and what
-    the motors' limits leave of them, is the model's business.
+    Action a moves cable a % 8: pulled if a < 8, released otherwise; the initial one moves none. How the 5 mm are spread
+    over the action, and what the motors' limits leave of them, is the model's business.
     """
     change = np.zeros((len(actions), CABLES))
     moved = np.where(actions < CABLES, DISPLACEMENT, -DISPLACEMENT) * (actions != INITIAL)

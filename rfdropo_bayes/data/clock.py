@@ -200,16 +200,17 @@ def clock_notes(time: Float[np.ndarray, " rows"]) -> list[str]:
     short = short_intervals(time)
     if len(short):
         notes.append(
-            f"{len(short)} of {len(time)} rows, the first of them row {short[0]}, have stamps that follow the row "
-            f"before at once, where one comes every {1e3 * usual:.4g} ms: stamps of arrival, not of measurement; for rows "
-            f"that were measured evenly give sample_time = {_between(time, short):.4g} in place of time"
+            f"{len(short)} of {len(time)} rows, first row {short[0]}, have stamps that follow the row before at once, "
+            f"where one comes every {1e3 * usual:.4g} ms: stamps of arrival, not of measurement; for rows that were "
+            f"measured evenly give sample_time = {_between(time, short):.4g} in place of time"
         )
     if not SLOWEST >= usual >= FASTEST:
         notes.append(
-            f"rows are {usual:.4g} s apart, from row 0 on: where that is not so, correct time_unit under [data.columns] "
-            f"({', '.join(PER_SECOND)})"
+            f"rows are {usual:.4g} s apart, from row 0 on: where that is not so, correct time_unit under "
+            f"[data.columns] ({', '.join(PER_SECOND)})"
         )
-    jumps = np.flatnonzero(gaps > JUMP * max(usual, float(np.quantile(gaps, 0.95)))) + 1
+    long = float(np.quantile(np.delete(gaps, short - 1), 0.95))  # between deliveries, where there are any
+    jumps = np.flatnonzero(gaps > JUMP * max(usual, long)) + 1
     for row in jumps[:1]:
         more = f", and {len(jumps) - 1} times more" if len(jumps) > 1 else ""
         notes.append(

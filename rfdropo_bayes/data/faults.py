@@ -169,8 +169,8 @@ def _name_notes(renamed: np.ndarray, changes: Sequence[Change], names: Sequence[
         for change in changes[:3]
     ) + ("; ..." if len(changes) > 3 else "")
     return [
-        f"markers change names in {shown}: {int(renamed.sum())} positions under other names than in row 0 are left out; "
-        "give the columns their right names from there on, or read pieces with rows"
+        f"markers change names in {shown}: {int(renamed.sum())} positions under other names than in row 0 are left "
+        "out; give the columns their right names from there on, or read pieces with rows"
     ]
 
 

@@ -58,8 +58,8 @@ def from_arrays(
         name: of the recording; robot: that was recorded.
 
     Raises:
-        InputError: an unknown unit, what is not a number, shapes that do not fit, times that do not increase, or lengths that cannot be
-            in the unit that was given.
+        InputError: an unknown unit, what is not a number, shapes that do not fit, times that do not increase, or
+            lengths that cannot be in the unit that was given.
     """
     metres, (unit, factor) = _unit(position_unit, METRES, name), _unit(command_unit, COMMAND_UNITS, name)
     begins = read_stamps(time, _known(time_unit, PER_SECOND, name), where=name)

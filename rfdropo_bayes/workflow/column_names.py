@@ -9,10 +9,13 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from rfdropo_bayes.data.clock import pace
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.errors import InputError
 
-TIME = re.compile(r"^(t|time|timestamp|stamp|secs?|seconds|clock)(?![a-z])", re.IGNORECASE)
+TIME = re.compile(
+    r"^\W*(t|ts|time|timestamp|stamp|date|datetime|secs?|seconds|millis|micros|nanos|clock)(?![a-z])", re.IGNORECASE
+)
 AXIS = re.compile(r"(?<![a-z])[xyz](?![a-z])", re.IGNORECASE)
 FORCE = re.compile(r"force|tension|load|(?<![a-z])[fn]\d", re.IGNORECASE)
 MEASURED = re.compile(r"meas|actual|encoder|enc(?![a-z])|feedback|(?<![a-z])fb", re.IGNORECASE)
@@ -22,6 +25,16 @@ COMMAND = re.compile(
 ANGLE = re.compile(r"motor|servo|theta|angle|(?<![a-z])q_?\d", re.IGNORECASE)
 WORD = re.compile(r"[a-z0-9]+")
 UNITS = {"mm", "cm", "m", "deg", "rad"}
+TIME_UNITS = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "usec", "micros", "microseconds", "µs", "μs"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
+}
+"""Words in the name of a column of times, and the unit they tell."""
+SHORTEST = {"ns": 0.9e6, "us": 0.9e3, "ms": 0.9}
+"""A millisecond, the shortest time between rows, in each unit, a tenth off for jitter: rows come more often than once in
+a second, so that a figure which is a second in one unit is a millisecond in the next."""
 LOOKED_AT = 2000
 """Rows that sizes are taken from."""
 MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
@@ -32,7 +45,7 @@ class Guess(NamedTuple):
     """Columns of a file, by their part.
 
     Attributes:
-        time, time_unit: column and unit of times; None without one.
+        time, time_unit: column and unit of times, "s" where they are dates; None without one.
         commands, command_unit: columns and unit of the commands.
         positions, position_unit: columns of x, y and z of each marker, and their unit.
         markers: a name for each marker, made of its columns'; numbered where they tell none.
@@ -58,9 +71,10 @@ def guess_columns(path: Path) -> Guess:
     Raises:
         InputError: a file that cannot be read, or in which no positions or commands are found.
     """
-    table = CsvTable(path, (), machine_written=False).numeric().head(LOOKED_AT)
+    whole = CsvTable(path, (), machine_written=False)
+    table = whole.numeric().head(LOOKED_AT)
     names = [str(name) for name in table.columns]
-    time = next((name for name in names if TIME.search(name)), None)
+    time = next((name for name in whole.frame.columns if TIME.search(name) and _holds_times(whole, name)), None)
     triples = _triples([name for name in names if name != time])
     positions = list(triples.values())
     rest = [name for name in names if name != time and not any(name in triple for triple in positions)]
@@ -77,7 +91,7 @@ def guess_columns(path: Path) -> Guess:
             )
     return Guess(
         time,
-        _time_unit(table, time),
+        _time_unit(whole, time),
         commands,
         _command_unit(table, commands),
         positions,
@@ -123,10 +137,24 @@ def _length_unit(table: pd.DataFrame) -> str:
     return "mm" if float(np.nanmax(np.abs(table.to_numpy()))) > MILLIMETRES_ABOVE else "m"
 
 
-def _time_unit(table: pd.DataFrame, time: str | None) -> str:
+def _holds_times(table: CsvTable, name: str) -> bool:
+    try:
+        ticks = table.stamps(name, "s").ticks
+    except InputError:
+        return False
+    return bool(len(ticks) == 1 or ticks[-1] != ticks[0])  # a date of the day alone is none
+
+
+def _time_unit(table: CsvTable, time: str | None) -> str:
+    """The unit that the name of a column tells, or else the time from row to row."""
     if time is None or len(table) < 2:
         return "s"
-    return "ms" if float(np.nanmedian(np.diff(table[time]))) > 1.0 else "s"
+    stamps = table.stamps(time, "s")
+    told = {TIME_UNITS[word] for word in re.findall(r"[^\W_]+", time.lower()) if word in TIME_UNITS}
+    if stamps.dated or len(told) == 1:
+        return "s" if stamps.dated else told.pop()
+    interval = pace(stamps.since(stamps, str(table.path)))
+    return next((unit for unit, shortest in SHORTEST.items() if interval >= shortest), "s")
 
 
 def _command_unit(table: pd.DataFrame, commands: list[str]) -> str:
