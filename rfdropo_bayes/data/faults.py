@@ -154,7 +154,7 @@ def _zero_notes(zero: np.ndarray, doubtful: np.ndarray, names: Sequence[str]) ->
         (zero, "taken for lost and left out; leave such cells empty to say so"),
         (doubtful, "taken as it stands; where it was lost, leave the cells empty, or the marker out"),
     ):
-        for marker in np.flatnonzero(kind.any(axis=0)):
+        for marker in np.flatnonzero(kind.any(axis=0)).tolist():
             rows = np.flatnonzero(kind[:, marker])
             said.append(f"{names[marker]} is exactly at 0, 0, 0 in {len(rows)} rows, first in row {rows[0]}: {words}")
     return said

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.data.clock import PER_SECOND, check_times, read_stamps
 from rfdropo_bayes.data.faults import fill_missing, find_faults
-from rfdropo_bayes.data.first_command import MEMORY, begun_from
+from rfdropo_bayes.data.first_command import MEMORY, Rule, begun_from
 from rfdropo_bayes.data.plain_csv import COMMAND_UNITS, METRES, CsvColumns, read_frame
 from rfdropo_bayes.data.trajectory import AXES, Trajectory
 from rfdropo_bayes.errors import InputError
@@ -27,7 +27,7 @@ def from_arrays(
     markers: Sequence[str],
     channels: Sequence[str],
     command_time: Float[Any, " command"] | None = None,
-    initial_command: Float[Any, " channel"] | Literal["first", "zero"] | None = None,
+    initial_command: Any = None,
     time_unit: str = "s",
     position_unit: str = "m",
     command_unit: str = "m",
@@ -64,19 +64,21 @@ def from_arrays(
     metres, (unit, factor) = _unit(position_unit, METRES, name), _unit(command_unit, COMMAND_UNITS, name)
     begins = read_stamps(time, _known(time_unit, PER_SECOND, name), where=name)
     clock = begins.since(begins, name)
-    rows, width = f"{len(clock)} times", f"{len(channels)} channels"
-    place = metres * _numbers(position, "positions", (rows, f"{len(markers)} markers", "3"), name)
-    sent = factor * _numbers(command, "commands", ("times", width), name)
+    rows: dict[str, int | None] = {"times": len(clock)}
+    width: dict[str, int | None] = {"channels": len(channels)}
+    place = metres * _numbers(position, "positions", rows | {"markers": len(markers), "": 3}, name)
+    sent = factor * _numbers(command, "commands", {"times": None} | width, name)
     stamps = clock[: len(sent)]
     if command_time is not None:
         stamps = read_stamps(command_time, time_unit, where=name, column="command_time").since(begins, name)
         check_times(stamps, name, "command_time")
     if len(sent) != len(stamps) or not len(sent):
-        raise InputError(f"commands have the shape {sent.shape}, and not ({len(stamps)} times, {width})", where=name)
+        wanted = f"({len(stamps)} times, {len(channels)} channels)"
+        raise InputError(f"commands have the shape {sent.shape}, and not {wanted}", where=name)
     faults = find_faults(clock, place, where=name, names=markers)
     pose = None
     if object_pose is not None:
-        pose = _numbers(object_pose, "poses", (rows, "7"), name) * np.repeat([metres, 1.0], [3, 4])
+        pose = _numbers(object_pose, "poses", rows | {"": 7}, name) * np.repeat([metres, 1.0], [3, 4])
     recording = Trajectory.build(
         name=name,
         robot=robot,
@@ -90,15 +92,12 @@ def from_arrays(
         command_unit=unit,
         initial_command=sent[0],
         cable_names=channels,
-        tension=None if tension is None else _numbers(tension, "tensions", (rows, width), name),
-        motor_angle=None if motor_angle is None else _numbers(motor_angle, "motor angles", (rows, width), name),
+        tension=None if tension is None else _numbers(tension, "tensions", rows | width, name),
+        motor_angle=None if motor_angle is None else _numbers(motor_angle, "motor angles", rows | width, name),
         object_pose=pose,
         settings=faults.settings,
     )
-    if initial_command is None or isinstance(initial_command, str):
-        return begun_from(recording, initial_command)
-    given = factor * _numbers(initial_command, "initial commands", (width,), name)
-    return recording.with_initial_command(given, {"rule": "given", "why": "initial_command"})
+    return _begun(recording, initial_command, factor)
 
 
 def from_pandas(
@@ -125,7 +124,8 @@ def from_xarray(dataset: xr.Dataset, name: str = "recording", *, robot: str = ""
     """A recording from a data set with ``position(time, marker, axis)`` and ``command(time, channel)``.
 
     Dimensions may be in any order; ``command`` may have a clock of its own, ``command_time``. Markers and channels are
-    named by their coordinates, units stand in the variables' attribute ``units`` ("m" where it is missing). Further
+    named by their coordinates, units stand in the variables' attribute ``units`` ("m" where it is missing, and "s" of
+    ``time``, which may hold dates). Further
     variables are ``initial_command``, ``tension``, ``motor_angle`` and ``object_pose``.
 
     Raises:
@@ -146,7 +146,7 @@ def from_xarray(dataset: xr.Dataset, name: str = "recording", *, robot: str = ""
     for key, wanted in known.items():
         if set(dataset[key].dims) != set(wanted):
             raise InputError(f"{key} has the dimensions {dataset[key].dims}, and not {wanted}", where=name)
-    arrays = {key: dataset[key].transpose(*wanted).values for key, wanted in known.items()}
+    arrays: dict[str, Any] = {key: dataset[key].transpose(*wanted).values for key, wanted in known.items()}
     return from_arrays(
         time=dataset["time"].values,
         command_time=dataset[clock].values[: len(arrays["command"])],
@@ -154,10 +154,28 @@ def from_xarray(dataset: xr.Dataset, name: str = "recording", *, robot: str = ""
         channels=[str(value) for value in dataset[channel].values],
         position_unit=str(dataset["position"].attrs.get("units", "m")),
         command_unit=str(dataset["command"].attrs.get("units", "m")),
+        time_unit=str(dataset["time"].attrs.get("units", "s")),
         name=name,
         robot=robot,
         **arrays,
     )
+
+
+def _begun(recording: Trajectory, initial_command: Any, factor: float) -> Trajectory:
+    """The recording with the command before its first row as it is given, or recognised."""
+    if initial_command is None or isinstance(initial_command, str):
+        rules: dict[str | None, Rule | None] = {None: None, "first": "first", "zero": "zero"}
+        if initial_command not in rules:
+            raise InputError(
+                f"initial_command is {initial_command!r}",
+                where=recording.name,
+                remedy='give "first", "zero", or one value per channel',
+            )
+        return begun_from(recording, rules[initial_command])
+    given = factor * _numbers(
+        initial_command, "initial commands", {"channels": len(recording.cable_names)}, recording.name
+    )
+    return recording.with_initial_command(given, {"rule": "given", "why": "initial_command"})
 
 
 def _unit(unit: str, known: Mapping[str, Any], where: str) -> Any:
@@ -170,23 +188,21 @@ def _known(unit: str, known: Mapping[str, Any], where: str) -> str:
     return unit
 
 
-def _numbers(values: Any, what: str, shape: tuple[str, ...], where: str) -> Float[np.ndarray, "..."]:
-    """Values as floats, NaN where they are missing, in a shape whose sizes are the numbers that words begin with."""
+def _numbers(values: Any, what: str, sizes: Mapping[str, int | None], where: str) -> np.ndarray:
+    """Values as floats, NaN where they are missing, in the shape of these sizes by their names; None: of any size."""
     try:
         found = np.ma.filled(np.ma.asarray(values).astype(float), np.nan)
-    except (TypeError, ValueError):  # pd.NA and None among others, or text
+    except (TypeError, ValueError):  # None and pd.NA among others, or text
+        cells = np.asarray(values, dtype=object)
         try:
-            cells = np.asarray(values, dtype=object)
             flat = pd.to_numeric(pd.Series(cells.ravel()))
-            found = flat.to_numpy(dtype=float, na_value=np.nan).reshape(cells.shape)
         except (TypeError, ValueError) as error:
             raise InputError(f"{what} are not all numbers ({error})", where=where, remedy="convert them") from None
-    sizes = [size.split()[0] for size in shape]
-    fits = found.ndim == len(shape) and all(
-        not size.isdigit() or int(size) == length for size, length in zip(sizes, found.shape, strict=True)
-    )
-    if not fits:
-        raise InputError(f"{what} have the shape {found.shape}, and not ({', '.join(shape)})", where=where)
+        found = flat.to_numpy(dtype=float, na_value=np.nan).reshape(cells.shape)
+    wanted = tuple(length if size is None else size for size, length in zip(sizes.values(), found.shape, strict=False))
+    if found.ndim != len(sizes) or found.shape != wanted:
+        words = ", ".join(f"{'' if size is None else size} {name}".strip() for name, size in sizes.items())
+        raise InputError(f"{what} have the shape {found.shape}, and not ({words})", where=where)
     return found
 
 

@@ -33,8 +33,8 @@ TIME_UNITS = {
 }
 """Words in the name of a column of times, and the unit they tell."""
 SHORTEST = {"ns": 0.9e6, "us": 0.9e3, "ms": 0.9}
-"""A millisecond, the shortest time between rows, in each unit, a tenth off for jitter: rows come more often than once in
-a second, so that a figure which is a second in one unit is a millisecond in the next."""
+"""A millisecond, the shortest time between rows, in each unit, a tenth off for jitter: rows come more often than once
+in a second, so that a figure which is a second in one unit is a millisecond in the next."""
 LOOKED_AT = 2000
 """Rows that sizes are taken from."""
 MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0

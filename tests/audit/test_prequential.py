@@ -60,7 +60,9 @@ def test_where_the_model_is_right_the_p_values_are_uniform_and_a_failure_is_seen
     assert "first from 0.5 to 1 s" in words
 
 
-@pytest.mark.parametrize(("rows", "asked_about"), [((0, 10), True), ((10, 20), False), ((0, 20), False), ((0, 0), False)])
+@pytest.mark.parametrize(
+    ("rows", "asked_about"), [((0, 10), True), ((10, 20), False), ((0, 20), False), ((0, 0), False)]
+)
 def test_a_misfit_of_the_first_block_alone_asks_about_the_beginning(rows, asked_about):
     rng = np.random.default_rng(3)
     _, jacobian, x, valid = drawn(rng)

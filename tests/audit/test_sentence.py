@@ -60,7 +60,7 @@ def test_what_is_held_at_nominal_values_says_what_to_do_at_the_robot():
 
 
 def test_a_misfit_of_the_first_block_alone_is_asked_about(answer):
-    """The first rows of a robot that set out from rest, where the recording says that its first command was in force."""
+    """The first rows of a robot that set out from rest, where its recording has the first command in force before."""
     assert "initial_command" not in said(answer)
     residual = np.zeros_like(answer.base.residual)
     place = answer.target.measurements.series(np.arange(len(residual)))

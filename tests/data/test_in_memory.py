@@ -56,6 +56,10 @@ def test_a_table_and_a_data_set_give_the_same():
         np.testing.assert_allclose(other.command, PULL)
         assert (other.marker_names, other.cable_names) == (("middle", "tip"), ("left", "right"))
     assert Trajectory.from_xarray(arrays().dataset).sha256 == arrays().sha256
+    dated = dataset.assign_coords(time=pd.Timestamp("2024-05-01") + pd.to_timedelta(TIME, "s"))
+    counted = dataset.assign_coords(time=("time", 1e3 * TIME, {"units": "ms"}))
+    for other in (dated, counted):
+        np.testing.assert_allclose(Trajectory.from_xarray(other).time, TIME, atol=1e-9)
 
 
 def test_missing_positions_are_masked_and_counted():
@@ -171,6 +175,7 @@ def test_tables_with_types_of_their_own_for_missing_values(backend):
         ({"time": 0.0 * TIME}, "row 1: time does not increase"),
         ({"command_time": 0.0 * TIME}, "row 1: command_time does not increase"),
         ({"time_unit": "min"}, "unknown unit 'min'"),
+        ({"initial_command": "last"}, 'initial_command is \'last\'; give "first", "zero"'),
     ],
 )
 def test_shapes_and_numbers_are_checked_before_anything_needs_them(changes, said):
@@ -186,5 +191,5 @@ def test_a_table_with_two_columns_of_one_name_is_refused():
 
 
 def test_a_new_grid_far_finer_than_the_rows_is_refused():
-    with pytest.raises(InputError, match="would be 1.9e.* rows of 20"):
+    with pytest.raises(InputError, match=r"would be 1\.9e.* rows of 20"):
         arrays(time=1e9 * TIME).resample(0.01)
