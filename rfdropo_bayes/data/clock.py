@@ -185,13 +185,20 @@ def evened(time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
     return time if not len(short) else time[0] + _between(time, short) * np.arange(len(time))
 
 
+def sample_time(time: Float[np.ndarray, " rows"]) -> float:
+    """Median time from row to row [s], on evenly spaced rows where stamps are those of deliveries."""
+    return float(np.median(np.diff(evened(time))))
+
+
 def _between(time: np.ndarray, short: np.ndarray) -> float:
     """Time from row to row [s] between the first delivery and the last, lost time left out."""
     starts = np.setdiff1d(np.arange(1, len(time)), short)
     if len(starts) < 2:
         return pace(time)
-    gaps = np.diff(time[starts[0] : starts[-1] + 1])
-    return float(gaps[gaps <= _window(time) * pace(time)].mean())
+    gaps = np.diff(time)
+    longest = JUMP * float(np.median(gaps[starts - 1]))
+    within = gaps[starts[0] : starts[-1]]
+    return float(within[within <= longest].mean())
 
 
 def clock_notes(time: Float[np.ndarray, " rows"]) -> list[str]:

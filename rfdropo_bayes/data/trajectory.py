@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.data import checks
+from rfdropo_bayes.data.clock import sample_time
 from rfdropo_bayes.data.faults import NOTES
 from rfdropo_bayes.data.held_readings import new_readings, present_readings
 from rfdropo_bayes.errors import InputError
@@ -114,7 +115,7 @@ class Trajectory:
             "format": format,
             "provenance": provenance,
             "frame": frame,
-            "sample_time": float(np.median(np.diff(time))) if len(time) > 1 else 0.0,
+            "sample_time": sample_time(np.asarray(time, dtype=float)) if len(time) > 1 else 0.0,
             "synthetic": int(synthetic),
             "settings": json.dumps(facts, sort_keys=True),
         }

@@ -8,6 +8,7 @@ import pytest
 
 from rfdropo_bayes.data import CsvColumns, Trajectory, find_faults, read_plain_csv
 from rfdropo_bayes.data.clock import check_times, clock_notes, read_stamps
+from rfdropo_bayes.data.held_readings import hold_time
 from rfdropo_bayes.errors import InputError
 
 STEP = 0.01  # [s]
@@ -181,6 +182,12 @@ def test_stamps_of_arrival_are_noted_and_mask_nothing(sizes):
     assert "stamps of arrival" in note
     given = float(note.partition("sample_time = ")[2].split()[0])
     assert given == pytest.approx(STEP, rel=0.05)
+    angle = np.random.default_rng(4).normal(size=(len(time) // 4 + 1, 1)).repeat(4, axis=0)[: len(time)]
+    found = Trajectory.from_arrays(
+        time=time, position=place, command=angle, command_unit="rad", motor_angle=angle, markers=["m"], channels=["u"]
+    )
+    assert found.dataset.attrs["sample_time"] == pytest.approx(STEP, rel=0.05)
+    assert hold_time(time, angle) == pytest.approx(4 * STEP, rel=0.05)
     place[200, 0, 1] += 0.03  # a jump is still found, on an even clock
     assert np.flatnonzero(~find_faults(time, place).mask[:, 0]).tolist() == [200]
 

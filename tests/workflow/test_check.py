@@ -159,6 +159,7 @@ def test_stamps_coarser_than_rows_are_a_problem_that_names_sample_time(tmp_path)
 def test_stamps_of_arrival_and_a_clock_that_jumps_are_notes(tmp_path):
     arrival = checked(tmp_path, time=0.3 * (ROWS // 6) + 3e-6 * (ROWS % 6))
     assert any("stamps of arrival" in note and "give sample_time = 0.05" in note for note in arrival.notes)
+    assert "61 rows over 3 s, one every 50 ms" in text_of(arrival)
     assert "no position is masked" in text_of(arrival)
     assert not arrival.problems
     jump = checked(tmp_path, time=0.05 * ROWS + 600.0 * (ROWS > 29))
