@@ -174,7 +174,8 @@ def short_intervals(time: Float[np.ndarray, " rows"]) -> np.ndarray:
     """Rows that came in one delivery with the row before, if so many did that stamps are those of deliveries."""
     usual, window = pace(time), _window(time)
     gaps = np.minimum(np.diff(time), window * usual)  # one gap of hours makes no others short
-    around = np.convolve(gaps, np.ones(window), "same") / np.convolve(np.ones(len(gaps)), np.ones(window), "same")
+    means = np.convolve(gaps, np.ones(window) / window, "valid")
+    around = np.pad(means, (window // 2, len(gaps) - len(means) - window // 2), "edge")
     short = np.flatnonzero(gaps < SHORT * around) + 1
     return short if len(short) >= BUNCHED * len(gaps) else short[:0]
 
