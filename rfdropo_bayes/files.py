@@ -17,7 +17,10 @@ _GLOB = "*?["
 
 
 def find_files(pattern: str, base: Path, *, folders: bool = False) -> list[Path]:
-    """Files of a name or glob in the first folder that has any: RFDROPO_DATA, or else ``base``.
+    """Files of a name or pattern in the first folder that has any: RFDROPO_DATA, or else ``base``.
+
+    A name that exists is taken as it stands, whatever signs of a pattern are in it, and so are the folders that a
+    pattern begins with.
 
     Args:
         pattern: the name or glob.
@@ -33,7 +36,10 @@ def find_files(pattern: str, base: Path, *, folders: bool = False) -> list[Path]
     if wanted.is_absolute():
         roots, wanted = [Path(wanted.anchor)], wanted.relative_to(wanted.anchor)
     for root in roots:
-        files = sorted(root.glob(str(wanted))) if any(sign in pattern for sign in _GLOB) else [root / wanted]
+        if (root / wanted).is_file() or (folders and (root / wanted).is_dir()):
+            return [root / wanted]
+    for root in roots:
+        files = matching_files(root, wanted)
         found = [file for file in files if file.is_file() or (folders and file.is_dir())]
         if found:
             return found
@@ -46,6 +52,17 @@ def find_files(pattern: str, base: Path, *, folders: bool = False) -> list[Path]
         where=pattern,
         remedy=f"correct the path, or set {DATA_VARIABLE} to the folder that holds the data",
     )
+
+
+def matching_files(root: Path, wanted: Path) -> list[Path]:
+    """Files and folders of a pattern below ``root``, in order; parts of it that exist are taken as they stand."""
+    parts = list(wanted.parts)
+    while parts and (root / parts[0]).exists():
+        root /= parts.pop(0)
+    if not parts:
+        return [root]
+    rest = str(Path(*parts))
+    return sorted(root.glob(rest)) if any(sign in rest for sign in _GLOB) else []
 
 
 @contextmanager

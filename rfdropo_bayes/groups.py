@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 
 from rfdropo_bayes.errors import InputError
+
+_PIECE = re.compile(r"(\[\d+:\d+\])+$")
 
 Patterns = Mapping[str, str | Sequence[str]]
 """Names of recordings, or wildcards, by the name of their group."""
 
 
 def whole(recording: str) -> str:
-    """The recording that a piece is cut from."""
-    return recording.partition("[")[0]
+    """The recording that a piece is cut from, such as "run" of "run[0:99]"; brackets elsewhere belong to its name."""
+    return _PIECE.sub("", recording)
 
 
 def group_of(recording: str, patterns: Patterns) -> str:

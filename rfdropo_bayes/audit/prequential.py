@@ -16,6 +16,11 @@ from scipy.stats import chi2
 from rfdropo_bayes.audit.fit import Fit, Target
 from rfdropo_bayes.audit.omnibus import BLOCK
 
+BEGINNING = (
+    "Only the first block fails: was another command in force before the first row than these recordings have, or was "
+    "the robot not at rest? rfdropo check says which command it is; initial_command sets it."
+)
+
 
 @dataclass(frozen=True)
 class Prequential:
@@ -86,4 +91,10 @@ def in_words(found: Prequential, markers: tuple[str, ...], level: float) -> str:
     return (
         f"The model fails {share} of rows, first from {found.edges[first]:.2g} to {found.edges[first + 1]:.2g} s, most "
         f"from {found.edges[worst]:.2g} to {found.edges[worst + 1]:.2g} s, and most at marker {markers[at]}."
+        + (f" {BEGINNING}" if begins_wrong(found, level) else "")
     )
+
+
+def begins_wrong(found: Prequential, level: float) -> bool:
+    """Whether the first block of rows fails, and no other of several."""
+    return len(found.p) > 1 and np.flatnonzero(found.p <= level / len(found.p)).tolist() == [0]

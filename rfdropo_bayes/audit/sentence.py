@@ -12,6 +12,7 @@ from rfdropo_bayes.audit.candidates import spoken
 from rfdropo_bayes.audit.extension import DISCRETISATION, TOLD_APART
 from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.pipeline import Answer
+from rfdropo_bayes.audit.prequential import BEGINNING, begins_wrong, prequential
 from rfdropo_bayes.audit.verdict import EXPLAINED, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED, unclear
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
 
@@ -27,6 +28,7 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         + _suspicion(answer)
         + _shifted(answer)
         + _numerical(answer)
+        + _beginning(answer)
         + _left_out(answer)
         + _stopped(answer)
     )
@@ -93,6 +95,14 @@ def _numerical(answer: Answer) -> str:
         f" Half the time step and a finer mesh move the last model's markers by {1e3 * error:.2g} mm, the noise by "
         f"{1e3 * noise:.2g} mm: what is found may stand for an error of the simulation; shorten [simulator] time_step."
     )
+
+
+def _beginning(answer: Answer) -> str:
+    """What is asked where the base model fails in the first block of rows alone."""
+    if answer.verdict == NO_DISCREPANCY or not answer.base.converged:
+        return ""
+    found = prequential(answer.target, answer.base)
+    return f" {BEGINNING}" if begins_wrong(found, answer.question.rules.base_passes) else ""
 
 
 def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:

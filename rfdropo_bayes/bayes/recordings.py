@@ -112,4 +112,7 @@ def commands_after(
     initial = trajectory.initial_command
     if isinstance(simulator, ExtendedSimulator):
         value = simulator.taken(trajectory.name, initial, value)
-    return simulator.commands(time, value, initial, trajectory.time)
+    try:
+        return simulator.commands(time, value, initial, trajectory.time)
+    except InputError as error:
+        raise InputError(error.what, where=error.where or trajectory.name, remedy=error.remedy) from None

@@ -19,11 +19,12 @@ SETTINGS = {"displacement_per_action": DISPLACEMENT, "updates_per_action": 5, "d
 def cumulative_displacement(actions: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 8"]:
     """Commanded displacement [m] of each cable after each action, pull > 0, without any limit.
 
-    Action a moves cable a % 8: pulled if a < 8, released otherwise. How the 5 mm are spread over the action, and what
-    the motors' limits leave of them, is the model's business.
+    Action a moves cable a % 8: pulled if a < 8, released otherwise; the initial one moves none. How the 5 mm are spread
+    over the action, and what the motors' limits leave of them, is the model's business.
     """
     change = np.zeros((len(actions), CABLES))
-    change[np.arange(len(actions)), actions % CABLES] = np.where(actions < CABLES, DISPLACEMENT, -DISPLACEMENT)
+    moved = np.where(actions < CABLES, DISPLACEMENT, -DISPLACEMENT) * (actions != INITIAL)
+    change[np.arange(len(actions)), actions % CABLES] = moved
     return change.cumsum(axis=0)
 
 
@@ -54,10 +55,10 @@ def actions_towards(target: Float[np.ndarray, "n 8"], initial: Float[np.ndarray,
 
 
 def read_actions(column: Float[np.ndarray, " rows"], where: str) -> Int[np.ndarray, " n"]:
-    """Actions of an episode whose first row is the initial state.
+    """Actions of an episode whose first row is the initial state; more such rows may follow before the first action.
 
     Raises:
-        InputError: if the first row is not the initial state, or a later one is not an action 0 ... 15.
+        InputError: if the first row is not the initial state, or one after the first action is not an action 0 ... 15.
     """
     if column[0] != INITIAL:
         raise InputError(
@@ -66,8 +67,10 @@ def read_actions(column: Float[np.ndarray, " rows"], where: str) -> Int[np.ndarr
             remedy="the file must start with the initial state; use rows = [first, last] to leave rows out",
         )
     allowed: Sequence[int] = range(2 * CABLES)
+    begun = False
     for row, action in enumerate(column[1:], start=1):
-        if action not in allowed:
+        begun = begun or action != INITIAL
+        if begun and action not in allowed:
             raise InputError(
                 f"{action:g} is not an action (0 to {2 * CABLES - 1})",
                 where=f"{where}, row {row}, column 'action'",

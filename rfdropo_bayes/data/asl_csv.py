@@ -76,10 +76,11 @@ def read_asl_csv(observations: Path, commands: Path | None, *, mask_missing: boo
     identity = table.numbers(["ID"])[:, 0].astype(int)
     position = table.points(_DISKS, allow_missing=mask_missing) @ MOCAP_TO_BASE.T
     time = np.arange(len(table)) / RATE
-    recording = _Recording(table, identity, time, position, find_faults(time, position))
+    faults = find_faults(time, position, where=str(observations), names=_FACTS["marker_names"])
+    recording = _Recording(table, identity, time, position, faults)
     command = _read_commands(commands) if commands is not None else np.zeros((len(table) - 1, MOTORS))
     content = (_settled_poses if len(set(identity)) < len(identity) else _motion)(recording, command, commands)
-    settings: dict[str, Any] = {"faults": recording.faults.counts} | content.pop("settings")
+    settings: dict[str, Any] = recording.faults.settings | content.pop("settings")
     payload = re.search(r"_(\d+)g$", _stem(observations))
     settings["payload_mass"] = 1e-3 * float(payload.group(1)) if payload else 0.0
     return Trajectory.build(

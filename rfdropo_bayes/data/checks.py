@@ -7,6 +7,7 @@ import json
 import numpy as np
 import xarray as xr
 
+from rfdropo_bayes.data.clock import check_times
 from rfdropo_bayes.errors import InputError
 
 DIMS: dict[str, tuple[str, ...]] = {
@@ -45,7 +46,8 @@ def check_dataset(dataset: xr.Dataset) -> None:
         names = [str(value) for value in dataset[key].values]
         if len(set(names)) != len(names):
             raise InputError(f"{key} names are not unique: {', '.join(names)}", where=name, remedy="rename them")
-    _check_times(dataset, name)
+    for key in ("time", "command_time"):
+        check_times(dataset[key].values, name, key)
     _check_finite(dataset, name)
     _check_lengths(dataset, name)
     _check_commands(dataset, name)
@@ -61,19 +63,14 @@ def check_dataset(dataset: xr.Dataset) -> None:
             )
 
 
-def _check_times(dataset: xr.Dataset, name: str) -> None:
-    for key in ("time", "command_time"):
-        values = dataset[key].values
-        if not np.all(np.isfinite(values)):
-            row = int(np.argmax(~np.isfinite(values)))
-            raise InputError(f"{key} is not a number", where=f"{name}, row {row}", remedy="repair the time column")
-        stuck = np.flatnonzero(np.diff(values) <= 0.0)
-        if stuck.size:
-            raise InputError(
-                f"{key} does not increase ({stuck.size} times)",
-                where=f"{name}, row {int(stuck[0]) + 1}",
-                remedy="sort the rows or remove duplicates",
-            )
+def check_pose(pose: np.ndarray | None, rows: int, name: str) -> None:
+    """Raise an InputError where the poses of an object are not seven numbers a row."""
+    if pose is not None and np.shape(pose) != (rows, 7):
+        raise InputError(
+            f"poses of the object have the shape {np.shape(pose)}, not ({rows}, 7)",
+            where=name,
+            remedy="give x, y, z and the quaternion x, y, z, w in every row",
+        )
 
 
 def _check_finite(dataset: xr.Dataset, name: str) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from rfdropo_bayes.data.clock import sample_time
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 
@@ -37,7 +38,7 @@ def commands_alone(
     Raises:
         InputError: a start without that row.
     """
-    clock = np.append(time, time[-1] + (float(np.median(np.diff(time))) if len(time) > 1 else 1.0))
+    clock = np.append(time, time[-1] + (sample_time(time) if len(time) > 1 else 1.0))
     position = np.zeros((len(clock), len(marker_names), 3))
     mask = np.zeros(position.shape[:2], dtype=bool)
     if start is not None:

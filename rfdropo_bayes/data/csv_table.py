@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from rfdropo_bayes.data.clock import Stamps, dated, numbers_of, read_stamps
 from rfdropo_bayes.errors import InputError
 
 MOTIVE = "Format Version"
@@ -166,12 +167,18 @@ class CsvTable:
     def of_frame(cls, frame: pd.DataFrame, name: str, required: Sequence[str]) -> CsvTable:
         """A table that is in memory; ``name`` stands for its path.
 
+        An index with a name is a column, too; one of dates without a name is the column "index".
+
         Raises:
-            InputError: no rows, or a missing column.
+            InputError: no rows, a column that appears twice, or a missing one.
         """
+        if frame.index.name is not None or isinstance(frame.index, pd.DatetimeIndex | pd.TimedeltaIndex):
+            called = frame.index.name if frame.index.name is not None else "index"
+            frame = frame.reset_index(drop=called in frame.columns)
         table = cls.__new__(cls)
         table.path, table.decimal = Path(name), "."
         table.frame = frame.rename(columns=str).reset_index(drop=True)
+        _check_names(table.path, list(table.frame.columns))
         if len(frame) == 0:
             raise InputError("has no rows", where=name)
         table.require(required)
@@ -204,7 +211,7 @@ class CsvTable:
         """
         self.require(names)
         cells = self.frame[list(names)]
-        values = np.array(cells.apply(self._number), dtype=np.float64)
+        values = np.array(cells.apply(self._number).to_numpy(dtype=np.float64, na_value=np.nan))
         text = np.isnan(values) & cells.notna().to_numpy()
         if text.any():
             row, column = np.argwhere(text)[0]
@@ -223,6 +230,17 @@ class CsvTable:
             )
         return values
 
+    def stamps(self, name: str, unit: str) -> Stamps:
+        """A column of times in a ``unit``, or of dates; see `read_stamps`.
+
+        Raises:
+            InputError: a cell that is empty, or neither a number nor a date.
+        """
+        self.require([name])
+        numbers, cells = self._number(self.frame[name]), self.frame[name]
+        told = numbers.notna() | cells.isna()
+        return read_stamps(numbers if told.all() else cells, unit, where=str(self.path), column=name)
+
     def numeric(self) -> pd.DataFrame:
         """The columns that hold nothing but numbers and empty cells, as numbers."""
         values = self.frame.apply(self._number)
@@ -230,12 +248,14 @@ class CsvTable:
         return values.loc[:, told]
 
     def _number(self, cells: pd.Series) -> pd.Series:
-        """Cells of a column as numbers; pandas leaves those of a column with any text as they were."""
+        """Cells of a column as numbers; pandas leaves those of a column with any text as they were. Dates are none."""
+        if dated(cells):
+            return pd.Series(np.nan, index=cells.index)
         if self.decimal == "," and not pd.api.types.is_numeric_dtype(cells):
             cells = cells.map(
                 lambda cell: str(cell).replace(",", ".") if "." not in str(cell) else "", na_action="ignore"
             )
-        return pd.to_numeric(cells, errors="coerce")
+        return numbers_of(cells)
 
     def points(self, names: Sequence[str], *, allow_missing: bool = False) -> Float[np.ndarray, "rows points 3"]:
         """Columns x, y, z of several points, in the order of ``names``."""
@@ -252,12 +272,16 @@ class CsvTable:
         return values
 
 
+def _check_names(path: Path, names: Sequence[str]) -> None:
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy="rename one of them")
+
+
 def _check_rectangular(path: Path, lines: Sequence[str], separator: str) -> None:
     header = [name.strip() for name in _cells(lines[0], separator)]
     fields = len(header)
-    repeated = sorted({name for name in header if header.count(name) > 1})
-    if repeated:
-        raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy="rename one of them")
+    _check_names(path, header)
     for row, line in enumerate(lines[1:]):
         found = len(_cells(line, separator))
         if found != fields:

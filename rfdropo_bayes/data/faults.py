@@ -1,8 +1,10 @@
 """Faults of a motion-capture recording: found and masked, never fitted.
 
-Three kinds, each by what it looks like in the numbers:
+Five kinds, each by what it looks like in the numbers:
 
 - *missing*: a position that is NaN (a marker was lost).
+- *zero*: a position that is exactly 0, 0, 0, far from where the marker is before and after: how some trackers write a
+  lost marker.
 - *held*: the tracker repeated its last pose. Real measurements carry noise in their last digits, so a position equal to
   the one before it in all three coordinates is no new measurement. The first row of a held run counts as measured.
 - *jump*: the tracker fitted the wrong rigid body for a row or a short run of rows, and then came back; two markers
@@ -10,21 +12,32 @@ Three kinds, each by what it looks like in the numbers:
   ``tolerance + max_acceleration * dt**2``. What is kept of each marker is its longest smooth path: the largest set of
   rows in which every row can be reached from the one kept before it. Leaving out more rows than ``longest_run`` is
   never worth it, so a lasting change of level (a moved frame, an impact) is kept and counted among the *breaks*.
+- *renamed*: the place of a marker under the name of another (`identities`).
 
-At low sampling rates ``max_acceleration * dt**2`` exceeds any motion: jumps cannot be told from it, nothing is masked.
+At low sampling rates ``max_acceleration * dt**2`` exceeds any motion: jumps cannot be told from it, none is masked.
 """
 
 from __future__ import annotations
 
 import warnings
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from rfdropo_bayes.data.clock import check_times, clock_notes, evened
+from rfdropo_bayes.data.identities import Change, changed_names
+from rfdropo_bayes.errors import InputError
+
+NOTES = "notes"  # among the settings of a recording: what is allowed of it, and perhaps not meant
+
 TOLERANCE = 1.5e-3  # [m]
 MAX_ACCELERATION = 20.0  # [m/s2]: about 2 g, in excess of what the neighbouring rows show
 LONGEST_RUN = 0.25  # [s]
+MOST_ROWS = 250  # of a run: as many as the longest has at 1 kHz; motion capture is not faster, and memory grows with it
+FAR = 10e-3  # [m] from a zero to where the marker is before and after
+FAR_STEPS = 3.0  # the same in steps of a fast row
 _VELOCITY_ROWS = 5
 _DRIFT_PER_ROW = 0.02  # share of the tolerance by which a smooth path may drift from the predicted one per row
 _ONSET_ROWS = 3  # over this few rows a motion may start or stop at once
@@ -35,47 +48,130 @@ class Faults(NamedTuple):
     """What is wrong with a recording.
 
     ``mask(time, marker)`` is True where the position may be used. ``counts`` maps each kind to its number of
-    positions per marker, and ``breaks`` to the number of lasting changes of level.
+    positions per marker, and ``breaks`` to the number of lasting changes of level; kinds "zero" and "renamed" are there
+    where there are any. ``notes`` say what a user should look at, by row, and what to do.
     """
 
     mask: Bool[np.ndarray, "time marker"]
     counts: dict[str, list[int]]
+    notes: list[str]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Counts and notes as facts about a recording, for `Trajectory.build`."""
+        return {"faults": self.counts} | ({NOTES: self.notes} if self.notes else {})
 
 
 def find_faults(
     time: Float[np.ndarray, " time"],
     position: Float[np.ndarray, "time marker 3"],
     *,
+    where: str = "recording",
+    names: Sequence[str] = (),
     tolerance: float = TOLERANCE,
     max_acceleration: float = MAX_ACCELERATION,
     longest_run: float = LONGEST_RUN,
 ) -> Faults:
-    """Mask missing, held and jumping positions of a measured recording (not meant for simulated ones).
+    """Mask lost, held, jumping and renamed positions of a measured recording (not meant for simulated ones).
 
     Args:
-        time: times of the rows [s], increasing.
+        time: times of the rows [s].
         position: marker positions [m]; NaN where a marker was lost.
+        where: what errors call the recording.
+        names: of the markers, for the notes; numbers by default.
         tolerance: distance that is no fault at any rate [m].
         max_acceleration: largest acceleration a marker can have [m/s2].
         longest_run: longest run of wrong positions that can be told from a lasting change [s].
+
+    Raises:
+        InputError: fewer than two rows, another number of positions than times, or times that do not increase.
     """
-    missing = np.isnan(position).any(axis=2)
+    _check_rows(time, position, where)
+    nan = np.isnan(position).any(axis=2)
+    zero, doubtful = find_zeros(position)
+    missing = nan | zero
     held = find_held(np.where(missing[..., None], 0.0, position)) & ~missing
     jumping = np.zeros_like(missing)
-    breaks = []
+    breaks, clock = [], evened(time)
     for marker in range(position.shape[1]):
         rows = np.flatnonzero(~(missing | held)[:, marker])
-        wrong, level_changes = _off_path(time[rows], position[rows, marker], tolerance, max_acceleration, longest_run)
+        wrong, level_changes = _off_path(clock[rows], position[rows, marker], tolerance, max_acceleration, longest_run)
         jumping[rows[wrong], marker] = True
         # a repeat of a wrong pose is as wrong as the pose; it is counted as held
         breaks.append(level_changes)
+    renamed, changes = changed_names(position, ~(missing | held | jumping))
+    renamed &= ~(missing | held | jumping)
     counts = {
-        "missing": missing.sum(axis=0).tolist(),
+        "missing": nan.sum(axis=0).tolist(),
         "held": held.sum(axis=0).tolist(),
         "jump": jumping.sum(axis=0).tolist(),
         "breaks": breaks,
-    }
-    return Faults(~(missing | held | jumping), counts)
+    } | {kind: each.sum(axis=0).tolist() for kind, each in (("zero", zero), ("renamed", renamed)) if each.any()}
+    names = names or [f"marker {number}" for number in range(1, position.shape[1] + 1)]
+    notes = clock_notes(time) + _zero_notes(zero, doubtful, names) + _name_notes(renamed, changes, names)
+    return Faults(~(missing | held | jumping | renamed), counts, notes)
+
+
+def _check_rows(time: np.ndarray, position: np.ndarray, where: str) -> None:
+    check_times(time, where)
+    if np.ndim(position) != 3 or position.shape[2] != 3 or position.shape[0] != len(time):
+        raise InputError(f"positions have the shape {np.shape(position)} for {len(time)} times", where=where)
+    if len(time) < 2:
+        raise InputError(f"has {len(time)} observation rows", where=where, remedy="at least 2 are needed")
+
+
+def find_zeros(
+    position: Float[np.ndarray, "time marker 3"],
+) -> tuple[Bool[np.ndarray, "time marker"], Bool[np.ndarray, "time marker"]]:
+    """True where a marker is exactly at 0, 0, 0 and was certainly lost, and True where it may have been.
+
+    Lost: where it was seen before and after the zeros is farther from them than it moves in a fast row. Not lost: a
+    marker that is near. Those between, at low sampling rates, and those that are never elsewhere are in doubt.
+    """
+    zero = (position == 0.0).all(axis=2)
+    lost, doubtful = np.zeros_like(zero), np.zeros_like(zero)
+    for marker in np.flatnonzero(zero.any(axis=0)):
+        seen = np.flatnonzero(np.isfinite(position[:, marker]).all(axis=1) & ~zero[:, marker])
+        rows = np.flatnonzero(zero[:, marker])
+        if not len(seen):
+            doubtful[rows, marker] = True
+            continue
+        radius = np.linalg.norm(position[seen, marker], axis=1)
+        following = np.searchsorted(seen, rows)
+        before, after = radius[np.maximum(following - 1, 0)], radius[np.minimum(following, len(seen) - 1)]
+        nearest = np.minimum(np.where(following == 0, after, before), np.where(following == len(seen), before, after))
+        steps = np.linalg.norm(np.diff(position[seen, marker], axis=0), axis=1)[np.diff(seen) == 1]
+        fast = float(np.quantile(steps, 0.99)) if len(steps) else 0.0
+        lost[rows, marker] = nearest > max(FAR, FAR_STEPS * fast)
+        doubtful[rows, marker] = (nearest > FAR) & ~lost[rows, marker]
+    return lost, doubtful
+
+
+def _zero_notes(zero: np.ndarray, doubtful: np.ndarray, names: Sequence[str]) -> list[str]:
+    """Markers at exactly 0, 0, 0, with the first row of each."""
+    said = []
+    for kind, words in (
+        (zero, "taken for lost and left out; leave such cells empty to say so"),
+        (doubtful, "taken as it stands; where it was lost, leave the cells empty, or the marker out"),
+    ):
+        for marker in np.flatnonzero(kind.any(axis=0)).tolist():
+            rows = np.flatnonzero(kind[:, marker])
+            said.append(f"{names[marker]} is exactly at 0, 0, 0 in {len(rows)} rows, first in row {rows[0]}: {words}")
+    return said
+
+
+def _name_notes(renamed: np.ndarray, changes: Sequence[Change], names: Sequence[str]) -> list[str]:
+    """Rows in which markers change names for longer than a moment."""
+    if not changes or not renamed.any():
+        return []
+    shown = "; ".join(
+        f"row {change.row}, where {' and '.join(names[m] for m in sorted(change.taken_by))} change names"
+        for change in changes[:3]
+    ) + ("; ..." if len(changes) > 3 else "")
+    return [
+        f"markers change names in {shown}: {int(renamed.sum())} positions under other names than in row 0 are left "
+        "out; give the columns their right names from there on, or read pieces with rows"
+    ]
 
 
 def find_held(position: Float[np.ndarray, "time marker 3"]) -> Bool[np.ndarray, "time marker"]:
@@ -126,7 +222,7 @@ def _off_path(
     if len(time) < 4 * _VELOCITY_ROWS:
         return np.zeros(len(time), dtype=bool), 0
     interval = float(np.median(np.diff(time)))
-    reach = max(round(longest_run / interval), 2)
+    reach = int(np.clip(round(longest_run / interval), 2, MOST_ROWS))
     allowed = tolerance + max_acceleration * interval**2
     smooth = _smooth_steps(time, position, reach, interval, allowed)
     step_value = np.where(smooth, 1.0, 1.0 - 0.5 * reach)
@@ -169,8 +265,7 @@ def _smooth_steps(
 
 def _end_velocities(time: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Median velocity of the few steps that arrive at each row, and of those that leave it: one bad step is ignored."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # times that do not increase are refused later, by their row
-        velocity = np.diff(position, axis=0) / np.diff(time)[:, None]
+    velocity = np.diff(position, axis=0) / np.diff(time)[:, None]
     edge = np.full((_VELOCITY_ROWS, 3), np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([edge, velocity, edge]), _VELOCITY_ROWS, axis=0)
     with warnings.catch_warnings():

@@ -27,8 +27,9 @@ RANK = 1e-9  # singular values below this share of the largest are rounding: cha
 CLEARLY = 0.7  # ratio of two errors below which the smaller decides; of 160 starts none fell on the wrong side
 
 
-UNTOLD = ("asl-csv", "csv", "motive-csv", "rosbag", "lerobot")
-"""Formats whose files do not tell what was in force before their first command."""
+MEMORY = "memory"  # the format of recordings from arrays
+UNTOLD = ("asl-csv", "csv", "motive-csv", "rosbag", "lerobot", MEMORY)
+"""Formats that do not tell what was in force before their first command."""
 
 MEASURED = {"rule": "measured", "why": "the motors' angles in the first row"}
 

@@ -6,6 +6,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
+from rfdropo_bayes.data.clock import evened, sample_time
+
 HELD = 1.5  # samples: readings that last longer are held
 
 
@@ -25,7 +27,7 @@ def present_readings(reading: np.ndarray | None) -> tuple[np.ndarray | None, np.
 def hold_time(time: Float[np.ndarray, " time"], reading: Float[np.ndarray, "time channel"]) -> float:
     """For how long a reading is repeated, the median over the recording [s]; 0 where there are too few changes."""
     changes = np.flatnonzero(_changed(np.asarray(present_readings(reading)[0])))
-    return float(np.median(np.diff(time[changes]))) if changes.size > 2 else 0.0
+    return float(np.median(np.diff(evened(time)[changes]))) if changes.size > 2 else 0.0
 
 
 def new_readings(
@@ -37,7 +39,7 @@ def new_readings(
     of any channel, because all are read together; when the first row was read is not known. A new reading that equals
     the last in every channel goes unnoticed, which loses only what a drive at rest would have repeated.
     """
-    if hold <= HELD * float(np.median(np.diff(time))):
+    if hold <= HELD * sample_time(time):
         return np.ones(reading.shape, dtype=bool)
     return np.broadcast_to(_changed(reading)[:, None], reading.shape).copy()
 

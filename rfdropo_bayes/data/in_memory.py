@@ -10,13 +10,13 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
+from rfdropo_bayes.data.clock import PER_SECOND, check_times, read_stamps
 from rfdropo_bayes.data.faults import fill_missing, find_faults
+from rfdropo_bayes.data.first_command import MEMORY, Rule, begun_from
 from rfdropo_bayes.data.plain_csv import COMMAND_UNITS, METRES, CsvColumns, read_frame
 from rfdropo_bayes.data.trajectory import AXES, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.tables import nearest, parse_table
-
-FORMAT = "memory"
 
 
 def from_arrays(
@@ -27,7 +27,8 @@ def from_arrays(
     markers: Sequence[str],
     channels: Sequence[str],
     command_time: Float[Any, " command"] | None = None,
-    initial_command: Float[Any, " channel"] | None = None,
+    initial_command: Any = None,
+    time_unit: str = "s",
     position_unit: str = "m",
     command_unit: str = "m",
     tension: Float[Any, "time channel"] | None = None,
@@ -39,13 +40,16 @@ def from_arrays(
     """A recording from arrays.
 
     Args:
-        time: of the observations [s].
+        time: of the observations, in ``time_unit``, or dates or durations of any type.
         position: of the markers, in the robot's base frame: x, y across, z along the axis away from the base. Positions
             that are not a number are left out and counted.
         command: cumulative commands, pull > 0, each in force until the next.
         markers, channels: their names, in the order of the arrays.
-        command_time: from when each command is in force [s]; the first times of the observations by default.
-        initial_command: in force before the first one; the first one by default.
+        command_time: from when each command is in force, on the clock of ``time``; the first times of the observations
+            by default.
+        initial_command: in force before the first one: "first" (that one was already), "zero", or one value per
+            channel; recognised from motor angles or the first rows by default, as in files (`first_command`).
+        time_unit: "s", "ms", "us" or "ns".
         position_unit: "m", "cm" or "mm"; also of ``object_pose``.
         command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor.
         tension: [N]; not a number where it is missing.
@@ -54,25 +58,31 @@ def from_arrays(
         name: of the recording; robot: that was recorded.
 
     Raises:
-        InputError: an unknown unit, shapes that do not fit, times that do not increase, or lengths that cannot be
-            in the unit that was given.
+        InputError: an unknown unit, what is not a number, shapes that do not fit, times that do not increase, or
+            lengths that cannot be in the unit that was given.
     """
     metres, (unit, factor) = _unit(position_unit, METRES, name), _unit(command_unit, COMMAND_UNITS, name)
-    clock, place = np.asarray(time, dtype=float), metres * np.asarray(position, dtype=float)
-    sent = factor * np.asarray(command, dtype=float)
-    if place.shape != (len(clock), len(markers), 3):
-        wanted = f"({len(clock)} times, {len(markers)} markers, 3)"
-        raise InputError(f"positions have the shape {place.shape}, and not {wanted}", where=name)
-    stamps = clock[: len(sent)] if command_time is None else np.asarray(command_time, dtype=float)
-    if sent.shape != (len(stamps), len(channels)):
+    begins = read_stamps(time, _known(time_unit, PER_SECOND, name), where=name)
+    clock = begins.since(begins, name)
+    rows: dict[str, int | None] = {"times": len(clock)}
+    width: dict[str, int | None] = {"channels": len(channels)}
+    place = metres * _numbers(position, "positions", rows | {"markers": len(markers), "": 3}, name)
+    sent = factor * _numbers(command, "commands", {"times": None} | width, name)
+    stamps = clock[: len(sent)]
+    if command_time is not None:
+        stamps = read_stamps(command_time, time_unit, where=name, column="command_time").since(begins, name)
+        check_times(stamps, name, "command_time")
+    if len(sent) != len(stamps) or not len(sent):
         wanted = f"({len(stamps)} times, {len(channels)} channels)"
         raise InputError(f"commands have the shape {sent.shape}, and not {wanted}", where=name)
-    faults = find_faults(clock, place)
-    pose = None if object_pose is None else np.asarray(object_pose, dtype=float) * np.repeat([metres, 1.0], [3, 4])
-    return Trajectory.build(
+    faults = find_faults(clock, place, where=name, names=markers)
+    pose = None
+    if object_pose is not None:
+        pose = _numbers(object_pose, "poses", rows | {"": 7}, name) * np.repeat([metres, 1.0], [3, 4])
+    recording = Trajectory.build(
         name=name,
         robot=robot,
-        format=FORMAT,
+        format=MEMORY,
         time=clock,
         position=fill_missing(clock, place),
         position_mask=faults.mask,
@@ -80,13 +90,14 @@ def from_arrays(
         command_time=stamps,
         command=sent,
         command_unit=unit,
-        initial_command=sent[0] if initial_command is None else factor * np.asarray(initial_command, dtype=float),
+        initial_command=sent[0],
         cable_names=channels,
-        tension=None if tension is None else np.asarray(tension, dtype=float),
-        motor_angle=None if motor_angle is None else np.asarray(motor_angle, dtype=float),
+        tension=None if tension is None else _numbers(tension, "tensions", rows | width, name),
+        motor_angle=None if motor_angle is None else _numbers(motor_angle, "motor angles", rows | width, name),
         object_pose=pose,
-        settings={"faults": faults.counts},
+        settings=faults.settings,
     )
+    return _begun(recording, initial_command, factor)
 
 
 def from_pandas(
@@ -96,7 +107,8 @@ def from_pandas(
 
     Args:
         frame: one row per observation.
-        columns: what each column is, as in an experiment file's [data.columns]; see `CsvColumns`.
+        columns: what each column is, as in an experiment file's [data.columns]; see `CsvColumns`. The index is a
+            column under its name, or "index".
         name: of the recording.
         mask_missing: leave out and count positions that are not a number; else they are an error.
 
@@ -105,14 +117,15 @@ def from_pandas(
     """
     if not isinstance(columns, CsvColumns):
         columns = parse_table(CsvColumns, _as_lists(columns), where="columns")
-    return read_frame(frame, columns, name, mask_missing=mask_missing)
+    return begun_from(read_frame(frame, columns, name, mask_missing=mask_missing), None)
 
 
 def from_xarray(dataset: xr.Dataset, name: str = "recording", *, robot: str = "") -> Trajectory:
     """A recording from a data set with ``position(time, marker, axis)`` and ``command(time, channel)``.
 
     Dimensions may be in any order; ``command`` may have a clock of its own, ``command_time``. Markers and channels are
-    named by their coordinates, units stand in the variables' attribute ``units`` ("m" where it is missing). Further
+    named by their coordinates, units stand in the variables' attribute ``units`` ("m" where it is missing, and "s" of
+    ``time``, which may hold dates). Further
     variables are ``initial_command``, ``tension``, ``motor_angle`` and ``object_pose``.
 
     Raises:
@@ -133,7 +146,7 @@ def from_xarray(dataset: xr.Dataset, name: str = "recording", *, robot: str = ""
     for key, wanted in known.items():
         if set(dataset[key].dims) != set(wanted):
             raise InputError(f"{key} has the dimensions {dataset[key].dims}, and not {wanted}", where=name)
-    arrays = {key: dataset[key].transpose(*wanted).values for key, wanted in known.items()}
+    arrays: dict[str, Any] = {key: dataset[key].transpose(*wanted).values for key, wanted in known.items()}
     return from_arrays(
         time=dataset["time"].values,
         command_time=dataset[clock].values[: len(arrays["command"])],
@@ -141,16 +154,56 @@ def from_xarray(dataset: xr.Dataset, name: str = "recording", *, robot: str = ""
         channels=[str(value) for value in dataset[channel].values],
         position_unit=str(dataset["position"].attrs.get("units", "m")),
         command_unit=str(dataset["command"].attrs.get("units", "m")),
+        time_unit=str(dataset["time"].attrs.get("units", "s")),
         name=name,
         robot=robot,
         **arrays,
     )
 
 
+def _begun(recording: Trajectory, initial_command: Any, factor: float) -> Trajectory:
+    """The recording with the command before its first row as it is given, or recognised."""
+    if initial_command is None or isinstance(initial_command, str):
+        rules: dict[str | None, Rule | None] = {None: None, "first": "first", "zero": "zero"}
+        if initial_command not in rules:
+            raise InputError(
+                f"initial_command is {initial_command!r}",
+                where=recording.name,
+                remedy='give "first", "zero", or one value per channel',
+            )
+        return begun_from(recording, rules[initial_command])
+    given = factor * _numbers(
+        initial_command, "initial commands", {"channels": len(recording.cable_names)}, recording.name
+    )
+    return recording.with_initial_command(given, {"rule": "given", "why": "initial_command"})
+
+
 def _unit(unit: str, known: Mapping[str, Any], where: str) -> Any:
+    return known[_known(unit, known, where)]
+
+
+def _known(unit: str, known: Mapping[str, Any], where: str) -> str:
     if unit not in known:
         raise InputError(f"unknown unit {unit!r}", where=where, remedy=nearest(unit, known))
-    return known[unit]
+    return unit
+
+
+def _numbers(values: Any, what: str, sizes: Mapping[str, int | None], where: str) -> np.ndarray:
+    """Values as floats, NaN where they are missing, in the shape of these sizes by their names; None: of any size."""
+    try:
+        found = np.ma.filled(np.ma.asarray(values).astype(float), np.nan)
+    except (TypeError, ValueError):  # None and pd.NA among others, or text
+        cells = np.asarray(values, dtype=object)
+        try:
+            flat = pd.to_numeric(pd.Series(cells.ravel()))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{what} are not all numbers ({error})", where=where, remedy="convert them") from None
+        found = flat.to_numpy(dtype=float, na_value=np.nan).reshape(cells.shape)
+    wanted = tuple(length if size is None else size for size, length in zip(sizes.values(), found.shape, strict=False))
+    if found.ndim != len(sizes) or found.shape != wanted:
+        words = ", ".join(f"{'' if size is None else size} {name}".strip() for name, size in sizes.items())
+        raise InputError(f"{what} have the shape {found.shape}, and not ({words})", where=where)
+    return found
 
 
 def _as_lists(columns: Mapping[str, Any]) -> dict[str, Any]:

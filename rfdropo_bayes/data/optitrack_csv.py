@@ -4,8 +4,9 @@ Timing. The recording loop notes the time, reads the last motion-capture frame, 
 k carries the pose at ``time[k]`` and action k leaves right after it. Command row k, the cumulative nominal displacement
 after action k, is therefore in force from ``time[k]``; row k + 1 shows what about 0.1 s of it did. Action 0 is the
 exception: reading the first frame took until row 1 was due (rows 0 and 1 hold the very same frame, which the frame
-counter puts at row 1), so that action 0 left within one frame before ``time[1]``, and action 1 right after it. When the
-motors acted on a command is not recorded: delays, ramps and limits are parameters of the model.
+counter puts at row 1), so that action 0 left within one frame before ``time[1]``, and action 1 right after it. While
+rows go on to show the initial action nothing was sent. When the motors acted on a command is not recorded: delays,
+ramps and limits are parameters of the model.
 
 The cube's pose is not masked: a jump of the cube alone does not make the trunk's markers wrong.
 """
@@ -47,9 +48,10 @@ def read_optitrack_csv(path: Path, *, mask_missing: bool = False) -> Trajectory:
     acted = actions.read_actions(table.numbers(["action"])[:, 0], str(path))
     time = table.numbers(["timestamp"])[:, 0]
     time = time - time[0]
-    _check_gaps(time, str(path))
     position = _MILLIMETRE * table.points(_COLUMNS, allow_missing=mask_missing)
-    faults = find_faults(time, position)
+    names = [f"m{marker}" for marker in range(1, MARKERS + 1)]
+    faults = find_faults(time, position, where=str(path), names=names)
+    _check_gaps(time, str(path))
     return Trajectory.build(
         name=path.stem,
         robot="trunk_physical",
@@ -57,14 +59,14 @@ def read_optitrack_csv(path: Path, *, mask_missing: bool = False) -> Trajectory:
         time=time,
         position=fill_missing(time, position),
         position_mask=faults.mask,
-        marker_names=[f"m{marker}" for marker in range(1, MARKERS + 1)],
+        marker_names=names,
         command_time=_sending_times(time, position),
         command=actions.cumulative_displacement(acted),
         command_unit="m",
         cable_names=actions.CABLE_NAMES,
         object_pose=table.pose(_CUBE, _MILLIMETRE, allow_missing=mask_missing),
         provenance=f"{path.name}: OptiTrack",
-        settings=actions.SETTINGS | {"faults": faults.counts},
+        settings=actions.SETTINGS | faults.settings,
     )
 
 
@@ -79,7 +81,7 @@ def _check_gaps(time: Float[np.ndarray, " rows"], where: str) -> None:
     """Rows lost in the middle would silently shift every later command; the first gap is long in every recording."""
     gaps = np.diff(time)
     typical = float(np.median(gaps))
-    if typical > 0.0 and np.any(gaps[1:] > 1.8 * typical):
+    if np.any(gaps[1:] > 1.8 * typical):
         row = int(np.argmax(gaps[1:] > 1.8 * typical)) + 2
         raise InputError(
             f"{gaps[row - 1]:.3g} s pass before this row, {typical:.3g} s before the others: rows are missing",

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import Rotation
 
+from rfdropo_bayes.data.clock import PER_SECOND, TimeUnit
 from rfdropo_bayes.data.commands_alone import commands_alone
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import fill_missing, find_faults
@@ -25,7 +26,6 @@ from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 
 FORMAT = "csv"
-SECONDS = {"s": 1.0, "ms": 1e-3}
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "rad": ("rad", 1.0),
@@ -58,12 +58,14 @@ class CsvColumns(BaseModel):
 
     time: str | None = Field(
         default=None,
-        description='column of the times; or give sample_time; for "rosbag": "header", stamps where messages have '
-        'them, or "log", the recorder\'s times',
+        description="column of the times: numbers in time_unit, or dates (ISO 8601); or give sample_time; for "
+        '"rosbag": "header", stamps where messages have them, or "log", the recorder\'s times',
     )
-    time_unit: Literal["s", "ms"] = Field(default="s", description="unit of the times")
+    time_unit: TimeUnit = Field(default="s", description="unit of the times; dates and durations need none")
     sample_time: float | None = Field(
-        default=None, gt=0, description="time between rows [s], where no column holds times"
+        default=None,
+        gt=0,
+        description="time between rows [s], where no column holds times, or one holds those of arrival",
     )
     commands: list[str] = Field(
         min_length=1,
@@ -77,7 +79,7 @@ class CsvColumns(BaseModel):
         description="column of the commands' own times, in their file; by default command k is sent in row k of the "
         "observations",
     )
-    command_time_unit: Literal["s", "ms"] | None = Field(
+    command_time_unit: TimeUnit | None = Field(
         default=None, description="unit of command_time; that of time by default"
     )
     command_offset: float = Field(
@@ -207,7 +209,8 @@ def read_tables(
     Further arguments take the place of the ``name``, ``format`` and ``provenance`` of a CSV.
     """
     position, time = _points(table, columns, mask_missing=mask_missing), _times(table, columns)
-    faults = find_faults(time, position)
+    described = _facts(table, columns)
+    faults = find_faults(time, position, where=str(table.path), names=described["marker_names"])
     command = _commands(table, source, columns)
     sent = time[: len(command)] if columns.command_time is None else _command_times(table, source, columns)
     angle = None
@@ -224,8 +227,8 @@ def read_tables(
         tension=None if columns.tensions is None else table.numbers(columns.tensions, allow_missing=True),
         motor_angle=angle,
         object_pose=_pose(table, columns),
-        settings={"faults": faults.counts} | ({} if angle is None else {"motor_angle_hold": hold_time(time, angle)}),
-        **_facts(table, columns) | facts,
+        settings=faults.settings | ({} if angle is None else {"motor_angle_hold": hold_time(time, angle)}),
+        **described | facts,
     )
 
 
@@ -255,9 +258,9 @@ def read_csv_start(path: Path, columns: CsvColumns, start: CsvTable | None, row:
         InputError: on a damaged file, a column that is not there, or a start without that row.
     """
     table = CsvTable(path, columns.commands, machine_written=False)
-    clock, seconds = _command_clock(columns)
+    clock, unit = _command_clock(columns)
     return commands_alone(
-        _times(table, columns) if clock is None else _since_first(seconds * table.numbers([clock])[:, 0]),
+        _times(table, columns) if clock is None else _from_first(table, clock, unit),
         _commands(table, table, columns),
         start=None if start is None else _points(start, columns, mask_missing=True),
         row=row,
@@ -270,8 +273,8 @@ def command_columns(
     columns: CsvColumns, time: Float[np.ndarray, " rows"], command: Float[np.ndarray, "rows cable"]
 ) -> dict[str, Float[np.ndarray, " rows"]]:
     """Times [s] and commands [m or rad] as the columns of a file that this table describes."""
-    clock, seconds = _command_clock(columns)
-    stamped = {} if clock is None else {clock: time / seconds}
+    clock, unit = _command_clock(columns)
+    stamped = {} if clock is None else {clock: time * PER_SECOND[unit]}
     return stamped | dict(zip(columns.commands, command.T / COMMAND_UNITS[columns.command_unit][1], strict=True))
 
 
@@ -286,16 +289,17 @@ def holds_commands_alone(path: Path, columns: CsvColumns) -> bool:
 def _times(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " rows"]:
     if columns.time is None:
         return float(columns.sample_time or 0.0) * np.arange(len(table))
-    return _since_first(SECONDS[columns.time_unit] * table.numbers([columns.time])[:, 0])
+    return _from_first(table, columns.time, columns.time_unit)
 
 
-def _since_first(time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-    return time - time[0]
+def _from_first(table: CsvTable, clock: str, unit: TimeUnit) -> Float[np.ndarray, " rows"]:
+    stamps = table.stamps(clock, unit)
+    return stamps.since(stamps, str(table.path))
 
 
-def _command_clock(columns: CsvColumns) -> tuple[str | None, float]:
-    """Column of times in a file of commands, and its unit [s]."""
-    return columns.command_time or columns.time, SECONDS[columns.command_time_unit or columns.time_unit]
+def _command_clock(columns: CsvColumns) -> tuple[str | None, TimeUnit]:
+    """Column of times in a file of commands, and its unit."""
+    return columns.command_time or columns.time, columns.command_time_unit or columns.time_unit
 
 
 def _command_times(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " command"]:
@@ -304,15 +308,17 @@ def _command_times(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Fl
     Raises:
         InputError: commands that were sent at other times than the recording.
     """
-    clock, seconds = _command_clock(columns)
-    sent = seconds * source.numbers([str(clock)])[:, 0] + columns.command_offset
-    first = 0.0 if columns.time is None else SECONDS[columns.time_unit] * table.numbers([columns.time])[0, 0]
-    last = float(_times(table, columns)[-1])
-    sent = sent - first
+    clock, unit = _command_clock(columns)
+    stamps, where = source.stamps(str(clock), unit), f"{table.path} with {source.path}"
+    if columns.time is None:
+        sent = stamps.ticks / stamps.per_second
+    else:
+        sent = stamps.since(table.stamps(columns.time, columns.time_unit), where)
+    sent, last = sent + columns.command_offset, float(_times(table, columns)[-1])
     if sent[0] > last or sent[-1] < -last:  # a command long before may hold throughout, but is likelier another clock's
         raise InputError(
             f"commands were sent from {sent[0]:.6g} to {sent[-1]:.6g} s, and {last:.6g} s were recorded from 0 s on",
-            where=f"{table.path} with {source.path}",
+            where=where,
             remedy="correct command_offset, or pair what was recorded together; for a bag whose stamps are of several "
             'clocks write time = "log"',
         )

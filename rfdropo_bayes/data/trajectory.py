@@ -15,6 +15,8 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.data import checks
+from rfdropo_bayes.data.clock import sample_time
+from rfdropo_bayes.data.faults import NOTES
 from rfdropo_bayes.data.held_readings import new_readings, present_readings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole
@@ -88,6 +90,7 @@ class Trajectory:
         angles and poses that are not a number are missing: they are left out and counted.
         """
         facts = dict(settings or {})
+        checks.check_pose(object_pose, len(time), name)
         tension, tension_mask = present_readings(tension)
         motor_angle, angle_mask = present_readings(motor_angle)
         facts |= _missing(tension_mask, angle_mask, object_pose)
@@ -112,7 +115,7 @@ class Trajectory:
             "format": format,
             "provenance": provenance,
             "frame": frame,
-            "sample_time": float(np.median(np.diff(time))) if len(time) > 1 else 0.0,
+            "sample_time": sample_time(np.asarray(time, dtype=float)) if len(time) > 1 else 0.0,
             "synthetic": int(synthetic),
             "settings": json.dumps(facts, sort_keys=True),
         }
@@ -216,8 +219,14 @@ class Trajectory:
         """What is left out of this recording as faulty or missing, in words; empty if nothing is."""
         faults = self.settings.get("faults", {})
         counts = {"held poses": "held", "jumps": "jump", "lost markers": "missing"}
+        counts |= {"lost markers at zero": "zero", "positions under other markers' names": "renamed"}
         said = [f"{sum(faults[kind])} {name}" for name, kind in counts.items() if sum(faults.get(kind, ()))]
         return ", ".join([*said, self.missing] if self.missing else said)
+
+    @property
+    def notes(self) -> list[str]:
+        """What the importer saw that is allowed, and perhaps not meant: by row of the file, with what to do."""
+        return list(self.settings.get(NOTES, ()))
 
     @property
     def missing(self) -> str:
@@ -321,7 +330,7 @@ class Trajectory:
         Nothing is filtered: resampling to a coarser grid picks rows, and their noise stays independent.
 
         Raises:
-            InputError: if the sample time is not positive or longer than the recording.
+            InputError: if the sample time is not positive, longer than the recording, or far below that of its rows.
         """
         duration = float(self.time[-1])
         if not (np.isfinite(sample_time) and 0.0 < sample_time <= duration):
@@ -329,6 +338,13 @@ class Trajectory:
                 f"cannot resample to every {sample_time} s",
                 where=self.name,
                 remedy=f"choose 0 < resample <= {duration:g} s, the length of the recording",
+            )
+        if duration / sample_time > FINEST * self.time.size:
+            raise InputError(
+                f"every {sample_time:g} s would be {duration / sample_time:.3g} rows of {self.time.size} over "
+                f"{duration:.4g} s",
+                where=self.name,
+                remedy="correct resample, or the unit of the times ([data.columns] time_unit)",
             )
         grid = sample_time * np.arange(int(np.floor(duration / sample_time + 1e-9)) + 1)
         left, weight = _brackets(self.time, grid)
@@ -401,6 +417,7 @@ def open_netcdf(path: Path) -> xr.Dataset:
         ) from None
 
 
+FINEST = 100.0  # rows of a new grid for one that was recorded: more are another unit of time
 _INSTANT = 1e-9  # [s]: times that differ by less are the same instant
 
 

@@ -11,6 +11,15 @@ from jaxtyping import Array, Float, Int
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.drives import animated_commands
 
+FEW_STEPS = 60_000  # ten minutes in steps of 10 ms: simulated however few the rows are, with a gigabyte or two
+MOST_STEPS_PER_ROW = 200.0  # beyond these: two seconds a row in steps of 10 ms, where cameras see ten rows a second
+UNITS = {
+    1e3: '"ms" taken for "s", "us" for "ms" or "ns" for "us"',
+    1e6: '"us" taken for "s" or "ns" for "ms"',
+    1e9: '"ns" taken for "s"',
+}
+"""Units of time by how much finer they are than the one they are taken for."""
+
 
 class Commands(NamedTuple):
     """A command sequence on a simulator's clock, and when it is observed.
@@ -57,15 +66,20 @@ def commands_on_grid(
         observation_time: when the state was observed [s], increasing.
 
     Raises:
-        InputError: times do not increase, or shapes do not fit.
+        InputError: times that are not finite or decrease, shapes that do not fit, or many more steps than rows.
     """
     time, value = np.asarray(time, float), np.asarray(value, float)
     observation_time = np.asarray(observation_time, float)
     if len(time) != len(value):
         raise InputError(f"{len(time)} command times for {len(value)} commands", remedy="give one time per command")
+    if not len(observation_time):
+        raise InputError("no observation", remedy="give the time of one at least")
     for name, clock in (("command", time), ("observation", observation_time)):
+        if not np.all(np.isfinite(clock)):
+            raise InputError(f"{name} time of row {int(np.argmax(~np.isfinite(clock)))} is not a number")
         if np.any(np.diff(clock) < 0):
             raise InputError(f"{name} times decrease at row {int(np.argmax(np.diff(clock) < 0)) + 1}")
+    _check_steps(time, observation_time, time_step)
     before = _steps_before(time, observation_time, time_step)
     elapsed = before + (observation_time - observation_time[0]) / time_step
     # Observation clocks jitter by microseconds: an observation within 1e-6 of a step's end belongs to that step.
@@ -109,6 +123,37 @@ def animated_on_grid(
     length = len(grid.step)
     held = _pad(steps, max(length, len(steps)))[:length]
     return grid._replace(step=grid.initial + held)
+
+
+def _check_steps(time: Float[np.ndarray, " command"], observation_time: np.ndarray, time_step: float) -> None:
+    """Raise an InputError where the clocks ask for many more steps than rows, before any of them takes memory."""
+    start = min(observation_time[0], time[0]) if len(time) else observation_time[0]
+    span, rows = float(observation_time[-1] - start), len(observation_time)
+    steps = span / time_step
+    if steps <= FEW_STEPS or steps <= MOST_STEPS_PER_ROW * rows:
+        return
+    gaps = np.diff(observation_time, prepend=start)
+    row = int(np.argmax(gaps))
+    if row == 0 and gaps[0] > 0.5 * span:
+        remedy = f"the first command comes {gaps[0]:.4g} s before the first observation: give both on one clock"
+    elif gaps[row] > 0.5 * span:
+        remedy = f"{gaps[row]:.4g} s of it pass before row {row}: keep the rows on one side with rows = [first, last]"
+    else:
+        remedy = _finer_unit(float(np.median(gaps[1:])))
+    raise InputError(
+        f"{rows} rows over {span:.4g} s would be {steps:.3g} steps of {1e3 * time_step:g} ms, {steps / rows:.3g} a row",
+        remedy=remedy,
+    )
+
+
+def _finer_unit(interval: float) -> str:
+    """What to do where rows are so many seconds apart that they hardly are."""
+    finer = [factor for factor in UNITS if interval / factor < 1.0]  # rows come more often than once in a second
+    factor = finer[0] if finer else max(UNITS)
+    return (
+        f"the times look like {UNITS[factor]}, with rows {1e3 * interval / factor:.4g} ms apart: correct time_unit "
+        "under [data.columns], or the times that were given"
+    )
 
 
 def _steps_before(time: Float[np.ndarray, " command"], observation_time: np.ndarray, time_step: float) -> int:

@@ -18,6 +18,7 @@ from rfdropo_bayes.data import (
     noise_floor,
     shared_markers,
 )
+from rfdropo_bayes.data.clock import sample_time
 from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder
@@ -123,8 +124,9 @@ def _read(found: Check, experiment: Experiment, folder: Path, role: str) -> Iter
 def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Robot) -> None:
     """Rows, markers, masks and commands of one recording, beside those of the robot."""
     gaps = np.diff(trajectory.time)
-    step = float(np.median(gaps))
+    step = sample_time(trajectory.time)
     rows = f"{len(trajectory.time)} rows over {trajectory.time[-1]:.4g} s, one every {1e3 * step:.4g} ms"
+    found.notes += [f"{trajectory.name}: {note}" for note in trajectory.notes]
     if gaps.max() > IRREGULAR * step:
         rows += f"; the longest gap is {1e3 * gaps.max():.4g} ms, at {trajectory.time[np.argmax(gaps)]:.4g} s"
     found.lines.append((f"{role}: {trajectory.name}", rows))

@@ -10,12 +10,15 @@ import numpy as np
 import pandas as pd
 
 from rfdropo_bayes.data import lerobot, motive_csv, plain_csv, rosbag
+from rfdropo_bayes.data.clock import pace
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.mapped_formats import recognised_format
 from rfdropo_bayes.data.streams import side_by_side
 from rfdropo_bayes.errors import InputError
 
-TIME = re.compile(r"^(t|time|timestamp|stamp|secs?|seconds|clock)(?![a-z])", re.IGNORECASE)
+TIME = re.compile(
+    r"^\W*(t|ts|time|timestamp|stamp|date|datetime|secs?|seconds|millis|micros|nanos|clock)(?![a-z])", re.IGNORECASE
+)
 AXIS = re.compile(r"(?<![a-z])[xyz](?![a-z])", re.IGNORECASE)
 FORCE = re.compile(r"force|tension|load|(?<![a-z])[fn]\d", re.IGNORECASE)
 MEASURED = re.compile(
@@ -41,6 +44,16 @@ STRUCTURE = re.compile(
 """Words that formats put around the name of a marker."""
 WORD = re.compile(r"[a-z0-9]+")
 UNITS = {"mm", "cm", "m", "deg", "rad"}
+TIME_UNITS = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "usec", "micros", "microseconds", "µs", "μs"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
+}
+"""Words in the name of a column of times, and the unit they tell."""
+SHORTEST = {"ns": 0.9e6, "us": 0.9e3, "ms": 0.9}
+"""A millisecond, the shortest time between rows, in each unit, a tenth off for jitter: rows come more often than once
+in a second, so that a figure which is a second in one unit is a millisecond in the next."""
 LOOKED_AT = 2000
 """Rows that sizes are taken from."""
 MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
@@ -51,7 +64,7 @@ class Guess(NamedTuple):
     """Columns of a file, by their part.
 
     Attributes:
-        time, time_unit: column and unit of times; None without one.
+        time, time_unit: column and unit of times, "s" where they are dates; None without one.
         commands, command_unit: columns and unit of the commands.
         positions, position_unit: columns of x, y and z of each marker, and their unit.
         markers: a name for each marker, made of its columns'; numbered where they tell none.
@@ -87,20 +100,20 @@ def guess_columns(path: Path, sent: Path | None = None) -> Guess:
         InputError: a file that cannot be read, or in which no positions or commands are found.
     """
     format = recognised_format(path)
-    table, unit = _measured(format, path)
+    whole, unit = _measured(format, path)
+    table = whole.numeric().head(LOOKED_AT)
     names = [str(name) for name in table.columns]
-    time = "header" if format == rosbag.FORMAT else next((name for name in names if TIME.search(name)), None)
+    time = "header" if format == rosbag.FORMAT else _clock_of(whole)
     triples = _markers(_triples([name for name in names if name != time]))
     positions = list(triples.values())
     rest = [name for name in names if name != time and not any(name in triple for triple in positions)]
     tensions = [name for name in rest if FORCE.search(name)]
     angles = [name for name in rest if MEASURED.search(name) and name not in tensions]
-    source, clock, free = table, None, [name for name in rest if name not in (*tensions, *angles)]
+    source, sending, clock, free = table, whole, None, [name for name in rest if name not in (*tensions, *angles)]
     if sent is not None:
-        source = CsvTable(sent, (), machine_written=False).numeric().head(LOOKED_AT)
-        columns = [str(name) for name in source.columns]
-        clock = next((name for name in columns if TIME.search(name)), None)
-        commands = _commands([name for name in columns if name != clock], any_name=True)
+        sending = CsvTable(sent, (), machine_written=False)
+        source, clock = sending.numeric().head(LOOKED_AT), _clock_of(sending)
+        commands = _commands([str(name) for name in source.columns if name != clock], any_name=True)
     else:
         commands = _commands(free, any_name=format == plain_csv.FORMAT)
     for what, found in (("positions (columns in x, y and z)", positions), ("commands", commands)):
@@ -114,7 +127,7 @@ def guess_columns(path: Path, sent: Path | None = None) -> Guess:
             )
     return Guess(
         time,
-        "s" if format == rosbag.FORMAT else _time_unit(table, time),
+        "s" if format == rosbag.FORMAT else _time_unit(whole, time),
         commands,
         _command_unit(source, commands),
         positions,
@@ -125,20 +138,26 @@ def guess_columns(path: Path, sent: Path | None = None) -> Guess:
         [name for name in free if name not in commands],
         format,
         clock,
-        _time_unit(source, clock),
+        _time_unit(sending, clock),
     )
 
 
-def _measured(format: str, path: Path) -> tuple[pd.DataFrame, str | None]:
-    """The numbers of a recording, and the unit of lengths where the file tells it."""
+def _measured(format: str, path: Path) -> tuple[CsvTable, str | None]:
+    """The table of a recording, and the unit of lengths where the file tells it."""
     if format == rosbag.FORMAT:
-        return side_by_side(rosbag.read_streams(path)), "m"
+        return CsvTable.of_frame(side_by_side(rosbag.read_streams(path)), str(path), ()), "m"
     if format == lerobot.FORMAT:
-        return lerobot.read_episode(path, lerobot.episode_numbers(path)[0]), None
+        frame = lerobot.read_episode(path, lerobot.episode_numbers(path)[0])
+        return CsvTable.of_frame(frame, str(path), ()), None
     if format == motive_csv.FORMAT:
         file = motive_csv.read_motive(path)
-        return file.table.numeric(), file.length_unit
-    return CsvTable(path, (), machine_written=False).numeric().head(LOOKED_AT), None
+        return file.table, file.length_unit
+    return CsvTable(path, (), machine_written=False), None
+
+
+def _clock_of(table: CsvTable) -> str | None:
+    """The first column that is called a time and holds times."""
+    return next((name for name in table.frame.columns if TIME.search(name) and _holds_times(table, name)), None)
 
 
 def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
@@ -195,10 +214,24 @@ def _length_unit(table: pd.DataFrame) -> str:
     return "mm" if float(np.nanmax(np.abs(table.to_numpy()))) > MILLIMETRES_ABOVE else "m"
 
 
-def _time_unit(table: pd.DataFrame, time: str | None) -> str:
+def _holds_times(table: CsvTable, name: str) -> bool:
+    try:
+        ticks = table.stamps(name, "s").ticks
+    except InputError:
+        return False
+    return bool(len(ticks) == 1 or ticks[-1] != ticks[0])  # a date of the day alone is none
+
+
+def _time_unit(table: CsvTable, time: str | None) -> str:
+    """The unit that the name of a column tells, or else the time from row to row."""
     if time is None or len(table) < 2:
         return "s"
-    return "ms" if float(np.nanmedian(np.diff(table[time]))) > 1.0 else "s"
+    stamps = table.stamps(time, "s")
+    told = {TIME_UNITS[word] for word in re.findall(r"[^\W_]+", time.lower()) if word in TIME_UNITS}
+    if stamps.dated or len(told) == 1:
+        return "s" if stamps.dated else told.pop()
+    interval = pace(stamps.since(stamps, str(table.path)))
+    return next((unit for unit, shortest in SHORTEST.items() if interval >= shortest), "s")
 
 
 def _command_unit(table: pd.DataFrame, commands: list[str]) -> str:

@@ -298,7 +298,7 @@ def matching(names: Sequence[str], patterns: str | Sequence[str], *, where: str)
         return list(names)
     chosen: list[str] = []
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        found = [name for name in names if fnmatchcase(name, pattern)]
+        found = [pattern] if pattern in names else [name for name in names if fnmatchcase(name, pattern)]
         if not found:
             raise InputError(f"no recording matches {pattern!r}", where=where, remedy=f"recordings: {', '.join(names)}")
         chosen += [name for name in found if name not in chosen]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import json
 import os
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 from rfdropo_bayes.data import lerobot, motive_csv, rosbag
 from rfdropo_bayes.data.mapped_formats import recognised_format
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import output_folder
+from rfdropo_bayes.files import matching_files, output_folder
 from rfdropo_bayes.robots.catalogue import load_robot
 from rfdropo_bayes.robots.outline import RobotOutline, robot_text
 from rfdropo_bayes.workflow.column_names import Guess, guess_columns
@@ -38,7 +37,10 @@ def matching_recordings(patterns: list[str]) -> list[Path]:
     """
     files: list[Path] = []
     for pattern in patterns:
-        found = [Path(name) for name in sorted(glob.glob(pattern))]
+        named = Path(pattern)
+        anchor = Path(named.anchor)
+        below = named.relative_to(anchor) if named.is_absolute() else named
+        found = matching_files(anchor, below)
         if not found:
             raise InputError("matches no file", where=pattern, remedy="give the path of a recording; quote patterns")
         files += [file for file in found if file not in files]

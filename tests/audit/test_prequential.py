@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import kstest, multivariate_normal
 
 from rfdropo_bayes.audit.fit import Fit
-from rfdropo_bayes.audit.prequential import in_words, prequential
+from rfdropo_bayes.audit.prequential import begins_wrong, in_words, prequential
 
 from .toys import measurements
 
@@ -58,3 +58,16 @@ def test_where_the_model_is_right_the_p_values_are_uniform_and_a_failure_is_seen
     assert in_words(before, ("base", "tip"), 0.01).startswith("No stretch")
     words = in_words(prequential(*asked(wrong.reshape(-1), jacobian, x, valid)), ("base", "tip"), 0.01)
     assert "first from 0.5 to 1 s" in words
+
+
+@pytest.mark.parametrize(
+    ("rows", "asked_about"), [((0, 10), True), ((10, 20), False), ((0, 20), False), ((0, 0), False)]
+)
+def test_a_misfit_of_the_first_block_alone_asks_about_the_beginning(rows, asked_about):
+    rng = np.random.default_rng(3)
+    _, jacobian, x, valid = drawn(rng)
+    wrong = rng.standard_normal(valid.shape) * valid
+    wrong[:, slice(*rows), 3:] += 6.0 * valid[:, slice(*rows), 3:]
+    found = prequential(*asked(wrong.reshape(-1), 0.0 * jacobian, x, valid))  # a misfit that no parameter takes up
+    assert begins_wrong(found, 0.01) == asked_about
+    assert ("another command in force before the first row" in in_words(found, ("base", "tip"), 0.01)) == asked_about

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from rfdropo_bayes.audit.held import with_held
+from rfdropo_bayes.audit.omnibus import BLOCK
 from rfdropo_bayes.audit.pipeline import Answer, audit
 from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.bayes.space import ParameterSpace
@@ -55,3 +57,13 @@ def test_what_is_held_at_nominal_values_says_what_to_do_at_the_robot():
     remedies = {candidate.name: candidate.mechanism.remedy for candidate in candidates}
     assert "turn each until its cable just begins to move the body" in remedies["initial_displacement"]
     assert remedies["disk_mass"].startswith("measure the disk mass at each place (base, middle, tip)")
+
+
+def test_a_misfit_of_the_first_block_alone_is_asked_about(answer):
+    """The first rows of a robot that set out from rest, where its recording has the first command in force before."""
+    assert "initial_command" not in said(answer)
+    residual = np.zeros_like(answer.base.residual)
+    place = answer.target.measurements.series(np.arange(len(residual)))
+    residual[place[:, :BLOCK]] = 5.0
+    alone = replace(answer, base=replace(answer.base, residual=residual, jacobian=0.0 * answer.base.jacobian))
+    assert "Only the first block fails: was another command in force before the first row" in said(alone)

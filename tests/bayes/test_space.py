@@ -156,6 +156,9 @@ def test_a_group_that_names_a_recording_comes_before_wildcards():
     assert group_of("a1[0:45]", {**DAYS, "winter": ["a1", "b"]}) == "winter"
     assert group_of("a2", {**DAYS, "winter": "a1"}) == "january"
     assert group_of("a1[0:45]", {**DAYS, "winter": "a1[0:45]"}) == "winter"  # a piece names its recording
+    named = {"first": "run [1]", "others": "run*"}  # brackets in the name of a recording are its own
+    assert [group_of(name, named) for name in ("run [1]", "run [1][0:45]", "run [2]")] == ["first", "first", "others"]
+    assert group_of("run [2][0:45][3:9]", {}) == "run [2]"
 
 
 def test_a_recording_is_moved_to_a_group_from_the_one_that_named_it():

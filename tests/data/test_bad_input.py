@@ -105,7 +105,10 @@ def test_a_nan_command_is_never_masked(optitrack_table, write, tmp_path):
         read_optitrack_csv(write(table, tmp_path / "run.csv"), mask_missing=True)
 
 
-@pytest.mark.parametrize(("row", "value", "message"), [(0, 3, "not -1"), (2, 16, "16 is not"), (3, 2.5, "2.5 is not")])
+@pytest.mark.parametrize(
+    ("row", "value", "message"),
+    [(0, 3, "not -1"), (2, 16, "16 is not"), (3, 2.5, "2.5 is not"), (3, -1, "row 3, column 'action': -1 is not")],
+)
 def test_actions_that_do_not_exist(sofa_table, write, tmp_path, row, value, message):
     table = sofa_table().astype({"action": float})
     table.loc[row, "action"] = value

@@ -147,3 +147,63 @@ def test_the_masked_rows_of_repeated_pulses_differ_from_the_other_pulses(dataset
     deviation = np.linalg.norm(position - np.median(position, axis=0), axis=3)
     assert (~mask).sum(axis=0).max() <= 4  # no phase of the fast motion is dropped as a rule
     assert np.median(deviation[:, :, 1:][~mask[:, :, 1:]]) > 2.0 * np.median(deviation[:, :, 1:][mask[:, :, 1:]])
+
+
+def test_markers_that_swap_for_good_are_masked_from_there_on_and_noted():
+    time, position = swinging()
+    position[700:, [0, 2]] = position[700:, [2, 0]]
+    faults = find_faults(time, position, names=["base", "mid", "tip"])
+    assert faults.mask[:, 1].all()
+    for marker in (0, 2):
+        assert np.flatnonzero(~faults.mask[:, marker]).tolist() == list(range(700, len(time)))
+    assert sum(faults.counts["renamed"]) + sum(faults.counts["jump"]) == 2 * 800
+    (note,) = faults.notes
+    assert "row 700, where base and tip change names" in note
+
+
+def test_names_that_go_round_or_come_back_are_followed():
+    """Three markers go round at rest, while none is seen for ten rows; all are right again from row 1000 on."""
+    time, position = swinging()
+    position[150:1000] = position[150:1000][:, [2, 0, 1]]
+    position[140:150] = np.nan
+    mask = find_faults(time, position).mask
+    assert not mask[140:1000].any()
+    assert mask[:140].all()
+    assert mask[1000:].all()
+
+
+@pytest.mark.parametrize("every", [2, 10, 20])
+def test_a_swap_is_seen_at_low_rates_too(every):
+    """At rest, a second after the start; in fast motion rows are too far apart to be certain."""
+    time, position = swinging()
+    time, position = time[::every], position[::every]
+    at = 100 // every
+    position[at:, [0, 1]] = position[at:, [1, 0]]
+    faults = find_faults(time, position)
+    assert np.array_equal(faults.mask[:, 0], np.arange(len(time)) < at)
+    assert find_faults(*(part[::every] for part in swinging())).mask.all()
+
+
+def test_zeros_far_from_a_marker_are_lost_markers():
+    time, position = swinging()
+    position[10:13, 1] = 0.0
+    position[:4, 2] = 0.0
+    faults = find_faults(time, position, names=["base", "mid", "tip"])
+    assert np.argwhere(~faults.mask).tolist() == [[0, 2], [1, 2], [2, 2], [3, 2], [10, 1], [11, 1], [12, 1]]
+    assert faults.counts["zero"] == [0, 3, 4]
+    assert any(
+        note.startswith("mid is exactly at 0, 0, 0 in 3 rows, first in row 10: taken for lost") for note in faults.notes
+    )
+
+
+def test_a_marker_that_is_at_the_origin_stays():
+    """One that sets out from there, as displacements do; and one that never leaves it, which is said."""
+    time, position = swinging(noise=0.0)
+    position[:, 0] -= position[0, 0]
+    faults = find_faults(time, position)
+    assert faults.mask.all()
+    assert not faults.notes
+    position[:, 0] = 0.0
+    faults = find_faults(time, position)
+    assert faults.mask.all()
+    assert "marker 1 is exactly at 0, 0, 0 in 1500 rows, first in row 0: taken as it stands" in faults.notes[0]

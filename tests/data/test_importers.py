@@ -14,6 +14,7 @@ from rfdropo_bayes.data import (
     read_plain_csv,
     read_sofa_csv,
 )
+from rfdropo_bayes.data.actions import cumulative_displacement
 from rfdropo_bayes.errors import InputError
 
 
@@ -202,3 +203,21 @@ def test_plain_csv_turns_the_object_with_the_frame(tmp_path):
     x, y, z, w = pose[0, 3:]
     first_axis = [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)]
     np.testing.assert_allclose(first_axis, [0.0, -1.0, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("idle", [1, 2, 5, 12])
+def test_rows_before_the_first_action_sent_nothing(optitrack_table, sofa_table, write, tmp_path, idle):
+    """The first action, in row k, is sent after row k - 1; a file may have none."""
+    table = optitrack_table()
+    table.loc[: idle - 1, "action"] = -1
+    found = read_optitrack_csv(write(table, tmp_path / "run.csv"))
+    usual = read_optitrack_csv(write(optitrack_table(), tmp_path / "usual.csv"))
+    expected = cumulative_displacement(optitrack_table()["action"].to_numpy()[idle:])
+    np.testing.assert_array_equal(found.command_at(found.time[: idle - 1]), 0.0)
+    np.testing.assert_allclose(found.command_at(found.time[idle - 1 : -1]), expected, atol=1e-15)
+    np.testing.assert_array_equal(found.time, usual.time)
+    episode = sofa_table()
+    episode.loc[:1, "action"] = -1
+    np.testing.assert_allclose(
+        read_sofa_csv(write(episode, tmp_path / "sofa.csv")).command[:, 2], [0.0, 0.005, 0.010, 0.015]
+    )

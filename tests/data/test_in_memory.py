@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import DataSpec, Trajectory, load_recordings
 from rfdropo_bayes.errors import InputError
 
 TIME = 0.1 * np.arange(20)
@@ -56,6 +56,10 @@ def test_a_table_and_a_data_set_give_the_same():
         np.testing.assert_allclose(other.command, PULL)
         assert (other.marker_names, other.cable_names) == (("middle", "tip"), ("left", "right"))
     assert Trajectory.from_xarray(arrays().dataset).sha256 == arrays().sha256
+    dated = dataset.assign_coords(time=pd.Timestamp("2024-05-01") + pd.to_timedelta(TIME, "s"))
+    counted = dataset.assign_coords(time=("time", 1e3 * TIME, {"units": "ms"}))
+    for other in (dated, counted):
+        np.testing.assert_allclose(Trajectory.from_xarray(other).time, TIME, atol=1e-9)
 
 
 def test_missing_positions_are_masked_and_counted():
@@ -81,3 +85,111 @@ def test_what_does_not_fit_is_said(changes, said):
         return
     with pytest.raises(InputError, match=said):
         arrays(**changes)
+
+
+def swinging(rest_first: bool, **changes) -> Trajectory:
+    """An arm at 20 Hz that is sent 10 mm in the first row, and sets out from rest or stands there already."""
+    time = 0.05 * np.arange(80)
+    sent = np.where(time < 2.0, 0.01, -0.005)
+    before = 0.0 if rest_first else sent[0]
+    level = np.empty(80)
+    for row in range(80):
+        before += (1.0 - np.exp(-0.05 / 0.2)) * (sent[max(row - 1, 0)] - before) * (row > 0)
+        level[row] = before
+    place = np.stack([5.0 * level, 0.0 * time, 0.2 + 0.0 * time], axis=-1)[:, None]
+    place += np.random.default_rng(0).normal(0.0, 1e-5, place.shape)
+    given = {"time": time, "position": place, "command": sent[:, None], "markers": ["tip"], "channels": ["pull"]}
+    return Trajectory.from_arrays(**(given | changes))
+
+
+@pytest.mark.parametrize(("rest_first", "initial"), [(True, 0.0), (False, 0.01)])
+def test_the_command_before_the_first_row_is_recognised_as_in_files(rest_first, initial, tmp_path):
+    found = swinging(rest_first)
+    assert found.initial_command == pytest.approx([initial])
+    assert "recognised" in found.first_command
+    frame = pd.DataFrame({"t": found.time, "pull": found.command[:, 0]})
+    frame[["x", "y", "z"]] = found.position[:, 0]
+    columns = {"time": "t", "commands": ["pull"], "command_unit": "m", "position_unit": "m"}
+    columns["positions"] = [["x", "y", "z"]]
+    frame.to_csv(tmp_path / "run.csv", index=False)
+    spec = DataSpec.parse({"format": "csv", "fit": ["run.csv"], "columns": columns})
+    for other in (Trajectory.from_pandas(frame, columns), *load_recordings(spec, tmp_path)):
+        assert other.first_command == found.first_command
+
+
+def test_a_command_before_the_first_row_that_is_given_is_taken():
+    assert swinging(True, initial_command="first").initial_command == pytest.approx([0.01])
+    assert swinging(False, initial_command="zero").initial_command == pytest.approx([0.0])
+    given = swinging(False, initial_command=[2.0], command=np.full((80, 1), 5.0), command_unit="mm")
+    assert given.initial_command == pytest.approx([0.002])
+
+
+@pytest.mark.parametrize(
+    "missing",
+    [
+        lambda values: values.astype(object),
+        lambda values: np.where(np.isnan(values), None, values.astype(object)),
+        lambda values: np.where(np.isnan(values), pd.NA, values.astype(object)),
+        lambda values: np.ma.masked_invalid(values),
+        lambda values: np.ma.array(np.nan_to_num(values, nan=7.0), mask=np.isnan(values)),
+        lambda values: values.tolist(),
+    ],
+    ids=["object", "None", "pd.NA", "masked", "masked, with values", "list"],
+)
+def test_every_way_to_say_that_a_position_is_missing(missing):
+    holes = PLACE.copy()
+    holes[3:5, 1] = np.nan
+    found = arrays(position=missing(holes))
+    assert np.argwhere(~found.position_mask).tolist() == [[3, 1], [4, 1]]
+    assert found.settings["faults"]["missing"] == [0, 2]
+
+
+@pytest.mark.parametrize("backend", ["numpy_nullable", "pyarrow"])
+def test_tables_with_types_of_their_own_for_missing_values(backend):
+    if backend == "pyarrow":
+        pytest.importorskip("pyarrow")
+    frame = pd.DataFrame({"t": TIME, "u": PULL[:, 0], "x": PLACE[:, 1, 0], "y": PLACE[:, 1, 1], "z": PLACE[:, 1, 2]})
+    frame.loc[6:9, ["x", "y", "z"]] = np.nan
+    frame["f"] = np.where(frame.index == 2, np.nan, 1.0)
+    columns = {"time": "t", "commands": ["u"], "command_unit": "m", "position_unit": "m", "tensions": ["f"]}
+    columns["positions"] = [["x", "y", "z"]]
+    found = Trajectory.from_pandas(frame.convert_dtypes(dtype_backend=backend), columns)
+    np.testing.assert_array_equal(found.position_mask[:, 0], (np.arange(20) < 6) | (np.arange(20) > 9))
+    assert found.missing == "1 missing tensions"
+    assert found.sha256 == Trajectory.from_pandas(frame, columns).sha256
+    with pytest.raises(InputError, match="NaN or empty cell"):
+        Trajectory.from_pandas(frame.assign(u=frame["x"]).convert_dtypes(dtype_backend=backend), columns)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"command": np.zeros((0, 2))}, "commands have the shape"),
+        ({"command": PULL[:, 0]}, r"commands have the shape \(20,\), and not \(times, 2 channels\)"),
+        ({"position": "here"}, "positions are not all numbers"),
+        ({"object_pose": np.zeros((20, 6))}, r"poses have the shape \(20, 6\), and not \(20 times, 7\)"),
+        ({"tension": np.zeros((19, 2))}, r"tensions have the shape \(19, 2\), and not \(20 times, 2 channels\)"),
+        ({"motor_angle": np.zeros(20)}, r"motor angles have the shape \(20,\)"),
+        ({"initial_command": [0.0]}, r"initial commands have the shape \(1,\), and not \(2 channels\)"),
+        ({"time": TIME[:1], "position": PLACE[:1], "command": PULL[:1]}, "has 1 observation rows"),
+        ({"time": 0.0 * TIME}, "row 1: time does not increase"),
+        ({"command_time": 0.0 * TIME}, "row 1: command_time does not increase"),
+        ({"time_unit": "min"}, "unknown unit 'min'"),
+        ({"initial_command": "last"}, 'initial_command is \'last\'; give "first", "zero"'),
+    ],
+)
+def test_shapes_and_numbers_are_checked_before_anything_needs_them(changes, said):
+    with pytest.raises(InputError, match=said):
+        arrays(**changes)
+
+
+def test_a_table_with_two_columns_of_one_name_is_refused():
+    frame = pd.DataFrame(np.zeros((3, 3)), columns=["t", "x", "x"])
+    columns = {"time": "t", "commands": ["t"], "command_unit": "m", "position_unit": "m"}
+    with pytest.raises(InputError, match="column 'x' appears twice"):
+        Trajectory.from_pandas(frame, {**columns, "positions": [["x", "x", "x"]]})
+
+
+def test_a_new_grid_far_finer_than_the_rows_is_refused():
+    with pytest.raises(InputError, match=r"would be 1\.9e.* rows of 20"):
+        arrays(time=1e9 * TIME).resample(0.01)

@@ -7,6 +7,7 @@ import pytest
 
 from rfdropo_bayes.data import DATA_VARIABLE, DataSpec, load_recordings
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import find_files
 
 
 @pytest.fixture
@@ -111,3 +112,31 @@ def test_the_real_tables_of_the_experiments_load(datasets, monkeypatch):
         }
     )
     assert [len(load_recordings(spec, datasets, role=role)) for role in ("fit", "test")] == [8, 3]
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_a_name_that_exists_is_no_pattern(folder, absolute):
+    """Signs of patterns in names of files, and of folders that patterns begin with."""
+    lab = folder / "[lab] data"
+    lab.mkdir()
+    for name in ("run [1].csv", "run [2].csv", "run 1.csv", "what?.csv"):
+        (lab / name).write_text("rows")
+    below = str(lab) if absolute else "[lab] data"
+
+    def found(name: str) -> list[str]:
+        return [path.name for path in find_files(f"{below}/{name}", folder)]
+
+    assert found("run [1].csv") == ["run [1].csv"]
+    assert found("what?.csv") == ["what?.csv"]
+    assert found("run*.csv") == ["run 1.csv", "run [1].csv", "run [2].csv"]
+    assert found("run [12].csv") == ["run 1.csv"]
+    with pytest.raises(InputError, match="no such file"):
+        found("run [5].csv")
+
+
+def test_a_name_that_exists_comes_before_a_pattern_that_matches_elsewhere(folder, tmp_path_factory, monkeypatch):
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    (elsewhere / "run 1.csv").write_text("other")
+    (folder / "run [1].csv").write_text("own")
+    monkeypatch.setenv(DATA_VARIABLE, str(elsewhere))
+    assert find_files("run [1].csv", folder) == [folder / "run [1].csv"]

@@ -85,3 +85,39 @@ def test_commands_from_before_the_first_observation_are_simulated_from_the_first
     np.testing.assert_array_equal(piece.initial, whole.initial)
     np.testing.assert_allclose(piece.step, whole.step, atol=1e-9)
     np.testing.assert_allclose(observed_at(piece, 0.02), observed_at(whole, 0.02)[first:], atol=1e-9)
+
+
+ROWS = np.arange(400.0)
+
+
+@pytest.mark.parametrize(
+    ("observed", "said"),
+    [
+        (10.0 * ROWS, '"ms" taken for "s", "us" for "ms" or "ns" for "us", with rows 10 ms apart'),
+        (1e4 * ROWS, '"us" taken for "s" or "ns" for "ms", with rows 10 ms apart'),
+        (1e7 * ROWS, '"ns" taken for "s", with rows 10 ms apart'),
+        (np.where(ROWS < 150, 0.01 * ROWS, 86400.0 + 0.01 * ROWS), "8.64e.* s of it pass before row 150"),
+        (1e6 + 0.01 * ROWS, "the first command comes 1e.06 s before the first observation"),
+    ],
+)
+def test_many_more_steps_than_rows_are_refused_before_they_take_memory(observed, said):
+    with pytest.raises(InputError, match=f"400 rows over .* steps of 10 ms, .* a row; .*{said}"):
+        grid(np.minimum(observed, 0.0)[:1], [1.0], observed, time_step=0.01)
+
+
+def test_few_rows_of_a_slow_experiment_are_simulated():
+    """Thirty poses at rest, five seconds apart, in steps of a millisecond."""
+    assert len(grid([0.0], [1.0], 5.0 * ROWS[:12], time_step=0.001).step) == 55_000
+
+
+@pytest.mark.parametrize(
+    ("time", "observed", "said"),
+    [
+        ([0.0], [], "no observation"),
+        ([0.0], [0.0, np.nan], "observation time of row 1 is not a number"),
+        ([np.inf], [0.0, 1.0], "command time of row 0 is not a number"),
+    ],
+)
+def test_times_that_are_none_are_refused(time, observed, said):
+    with pytest.raises(InputError, match=said):
+        grid(time, [1.0], observed, time_step=0.01)

@@ -33,10 +33,12 @@ position_unit = "mm"
 FOUR = '"c1", "c2", "c3", "c4"'
 
 
-def checked(tmp_path: Path, commands: str = FOUR, more: str = "", priors: str = "young_modulus") -> Check:
-    """What check says of a recording of the demo that was written as CSV."""
+def checked(
+    tmp_path: Path, commands: str = FOUR, more: str = "", priors: str = "young_modulus", time: np.ndarray | None = None
+) -> Check:
+    """What check says of a recording of the demo that was written as CSV, with other times where they are given."""
     demo = Trajectory.load(DEMO)
-    columns = {"t": demo.time}
+    columns = {"t": demo.time if time is None else time}
     for k, point in enumerate(np.moveaxis(demo.position, 1, 0), start=1):
         columns |= {f"{axis}{k}": 1e3 * point[:, i] for i, axis in enumerate("xyz")}
     columns |= {f"c{k}": 1e3 * values for k, values in enumerate(demo.command_at(demo.time).T, start=1)}
@@ -128,3 +130,37 @@ def test_markers_in_another_order_are_named():
 def test_a_wrong_unit_stretches_the_robot():
     hints, _ = moved(lambda position: 10.0 * position)
     assert any("apart in the first row" in hint and "position_unit" in hint for hint in hints)
+
+
+ROWS = np.arange(61)
+STAMPS = 1_530_018_381_010_286_378 + 50_000_000 * ROWS  # [ns]
+
+
+def test_times_in_another_unit_are_a_problem_that_names_it_before_anything_is_simulated(tmp_path):
+    found = checked(tmp_path, time=STAMPS)
+    (problem,) = found.problems
+    assert problem.startswith("run: 61 rows over 3e+09 s would be ")
+    assert '"ns" taken for "s", with rows 50 ms apart: correct time_unit under [data.columns]' in problem
+    assert any(note.startswith("run: rows are 5e+07 s apart") for note in found.notes)
+
+
+def test_nanoseconds_are_read_to_the_last(tmp_path):
+    found = checked(tmp_path, more='time_unit = "ns"', time=STAMPS)
+    assert not found.problems
+    assert "61 rows over 3 s, one every 50 ms" in text_of(found)
+
+
+def test_stamps_coarser_than_rows_are_a_problem_that_names_sample_time(tmp_path):
+    (problem,) = checked(tmp_path, time=0.25 * (ROWS // 5)).problems
+    assert "run.csv, row 1: time does not increase (48 times)" in problem
+    assert "give sample_time = 0.05" in problem
+
+
+def test_stamps_of_arrival_and_a_clock_that_jumps_are_notes(tmp_path):
+    arrival = checked(tmp_path, time=0.3 * (ROWS // 6) + 3e-6 * (ROWS % 6))
+    assert any("stamps of arrival" in note and "give sample_time = 0.05" in note for note in arrival.notes)
+    assert "61 rows over 3 s, one every 50 ms" in text_of(arrival)
+    assert "no position is masked" in text_of(arrival)
+    assert not arrival.problems
+    jump = checked(tmp_path, time=0.05 * ROWS + 600.0 * (ROWS > 29))
+    assert any("run: the clock jumps by 600 s before row 30" in note for note in jump.notes)

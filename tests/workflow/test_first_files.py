@@ -14,7 +14,7 @@ from rfdropo_bayes.data import load_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.workflow.assembly import find_robot
 from rfdropo_bayes.workflow.column_names import guess_columns
-from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.workflow.experiment import load_experiment, matching
 
 ROWS = 40
 TIME = 0.05 * np.arange(ROWS)
@@ -127,3 +127,47 @@ def test_what_does_not_fit_is_said_in_one_line(tmp_path, monkeypatch, capsys, wo
     assert message in told
     assert told.count("\n") == 1
     assert not (tmp_path / "arm").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "unit"),
+    [
+        ("t", 1e6, "us"),
+        ("timestamp", 1e9, "ns"),
+        ("%time", 1e9, "ns"),
+        ("time_us", 1e6, "us"),
+        ("t [ns]", 1e9, "ns"),
+        ("Time (ms)", 1e3, "ms"),
+        ("time_ms", 20.0, "ms"),  # 1 kHz: the name says what the size does not
+        ("t", 20e3, "us"),
+        ("t", 20e6, "ns"),
+    ],
+)
+def test_the_unit_of_times_is_told_by_their_name_or_size(tmp_path, name, factor, unit):
+    run = table(name, "{marker}_{axis}", "motor{0}", factor=factor)
+    run[name] = (run[name] + 1e3 * factor).round().astype("int64")
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.time, guess.time_unit) == (name, unit)
+    assert name not in guess.left
+
+
+def test_dates_are_times(tmp_path):
+    run = table("date", "{marker}_{axis}", "motor{0}")
+    run["date"] = "2024-05-01"
+    run["stamp"] = [date.isoformat() for date in pd.Timestamp("2024-05-01T10:00:00+02:00") + pd.to_timedelta(TIME, "s")]
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.time, guess.time_unit) == ("stamp", "s")
+
+
+def test_a_recording_with_signs_of_patterns_in_its_name(tmp_path, monkeypatch, capsys):
+    (tmp_path / "[lab] data").mkdir()
+    for name in ("run [1].csv", "run 1.csv"):
+        table("t", "{marker}_{axis}", "motor{0}").to_csv(tmp_path / "[lab] data" / name, index=False)
+    monkeypatch.chdir(tmp_path)
+    assert init(monkeypatch, capsys, "arm", "--recording", "[lab] data/run [1].csv", "--length-mm", "200")[0] == 0
+    experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
+    assert [run.name for run in load_recordings(experiment.data, tmp_path / "arm")] == ["run [1]"]
+    assert matching(["run [1]", "run 1"], "run [1]", where="here") == ["run [1]"]
+    assert matching(["run [2]", "run 1"], "run [1]", where="here") == ["run 1"]
