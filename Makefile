@@ -17,10 +17,10 @@ ALL     = $(VENV)/all.stamp
 export OPENBLAS_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all test-compiler matrix lint format bench validate notebooks notebook-outputs reference demo-data clean
+.PHONY: help demo test test-portable test-compiler test-all matrix lint format bench validate notebooks notebook-outputs reference demo-data clean
 
 help: ## this list
-	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-16s%s\n", $$1, $$2 }'
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-20s%s\n", $$1, $$2 }'
 
 demo: $(CORE) ## calibrate the bundled example and write its report (minutes)
 	$(BIN)/rfdropo calibrate experiments/demo.toml --out reports/demo --overwrite
@@ -28,6 +28,11 @@ demo: $(CORE) ## calibrate the bundled example and write its report (minutes)
 
 test: $(DEV) ## the tests that are not slow
 	$(PYTEST) -n $(WORKERS) -m "not slow and not notebook"
+
+# The rooms that compute. `make test-portable ROOMS="training audit"` runs some of them: those that learn, sample and
+# search are where a test that rests on one processor shows, because a last bit becomes another curve there.
+test-portable: $(DEV) ## the numerical tests with other instruction sets: what rests on one processor fails
+	$(BIN)/python tools/portable.py $(ROOMS) -- -n $(WORKERS)
 
 test-all: $(ALL) ## every test, the slow ones, the notebooks and those of optional packages too
 	$(PYTEST) -n $(WORKERS)

@@ -14,6 +14,8 @@ ALGORITHMS = ("PPO", "A2C", "SAC", "TD3", "DDPG", "DQN")
 CONTINUOUS_ONLY, DISCRETE_ONLY = ("SAC", "TD3", "DDPG"), ("DQN",)
 OURS = ("policy", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model")
 """Arguments that the training sets itself."""
+OBJECTS = ("action_noise", "replay_buffer_class", "rollout_buffer_class")
+"""Arguments that are Python objects, which neither an experiment file nor a checkpoint's settings hold."""
 
 LARGEST_BATCH = 512
 PPO_DEFAULTS: dict[str, Any] = {
@@ -57,18 +59,24 @@ def algorithm_options(
         environments: how many are simulated at once; a batch of PPO divides what they gather.
 
     Raises:
-        InputError: an option that the algorithm does not have, or another activation.
+        InputError: an option that the algorithm does not have or no file can hold, or another activation.
     """
     known = [p for p in inspect.signature(algorithm_class(name, kind).__init__).parameters if p not in ("self", *OURS)]
     short = ("net_arch", "log_std_init", "activation")
     for option in given:
+        if option in OBJECTS and option in known:
+            what = f"{option} is an object of Python, which no file can hold"
+            raise InputError(what, where="[training.options]", remedy=f"leave out {option}")
         if option not in (*known, *short):
             remedy = nearest(option, [*known, *short])
             raise InputError(f"{name} has no option {option!r}", where="[training.options]", remedy=remedy)
     policy: dict[str, Any] = {"net_arch": [128, 128]}
     if name in ("PPO", "A2C") and kind == "continuous":
         policy["log_std_init"] = -1.0
-    policy |= given.get("policy_kwargs", {}) | {key: given[key] for key in short if key in given}
+    own = given.get("policy_kwargs", {})
+    if not isinstance(own, Mapping):
+        raise InputError("policy_kwargs is no table", where="[training.options]", remedy="give it keys and values")
+    policy |= {**own, **{key: given[key] for key in short if key in given}}
     if "activation" in policy:
         policy["activation_fn"] = _activation(policy.pop("activation"))
     ours = PPO_DEFAULTS if name == "PPO" else {}

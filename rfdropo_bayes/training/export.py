@@ -55,16 +55,21 @@ class _Graph:
         """Layers of a sequential network of PyTorch."""
         for module in modules:
             kind = type(module).__name__
-            if kind == "Linear":
-                weight, bias = (self.constant(p.detach().cpu().numpy()) for p in (module.weight, module.bias))
-                self.apply("Gemm", weight, bias, transB=1)
+            if not type(module).__module__.startswith(("torch.nn.", "stable_baselines3.")):
+                kind = f"{type(module).__module__}.{kind}"  # whatever it is called, it may do something else
+            if kind == "Sequential":
+                self.network(module)
+            elif kind == "Linear":
+                self.apply("Gemm", *(self.constant(p.detach().cpu().numpy()) for p in module.parameters()), transB=1)
+            elif kind == "Hardtanh":
+                self.apply("Clip", self.constant(module.min_val), self.constant(module.max_val))
             elif kind == "ELU":
                 self.apply("Elu", alpha=float(module.alpha))
             elif kind == "LeakyReLU":
                 self.apply("LeakyRelu", alpha=float(module.negative_slope))
             elif kind in ACTIVATIONS:
                 self.apply(ACTIVATIONS[kind])
-            elif kind not in ("Flatten", "Identity"):
+            elif kind not in ("Flatten", "FlattenExtractor", "Identity"):
                 raise InputError(
                     f"a layer of type {kind} cannot be exported",
                     where="policy",
@@ -75,13 +80,14 @@ class _Graph:
 def policy_layers(model: Any) -> tuple[list[Any], bool]:
     """Layers of a model of Stable-Baselines3 from observation to action, and whether a tanh ends them."""
     policy = model.policy
-    if hasattr(policy, "mlp_extractor"):  # PPO, A2C
-        return [*policy.mlp_extractor.policy_net, policy.action_net], False
+    if hasattr(policy, "mlp_extractor"):  # PPO, A2C; a tanh only with gSDE and squash_output
+        return [policy.pi_features_extractor, policy.mlp_extractor.policy_net, policy.action_net], policy.squash_output
     if hasattr(policy, "q_net"):  # DQN
-        return [*policy.q_net.q_net], False
-    if hasattr(policy.actor, "latent_pi"):  # SAC
-        return [*policy.actor.latent_pi, policy.actor.mu], True
-    return [*policy.actor.mu], False  # TD3, DDPG: a tanh is among the layers
+        return [policy.q_net.features_extractor, policy.q_net.q_net], False
+    actor = policy.actor
+    if hasattr(actor, "latent_pi"):  # SAC
+        return [actor.features_extractor, actor.latent_pi, actor.mu], True
+    return [actor.features_extractor, actor.mu], False  # TD3, DDPG: a tanh is among the layers
 
 
 def export_policy(model: Any, normalisation: Any, layout: PolicyLayout, path: Path, facts: Mapping[str, str]) -> Path:

@@ -17,16 +17,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic_core import PydanticSerializationError
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.training.algorithms import algorithm_class, algorithm_options
 from rfdropo_bayes.training.config import TrainingTable
 from rfdropo_bayes.training.evaluation import Case, Episode, draw_cases, play
+from rfdropo_bayes.training.parity import check_exportable
 
 EVALUATION_SEED = 1_000_003  # cases of an evaluation are none of the episodes that training begins with
 CHECKPOINT, EPISODES = "checkpoints", "episodes.jsonl"
 LAST, BEST = "", "best_"  # what files of a checkpoint begin with
+STATE = ("known", "leg", "seconds", "diverged", "redrawn", "curve", "logged")
+"""Keys of a checkpoint's state.json."""
 
 LEAST_SPREAD = 0.01
 """Added to the deviations by which observations are divided, in quadrature [m; quaternions: 1]. In training the cube's
@@ -98,13 +102,14 @@ def train(
 
     torch.set_num_threads(1)  # networks this small are slower on two
     venv = environments(table.environments)
-    kind = venv.get_attr("layout")[0].kind
-    options = algorithm_options(table.algorithm, kind, gamma, table.options, table.environments)
-    maker = algorithm_class(table.algorithm, kind)
-    known = {"table": table.model_dump(mode="json"), "seed": seed, **(fingerprint or {})}
+    layout = venv.get_attr("layout")[0]
+    options = algorithm_options(table.algorithm, layout.kind, gamma, table.options, table.environments)
+    maker = algorithm_class(table.algorithm, layout.kind)
+    known = {"table": _plain(table), "seed": seed, **(fingerprint or {})}
     folder = Path(out) / CHECKPOINT
     state = _load_state(folder, known) if resume else None
     model, normalisation = _begin(maker, options, venv, table, folder, state, out, seed)
+    check_exportable(model, normalisation, Trained(model, normalisation, [], 0, 0.0).act, layout)
     cases = draw_cases(venv, table.evaluation_episodes, EVALUATION_SEED + seed)
     state = state or {"known": known, "leg": 0, "seconds": 0.0, "diverged": 0, "redrawn": 0, "curve": [], "logged": 0}
     log = Path(out) / EPISODES
@@ -118,6 +123,18 @@ def train(
     if _best_row(state["curve"]) < len(state["curve"]) - 1:
         model, normalisation = _load(maker, venv, table, folder, BEST)
     return Trained(model, normalisation, state["curve"], state["diverged"], state["seconds"], state["redrawn"])
+
+
+def _plain(table: TrainingTable) -> dict[str, Any]:
+    """The table as it stands in a checkpoint."""
+    try:
+        return table.model_dump(mode="json")
+    except PydanticSerializationError as error:
+        raise InputError(
+            f"a value that no file can hold: {error}",
+            where="[training.options]",
+            remedy='use numbers, words, lists and tables, such as activation = "relu"',
+        ) from None
 
 
 def _begin(
@@ -137,15 +154,15 @@ def _begin(
     if state is None:
         spread = LEAST_SPREAD**2  # added to variances
         normalisation = VecNormalize(venv, gamma=options["gamma"], epsilon=spread) if table.normalise else None
-        model = maker(
-            "MlpPolicy",
-            normalisation or venv,
-            seed=seed,
-            device="cpu",
-            tensorboard_log=tensorboard,
-            **options,
-        )
-        return model, normalisation
+        ours = {"seed": seed, "device": "cpu", "tensorboard_log": tensorboard}
+        try:
+            return maker("MlpPolicy", normalisation or venv, **ours, **options), normalisation
+        except Exception as error:  # Stable-Baselines3 asserts, and PyTorch and Python raise whatever they raise
+            raise InputError(
+                f"{maker.__name__} cannot be made: {error}",
+                where="[training.options]",
+                remedy=f"see the options of {maker.__name__} in the documentation of Stable-Baselines3",
+            ) from error
     model, normalisation = _load(maker, venv, table, folder, LAST, tensorboard)
     if (folder / "replay.pkl").exists():
         model.load_replay_buffer(folder / "replay.pkl")
@@ -286,6 +303,15 @@ def _load_state(folder: Path, known: Mapping[str, Any]) -> dict[str, Any]:
         raise InputError(
             "there is no checkpoint to go on from", where=str(folder), remedy="leave out --resume"
         ) from None
+    files = ("model.zip", "normalisation.pkl") if known["table"]["normalise"] else ("model.zip",)
+    absent = [name for name in STATE if name not in state]
+    absent += [which + name for which in (LAST, BEST) for name in files if not (folder / (which + name)).exists()]
+    if absent:
+        raise InputError(
+            f"the checkpoint lacks {', '.join(absent)}: it is damaged, or of an earlier version",
+            where=str(folder),
+            remedy="start anew: give --overwrite, not --resume",
+        )
     before = json.loads(json.dumps(state["known"]))
     now = json.loads(json.dumps(known))
     changed = [name for name in now if name != "table" and now[name] != before.get(name)]

@@ -35,6 +35,7 @@ from rfdropo_bayes.training.evaluation import (
 )
 from rfdropo_bayes.training.export import ExportedPolicy, export_policy, latency
 from rfdropo_bayes.training.figures import curve_figure, save_animation, success_figure
+from rfdropo_bayes.training.parity import difference, observations
 from rfdropo_bayes.training.run import Trained, train
 from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values
 from rfdropo_bayes.workflow.calibrated import Calibration
@@ -325,11 +326,10 @@ def _names(policies: Sequence[Path]) -> list[str]:
 
 def _check_parity(policy: ExportedPolicy, trained: Trained) -> None:
     """Raise if the exported policy does not act as the trained one does, on what it may see."""
-    seen = np.random.default_rng(0).normal(0.0, 0.05, (256, policy.layout.size)).astype(np.float32)
-    apart = float(np.max(np.abs(policy.act(seen).astype(float) - np.asarray(trained.act(seen), dtype=float))))
-    if apart > 1e-4:
+    apart = difference(policy, trained.act, observations(trained.normalisation, policy.layout.size))
+    if apart is not None:
         raise InputError(
-            f"the exported policy acts otherwise than the trained one, by {apart:.2g}",
+            f"the exported policy acts otherwise than the trained one: {apart}",
             where=POLICY,
             remedy="report this as an error",
         )

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -216,9 +215,11 @@ def test_a_killed_audit_goes_on_where_it_was_and_says_the_same(tmp_path, monkeyp
     # What the first part took counts: a resumed audit that looks nearly all up has a longer account than its own time.
     assert sum(resumed.profile.values()) == resumed.seconds
     assert {"base model", "screening", "joint test", "refits", "gain"} <= set(resumed.profile)
-    began = time.monotonic()
+    for path in set(tmp_path.glob("*.npz")) - {tmp_path / "broken.npz"}:
+        with np.load(path) as kept:
+            np.savez(path, **{**kept, **({"seconds": np.asarray(1e6)} if "seconds" in kept else {})})
     once_more = audit(asked, journal=Journal(tmp_path, resume=True))
-    assert once_more.seconds > 1.2 * (time.monotonic() - began)
+    assert once_more.seconds > 1e6
     first, second = (record(a, versions={}, data_sha256="", next_experiment=None) for a in (resumed, whole))
     assert untimed(first) == untimed(second)
     # Other data share nothing with what was kept; without resume, what was kept is gone.

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -77,11 +77,26 @@ def vector_type(simd: SimdType) -> ir.VectorType:
     return ir.VectorType(ir.DoubleType() if simd.dtype.bitwidth == 64 else ir.FloatType(), simd.lanes)
 
 
+@cache
+def vector_width() -> int:
+    """Bytes of the widest vector register of the processor that Numba compiles for: this machine's, or the one that
+    ``NUMBA_CPU_NAME`` and ``NUMBA_CPU_FEATURES`` name. At least 16, as on any 64-bit machine.
+    """
+    # A name such as x86-64-v3 has no list of features: LLVM is asked which registers it adds 64 bytes in.
+    module = llvm.parse_assembly(
+        "define void @add(ptr %at) {\n"
+        "%one = load <16 x float>, ptr %at\n"
+        "%two = fadd <16 x float> %one, %one\n"
+        "store <16 x float> %two, ptr %at\n"
+        "ret void }"
+    )
+    assembly = cpu_target.target_context.codegen()._tm.emit_assembly(module)
+    return 64 if "zmm" in assembly else 32 if "ymm" in assembly else 16
+
+
 def native_lanes(dtype: Any) -> int:
-    """Lanes of ``dtype`` in this machine's widest vector register (at least 16 bytes, as on any 64-bit machine)."""
-    features = llvm.get_host_cpu_features()
-    width = 64 if features.get("avx512f") else 32 if features.get("avx") else 16
-    return width // np.dtype(dtype).itemsize
+    """Lanes of ``dtype`` in a vector register of `vector_width`."""
+    return vector_width() // np.dtype(dtype).itemsize
 
 
 def lane_token(lanes: int) -> tuple[int, ...]:
