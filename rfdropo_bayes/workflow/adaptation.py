@@ -142,9 +142,8 @@ def _adapt(
     body |= _drawn_spreads(space, body, spread_key)
     channel = Markers.gather(recordings, STATED, noise)
     program = TrajectoryModel(simulator, space, fixed, recordings, (channel,))
-    problem = CalibrationProblem(program, chunk=simulator.lanes)
     evaluations: list[float] = []
-    problem.watch = evaluations.append
+    problem = CalibrationProblem(program, chunk=simulator.lanes).telling(evaluations.append)
     with Progress("adapt", show=show) as progress:
         words = {"draws": len(next(iter(body.values()))), "parameters": len(own)}
         found = fit_day(

@@ -127,7 +127,7 @@ def _fit(
     key, predicting = jax.random.split(jax.random.key(seed))
     log, kept = (None, None) if out is None else (out / LOG, out / CHECKPOINTS)
     with Progress(method, show=show, log=log, budget=getattr(config, "rollouts", None)) as progress:
-        problem.watch = progress.spend
+        problem = problem.telling(progress.spend)
         result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
     problem = problem.holding(result.held)
     attributes = {**_attributes(model.name, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
