@@ -23,33 +23,34 @@ from rfdropo_bayes.groups import whole
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.report.coverage import predictive_bands
+from rfdropo_bayes.tables import changed
 from rfdropo_bayes.workflow.assembly import load_data
 from rfdropo_bayes.workflow.calibration import calibrate, inference_options
-from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
-from rfdropo_bayes.workflow.model import Model
 
 HEAD = ("left out", "recording", "start held [mm]", "error [mm]", "coordinates in", "of the tip", "tips in")
 
 
-def whole_recordings(experiment: Experiment, folder: Path, pattern: str) -> list[rb.Trajectory]:
+def whole_recordings(model: rb.Model, pattern: str) -> list[rb.Trajectory]:
     """The recordings that a pattern stands for, all rows of them."""
-    entries = experiment.data.model_dump(include={"fit", "test"}).values()
+    data = model.settings.data
+    assert data is not None
+    entries = data.model_dump(include={"fit", "test"}).values()
     entire = {entry["observations"]: RecordingEntry(**{**entry, "rows": None}) for kind in entries for entry in kind}
-    data = experiment.data.model_copy(update={"fit": list(entire.values()), "test": []})
-    every = load_data(experiment.model_copy(update={"data": data}), folder, "fit")
+    every = load_data(changed(data, where="[data]", fit=list(entire.values()), test=[]), model.folder, "fit")
     return [run for run in every if fnmatchcase(run.name, pattern)]
 
 
-def left_out(experiment: Experiment, folder: Path, pattern: str, out: Path) -> rb.Calibration:
+def left_out(model: rb.Model, pattern: str, out: Path) -> rb.Calibration:
     """A fit that has not seen the recordings that a pattern stands for, and predicts them."""
     if (out / "posterior.nc").exists():
         return rb.load(out)
+    table = model.settings.inference
     return calibrate(
-        Model.of_experiment(experiment, folder),
-        [run for run in load_data(experiment, folder, "fit") if not fnmatchcase(whole(run.name), pattern)],
-        make_config(experiment.inference.method, inference_options(experiment)),
-        test=whole_recordings(experiment, folder, pattern),
-        seed=experiment.seed,
+        model,
+        [run for run in model.recordings("fit") if not fnmatchcase(whole(run.name), pattern)],
+        make_config(table.method, inference_options(table)),
+        test=whole_recordings(model, pattern),
+        seed=model.settings.seed,
         out=out,
         overwrite=True,
     )
@@ -79,15 +80,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("reports/leave_out"))
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     given = parser.parse_args()
-    experiment, _ = load_experiment(given.experiment, given.overrides)
+    model, _ = rb.Model.read(given.experiment, given.overrides)
     print("| " + " | ".join(HEAD) + " |\n" + "|---" * len(HEAD) + "|", flush=True)
     for pattern in given.patterns:
         out = given.out / pattern.replace("*", "")
-        folder = given.experiment.resolve().parent
-        found = left_out(experiment, folder, pattern, out)
+        found = left_out(model, pattern, out)
         rows = [(pattern, prediction) for prediction in tested(found)]
         if given.adapt is not None:
-            first, *others = whole_recordings(experiment, folder, pattern)
+            first, *others = whole_recordings(model, pattern)
             adapted = rb.adapt(found, first, seconds=given.adapt, test=others, group="the day left out")
             rows += [(f"{pattern}, adapted", prediction) for prediction in tested(adapted)]
         for words, prediction in rows:

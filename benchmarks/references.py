@@ -28,7 +28,7 @@ from rfdropo_bayes.fem.rigid_body import (
     rotation_matrix,
     solid_gyration_radius,
 )
-from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.workflow.model import Model
 from rfdropo_bayes.workflow.simulation import simulate_all
 
 EXPERIMENTS = Path(__file__).resolve().parents[1] / "experiments"
@@ -263,9 +263,9 @@ def recordings() -> Iterator[Reference]:
     )
     for name, file, overrides in runs:
         try:
-            experiment, _ = load_experiment(EXPERIMENTS / file, overrides)
+            model, _ = Model.read(EXPERIMENTS / file, overrides)
             with tempfile.TemporaryDirectory() as folder:
-                found = simulate_all(experiment, EXPERIMENTS, Path(folder))
+                found = simulate_all(model, Path(folder))
         except InputError as error:
             print(f"{name}: {error}")
             continue

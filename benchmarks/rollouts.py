@@ -40,9 +40,10 @@ from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.engine import Engine
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.trunk import Assembly
-from rfdropo_bayes.workflow.assembly import build_simulator
+from rfdropo_bayes.workflow.assembly import build_robot_simulator
 from rfdropo_bayes.workflow.engines import backend
-from rfdropo_bayes.workflow.experiment import Experiment, SimulatorTable
+from rfdropo_bayes.workflow.experiment import SimulatorTable
+from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 SOLVES = 100
 TIME_STEP = 0.01  # [s]
@@ -169,7 +170,7 @@ def sag_error(case: Case) -> float:
 def trunk_rollouts(case: Case) -> tuple[Run, Values]:
     """Rollouts of the trunk at the simulator."""
     robot = "trunk_sofa_mesh" if case.mesh else TRUNK
-    trunk = build_simulator(Experiment(robot=robot, simulator=case.table), load_robot(robot))
+    trunk = build_robot_simulator(ModelSpec(load_robot(robot), simulator=case.table))
     step = trunk.description["time_step_s"]
     channels, clock = len(trunk.channel_names), np.arange(0, SOLVES, 10) * step
     ends = np.array([0.0, SOLVES * step])

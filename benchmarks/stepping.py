@@ -26,7 +26,8 @@ from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators import Commands
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 from rfdropo_bayes.workflow.assembly import build_simulator
-from rfdropo_bayes.workflow.experiment import Experiment
+from rfdropo_bayes.workflow.experiment import SimulatorTable
+from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 ROBOT, PERIOD, SOLVES, ACTIONS = "trunk_sofa", 0.05, 5, 20
 
@@ -47,9 +48,8 @@ class Row(NamedTuple):
 def simulator(precision: str, threads: int | None, state: str = "rest", *, push: bool = False) -> TrunkSimulator:
     """The trunk of the paper on the compiled engine, alone or with its cube."""
     options = {"engine": "numba", "precision": precision, "threads": threads, "push": push}
-    table = {"robot": ROBOT, "simulator": options}
-    robot = load_robot(ROBOT).model_copy(update={"initial_state": state})
-    built = build_simulator(Experiment.model_validate(table), robot)
+    table = SimulatorTable.model_validate(options)
+    built = build_simulator(ModelSpec(load_robot(ROBOT).with_changes(initial_state=state), simulator=table))
     assert isinstance(built, TrunkSimulator)
     return built
 

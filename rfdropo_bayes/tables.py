@@ -49,6 +49,16 @@ def parse_table(schema: type[Parsed], table: Mapping[str, Any], *, where: str) -
         raise InputError(what, where=where, remedy=remedy) from None
 
 
+def changed(table: Parsed, *, where: str, **values: Any) -> Parsed:
+    """The same table with other values of some keys, validated as if it had been read with them.
+
+    Raises:
+        InputError: as `parse_table`.
+    """
+    given = {name: value for name, value in table if name in table.model_fields_set}
+    return parse_table(type(table), {**given, **values}, where=where)
+
+
 def _follow(schema: type[BaseModel], location: Sequence[str | int]) -> tuple[list[str], list[type[BaseModel]]]:
     """What a user would call a place that pydantic names, and the tables that may stand there.
 

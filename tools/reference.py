@@ -33,9 +33,10 @@ from rfdropo_bayes.robots.sections import SHAPES, SectionedBody
 from rfdropo_bayes.simulators.mechanisms import STAGES
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.workflow.assembly import measurement_specs
-from rfdropo_bayes.workflow.experiment import Experiment, ModelTable
+from rfdropo_bayes.workflow.experiment import Experiment, NoiseModel
 from rfdropo_bayes.workflow.listings import format_rows, robot_rows
 from rfdropo_bayes.workflow.model_listings import EXAMPLE_ROBOT, first_paragraph, mechanism_facts, prior_text
+from rfdropo_bayes.workflow.model_spec import DataChannels
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "reference"
 NOTE = "<!-- Written by tools/reference.py from the code: change the code, then run it. -->"
@@ -287,14 +288,15 @@ def measured_parameters() -> Iterator[tuple[ParameterSpec, str]]:
     """Parameters of noise and of further channels, with the setting that brings them in."""
     seen: set[str] = set()
     settings: list[dict[str, Any]] = [
-        *({"noise": name} for name in get_args(ModelTable.model_fields["noise"].annotation)),
+        *({"noise": name} for name in get_args(NoiseModel)),
         {"tension": True},
         {"motor_angle": True},
         {"object_pose": True},
     ]
     for setting in settings:
         ((key, value),) = setting.items()
-        for spec in measurement_specs(ModelTable(**setting)):
+        noise, chosen = str(setting.get("noise", "auto")), {k: v for k, v in setting.items() if k != "noise"}
+        for spec in measurement_specs(noise, DataChannels(**chosen)):
             if spec.name not in seen:
                 seen.add(spec.name)
                 yield spec, code(f'{key} = "{value}"' if isinstance(value, str) else f"{key} = true")

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.audit.fit import CLOSE, Fit, Target, heights
+from rfdropo_bayes.bayes.problem import ProblemDefaults
 from rfdropo_bayes.bayes.space import ParameterSpace
 from rfdropo_bayes.inference import LaplaceConfig, climb_cost, find_modes
 from rfdropo_bayes.simulators.differences import usable_difference
@@ -29,7 +30,7 @@ WITHIN = 0.5 * max(ALONG) ** 2  # nats that a step of slopes promises which is n
 
 
 @dataclass(frozen=True)
-class BaseProblem:
+class BaseProblem(ProblemDefaults):
     """The base model's posterior as inference methods see it; see `bayes.problem.ResidualProblem`.
 
     A row is one row of every group of repeats, whitened given those before it. The noise is known.

@@ -45,7 +45,7 @@ class CalibrationProblem:
         self.measured = model.measured
         self.shares = dict.fromkeys(self.measured, 1.0)  # what each channel counts
         self.jacobian = "auto"
-        self.watch: Callable[[float], None] | None = None  # told of rollouts, in full-length ones, as they are done
+        self._told: Callable[[float], None] | None = None
         self.chunk = chunk
         self.names = model.space.names
         self.units = {p.name: p.spec.unit for p in model.space.parameters}
@@ -89,7 +89,13 @@ class CalibrationProblem:
         model = replace(self.model, space=self.model.space.holding(values), fixed={**self.model.fixed, **values})
         other = CalibrationProblem(model, chunk=self.chunk, earlier=self.earlier)
         other.measured, other.shares = self.measured, self.shares
-        other.jacobian, other.watch = self.jacobian, self.watch
+        other.jacobian, other._told = self.jacobian, self._told
+        return other
+
+    def telling(self, spent: Callable[[float], None]) -> CalibrationProblem:
+        """The same problem, which tells of rollouts, in full-length ones, as they are done."""
+        other = self._copied()
+        other._told = spent
         return other
 
     def scale_log_prior(self, values: Float[np.ndarray, "n scale"]) -> Float[np.ndarray, " n"]:
@@ -264,9 +270,9 @@ class CalibrationProblem:
 
     def _copied(self) -> CalibrationProblem:
         """The same problem, which shares all that has been compiled."""
-        coordinates = ("_unconstrained", "_constrained", "_log_prior", "prior_derivatives")
-        for shared in ("_rows", "_white", "_positions", "_features", "_observations", "actions", *coordinates):
-            getattr(self, shared)  # made before the copy, so that all copies have the same compiled functions
+        # Made before the copy, so that all copies have the same compiled functions.
+        _ = self._rows, self._white, self._positions, self._features, self._observations, self.actions
+        _ = self._unconstrained, self._constrained, self._log_prior, self.prior_derivatives
         other = copy.copy(self)
         other.__dict__.pop("fingerprint", None)
         return other
@@ -364,8 +370,8 @@ class CalibrationProblem:
             index = np.minimum(np.arange(start, start + size), n - 1)
             chunk = {name: column[index] for name, column in columns.items()}
             parts.append(jax.device_get(evaluate(chunk, steps, *rest)))
-            if self.watch is not None:
-                self.watch(min(n - start, self.chunk) * horizon / self.n_rows)
+            if self._told is not None:
+                self._told(min(n - start, self.chunk) * horizon / self.n_rows)
         return jax.tree.map(lambda *column: np.concatenate(column)[:n], *parts)
 
     def _flat(self, white: Mapping[str, Any], horizon: int) -> Any:

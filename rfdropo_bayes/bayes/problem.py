@@ -1,11 +1,31 @@
-"""What an inference method sees: a posterior given data, in named parameters. Simulators stay hidden behind it."""
+"""What an inference method sees: a posterior given data, in named parameters. Simulators stay hidden behind it.
+
+| a protocol | for |
+|---|---|
+| `Problem` | every method |
+| `ResidualProblem`, `BatchedResiduals` | climbs by Gauss-Newton |
+| `TraceableProblem` | climbs by Hessians, NUTS, nested sampling |
+| `WarmStart` | climbs that need not start at the prior |
+| `Hierarchy` | climbs of a posterior some of whose parameters are standard deviations of others |
+| `RolloutProblem` | RF-DROPO, and methods that learn from simulations |
+
+All members of a protocol are required. `ProblemDefaults` and `RolloutDefaults` hold those that a problem may leave as
+they usually are.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
 
-from jaxtyping import Bool, Float, Int, PRNGKeyArray
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from rfdropo_bayes.errors import InputError
 
 # Arrays of JAX or of NumPy: a problem takes and returns either.
 Values = Mapping[str, Float[Any, " n"]]
@@ -22,28 +42,32 @@ class Problem(Protocol):
         names: scalar parameters, in sampling order.
         units: unit of each parameter, SI.
         bounds: hard bounds of each parameter; infinite where there is none.
+        prior_ends: where each parameter's prior ends: on its hard bounds or between them.
         n_rows: rows of data; horizons run from 1 to ``n_rows``.
-
-    A problem may also have
-
-    - ``fingerprint: str``, a digest of its data and model: checkpoints of another problem are then refused;
-    - ``prior_ends: dict[str, tuple[float, float]]``, where each parameter's prior ends: on its hard bounds or between
-      them; without, the bounds are taken for them;
-    - ``status_names: Mapping[int, str]``, words for its status codes, used when excluded rollouts are counted;
-    - ``log_likelihood_at(u)`` of one unconstrained point, traceable by JAX, as NUTS and nested sampling want it.
+        fingerprint: a digest of its data and model; checkpoints of a problem with another one are refused.
+        status_names: words for its status codes, used when excluded rollouts are counted.
     """
 
     @property
     def names(self) -> tuple[str, ...]: ...
 
     @property
-    def units(self) -> dict[str, str]: ...
+    def units(self) -> Mapping[str, str]: ...
 
     @property
-    def bounds(self) -> dict[str, tuple[float, float]]: ...
+    def bounds(self) -> Mapping[str, tuple[float, float]]: ...
+
+    @property
+    def prior_ends(self) -> Mapping[str, tuple[float, float]]: ...
 
     @property
     def n_rows(self) -> int: ...
+
+    @property
+    def fingerprint(self) -> str: ...
+
+    @property
+    def status_names(self) -> Mapping[int, str]: ...
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
         """Independent prior draws."""
@@ -71,21 +95,78 @@ class Problem(Protocol):
         ...
 
 
-@runtime_checkable
-class ResidualProblem(Problem, Protocol):
-    """A problem whose log likelihood is a sum of squares, as Gauss-Newton wants it.
+Derivatives = tuple[Callable[[Any], Any], Callable[[Any], Any]]
+"""Gradient (d,) and Hessian (d, d) of a density, as functions of one unconstrained point (d,)."""
 
-    It may also have ``prior_derivatives``, compiled gradient and Hessian of the log prior; ``residual_batch(values,
-    horizon)``, the residuals of many sets of values; and ``jacobian``, the way its Jacobians are to be taken ("auto",
-    "forward" or "central").
+
+@runtime_checkable
+class ClimbedProblem(Problem, Protocol):
+    """A problem with the derivatives of its log prior.
+
+    Attributes:
+        prior_derivatives: of the log prior.
     """
 
-    def residuals(self, values: Mapping[str, Float[Any, ""]], horizon: int) -> Float[Any, " m"]:
+    @property
+    def prior_derivatives(self) -> Derivatives: ...
+
+
+@runtime_checkable
+class ResidualProblem(ClimbedProblem, Protocol):
+    """A problem whose log likelihood is a sum of squares, as Gauss-Newton wants it.
+
+    Attributes:
+        physical_names: parameters that the simulation depends on; the others are noise. All of ``names`` where that is
+            not known: it is then found out.
+        jacobian: how Jacobians are to be taken: "forward", "central", or "auto".
+    """
+
+    @property
+    def physical_names(self) -> tuple[str, ...]: ...
+
+    @property
+    def jacobian(self) -> str: ...
+
+    def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Any, " m"]:
         """Whitened residuals r of the first ``horizon`` rows for ONE set of values.
 
         ``-0.5 * sum(r**2) + c`` is the log likelihood, where ``c`` depends on noise parameters only. Traceable by JAX
         where the simulator is; otherwise Jacobians are taken by central differences.
         """
+        ...
+
+
+@runtime_checkable
+class BatchedResiduals(ResidualProblem, Protocol):
+    """A problem that simulates many sets of values at once, for central differences of its residuals."""
+
+    def residual_batch(self, values: Values, horizon: int) -> Float[Any, "n m"]:
+        """`residuals` of many sets of values."""
+        ...
+
+
+@runtime_checkable
+class TraceableProblem(ClimbedProblem, Protocol):
+    """A problem whose likelihood JAX can trace; NUTS and Hessians also differentiate it."""
+
+    def log_likelihood_at(self, u: Float[Array, " d"]) -> Float[Array, ""]:
+        """Log likelihood of all rows at one unconstrained point."""
+        ...
+
+
+@runtime_checkable
+class WarmStart(Problem, Protocol):
+    """A problem that knows places to start from beside its prior.
+
+    Attributes:
+        earlier: draws of an earlier posterior, by parameter name; empty without one.
+    """
+
+    @property
+    def earlier(self) -> Mapping[str, Float[Any, " n"]]: ...
+
+    def sample_starts(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
+        """Where climbs may start."""
         ...
 
 
@@ -98,8 +179,11 @@ class Hierarchy(Problem, Protocol):
         typical_scales: a value of each from the middle of its prior.
     """
 
-    scales: Mapping[str, tuple[str, ...]]
-    typical_scales: Mapping[str, float]
+    @property
+    def scales(self) -> Mapping[str, tuple[str, ...]]: ...
+
+    @property
+    def typical_scales(self) -> Mapping[str, float]: ...
 
     def holding(self, values: Mapping[str, float]) -> ResidualProblem:
         """The same problem with some parameters known; what a known standard deviation is of has itself for its
@@ -116,15 +200,15 @@ class RolloutProblem(Problem, Protocol):
     """A problem that can be simulated without a noise model, as RF-DROPO wants it.
 
     Attributes:
+        physical_names: parameters that a rollout depends on; the others, such as the noise scale, are passed at their
+            prior median.
         observed: measured features, laid out like `rollouts`.
         observed_mask: True where ``observed`` may be used.
-
-    It may also have ``physical_names: tuple[str, ...]``, the parameters that a rollout depends on (all of ``names``
-    where it is missing); the others, such as the noise scale, are passed at their prior median. Methods that learn from
-    simulations use ``noisy_rollouts(key, values)``, rollouts of all rows with observation noise, and ``actions``
-    (n_rows, a), the commands at the rows, where it has them. To the variances of rollouts RF-DROPO adds those of
-    ``noise_deviation(values)``, the standard deviation (feature,) of each feature's noise at one set of values.
+        actions: commands at the rows; (n_rows, 0) where there are none.
     """
+
+    @property
+    def physical_names(self) -> tuple[str, ...]: ...
 
     @property
     def observed(self) -> Float[Any, "n_rows feature"]: ...
@@ -132,6 +216,115 @@ class RolloutProblem(Problem, Protocol):
     @property
     def observed_mask(self) -> Bool[Any, "n_rows feature"]: ...
 
+    @property
+    def actions(self) -> Float[Any, "n_rows action"]: ...
+
     def rollouts(self, values: Values, horizon: int) -> tuple[Float[Any, "n horizon feature"], Int[Any, " n"]]:
         """Simulated features of the first ``horizon`` rows, without observation noise, and the status of each."""
         ...
+
+    def noisy_rollouts(
+        self, key: PRNGKeyArray, values: Values
+    ) -> tuple[Float[Any, "n n_rows feature"], Int[Any, " n"]]:
+        """`rollouts` of all rows, with observation noise."""
+        ...
+
+    def noise_deviation(self, values: Mapping[str, float]) -> Float[Any, " feature"]:
+        """Standard deviation of each feature's observation noise, at one set of values."""
+        ...
+
+
+class ProblemDefaults:
+    """What a problem has that says nothing else: a prior that ends on the bounds, and no fingerprint.
+
+    Its derivatives of the prior are JAX's.
+    """
+
+    fingerprint: str = ""
+    status_names: Mapping[int, str] = MappingProxyType({})
+    jacobian: str = "auto"
+
+    @cached_property
+    def prior_ends(self: Problem) -> Mapping[str, tuple[float, float]]:
+        """The hard bounds."""
+        return self.bounds
+
+    @cached_property
+    def physical_names(self: Problem) -> tuple[str, ...]:
+        """All."""
+        return self.names
+
+    @cached_property
+    def prior_derivatives(self: Problem) -> Derivatives:
+        """Gradient and Hessian of the log prior at one unconstrained point, compiled."""
+
+        def single(u: Array) -> Array:
+            return jnp.asarray(self.log_prior(u[None]))[0]
+
+        return jax.jit(jax.grad(single)), jax.jit(jax.hessian(single))
+
+
+class RolloutDefaults(ProblemDefaults):
+    """The same of a problem with rollouts: neither noise nor commands."""
+
+    @cached_property
+    def actions(self: Problem) -> Float[np.ndarray, "n_rows 0"]:
+        """None."""
+        return np.zeros((self.n_rows, 0))
+
+    def noisy_rollouts(
+        self: RolloutProblem, key: PRNGKeyArray, values: Values
+    ) -> tuple[Float[Any, "n n_rows feature"], Int[Any, " n"]]:
+        """The rollouts as they are."""
+        return self.rollouts(values, self.n_rows)
+
+    def noise_deviation(self: RolloutProblem, values: Mapping[str, float]) -> Float[np.ndarray, " feature"]:
+        """Zero."""
+        return np.zeros(np.shape(self.observed)[1])
+
+
+def with_rollouts(problem: Problem) -> RolloutProblem:
+    """A problem for a method that learns from rollouts.
+
+    Raises:
+        InputError: it has none.
+    """
+    if not isinstance(problem, RolloutProblem):
+        raise InputError("this problem has no rollouts", where="[inference] method", remedy='use method = "smc"')
+    return problem
+
+
+CAPABILITIES: dict[str, type] = {
+    "residuals": ResidualProblem,
+    "log_likelihood_at": TraceableProblem,
+    "sample_starts": WarmStart,
+    "scales": Hierarchy,
+    "rollouts": RolloutProblem,
+}
+"""What a problem can do beside what each can, by the member that says so."""
+
+
+def check_problem(problem: object) -> None:
+    """Look through a problem before a method runs.
+
+    Raises:
+        InputError: it lacks a member of `Problem`, or of a protocol that another of its members belongs to. A method
+            would take the problem for one that cannot do what it can.
+    """
+    there = {*dir(problem)}
+    wanted = [("", Problem), *((member, kind) for member, kind in CAPABILITIES.items() if member in there)]
+    for member, kind in wanted:
+        missing = sorted(_members(kind) - there)
+        if missing:
+            having = f"has {member!r} but lacks" if member else "lacks"
+            raise InputError(
+                f"{type(problem).__name__} {having} {', '.join(missing)}",
+                where="problem",
+                remedy=f"define what {kind.__name__} asks for; {ProblemDefaults.__name__} and "
+                f"{RolloutDefaults.__name__}, to derive from, have what a problem may leave as it usually is",
+            )
+
+
+def _members(kind: type) -> set[str]:
+    """Public members of a protocol and of those that it extends."""
+    return {name for each in kind.__mro__[:-1] for name in vars(each) if not name.startswith("_")}

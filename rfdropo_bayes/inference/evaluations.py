@@ -63,9 +63,8 @@ class Ledger:
 
     def exclude(self, problem: Problem, status: Int[np.ndarray, " n"], not_a_number: np.ndarray) -> None:
         """Count what is left out: by its status, or for a likelihood that is not a number."""
-        words = getattr(problem, "status_names", {})
         for code, count in zip(*np.unique(status[status != 0], return_counts=True), strict=True):
-            self.excluded[words.get(int(code), f"status_{int(code)}")] += int(count)
+            self.excluded[problem.status_names.get(int(code), f"status_{int(code)}")] += int(count)
         unexplained = int(np.sum(not_a_number & (status == 0)))
         if unexplained:
             self.excluded[NOT_A_NUMBER] += unexplained

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from jaxtyping import PRNGKeyArray
 
-from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.bayes.problem import Problem, check_problem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import nested, nuts, rivals
 from rfdropo_bayes.inference.modes import search as laplace
@@ -103,8 +103,13 @@ def run(
         checkpoint_dir: folder for checkpoints; None keeps none.
         resume: go on from the checkpoints found there; a finished run is then only read.
         progress: where to report stages.
+
+    Raises:
+        InputError: no such method or option, a problem that lacks members (`check_problem`) or that the method cannot
+            take; and what the method itself says.
     """
     method = method_named(name)
+    check_problem(problem)
     config = options if isinstance(options, method.config) else make_config(name, options)
     return method.run(problem, config, key, Logbook(checkpoint_dir, resume, progress))
 

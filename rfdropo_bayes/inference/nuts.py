@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from numpyro.infer import MCMC, NUTS
 
-from rfdropo_bayes.bayes.problem import Problem
+from rfdropo_bayes.bayes.problem import Problem, TraceableProblem
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
@@ -57,8 +57,7 @@ def log_densities(problem: Problem) -> tuple[Callable[[Array], Array], Callable[
     Raises:
         InputError: the problem has no likelihood that JAX can trace.
     """
-    likelihood = getattr(problem, "log_likelihood_at", None)
-    if likelihood is None:
+    if not isinstance(problem, TraceableProblem):
         raise InputError(
             "this problem has no likelihood that JAX can trace", where="[inference] method", remedy='use method = "smc"'
         )
@@ -67,7 +66,7 @@ def log_densities(problem: Problem) -> tuple[Callable[[Array], Array], Callable[
         return jnp.asarray(problem.log_prior(u[None]))[0]
 
     def clipped(u: Float[Array, " d"]) -> Float[Array, ""]:
-        value = likelihood(u)
+        value = problem.log_likelihood_at(u)
         return jnp.where(jnp.isfinite(value), value, LOWEST)
 
     return prior, clipped

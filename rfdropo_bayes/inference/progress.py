@@ -150,7 +150,7 @@ def run_digest(problem: Problem, method: str, config: Any, key: PRNGKeyArray) ->
     """Digest of everything that a run's draws depend on: problem, method, its configuration and the random key.
 
     The problem is known by its names, units, bounds, rows, its prior's density at a few of its own draws, and its
-    ``fingerprint`` where it has one.
+    ``fingerprint``.
     """
     probe = problem.to_unconstrained(problem.sample_prior(jax.random.key(0), 3))
     parts = {
@@ -163,7 +163,7 @@ def run_digest(problem: Problem, method: str, config: Any, key: PRNGKeyArray) ->
         "bounds": {name: [float(x) for x in problem.bounds[name]] for name in problem.names},
         "n_rows": int(problem.n_rows),
         "prior": [float(x).hex() for x in np.asarray(problem.log_prior(probe)).ravel()],
-        "fingerprint": getattr(problem, "fingerprint", ""),
+        "fingerprint": problem.fingerprint,
     }
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 

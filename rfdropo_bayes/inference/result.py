@@ -85,7 +85,7 @@ def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
     A prior that is more even in logarithms has its posterior compared with a bound in logarithms: a scale that ranges
     over decades has much of a linear range's mass at the lower end.
     """
-    drawn, ends = problem.sample_prior(jax.random.key(0), PRIOR_DRAWS), getattr(problem, "prior_ends", problem.bounds)
+    drawn, ends = problem.sample_prior(jax.random.key(0), PRIOR_DRAWS), problem.prior_ends
     found, apart = [], []
     for name, values in draws.items():
         values, (low, high), prior = np.ravel(values), ends[name], np.asarray(drawn[name], dtype=float)

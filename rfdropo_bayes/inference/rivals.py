@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, PRNGKeyArray
 
-from rfdropo_bayes.bayes.problem import Problem, RolloutProblem
+from rfdropo_bayes.bayes.problem import Problem, RolloutProblem, with_rollouts
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
@@ -188,8 +188,7 @@ def simulate(
 ) -> Simulations:
     """Roll out parameter sets and put observation noise on them."""
     values = problem.from_unconstrained(jnp.asarray(prior.unconstrained(theta)))
-    noisy = getattr(problem, "noisy_rollouts", None)
-    features, status = noisy(key, values) if noisy else problem.rollouts(values, problem.n_rows)
+    features, status = problem.noisy_rollouts(key, values)
     features, status = np.asarray(features, dtype=float), np.asarray(status)
     ledger.charge(problem, len(theta), problem.n_rows)
     broken = np.logical_not(np.isfinite(features).all(axis=(1, 2)))
@@ -209,14 +208,17 @@ def run_bayessim(
     key: PRNGKeyArray,
     logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
-    """BayesSim. It has one stage, so there is nothing to resume from."""
-    actions = getattr(problem, "actions", None)
+    """BayesSim. It has one stage, so there is nothing to resume from.
+
+    Raises:
+        InputError: a problem without rollouts, or sbi is not installed.
+    """
+    simulated = with_rollouts(problem)
 
     def summarise(features: np.ndarray) -> np.ndarray:
-        known = np.zeros((features.shape[1], 0)) if actions is None else np.asarray(actions)
-        return cross_correlation_summary(features, known)
+        return cross_correlation_summary(features, np.asarray(simulated.actions))
 
-    return _run(problem, "bayessim", config, key, summarise, rounds=1, logbook=logbook)
+    return _run(simulated, "bayessim", config, key, summarise, rounds=1, logbook=logbook)
 
 
 def run_npdr(
@@ -225,12 +227,16 @@ def run_npdr(
     key: PRNGKeyArray,
     logbook: Logbook = UNRECORDED,
 ) -> InferenceResult:
-    """NPDR. Rounds build on trained networks, which are not kept: an interrupted run starts again."""
-    return _run(problem, "npdr", config, key, thinned_summary, rounds=config.rounds, logbook=logbook)
+    """NPDR. Rounds build on trained networks, which are not kept: an interrupted run starts again.
+
+    Raises:
+        InputError: a problem without rollouts, or sbi is not installed.
+    """
+    return _run(with_rollouts(problem), "npdr", config, key, thinned_summary, rounds=config.rounds, logbook=logbook)
 
 
 def _run(
-    problem: Problem,
+    problem: RolloutProblem,
     name: str,
     config: Any,
     key: PRNGKeyArray,
@@ -239,8 +245,6 @@ def _run(
     rounds: int,
     logbook: Logbook,
 ) -> InferenceResult:
-    if not isinstance(problem, RolloutProblem):
-        raise InputError("this problem has no rollouts", where="[inference] method", remedy='use method = "smc"')
     torch, sbi = import_sbi()
     began = time.monotonic()
     prior_key, noise_key, seed_key = jax.random.split(key, 3)

@@ -11,6 +11,7 @@ import importlib
 import importlib.util
 import sys
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -105,11 +106,37 @@ def mechanisms_named(
     folder: Path = Path(),
     where: str = "[model] mechanisms",
 ) -> tuple[Mechanism, ...]:
-    """The mechanisms of an experiment file, in its order.
+    """The mechanisms of an experiment file, in its order: those of `choose_mechanisms`, for a robot."""
+    return tuple(choice.made_for(robot) for choice in choose_mechanisms(names, folder=folder, where=where))
+
+
+@dataclass(frozen=True)
+class MechanismChoice:
+    """A mechanism of a model, which is yet to be made for its robot.
+
+    Attributes:
+        source: name under which a file would ask for it.
+        kind: its class, or the mechanism itself.
+    """
+
+    source: str
+    kind: Any
+
+    def made_for(self, robot: Robot | BlackBox | None) -> Mechanism:
+        """The mechanism; one with parameters per cable (a class method ``for_robot``) is made for the robot."""
+        if not isinstance(self.kind, type):
+            return self.kind
+        kind: Any = self.kind
+        return kind.for_robot(robot) if robot is not None and hasattr(kind, "for_robot") else kind()
+
+
+def choose_mechanisms(
+    names: Iterable[Any], *, folder: Path = Path(), where: str = "[model] mechanisms"
+) -> tuple[MechanismChoice, ...]:
+    """The mechanisms that names stand for.
 
     Args:
         names: of the registry, ``module:ClassName`` of a user's own, or a mechanism itself, as a class or an object.
-        robot: that they are for; one with parameters per cable (a class method ``for_robot``) is made for it.
         folder: that files of a user's own are relative to.
         where: the names stand, for messages.
 
@@ -118,19 +145,23 @@ def mechanisms_named(
     """
     chosen = []
     for name in names:
-        if not isinstance(name, str):
+        kind = name
+        if isinstance(name, str):
+            kind = _imported(name, folder, where) if ":" in name else REGISTRY.get(name)
+            if kind is None:
+                raise InputError(f"unknown mechanism {name!r}", where=where, remedy=nearest(name, REGISTRY))
+        else:
             _check_kind(name if isinstance(name, type) else type(name), str(getattr(name, "name", name)), where)
-            chosen.append(_made(name, robot) if isinstance(name, type) else name)
-            continue
-        kind = _imported(name, folder, where) if ":" in name else REGISTRY.get(name)
-        if kind is None:
-            raise InputError(f"unknown mechanism {name!r}", where=where, remedy=nearest(name, REGISTRY))
-        chosen.append(_made(kind, robot))
+        chosen.append(MechanismChoice(source_of(name), kind))
     return tuple(chosen)
 
 
-def _made(kind: Any, robot: Robot | BlackBox | None) -> Mechanism:
-    return kind.for_robot(robot) if robot is not None and hasattr(kind, "for_robot") else kind()
+def source_of(mechanism: Any) -> str:
+    """Under which name a file would ask for a mechanism: its name, or ``module:ClassName`` of a class or an object."""
+    if isinstance(mechanism, str):
+        return mechanism
+    kind = mechanism if isinstance(mechanism, type) else type(mechanism)
+    return f"{kind.__module__}:{kind.__qualname__}"
 
 
 def _imported(name: str, folder: Path, where: str) -> Any:

@@ -18,7 +18,7 @@ from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in, un
 from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.table import Name, Positive, Table, Vector
-from rfdropo_bayes.tables import nearest
+from rfdropo_bayes.tables import changed, nearest
 
 REQUIRED = (
     "young_modulus",
@@ -165,7 +165,15 @@ class Robot(Table):
 
     def without_command_timing(self) -> Robot:
         """The same robot, carrying every command out at once: no ramp, no dead time."""
-        return self.model_copy(update={"command": Command(unit=self.command.unit, ramp_s=0.0, dead_time_s=0.0)})
+        return self.with_changes(command=Command(unit=self.command.unit, ramp_s=0.0, dead_time_s=0.0))
+
+    def with_changes(self, **values: Any) -> Robot:
+        """The same robot with other values of some fields, validated anew.
+
+        Raises:
+            InputError: values that do not fit together.
+        """
+        return changed(self, where=f"robot {self.name}", **values).grouped(self._groups)
 
     def travel(self, recording: str, initial: Float[np.ndarray, " channel"]) -> Travel | None:
         """What is stated of the drives in a recording that begins at this command [m or rad]; see `travel_in`."""
@@ -244,7 +252,9 @@ class Robot(Table):
             if parameter.each == "cable":
                 for cable in self.cable_names:
                     described = f"{parameter.description} (cable {cable})"
-                    table[f"{name}_{cable}"] = parameter.model_copy(update={"description": described, "each": None})
+                    table[f"{name}_{cable}"] = changed(
+                        parameter, where=f"robot {self.name}", description=described, each=None
+                    )
             else:
                 table[name] = parameter
         return table

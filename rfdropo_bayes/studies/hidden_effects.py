@@ -29,11 +29,12 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.simulators.protocol import Observation
-from rfdropo_bayes.workflow.assembly import build_simulator, find_robot
+from rfdropo_bayes.workflow.assembly import build_simulator
 from rfdropo_bayes.workflow.audit import Workshop, build_question
 from rfdropo_bayes.workflow.commands import random_walk
-from rfdropo_bayes.workflow.experiment import AuditTable, CommandsTable, Experiment
+from rfdropo_bayes.workflow.experiment import AuditTable, CommandsTable, Experiment, SimulatorTable
 from rfdropo_bayes.workflow.experiment_file import describe
+from rfdropo_bayes.workflow.model_spec import find_robot, spec_of
 
 NOISE, MEMORY = 5e-4, 0.6  # standard deviation [m] and correlation from row to row
 TENSION_NOISE = 0.02  # of a tension reading
@@ -126,7 +127,7 @@ def hide(
     experiment = _experiment(setting, exclude)
     blank = _blank_recordings(setting, rng)
     fitted, untouched = blank[: REPEATS + 1], blank[REPEATS + 1 :]
-    question = build_question(_with_all(experiment), out, fitted, untouched, seed, workshop=workshop)
+    question = build_question(spec_of(experiment, out), AuditTable(), fitted, untouched, seed, workshop=workshop)
     coordinates = question.coordinates
     truth = coordinates.null.copy()
     truth[: coordinates.base] += (
@@ -180,13 +181,9 @@ def _experiment(setting: Setting, exclude: Sequence[str]) -> Experiment:
     )
 
 
-def _with_all(experiment: Experiment) -> Experiment:
-    return experiment.model_copy(update={"audit": AuditTable()})
-
-
 def _blank_recordings(setting: Setting, rng: np.random.Generator) -> list[Trajectory]:
     """Commands and times of all recordings; their positions are still those at rest."""
-    robot = find_robot(_experiment(setting, ()), Path())
+    robot = find_robot(setting.robot, Path())
     table = setting.commands
     sequences = [random_walk(table, len(robot.channel_names), rng) for _ in range(2 + UNTOUCHED)]
     names = [*(f"fit_{k + 1}" for k in range(REPEATS)), "screen", *(f"test_{k + 1}" for k in range(UNTOUCHED))]
@@ -249,14 +246,8 @@ def _made(
     setting: Setting, mechanisms: Sequence[str], values: Mapping[str, float], blank: Sequence[Trajectory]
 ) -> Observation:
     """What the finer simulator shows of every recording."""
-    experiment = _experiment(setting, ())
-    experiment = experiment.model_copy(
-        update={
-            "model": experiment.model.model_copy(update={"mechanisms": list(mechanisms)}),
-            "simulator": type(experiment.simulator).model_validate(dict(setting.made)),
-        }
-    )
-    simulator = build_simulator(experiment, find_robot(experiment, Path()))
+    spec = spec_of(_experiment(setting, ()), Path(), mechanisms=mechanisms)
+    simulator = build_simulator(replace(spec, simulator=SimulatorTable.model_validate(dict(setting.made))))
     recordings = gather_recordings(simulator, blank)
     given = {name: jnp.asarray(v) for name, v in values.items()}
     observed = jax.vmap(lambda c: simulator.rollout(given, c, jnp.asarray(c.step.shape[0])))(recordings.commands)

@@ -48,10 +48,10 @@ def run_check(
     if check not in CHECKS:
         raise InputError(f"unknown check {check!r}", where="--check", remedy=f"one of {', '.join(CHECKS)}")
     model, tables = Model.read(path, overrides)
-    experiment, fitted = model.experiment, model.recordings("fit")
+    chosen, fitted = model.settings, model.recordings("fit")
     problem = model.problem(fitted)
-    options = inference_options(experiment)
-    make_config(experiment.inference.method, options)
+    options = inference_options(chosen.inference)
+    make_config(chosen.inference.method, options)
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(fitted)}
     settings["options"] = {"check": check}
     with run_folder(out, "check", **settings, resume=resume, overwrite=overwrite) as out:
@@ -59,9 +59,9 @@ def run_check(
             found = sbc.calibrate(
                 problem,
                 lambda key: simulate_data_set(problem, key),
-                experiment.inference.method,
+                chosen.inference.method,
                 options,
-                jax.random.key(experiment.seed),
+                jax.random.key(chosen.seed),
                 datasets,
                 log=out / "sbc.jsonl",
                 resume=resume,
@@ -69,10 +69,10 @@ def run_check(
             )
         content = {
             **found.as_dict(),
-            "method": experiment.inference.method,
+            "method": chosen.inference.method,
             "options": options,
-            "seed": experiment.seed,
-            "robot": experiment.robot,
+            "seed": chosen.seed,
+            "robot": model.spec.named,
             "simulator": model.simulator.description,
         }
         write_json(out / "sbc.json", content)

@@ -14,9 +14,10 @@ from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
-from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator
+from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_robot_simulator
 from rfdropo_bayes.workflow.commands import random_walk
-from rfdropo_bayes.workflow.experiment import CommandsTable, Experiment
+from rfdropo_bayes.workflow.experiment import CommandsTable, SimulatorTable
+from rfdropo_bayes.workflow.model_spec import DataChannels, ModelSpec
 
 POSITION_NOISE, CORRELATION, TENSION_NOISE = 5e-4, 0.3, 0.01  # m; from row to row; share of the reading
 TURN_NOISE = 0.02  # rad, of a cube seen by markers some 25 mm from its centre
@@ -82,10 +83,10 @@ def task_problem(task: str, actions: int, tension: bool, held_out: bool, seed: i
         held_out: commands that no fit sees.
         seed: of the commands.
     """
-    experiment = _experiment(TASKS[task], tension)
-    simulator = build_simulator(experiment, load_robot(TASKS[task].robot))
+    spec = _spec(TASKS[task], tension)
+    simulator = build_robot_simulator(spec)
     commands = _commands(task, actions, held_out, seed)
-    return build_problem(build_model(experiment, simulator, [_blank(simulator, commands, actions, tension)]))
+    return build_problem(build_model(spec, simulator, [_blank(simulator, commands, actions, tension)]))
 
 
 def draw_truth(task: Task, kind: str, names: tuple[str, ...], rng: np.random.Generator) -> dict[str, float]:
@@ -108,7 +109,7 @@ def excited(task: Task, problem: CalibrationProblem, truth: Mapping[str, float])
     return tuple(name for name in task.ranges if name not in task.cube or way > PUSHED)
 
 
-def _experiment(task: Task, tension: bool) -> Experiment:
+def _spec(task: Task, tension: bool) -> ModelSpec:
     priors = {name: {"distribution": "Uniform", "low": low, "high": high} for name, (low, high) in task.ranges.items()}
     noise = {"observation_noise": POSITION_NOISE, "noise_correlation_time": 0.04}
     noise |= {"tension_noise": TENSION_NOISE} if tension else {}
@@ -118,19 +119,15 @@ def _experiment(task: Task, tension: bool) -> Experiment:
         "object_turn_noise": TURN_NOISE,
         "object_correlation_time": CORRELATION_TIME,
     }
-    return Experiment.model_validate(
-        {
-            "robot": task.robot,
-            "simulator": {"push": bool(task.cube), "threads": None},
-            "model": {
-                "noise": "ar1",
-                "tension": tension,
-                "object_pose": bool(task.cube),
-                "fixed": known if task.cube else {},
-                "priors": priors
-                | {name: {"distribution": "LogNormal", "median": size, "sigma": 0.5} for name, size in noise.items()},
-            },
-        }
+    sizes = {name: {"distribution": "LogNormal", "median": size, "sigma": 0.5} for name, size in noise.items()}
+    return ModelSpec(
+        load_robot(task.robot),
+        named=task.robot,
+        simulator=SimulatorTable(push=bool(task.cube)),
+        noise="ar1",
+        channels=DataChannels(tension=tension, object_pose=bool(task.cube)),
+        fixed=known if task.cube else {},
+        priors=priors | sizes,
     )
 
 
@@ -151,10 +148,10 @@ def _commands(task: str, actions: int, held_out: bool, seed: int) -> Commands:
     walks = [random_walk(table, channels, rng) for _ in range(WALKS if chosen.cube else 1)]
     if len(walks) == 1:
         return walks[0]
-    experiment = _experiment(chosen, False)
-    simulator = build_simulator(experiment, load_robot(chosen.robot))
+    spec = _spec(chosen, False)
+    simulator = build_robot_simulator(spec)
     recordings = [_blank(simulator, walk, actions, False, f"walk_{i}") for i, walk in enumerate(walks)]
-    problem = build_problem(build_model(experiment, simulator, recordings))
+    problem = build_problem(build_model(spec, simulator, recordings))
     middle = {name: 0.5 * sum(ends) for name, ends in chosen.ranges.items()} | NOISE
     seen = problem.observe({name: jnp.array([middle[name]]) for name in problem.names})
     return walks[int(np.argmax(np.nan_to_num(_ways(np.asarray(seen.object_pose))[0])))]

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -21,7 +21,7 @@ from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace, deviations, spread_of
 from rfdropo_bayes.cautions import Caution, Code
-from rfdropo_bayes.data import Trajectory, load_recordings
+from rfdropo_bayes.data import DataSpec, Trajectory, load_recordings
 from rfdropo_bayes.data.spec import RecordingEntry
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import group_of, in_group
@@ -44,10 +44,11 @@ from rfdropo_bayes.prediction.predictive import (
 )
 from rfdropo_bayes.report import build_summary
 from rfdropo_bayes.report.run_folder import CONFIG, POSTERIOR
+from rfdropo_bayes.tables import changed
 from rfdropo_bayes.workflow.assembly import pooling
 from rfdropo_bayes.workflow.calibrated import Calibration
 from rfdropo_bayes.workflow.calibration import gather_facts, with_ratios
-from rfdropo_bayes.workflow.experiment import Experiment, NoiseTable
+from rfdropo_bayes.workflow.experiment import NoiseTable
 from rfdropo_bayes.workflow.experiment_file import describe
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
@@ -97,16 +98,15 @@ def adapt(
     """
     model = model_of(fit)
     head, rest = _parted(recording, seconds)
-    day = group_of(recording.name, model.experiment.model.groups) if group is None else group
+    day = group_of(recording.name, model.spec.groups) if group is None else group
     left = model_error_of(fit.record)
-    adapted = _experiment(model.experiment, left, recording, group, entry)
-    moved = Model.of_experiment(adapted, model.folder)
+    moved = _adapted(model, left, recording, group, entry)
     space = day_space(fitted_parts(fit)[1], moved, [head.name], day, fit.record.attrs[FITTED])
     own = _own_of_day(fit.record, space, recording.name, day)
     settings: dict[str, Any] = {"tables": moved.tables(), "folder": model.folder, "texts": moved.texts()}
     settings |= {"data": hashes([recording, *test]), "options": {"run": fit.folder, "seconds": seconds, "group": group}}
     tested = [*([] if rest is None else [rest]), *test]
-    run = partial(_adapt, fit, moved, space, own, head, tested, day, left, draws, seed, show)
+    run = partial(_adapt, Day(fit, moved, space, own, head, tested, day, left), draws, seed, show)
     if out is None:
         return run(None, describe(moved.tables()))
     with run_folder(Path(out), "adapt", **settings, overwrite=overwrite) as folder:
@@ -115,22 +115,30 @@ def adapt(
     return found
 
 
-def _adapt(
-    fit: Calibration,
-    model: Model,
-    space: ParameterSpace,
-    own: Sequence[Parameter],
-    head: Trajectory,
-    tested: Sequence[Trajectory],
-    day: str,
-    left: ModelError,
-    draws: int,
-    seed: int,
-    show: bool | None,
-    out: Path | None,
-    text: str,
-) -> Calibration:
+class Day(NamedTuple):
+    """A day that a calibration is adapted to.
+
+    Attributes:
+        fit: the calibration; model: that of the adapted run.
+        space: parameters of the body, the day and its recordings; own: those of the day.
+        head: the recording, as far as it is looked at; tested: what is predicted.
+        name: of the day.
+        left: what the model leaves of the recordings that were fitted.
+    """
+
+    fit: Calibration
+    model: Model
+    space: ParameterSpace
+    own: Sequence[Parameter]
+    head: Trajectory
+    tested: Sequence[Trajectory]
+    name: str
+    left: ModelError
+
+
+def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | None, text: str) -> Calibration:
     """Fit the day and predict its recording; ``text`` is the experiment as TOML."""
+    fit, model, space, own, head, tested, day, left = asked
     began = time.monotonic()
     simulator, key = model.simulator, jax.random.key(seed)
     fixed, _ = fitted_parts(fit)
@@ -142,9 +150,8 @@ def _adapt(
     body |= _drawn_spreads(space, body, spread_key)
     channel = Markers.gather(recordings, STATED, noise)
     program = TrajectoryModel(simulator, space, fixed, recordings, (channel,))
-    problem = CalibrationProblem(program, chunk=simulator.lanes)
     evaluations: list[float] = []
-    problem.watch = evaluations.append
+    problem = CalibrationProblem(program, chunk=simulator.lanes).telling(evaluations.append)
     with Progress("adapt", show=show) as progress:
         words = {"draws": len(next(iter(body.values()))), "parameters": len(own)}
         found = fit_day(
@@ -228,11 +235,11 @@ def run_adaptation(
     if not path.is_file():
         raise InputError(f"{run} holds no {CONFIG}", where="RUN", remedy="name the experiment file with --experiment")
     model, _ = Model.read(path, overrides)
-    read = model.experiment
+    read = model.settings
     if read.data is None:
         raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format recordings are")
     entry = RecordingEntry(observations=recording, commands=commands)
-    found = load_recordings(read.data.model_copy(update={"fit": [entry], "test": [], "missing": "mask"}), model.folder)
+    found = load_recordings(_alone(read.data, entry), model.folder)
     if len(found) > 1:
         raise InputError(f"names {len(found)} files", where=recording, remedy="adapt to one at a time")
     record = PosteriorRecord.load(run / POSTERIOR)
@@ -280,19 +287,23 @@ def model_error_of(record: PosteriorRecord) -> ModelError:
     return found
 
 
-def _experiment(
-    experiment: Experiment, left: ModelError, recording: Trajectory, group: str | None, entry: RecordingEntry | None
-) -> Experiment:
-    """The experiment file of the adapted run: its noise is known, and its group and its recording are named."""
-    groups = experiment.model.groups if group is None else in_group(recording.name, group, experiment.model.groups)
-    model = experiment.model.model_copy(update={"noise": STATED, "groups": groups})
+def _adapted(
+    model: Model, left: ModelError, recording: Trajectory, group: str | None, entry: RecordingEntry | None
+) -> Model:
+    """The model of the adapted run: its noise is known, and its group and its recording are named."""
+    groups = model.spec.groups if group is None else in_group(recording.name, group, model.spec.groups)
     noise = NoiseTable(
         standard_deviation=float(np.sqrt(np.mean(np.square(left.scale)))), correlation_time=left.correlation_time
     )
-    changes: dict[str, Any] = {"model": model, "noise": noise}
-    if entry is not None and experiment.data is not None:
-        changes["data"] = experiment.data.model_copy(update={"fit": [entry], "test": [], "missing": "mask"})
-    return experiment.model_copy(update=changes)
+    settings = model.settings
+    if entry is not None and settings.data is not None:
+        settings = replace(settings, data=_alone(settings.data, entry))
+    return Model.of(replace(model.spec, noise=STATED, stated=noise, groups=groups), settings)
+
+
+def _alone(data: DataSpec, entry: RecordingEntry) -> DataSpec:
+    """[data] with one recording to fit, whose lost markers are left out."""
+    return changed(data, where="[data]", fit=[entry], test=[], missing="mask")
 
 
 def day_space(
@@ -304,7 +315,7 @@ def day_space(
     kinds = {p.spec.name: p for p in space.parameters if p.added_to}
     added = [replace(p, recording=day, members=tuple(recordings)) for p in kinds.values()]
     spreads: list[Parameter] = []
-    for name, pooled in pooling(model.experiment, model.simulator.parameters, recordings).items():
+    for name, pooled in pooling(model.spec, model.simulator.parameters, recordings).items():
         if any(p.added_to == name for p in added):
             continue
         spec = next((p.spec for p in shared if p.spec.name == name), None)

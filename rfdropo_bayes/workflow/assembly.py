@@ -1,11 +1,11 @@
-"""From an experiment's tables to the objects they stand for."""
+"""From what a model means to the simulator, the probabilistic program and the problem that make it up."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, Literal, TypeVar
 
 from rfdropo_bayes.bayes.calibration import Batch, CalibrationProblem
 from rfdropo_bayes.bayes.channels import (
@@ -15,7 +15,6 @@ from rfdropo_bayes.bayes.channels import (
     ObjectPose,
     Series,
     Tension,
-    Weighed,
     WeighedParts,
 )
 from rfdropo_bayes.bayes.channels.motor_angle import MOTOR_ANGLE_NOISE
@@ -34,12 +33,12 @@ from rfdropo_bayes.bayes.pooling import Pooled
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.repeats import group_recordings, with_noise_of_repeats
 from rfdropo_bayes.bayes.space import ParameterSpace, build_space
-from rfdropo_bayes.data import Trajectory, find_data_file, load_recordings
+from rfdropo_bayes.data import DataSpec, Trajectory, find_data_file, load_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.mechanisms.registry import REGISTRY
-from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
 from rfdropo_bayes.simulators.engine import Engine
@@ -50,7 +49,8 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, chec
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 from rfdropo_bayes.workflow.engines import backend
-from rfdropo_bayes.workflow.experiment import Experiment, ModelTable, Workpiece, matching
+from rfdropo_bayes.workflow.experiment import matching
+from rfdropo_bayes.workflow.model_spec import DataChannels, ModelSpec
 
 Entry = TypeVar("Entry")
 AnySimulator = RobotSimulator | BlackBoxSimulator
@@ -64,57 +64,39 @@ SWITCHED = {  # channels beside the markers, by the key of [model] that makes th
 }
 
 
-def find_workpiece(experiment: Experiment, folder: Path) -> Workpiece:
-    """The robot an experiment names: one that comes with the package, or a file relative to the experiment's.
-
-    One that was put together in Python holds its robot or black box itself.
-    """
-    if not isinstance(experiment.robot, str):
-        return experiment.robot
-    beside = folder / experiment.robot
-    return load_robot(beside if beside.suffix == ".toml" and beside.is_file() else experiment.robot)
-
-
-def find_robot(experiment: Experiment, folder: Path) -> Robot:
-    """The same where only a robot will do.
+def robot_of(spec: ModelSpec) -> Robot:
+    """The robot of a model, where only a robot will do.
 
     Raises:
         InputError: a black box.
     """
-    found = find_workpiece(experiment, folder)
-    if isinstance(found, BlackBox):
-        raise InputError("a black box has no body", where=found.name, remedy="use a robot")
-    return found
+    if isinstance(spec.robot, BlackBox):
+        raise InputError("a black box has no body", where=spec.robot.name, remedy="use a robot")
+    return spec.robot
 
 
-@overload
-def build_simulator(experiment: Experiment, robot: Robot, folder: Path = Path()) -> RobotSimulator: ...
+def build_simulator(spec: ModelSpec) -> AnySimulator:
+    """The simulator of a model, mechanisms included."""
+    if isinstance(spec.robot, BlackBox):
+        return BlackBoxSimulator(spec.robot, tuple(choice.made_for(spec.robot) for choice in spec.mechanisms))
+    return build_robot_simulator(spec)
 
 
-@overload
-def build_simulator(
-    experiment: Experiment, robot: Workpiece, folder: Path = Path()
-) -> RobotSimulator | BlackBoxSimulator: ...
+def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
+    """The same where only a robot will do: body, engine and mechanisms.
 
-
-def build_simulator(
-    experiment: Experiment, robot: Workpiece, folder: Path = Path()
-) -> RobotSimulator | BlackBoxSimulator:
-    """Robot, body, engine and mechanisms; ``folder`` is that of the experiment file, for the mesh of a body."""
-    table = experiment.simulator
-    if isinstance(robot, BlackBox):
-        if experiment.model.drives:
-            raise InputError("a black box has no drives", where="[[model.drives]]", remedy="let the box have them")
-        return BlackBoxSimulator(robot, mechanisms_named(experiment.model.mechanisms, robot, folder=folder))
-    robot = with_drives(robot, experiment.model)
+    Raises:
+        InputError: a black box.
+    """
+    table, robot = spec.simulator, with_drives(robot_of(spec), spec.drives, spec.groups)
     if table.drives == "direct":
         robot = robot.without_command_timing()
     time_step = table.time_step or robot.time_step_s
-    mechanisms = mechanisms_named(experiment.model.mechanisms, robot, folder=folder)
+    mechanisms = tuple(choice.made_for(robot) for choice in spec.mechanisms)
     trunk: TrunkSimulator | MeshTrunkSimulator
     if table.body == "tetrahedra" and table.tetrahedra is not None:
         options = table.tetrahedra
-        mesh = read_tetrahedra(find_data_file(options.mesh, folder), options.unit)
+        mesh = read_tetrahedra(find_data_file(options.mesh, spec.folder), options.unit)
         bound = assemble_mesh(robot, mesh, options)
         engine = Engine(bound, time_step, backend(table, False))
         trunk = MeshTrunkSimulator(robot, engine, bound, options, time_step, mechanisms)
@@ -126,16 +108,14 @@ def build_simulator(
     return trunk.pushing() if table.push else trunk
 
 
-def with_drives(robot: Robot, table: ModelTable) -> Robot:
-    """A robot with what the experiment states of its drives, and the groups that it states it for.
+def with_drives(robot: Robot, drives: Sequence[DriveTravel], groups: Patterns) -> Robot:
+    """A robot with what an experiment states of its drives, and the groups that it states it for.
 
     Raises:
         InputError: a cable that the robot does not have.
     """
-    stated = (*robot.drives, *table.drives)
-    for drives in stated:
-        drives.columns(robot.channel_names)
-    return robot.model_copy(update={"drives": stated}).grouped(table.groups) if stated else robot
+    stated = (*robot.drives, *drives)
+    return robot.with_changes(drives=stated).grouped(groups) if stated else robot
 
 
 def with_groups(simulator: AnySimulator, groups: Patterns) -> AnySimulator:
@@ -145,31 +125,40 @@ def with_groups(simulator: AnySimulator, groups: Patterns) -> AnySimulator:
     return replace(simulator, robot=simulator.robot.grouped(groups))  # type: ignore[type-var]
 
 
-def measurement_specs(table: ModelTable) -> tuple[ParameterSpec, ...]:
+def measurement_specs(noise: str, channels: DataChannels) -> tuple[ParameterSpec, ...]:
     """Parameters of the channels that are data: the noise of the positions, and of what else is measured."""
-    noise = () if table.noise in KNOWN else noise_specs(table.noise)
-    further = [spec for key, specs in SWITCHED.items() if getattr(table, key) for spec in specs]
-    if table.noise == "white":
+    own = () if noise in KNOWN else noise_specs(noise)
+    further = [spec for key, chosen in asdict(channels).items() if chosen for spec in SWITCHED[key]]
+    if noise == "white":
         further = [spec for spec in further if spec != OBJECT_CORRELATION_TIME]
-    return (*noise, *(s for s in further if table.noise != REPEATS or s == TENSION_GAIN))
+    return (*own, *(s for s in further if noise != REPEATS or s == TENSION_GAIN))
 
 
-def fixed_values(experiment: Experiment, simulator: AnySimulator) -> dict[str, float]:
+def model_specs(spec: ModelSpec, simulator: AnySimulator) -> tuple[ParameterSpec, ...]:
+    """Every parameter of a model: of the simulator, and of the channels that are data."""
+    return simulator.parameters + measurement_specs(spec.noise, spec.channels)
+
+
+def fixed_values(spec: ModelSpec, simulator: AnySimulator) -> dict[str, float]:
     """Values of [model.fixed], checked against names and hard bounds."""
-    table = experiment.model
-    specs = simulator.parameters + measurement_specs(table)
-    check_used(table.fixed, experiment, simulator, where="[model.fixed]")
-    by_name = {spec.name: spec for spec in specs}
-    given = expand_groups(table.fixed, specs)
+    specs = model_specs(spec, simulator)
+    check_used(spec.fixed, spec, simulator, where="[model.fixed]")
+    by_name = {each.name: each for each in specs}
+    given = expand_groups(spec.fixed, specs)
     return {name: check_value(by_name[name], value, where="[model.fixed]") for name, value in given.items()}
 
 
-def check_used(names: Iterable[str], experiment: Experiment, simulator: AnySimulator, *, where: str) -> None:
+def physical_values(spec: ModelSpec, simulator: AnySimulator) -> dict[str, float]:
+    """Those of `fixed_values` that the simulator is given."""
+    known = {each.name for each in simulator.parameters}
+    return {name: value for name, value in fixed_values(spec, simulator).items() if name in known}
+
+
+def check_used(names: Iterable[str], spec: ModelSpec, simulator: AnySimulator, *, where: str) -> None:
     """Raise InputError for a parameter that the model does not have, and say what would bring it in."""
-    table = experiment.model
-    specs = simulator.parameters + measurement_specs(table)
-    known = [spec.name for spec in specs]
-    further = {f"set [model] {key} = true": found for key, found in SWITCHED.items() if not getattr(table, key)}
+    specs, chosen = model_specs(spec, simulator), asdict(spec.channels)
+    known = [each.name for each in specs]
+    further = {f"set [model] {key} = true": found for key, found in SWITCHED.items() if not chosen[key]}
     further['let the noise last, [model] noise = "auto"'] = (OBJECT_CORRELATION_TIME,)
     further |= {f'set [model] noise = "{model}"': noise_specs(model) for model in NOISE_MODELS}
     for mechanism in mechanisms_named(REGISTRY, simulator.robot):
@@ -178,16 +167,16 @@ def check_used(names: Iterable[str], experiment: Experiment, simulator: AnySimul
         if name in known or any(each.startswith(f"{name}_") for each in known):
             continue
         for remedy, absent in further.items():
-            if name in [spec.name for spec in absent]:
+            if name in [each.name for each in absent]:
                 raise InputError(f"the model has no parameter {name!r}", where=where, remedy=f"{remedy}, or remove it")
         check_names([name], specs, where=where)
 
 
-def load_data(experiment: Experiment, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
+def load_data(data: DataSpec | None, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
     """The recordings of one role, ``"fit"`` or ``"test"``."""
-    if experiment.data is None:
+    if data is None:
         raise InputError("the experiment has no [data]", remedy="name the recordings to fit")
-    return load_recordings(experiment.data, folder, role=role)
+    return load_recordings(data, folder, role=role)
 
 
 def expand_groups(table: Mapping[str, Entry], specs: Sequence[ParameterSpec]) -> dict[str, Entry]:
@@ -201,38 +190,37 @@ def expand_groups(table: Mapping[str, Entry], specs: Sequence[ParameterSpec]) ->
 
 
 def pooling(
-    experiment: Experiment, specs: Sequence[ParameterSpec], fitted: Sequence[str], others: Sequence[str] = ()
+    spec: ModelSpec, specs: Sequence[ParameterSpec], fitted: Sequence[str], others: Sequence[str] = ()
 ) -> dict[str, Pooled]:
     """The parameters of [model.per_group], with the recordings of each group that has one to fit.
 
     Raises:
         InputError: a name that is none of ``specs``, those of the simulator: noise is the same for all recordings.
     """
-    groups = gather_groups([*fitted, *others], experiment.model.groups)
+    groups = gather_groups([*fitted, *others], spec.groups)
     known = {group: members for group, members in groups.items() if set(members) & set(fitted)}
     found: dict[str, Pooled] = {}
-    for family, spread in experiment.model.per_group.items():
+    for family, spread in spec.per_group.items():
         members = expand_groups({family: spread}, specs)
         check_names(members, specs, where="[model.per_group]")
         found |= {name: Pooled(spread, known, family) for name in members}
     return found
 
 
-def build_model(experiment: Experiment, simulator: AnySimulator, trajectories: Sequence[Trajectory]) -> TrajectoryModel:
-    """The probabilistic program of an experiment for the given recordings.
+def build_model(spec: ModelSpec, simulator: AnySimulator, trajectories: Sequence[Trajectory]) -> TrajectoryModel:
+    """The probabilistic program of a model for the given recordings.
 
     Raises:
         InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
     """
     recordings = gather_recordings(simulator, trajectories)
-    specs = simulator.parameters + measurement_specs(experiment.model)
-    space = model_space(experiment, simulator, specs, recordings.names)
-    channels = gather_channels(experiment, simulator, trajectories, recordings, space.names)
-    return TrajectoryModel(simulator, space, fixed_values(experiment, simulator), recordings, channels)
+    space = model_space(spec, simulator, model_specs(spec, simulator), recordings.names)
+    channels = gather_channels(spec, simulator, trajectories, recordings, space.names)
+    return TrajectoryModel(simulator, space, fixed_values(spec, simulator), recordings, channels)
 
 
 def model_space(
-    experiment: Experiment,
+    spec: ModelSpec,
     simulator: AnySimulator,
     specs: Sequence[ParameterSpec],
     fitted: Sequence[str],
@@ -244,7 +232,7 @@ def model_space(
     The noise parameters are always inferred, unless [model.fixed] holds them; the gain of tensions with a prior only.
 
     Args:
-        experiment: says which have a prior.
+        spec: says which have a prior.
         simulator: with all mechanisms.
         specs: parameters that may be inferred.
         fitted: names of the recordings that are fitted; others: of those that are not, which may belong to groups.
@@ -253,29 +241,29 @@ def model_space(
     Raises:
         InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
     """
-    table, fixed = experiment.model, fixed_values(experiment, simulator)
-    check_used(table.priors, experiment, simulator, where="[model.priors]")
-    check_used(table.per_recording, experiment, simulator, where="[model.per_recording]")
-    known, last = {spec.name for spec in specs}, [spec.name for m in later for spec in m.parameters]
-    added = [spec.name for mechanism in simulator.mechanisms if mechanism not in later for spec in mechanism.parameters]
+    fixed = fixed_values(spec, simulator)
+    check_used(spec.priors, spec, simulator, where="[model.priors]")
+    check_used(spec.per_recording, spec, simulator, where="[model.per_recording]")
+    known, last = {each.name for each in specs}, [each.name for m in later for each in m.parameters]
+    added = [each.name for mechanism in simulator.mechanisms if mechanism not in later for each in mechanism.parameters]
     measured = [s.name for s in specs if s not in simulator.parameters and s != TENSION_GAIN]
-    every = simulator.parameters + measurement_specs(table)
-    given = {name: entry for name, entry in expand_groups(table.priors, every).items() if name in known}
+    every = model_specs(spec, simulator)
+    given = {name: entry for name, entry in expand_groups(spec.priors, every).items() if name in known}
     both = sorted(set(fixed) & set(given))
     if both:
         raise InputError(f"{both[0]!r} has a prior and a fixed value", where="[model]", remedy="remove one of them")
-    shared = expand_groups(table.per_recording, every)
+    shared = expand_groups(spec.per_recording, every)
     defaults = [name for name in (*added, *shared, *measured) if name not in fixed and name not in given]
     priors: dict[str, Any] = {name: given.get(name, {}) for name in (*given, *defaults) if name not in last}
     priors |= {name: given.get(name, {}) for name in last if name not in fixed and name not in priors}
     scopes = {
         name: matching(fitted, patterns, where=f"[model.per_recording] {name}") for name, patterns in shared.items()
     }
-    return build_space(specs, priors, scopes, fitted, pooled=pooling(experiment, simulator.parameters, fitted, others))
+    return build_space(specs, priors, scopes, fitted, pooled=pooling(spec, simulator.parameters, fitted, others))
 
 
 def gather_channels(
-    experiment: Experiment,
+    spec: ModelSpec,
     simulator: AnySimulator,
     trajectories: Sequence[Trajectory],
     recordings: RecordingSet,
@@ -287,31 +275,30 @@ def gather_channels(
     ``inferred`` are the names of parameters, of which some may be weighed; ``fitted`` is the number of recordings, the
     first ones, that need what [model] asks for; all by default.
     """
-    table, length = experiment.model, recordings.time.shape[1]
-    stated = stated_noise(experiment, recordings, trajectories[0]) if table.noise == STATED else None
-    channels: list[Channel] = [Markers.gather(recordings, table.noise, stated)]
-    if table.tension:
+    chosen, length = spec.channels, recordings.time.shape[1]
+    stated = stated_noise(spec, recordings, trajectories[0]) if spec.noise == STATED else None
+    channels: list[Channel] = [Markers.gather(recordings, spec.noise, stated)]
+    if chosen.tension:
         channels.append(Tension.gather(simulator, trajectories, length, fitted))
-    if table.motor_angle:
+    if chosen.motor_angle:
         channels.append(MotorAngle.gather(trajectories, length, fitted))
-    if table.object_pose:
-        channels.append(ObjectPose.gather(simulator, trajectories, length, lasting=table.noise != "white"))
-    if table.noise == REPEATS:
+    if chosen.object_pose:
+        channels.append(ObjectPose.gather(simulator, trajectories, length, lasting=spec.noise != "white"))
+    if spec.noise == REPEATS:
         groups = group_recordings(recordings, trajectories)
         channels = [with_noise_of_repeats(channel, groups) for channel in channels if isinstance(channel, Series)]
-    if table.weighed:
-        entries = (Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed)
-        channels.append(WeighedParts(tuple(entries)).named(inferred))
+    if spec.weighed:
+        channels.append(WeighedParts(spec.weighed).named(inferred))
     return tuple(channels)
 
 
-def stated_noise(experiment: Experiment, recordings: RecordingSet, first: Trajectory) -> Autoregression:
-    """The noise of the positions that the experiment file states.
+def stated_noise(spec: ModelSpec, recordings: RecordingSet, first: Trajectory) -> Autoregression:
+    """The noise of the positions that is stated.
 
     Raises:
         InputError: none is stated.
     """
-    noise = experiment.noise
+    noise = spec.stated
     if noise is None or noise.standard_deviation == 0.0:
         raise InputError("no noise is stated", where='[model] noise = "stated"', remedy="give [noise]")
     values = {OBSERVATION_NOISE.name: noise.standard_deviation}

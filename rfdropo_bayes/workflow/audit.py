@@ -31,6 +31,7 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
+from rfdropo_bayes.mechanisms.registry import source_of
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.audit_page import render_audit, shown
 from rfdropo_bayes.report.run_folder import SUMMARY
@@ -41,12 +42,11 @@ from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechanism, obstacle
 from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
-from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.tables import changed, parse_table
 from rfdropo_bayes.workflow.assembly import (
     AnySimulator,
     build_simulator,
     expand_groups,
-    find_workpiece,
     fixed_values,
     gather_channels,
     measurement_specs,
@@ -56,10 +56,11 @@ from rfdropo_bayes.workflow.assembly import (
 from rfdropo_bayes.workflow.audited import Audit
 from rfdropo_bayes.workflow.between import Between, extend_groups, find_groups
 from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.experiment import AuditTable, Experiment, NoiseTable, Workpiece
+from rfdropo_bayes.workflow.experiment import AuditTable, NoiseTable
 from rfdropo_bayes.workflow.experiment_file import code_placed, describe, self_contained
 from rfdropo_bayes.workflow.files import hashes, run_folder
-from rfdropo_bayes.workflow.model import Model, source_of
+from rfdropo_bayes.workflow.model import Model
+from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 Workshop = dict[str, Lanes]
 
@@ -114,13 +115,13 @@ def audit(
         InputError: bad input, before anything long has started.
     """
     model = _asked(model, noise, options)
-    experiment, folder, title = model.experiment, model.folder, title or model.name
-    deadline = Deadline(experiment.audit.minutes)
+    spec, table, title = model.spec, model.settings.audit, title or model.name
+    deadline = Deadline(table.minutes)
     groups = None
     if between is not None:
-        groups, runs, test = find_groups(between, experiment.model.groups, runs, test)
+        groups, runs, test = find_groups(between, spec.groups, runs, test)
     start = start_values(base)
-    question = build_question(experiment, folder, runs, test, seed, start=start, workshop=workshop, groups=groups)
+    question = build_question(spec, table, runs, test, seed, start=start, workshop=workshop, groups=groups)
     tables = {**model.tables(), "title": title, "seed": seed} if tables is None else tables
 
     def found(out: Path | None) -> Audit:
@@ -132,7 +133,7 @@ def audit(
 
     if out is None:
         return found(None)
-    settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes([*runs, *test])}
+    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes([*runs, *test])}
     given: dict[str, Any] = {"base": base.folder if isinstance(base, Calibration) else base, "seed": seed}
     given |= {} if groups is None else {"between": {name: list(own) for name, own in groups.members.items()}}
     settings |= {"options": given, "texts": model.texts()}
@@ -151,21 +152,21 @@ def _audited(
     seen, shape = shown(answer), robot_shape(model.robot) if isinstance(model.robot, Robot) else None
     page = render_audit(seen, content, title, describe(tables), shape)
     extended = extended_tables(dict(tables), answer, model.folder, out)
-    made = None if isinstance(model.experiment.robot, str) else model.experiment.robot
+    made = None if model.spec.named else model.robot
     return Audit(content, extended, page, made, out or model.folder, out, seen)
 
 
 def _asked(model: Model, noise: Mapping[str, float] | None, options: Mapping[str, Any]) -> Model:
     """The model with the tables [audit] and [noise] of a call."""
-    changes: dict[str, Any] = {}
+    spec, settings = model.spec, model.settings
     if options:
-        chosen = {**model.experiment.audit.model_dump(exclude_unset=True), **options}
+        chosen = {**settings.audit.model_dump(exclude_unset=True), **options}
         if "candidates" in chosen:
             chosen["candidates"] = [source_of(candidate) for candidate in chosen["candidates"]]
-        changes["audit"] = parse_table(AuditTable, chosen, where="audit")
+        settings = replace(settings, audit=parse_table(AuditTable, chosen, where="audit"))
     if noise is not None:
-        changes["noise"] = parse_table(NoiseTable, noise, where="audit, noise")
-    return Model.of_experiment(model.experiment.model_copy(update=changes), model.folder) if changes else model
+        spec = replace(spec, stated=parse_table(NoiseTable, noise, where="audit, noise"))
+    return Model.of(spec, settings)
 
 
 def run_audit(
@@ -185,9 +186,9 @@ def run_audit(
         model,
         model.recordings("fit"),
         test=model.recordings("test"),
-        seed=model.experiment.seed if seed is None else seed,
+        seed=model.settings.seed if seed is None else seed,
         out=out,
-        title=model.experiment.title or path.stem,
+        title=model.settings.title or path.stem,
         tables=tables,
         **options,
     )
@@ -195,8 +196,8 @@ def run_audit(
 
 
 def build_question(
-    experiment: Experiment,
-    folder: Path,
+    spec: ModelSpec,
+    table: AuditTable,
     fitted: Sequence[Trajectory],
     tested: Sequence[Trajectory],
     seed: int,
@@ -206,54 +207,51 @@ def build_question(
     names: Sequence[str] | None = None,
     groups: Groups | None = None,
 ) -> Question:
-    """The experiment's base model with every candidate of the library in it, at its null value.
+    """The base model with every candidate of the library in it, at its null value.
 
-    ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names`` are the candidates,
-    where it is not all; ``groups`` of recordings are compared.
+    ``table`` is [audit]; ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names``
+    are the candidates, where it is not all; ``groups`` of recordings are compared.
     """
-    spreads = experiment.model.per_group
+    spreads, robot = spec.per_group, spec.robot
     if groups is not None:  # what the groups do not share is to be found
-        experiment = experiment.model_copy(update={"model": experiment.model.model_copy(update={"per_group": {}})})
-    robot = find_workpiece(experiment, folder)
+        spec = replace(spec, per_group={})
     trajectories = [*fitted, *tested]
     left_out: dict[str, str] = {}
     library = names is None
     if names is None:
-        names = candidate_names(experiment, robot)
-        left_out = obstacles(experiment, names, robot, folder, trajectories[0])
+        names = candidate_names(spec, table)
+        left_out = obstacles(spec, names, trajectories[0])
         names = [name for name in names if name not in left_out]
-    simulator = build_simulator(_with(experiment, names), robot, folder)
-    model, base = _model(experiment, simulator, trajectories, len(fitted), names)
-    added = simulator.mechanisms[len(experiment.model.mechanisms) :]
+    simulator = build_simulator(spec.with_mechanisms(*names))
+    model, base = _model(spec, simulator, trajectories, len(fitted))
+    added = simulator.mechanisms[len(spec.mechanisms) :]
     index = {p.spec.name: i for i, p in enumerate(model.space.parameters)}
     candidates = [
         Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
         for name, m in zip(names, added, strict=True)
-        if name not in experiment.audit.exclude
+        if name not in table.exclude
     ]
     specs = simulator.parameters
     if library:
         of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
         plain, stated = [s for s in specs if s.name not in of_candidates], expand_groups(spreads, specs)
         model, candidates = _with_own(model, base, plain, candidates, groups, stated)
-        candidates = [c for c in candidates if c.name not in experiment.audit.exclude]
+        candidates = [c for c in candidates if c.name not in table.exclude]
     nominal, limits = {s.name: s.nominal for s in specs}, {s.name: (s.low, s.high) for s in specs}
     coordinates = Coordinates(model.space, base, tuple(nominal), nominal, model.fixed, limits)
-    made = partial(
-        _lanes_in, {} if workshop is None else workshop, names, robot, folder, trajectories, model, coordinates
-    )
+    made = partial(_lanes_in, {} if workshop is None else workshop, names, trajectories, model, coordinates)
     return Question(
-        made(experiment)[0],
-        None if isinstance(robot, BlackBox) else made(_finer(experiment, robot)),
+        made(spec)[0],
+        None if isinstance(robot, BlackBox) else made(_finer(spec, robot)),
         coordinates,
         model,
         list(fitted),
         candidates,
-        _stated(experiment, model, fitted[0]),
+        _stated(spec, model, fitted[0]),
         start,
-        Rules(bootstraps=experiment.audit.bootstraps, minutes=experiment.audit.minutes),
+        Rules(bootstraps=table.bootstraps, minutes=table.minutes),
         seed,
-        {name: why for name, why in left_out.items() if name not in experiment.audit.exclude},
+        {name: why for name, why in left_out.items() if name not in table.exclude},
         groups,
     )
 
@@ -275,7 +273,7 @@ def _with_own(
     return replace(model, space=space), [*candidates, *own]
 
 
-def candidate_names(experiment: Experiment, robot: Workpiece) -> list[str]:
+def candidate_names(spec: ModelSpec, table: AuditTable) -> list[str]:
     """What may be in the model: the registry and the experiment's own, less what is in its base model.
 
     Excluded ones are among them, so that what is compiled does not depend on what is excluded.
@@ -283,32 +281,29 @@ def candidate_names(experiment: Experiment, robot: Workpiece) -> list[str]:
     Raises:
         InputError: a name to exclude that is not there.
     """
-    table = experiment.audit
     known = [*REGISTRY, *(name for name in table.candidates if name not in REGISTRY)]
-    own = robot.parameter_table() if isinstance(robot, Robot) else {}
+    own = spec.robot.parameter_table() if isinstance(spec.robot, Robot) else {}
     for name in table.exclude:
         if name not in known and not any(parameter.startswith(f"{name}_") for parameter in own):
             raise InputError(f"unknown mechanism {name!r}", where="[audit] exclude", remedy=nearest(name, known))
-    return [name for name in known if name not in experiment.model.mechanisms]
+    return [name for name in known if name not in spec.sources]
 
 
-def obstacles(
-    experiment: Experiment, names: Sequence[str], robot: Workpiece, folder: Path, recording: Trajectory
-) -> dict[str, str]:
+def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> dict[str, str]:
     """Which of the candidates cannot run on the experiment's body and engine, and why.
 
     A mechanism of the library says where it runs; one of a user's own is tried, too.
     """
-    simulator = build_simulator(experiment, robot, folder)
+    simulator = build_simulator(spec)
     engine = str(simulator.description["engine"])
     commands = gather_recordings(simulator, [recording]).commands
     found = {}
     for name in names:
-        (mechanism,) = mechanisms_named([name], robot, folder=folder, where="[audit] candidates")
-        body = BLACK_BOX if isinstance(robot, BlackBox) else experiment.simulator.body
+        (mechanism,) = mechanisms_named([name], spec.robot, folder=spec.folder, where="[audit] candidates")
+        body = BLACK_BOX if isinstance(spec.robot, BlackBox) else spec.simulator.body
         why = obstacle(mechanism, body, engine)
         if why is None and name not in REGISTRY:
-            why = _refusal(build_simulator(_with(experiment, [name]), robot, folder), commands)
+            why = _refusal(build_simulator(spec.with_mechanisms(name)), commands)
         if why is not None:
             found[name] = why
     return found
@@ -323,51 +318,41 @@ def _refusal(simulator: AnySimulator, commands: Commands) -> str | None:
     return None
 
 
-def _with(experiment: Experiment, names: Sequence[str]) -> Experiment:
-    """The experiment with more mechanisms."""
-    model = experiment.model.model_copy(update={"mechanisms": [*experiment.model.mechanisms, *names]})
-    return experiment.model_copy(update={"model": model})
-
-
 def _lanes_in(
     workshop: Workshop,
     names: Sequence[str],
-    robot: Workpiece,
-    folder: Path,
     trajectories: Sequence[Trajectory],
     model: TrajectoryModel,
     coordinates: Coordinates,
-    experiment: Experiment,
+    spec: ModelSpec,
 ) -> tuple[Lanes, Commands]:
     """As `_lanes`; those that the workshop has are not made again."""
     fields, markers = _fields(model), model.recordings.marker_index.tolist()
-    key = repr((experiment.robot, experiment.simulator, names, markers, coordinates.fixed, fields))
-    found, commands = _lanes(experiment, names, robot, folder, trajectories, coordinates, workshop.get(key), fields)
+    key = repr((spec.robot, spec.simulator, names, markers, coordinates.fixed, fields))
+    found, commands = _lanes(spec, names, trajectories, coordinates, workshop.get(key), fields)
     workshop[key] = found
     return found, commands
 
 
 def _lanes(
-    experiment: Experiment,
+    spec: ModelSpec,
     names: Sequence[str],
-    robot: Workpiece,
-    folder: Path,
     trajectories: Sequence[Trajectory],
     coordinates: Coordinates,
     made: Lanes | None,
     fields: Sequence[str],
 ) -> tuple[Lanes, Commands]:
     """The simulator with all candidates; those that would slow every rollout down get a simulator of their own."""
-    whole = build_simulator(_with(experiment, names), robot, folder)
+    whole = build_simulator(spec.with_mechanisms(*names))
     recordings = gather_recordings(whole, trajectories)
     if made is not None:
         return made, recordings.commands
     slow = {m.name for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _costly(whole, m)}
-    added = whole.mechanisms[len(experiment.model.mechanisms) :]
+    added = whole.mechanisms[len(spec.mechanisms) :]
     kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
     if len(kept) == len(names):
         return _brisk(whole, recordings.marker_index, fields), recordings.commands
-    fast = _brisk(build_simulator(_with(experiment, kept), robot, folder), recordings.marker_index, fields)
+    fast = _brisk(build_simulator(spec.with_mechanisms(*kept)), recordings.marker_index, fields)
     null = dict(coordinates.nominal) | dict(coordinates.fixed) | coordinates.named(coordinates.null)
     routed = RoutedLanes(fast, _brisk(whole, recordings.marker_index, fields), null)
     return routed, recordings.commands
@@ -390,37 +375,35 @@ def _costly(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
     return mechanism.embody(values, plain, simulator.assembly.system.body).effects.rubs
 
 
-def _finer(experiment: Experiment, robot: Robot) -> Experiment:
-    """The experiment with half the time step, and twice the layers of a body of layers; a mesh stays as it is."""
-    table = experiment.simulator
+def _finer(spec: ModelSpec, robot: Robot) -> ModelSpec:
+    """The model with half the time step, and twice the layers of a body of layers; a mesh stays as it is."""
+    table = spec.simulator
     finer: dict[str, Any] = {"time_step": (table.time_step or robot.time_step_s) / FINER}
     if table.body == "layered":
         finer["refine"] = min(FINER * table.refine, 16)
     elif table.tetrahedra is not None and table.tetrahedra.drive_rate is not None:  # which is per step
-        finer["tetrahedra"] = table.tetrahedra.model_copy(update={"drive_rate": table.tetrahedra.drive_rate / FINER})
-    changed = table.model_copy(update=finer)
-    return experiment.model_copy(update={"simulator": changed})
+        rate = table.tetrahedra.drive_rate / FINER
+        finer["tetrahedra"] = changed(table.tetrahedra, where="[simulator.tetrahedra]", drive_rate=rate)
+    return replace(spec, simulator=changed(table, where="[simulator]", **finer))
 
 
 def _model(
-    experiment: Experiment,
+    spec: ModelSpec,
     simulator: AnySimulator,
     trajectories: Sequence[Trajectory],
     fitted: int,
-    names: Sequence[str],
 ) -> tuple[TrajectoryModel, int]:
-    """The experiment's model with all candidates, and how many of its parameters are of the base model, which come
+    """The model with all candidates, and how many of its parameters are of the base model, which come
     first. The noise of its channels is known, so that its parameters are not among them."""
-    table, recordings = experiment.model, gather_recordings(simulator, trajectories)
-    added = simulator.mechanisms[len(table.mechanisms) :]
-    gains = [spec for spec in measurement_specs(table) if spec == TENSION_GAIN]
+    recordings, added = gather_recordings(simulator, trajectories), simulator.mechanisms[len(spec.mechanisms) :]
+    gains = [each for each in measurement_specs(spec.noise, spec.channels) if each == TENSION_GAIN]
     specs, groups = (*simulator.parameters, *gains), (recordings.names[:fitted], recordings.names[fitted:])
-    space = model_space(experiment, simulator, specs, *groups, later=added)
+    space = model_space(spec, simulator, specs, *groups, later=added)
     space = space.holding(space.typical_scales)  # evidences are compared at one spread between groups
-    of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
+    of_candidates = {each.name for mechanism in added for each in mechanism.parameters}
     base = sum(p.spec.name not in of_candidates for p in space.parameters)
-    channels = gather_channels(experiment, simulator, trajectories, recordings, space.names, fitted)
-    return TrajectoryModel(simulator, space, fixed_values(experiment, simulator), recordings, channels), base
+    channels = gather_channels(spec, simulator, trajectories, recordings, space.names, fitted)
+    return TrajectoryModel(simulator, space, fixed_values(spec, simulator), recordings, channels), base
 
 
 def _fields(model: TrajectoryModel) -> list[str]:
@@ -429,15 +412,15 @@ def _fields(model: TrajectoryModel) -> list[str]:
     return ["position" if name == "markers" else name for name in series]
 
 
-def _stated(experiment: Experiment, model: TrajectoryModel, first: Trajectory) -> Stacked | None:
-    """The noise that the experiment file states, for recordings without repeats: that of the positions under [noise],
+def _stated(spec: ModelSpec, model: TrajectoryModel, first: Trajectory) -> Stacked | None:
+    """The noise that the experiment states, for recordings without repeats: that of the positions under [noise],
     that of other channels under [model.fixed]; None where that of any channel is not stated."""
-    if experiment.noise is None or experiment.noise.standard_deviation == 0.0:
+    if spec.stated is None or spec.stated.standard_deviation == 0.0:
         return None
-    parts = [stated_noise(experiment, model.recordings, first)]
+    parts = [stated_noise(spec, model.recordings, first)]
     for channel in model.channels[1:]:
         if isinstance(channel, Series):
-            known = [model.fixed.get(spec.name) for spec in channel.noise_specs]
+            known = [model.fixed.get(each.name) for each in channel.noise_specs]
             if any(value is None for value in known):
                 return None
             parts.append(channel.stated(model.fixed, float(first.dataset.attrs["sample_time"])))

@@ -21,6 +21,7 @@ from rfdropo_bayes.workflow.calibrated import axes_or_new
 from rfdropo_bayes.workflow.experiment import Experiment
 from rfdropo_bayes.workflow.experiment_file import describe
 from rfdropo_bayes.workflow.model import Model
+from rfdropo_bayes.workflow.model_spec import RunSettings, Workpiece, spec_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +37,7 @@ class Audit:
         content: of audit.json.
         tables: of the experiment extended by what was adopted, as a file has them.
         page: of the report, HTML.
-        robot: that was audited: a name or path, or the object itself.
+        robot: that was audited, where it was made in Python; None where the tables name it.
         base: folder that paths in the tables are relative to.
         folder: that it was written to, if any.
         shown: what its figures show; None where it was read from files.
@@ -45,7 +46,7 @@ class Audit:
     content: Mapping[str, Any]
     tables: Mapping[str, Any]
     page: str
-    robot: Any
+    robot: Workpiece | None
     base: Path
     folder: Path | None = None
     shown: Shown | None = None
@@ -86,9 +87,7 @@ class Audit:
     def extended(self) -> Model:
         """The model with the mechanisms that unseen recordings support, with priors for their parameters."""
         experiment = parse_table(Experiment, self.tables, where=EXTENDED)
-        if self.robot is not None:
-            experiment = experiment.model_copy(update={"robot": self.robot})
-        return Model.of_experiment(experiment, self.base)
+        return Model.of(spec_of(experiment, self.base, self.robot), RunSettings.of(experiment))
 
     def plot_residual(self, against: str = "time", ax: Axes | None = None) -> Axes:
         """Draw what the base model leaves of the fitted recordings, beside what might have caused it.

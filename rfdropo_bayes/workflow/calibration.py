@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -40,9 +40,10 @@ from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
 from rfdropo_bayes.report.run_folder import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import read_summary
-from rfdropo_bayes.robots import Robot, robot_shape
+from rfdropo_bayes.robots import robot_shape
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.experiment import Experiment, InferenceTable
+from rfdropo_bayes.workflow.experiment import InferenceTable
 from rfdropo_bayes.workflow.experiment_file import describe
 from rfdropo_bayes.workflow.files import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
@@ -97,7 +98,7 @@ def calibrate(
     if tables is None:
         options = {key: value for key, value in dataclasses.asdict(config).items() if value is not None}
         tables = {**model.tables(), "title": title, "seed": seed, "inference": {"method": name, **options}}
-    fit = partial(_fit, model, problem, config, runs, test, seed, title)
+    fit = partial(_fit, Fitting(model, problem, config, runs, test, seed, title))
     if out is None:
         return fit(None, describe(tables), resume=False, show=show)
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(recordings)}
@@ -108,30 +109,30 @@ def calibrate(
     return found
 
 
-def _fit(
-    model: Model,
-    problem: CalibrationProblem,
-    config: Any,
-    runs: Sequence[Trajectory],
-    test: Sequence[Trajectory],
-    seed: int,
-    title: str,
-    out: Path | None,
-    text: str,
-    *,
-    resume: bool,
-    show: bool | None,
-) -> Calibration:
+class Fitting(NamedTuple):
+    """What is fitted to what, by which method; see `calibrate`."""
+
+    model: Model
+    problem: CalibrationProblem
+    config: Any
+    runs: Sequence[Trajectory]
+    test: Sequence[Trajectory]
+    seed: int
+    title: str
+
+
+def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: bool | None) -> Calibration:
     """Run the method; ``text`` is the experiment as TOML, ``out`` the folder for log and checkpoints."""
+    model, problem, config, runs, test, seed, title = asked
     method = method_of(config)
     key, predicting = jax.random.split(jax.random.key(seed))
     log, kept = (None, None) if out is None else (out / LOG, out / CHECKPOINTS)
     with Progress(method, show=show, log=log, budget=getattr(config, "rollouts", None)) as progress:
-        problem.watch = progress.spend
+        problem = problem.telling(progress.spend)
         result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
     problem = problem.holding(result.held)
     attributes = {**_attributes(model.name, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
-    record, unmatched = record_posterior(problem, result, test, predicting, attributes, model.experiment.model.groups)
+    record, unmatched = record_posterior(problem, result, test, predicting, attributes, model.spec.groups)
     facts = gather_facts(title, seed, problem, result, runs, test, record, unmatched)
     return Calibration(record, build_summary(record, facts), text, model, out)
 
@@ -148,16 +149,16 @@ def run_calibration(
 ) -> Calibration:
     """`calibrate` what an experiment file says; ``overrides`` are assignments that replace entries of the file."""
     model, tables = Model.read(path, overrides)
-    experiment = model.experiment
+    settings = model.settings
     return calibrate(
         model,
         model.recordings("fit"),
-        make_config(experiment.inference.method, inference_options(experiment)),
+        make_config(settings.inference.method, inference_options(settings.inference)),
         test=model.recordings("test"),
-        seed=experiment.seed,
+        seed=settings.seed,
         out=out,
         start=start,
-        title=experiment.title or path.stem,
+        title=settings.title or path.stem,
         resume=resume,
         overwrite=overwrite,
         show=show,
@@ -194,11 +195,11 @@ def earlier_draws(start: Calibration | Path | None, method: str) -> Batch | None
     return {name: np.concatenate([np.full(len(column), optimum[name]), column]) for name, column in draws.items()}
 
 
-def inference_options(experiment: Experiment) -> dict[str, Any]:
+def inference_options(table: InferenceTable) -> dict[str, Any]:
     """Options of the method; the budget is among them where the method takes one."""
-    options = experiment.inference.options
-    fields = {field.name for field in dataclasses.fields(method_named(experiment.inference.method).config)}
-    return {**options, "rollouts": experiment.inference.rollouts} if "rollouts" in fields else options
+    options = table.options
+    fields = {field.name for field in dataclasses.fields(method_named(table.method).config)}
+    return {**options, "rollouts": table.rollouts} if "rollouts" in fields else options
 
 
 def record_posterior(
@@ -308,11 +309,12 @@ def gather_facts(
     """What the report says beside the posterior."""
     unseen = [prediction for prediction in record.recordings if prediction.split == "test"]
     description = problem.model.simulator.description
-    robot: Any = getattr(problem.model.simulator, "robot", None)
+    simulator = problem.model.simulator
+    robot = simulator.robot if isinstance(simulator, RobotSimulator) else None
     added: Any = description.get("mechanisms", ())
     checks = check_fit(problem, record, problem.model.markers.name in result.details.get("lasting", {}))
     floor = noise_floor([*fitted, *tested])
-    undriven = robot.unstated(run.name for run in (*fitted, *tested)) if isinstance(robot, Robot) else []
+    undriven = [] if robot is None else robot.unstated(run.name for run in (*fitted, *tested))
     return RunFacts(
         title=title,
         robot=str(description["robot"]),
@@ -345,7 +347,7 @@ def gather_facts(
         objects=score_objects(unseen, [*fitted, *tested]),
         versions=software_versions(),
         details=result.details,
-        outline=robot_shape(robot) if isinstance(robot, Robot) else None,
+        outline=None if robot is None else robot_shape(robot),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import asdict, astuple, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -25,10 +25,12 @@ from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.report.recording_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
-from rfdropo_bayes.workflow.assembly import build_model, build_simulator, find_robot, with_drives
+from rfdropo_bayes.tables import changed
+from rfdropo_bayes.workflow.assembly import build_model, build_simulator, with_drives
 from rfdropo_bayes.workflow.calibration import inference_options
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
 from rfdropo_bayes.workflow.listings import robot_facts
+from rfdropo_bayes.workflow.model_spec import find_robot, spec_of
 from rfdropo_bayes.workflow.placement import far_from_rest, placement_hints
 
 MILLIMETRES = 1e3
@@ -69,9 +71,9 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
     """
     experiment, _ = load_experiment(path, overrides)
     folder = Path(path).resolve().parent
-    robot = find_robot(experiment, folder)
+    robot = find_robot(experiment.robot, folder)
     found = Check()
-    robot = _try(found, partial(with_drives, robot, experiment.model)) or robot
+    robot = _try(found, partial(with_drives, robot, experiment.model.drives, experiment.model.groups)) or robot
     _say_robot(found, robot)
     recordings = {role: list(_read(found, experiment, folder, role)) for role in ("fit", "test")}
     for role, trajectories in recordings.items():
@@ -80,7 +82,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
     named = [trajectory.name for trajectories in recordings.values() for trajectory in trajectories]
     found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
     _say_repeats(found, [*recordings["fit"], *recordings["test"]])
-    _say_model(found, experiment, robot, folder, recordings["fit"])
+    _say_model(found, experiment, folder, recordings["fit"])
     if any(recordings.values()):
         out = output_folder(out)
     rest = robot_shape(robot)
@@ -116,7 +118,7 @@ def _read(found: Check, experiment: Experiment, folder: Path, role: str) -> Iter
         return
     entries: list[RecordingEntry] = spec.fit if role == "fit" else spec.test
     for entry in entries:
-        alone = spec.model_copy(update={"fit": [entry], "test": []})
+        alone = changed(spec, where="[data]", fit=[entry], test=[])
         yield from _try(found, partial(load_recordings, alone, folder)) or []
     _try(found, lambda: load_recordings(spec, folder, role="fit" if role == "fit" else "test"))
 
@@ -232,18 +234,19 @@ def _say_repeats(found: Check, trajectories: Sequence[Trajectory]) -> None:
         found.notes.append("no recording was repeated: nothing tells noise from what the simulator misses")
 
 
-def _say_model(found: Check, experiment: Experiment, robot: Robot, folder: Path, fitted: list[Trajectory]) -> None:
+def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[Trajectory]) -> None:
     """What is inferred, and how; a model that cannot be built is a problem."""
-    method = experiment.inference.method
-    _try(found, lambda: make_config(method, inference_options(experiment)))
+    method, named = experiment.inference.method, experiment.model.mechanisms
+    _try(found, lambda: make_config(method, inference_options(experiment.inference)))
     found.lines.append(("method", f"{method}, {experiment.inference.rollouts} rollouts, seed {experiment.seed}"))
-    found.lines.append(("mechanisms", ", ".join(experiment.model.mechanisms) or "none"))
-    simulator = _try(found, lambda: build_simulator(experiment, robot, folder))
-    if simulator is None or not fitted:
+    found.lines.append(("mechanisms", ", ".join(named) or "none"))
+    spec = _try(found, lambda: spec_of(experiment, folder))
+    simulator = None if spec is None else _try(found, partial(build_simulator, spec))
+    if spec is None or simulator is None or not fitted:
         return
     step = float(simulator.description["time_step_s"])  # type: ignore[arg-type]
     found.lines.append(("time step", f"{1e3 * step:.4g} ms"))
-    model = _try(found, lambda: build_model(experiment, simulator, fitted))
+    model = _try(found, lambda: build_model(spec, simulator, fitted))
     if model is not None:
         for index, parameter in enumerate(model.space.parameters):
             table = parameter.table or {}
@@ -256,7 +259,7 @@ def _say_model(found: Check, experiment: Experiment, robot: Robot, folder: Path,
         "object_pose": any(t.object_pose is not None for t in fitted),
     }
     for key, there in recorded.items():
-        if there and not getattr(experiment.model, key):
+        if there and not asdict(spec.channels)[key]:
             words = key.replace("_", " ")
             found.notes.append(f"{words} was recorded, and is no data: [model] {key} = true would make it so")
 

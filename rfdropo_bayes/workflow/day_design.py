@@ -84,7 +84,7 @@ def design_day(
         InputError: nothing of the model differs between days, or no recording is of the group.
     """
     model, left = model_of(fit), model_error_of(fit.record)
-    day, known = _of_group(runs, model.experiment.model.groups, group)
+    day, known = _of_group(runs, model.spec.groups, group)
     begun = _begun_like(known[0], seconds)
     tried = _followed_proposals(model, begun, known[0], runs, np.random.default_rng(seed))
     sequences = [_as_recording(begun, f"{begun.name}[proposal {k}]", *tried[k][1:]) for k in range(len(tried))]
@@ -112,7 +112,7 @@ def design_day(
     kept = times <= length
     before = uncertain(np.zeros((len(names), len(names))))
     content = {
-        "sentence": _sentence(kind, found[best], length, before, error) + units_said(model.experiment),
+        "sentence": _sentence(kind, found[best], length, before, error) + units_said(model.settings.data),
         "kind": kind,
         "group": day,
         "seconds": length,
@@ -125,7 +125,7 @@ def design_day(
         "seed": seed,
         "schema_version": 1,
     }
-    table = command_table(model.experiment, begun, times[kept], value[kept], length)
+    table = command_table(model.settings.data, begun, times[kept], value[kept], length)
     if PER_ACTION in known[0].settings:
         table["action"] = actions.actions_of(value[kept], begun.initial_command)
     return Design(content, table)
@@ -147,7 +147,7 @@ def run_day_design(
     model, tables = Model.read(path, overrides)
     runs = model.recordings("fit")
     fit = Calibration(PosteriorRecord.load(base / POSTERIOR), {}, "", model, base)
-    chosen = model.experiment.seed if seed is None else seed
+    chosen = model.settings.seed if seed is None else seed
     options = {"base": base, "seed": chosen, "adapt": True, "seconds": seconds, "group": group}
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(runs), "options": options}
     with run_folder(out, "design", **settings, overwrite=overwrite) as out:

@@ -21,14 +21,13 @@ from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry
 from rfdropo_bayes.audit.fit import Fit, Target
 from rfdropo_bayes.audit.pipeline import Question, base_model
 from rfdropo_bayes.bayes.recordings import commands_after
-from rfdropo_bayes.data import Trajectory, asl_csv
+from rfdropo_bayes.data import DataSpec, Trajectory, asl_csv
 from rfdropo_bayes.data.asl_csv import FORMAT as ASL
 from rfdropo_bayes.data.plain_csv import command_columns
 from rfdropo_bayes.files import whole, write_json
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.workflow.audit import build_question, start_values
 from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.experiment import Experiment
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
 
@@ -118,9 +117,9 @@ def design(
     Raises:
         InputError: bad input, or a base model that was not fitted in the time.
     """
-    experiment = model.experiment
-    question = build_question(experiment, model.folder, runs, [], seed, start=start_values(base))
-    clock = Clock(experiment.design.minutes if minutes is None else minutes)
+    settings = model.settings
+    question = build_question(model.spec, settings.audit, runs, [], seed, start=start_values(base))
+    clock = Clock(settings.design.minutes if minutes is None else minutes)
     rng = np.random.default_rng(question.seed)
     clock.share = 1.0
     target, fitted = base_model(question, question.seed, report=report, deadline=clock)
@@ -133,7 +132,7 @@ def design(
     now = at_hand(target, hypotheses)
     content = {
         "sentence": _sentence(kind, outlook[chosen], now, SCREENING not in clock.missed)
-        + units_said(experiment)
+        + units_said(settings.data)
         + _unfinished(clock),
         "kind": kind,
         "hypotheses": [h.name for h in hypotheses],
@@ -150,7 +149,7 @@ def design(
         "seed": question.seed,
         "schema_version": 1,
     }
-    return Design(content, command_table(experiment, runs[0], times, value, float(runs[0].time[-1])))
+    return Design(content, command_table(settings.data, runs[0], times, value, float(runs[0].time[-1])))
 
 
 def run_design(
@@ -166,7 +165,7 @@ def run_design(
     """`design` what an experiment file says, and write design.json and next_commands.csv; return the former."""
     model, tables = Model.read(path, overrides)
     fitted = model.recordings("fit")
-    chosen = model.experiment.seed if seed is None else seed
+    chosen = model.settings.seed if seed is None else seed
     options = {"base": base, "seed": chosen}
     settings = {"tables": tables, "folder": model.folder, "data": hashes(fitted), "options": options}
     with run_folder(out, "design", **settings, overwrite=overwrite) as out:
@@ -217,20 +216,20 @@ def _outlooks(
 
 
 def command_table(
-    experiment: Experiment, first: Trajectory, time: np.ndarray, value: np.ndarray, seconds: float
+    data: DataSpec | None, first: Trajectory, time: np.ndarray, value: np.ndarray, seconds: float
 ) -> pd.DataFrame:
     """The proposal, of so many seconds, in the columns of the experiment's recordings."""
-    if experiment.data is not None and experiment.data.format == ASL:
+    if data is not None and data.format == ASL:
         return pd.DataFrame(asl_csv.command_columns(time, value, seconds))
-    if experiment.data is not None and experiment.data.columns is not None:
-        return pd.DataFrame(command_columns(experiment.data.columns, time, value))
+    if data is not None and data.columns is not None:
+        return pd.DataFrame(command_columns(data.columns, time, value))
     channels = {f"{c}_{first.command_unit}": value[:, k] for k, c in enumerate(first.cable_names)}
     return pd.DataFrame({"time_s": time, **channels})
 
 
-def units_said(experiment: Experiment) -> str:
+def units_said(data: DataSpec | None) -> str:
     """What the columns of `command_table` are in, where their names do not say it."""
-    if experiment.data is not None and experiment.data.format == ASL:
+    if data is not None and data.format == ASL:
         return " Columns u1 to u6 are in degrees, a row every 10 ms, as that format has them."
     return ""
 

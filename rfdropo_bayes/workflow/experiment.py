@@ -1,4 +1,7 @@
-"""The experiment file: one TOML that names robot, data, priors, mechanisms, method, budget and seed."""
+"""The experiment file: one TOML that names robot, data, priors, mechanisms, method, budget and seed.
+
+Names and numbers, as the file has them; `model_spec` says what they mean.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +13,13 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rfdropo_bayes.data import DataSpec
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import DriveTravel, Robot
-from rfdropo_bayes.simulators.black_box import BlackBox
+from rfdropo_bayes.robots import DriveTravel
 from rfdropo_bayes.simulators.mesh_body import TetrahedraTable
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.training.config import TrainingTable
 from rfdropo_bayes.workflow.experiment_file import override, read_tables
 
-Workpiece = Robot | BlackBox
-"""What is simulated."""
+NoiseModel = Literal["auto", "white", "ar1", "student-t", "repeats", "stated"]
 
 
 class Table(BaseModel):
@@ -44,7 +45,7 @@ class ModelTable(Table):
         default_factory=list,
         description="effects on top of the base simulator, by name, or file.py:ClassName of one's own",
     )
-    noise: Literal["auto", "white", "ar1", "student-t", "repeats", "stated"] = Field(
+    noise: NoiseModel = Field(
         default="auto",
         description="noise of the positions: white and lasting (auto), white, lasting (ar1), heavy-tailed (student-t);"
         " of all that is measured, what repeats differ by (repeats); what [noise] says (stated);"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +14,6 @@ from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.numpyro_priors import table_of
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.prediction.predictive import Batch
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
@@ -25,13 +24,14 @@ from rfdropo_bayes.workflow.assembly import (
     build_problem,
     build_simulator,
     expand_groups,
-    find_workpiece,
     fixed_values,
     load_data,
     measurement_specs,
+    model_specs,
 )
-from rfdropo_bayes.workflow.experiment import Experiment, Workpiece, load_experiment
+from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
 from rfdropo_bayes.workflow.experiment_file import ROBOT_COPY, describe
+from rfdropo_bayes.workflow.model_spec import ModelSpec, RunSettings, Workpiece, spec_of
 
 
 class Model:
@@ -50,6 +50,10 @@ class Model:
         simulator: body, engine and discretisation: the keys of an experiment file's [simulator].
         folder: that paths are relative to.
         more: further keys of an experiment file's [model], such as ``tension = True`` or ``per_recording``.
+
+    Attributes:
+        spec: what it means, as objects.
+        settings: what its experiment says beside the model.
 
     Raises:
         InputError: an unknown robot, key or mechanism, or a distribution that cannot be a prior. What is wrong with a
@@ -74,30 +78,27 @@ class Model:
         given = {name: table_of(prior, where=f"priors, {name}") for name, prior in (priors or {}).items()}
         stated = dict(noise) if isinstance(noise, Mapping) else None
         described = {"priors": given, "noise": noise if stated is None else STATED, "fixed": fixed, **more}
-        named = [mechanism for mechanism in mechanisms if isinstance(mechanism, str)]
-        tables: dict[str, Any] = {"robot": _name(robot), "model": {**described, "mechanisms": named}}
+        made = None if isinstance(robot, str | Path) else robot
+        tables: dict[str, Any] = {"robot": str(robot) if made is None else "", "model": described}
         if stated is not None:
             tables["noise"] = stated
         if simulator:
             tables["simulator"] = dict(simulator)
         experiment = parse_table(Experiment, tables, where="Model")
-        if not isinstance(robot, str | Path):
-            experiment = experiment.model_copy(update={"robot": robot})
-        if len(named) < len(mechanisms):
-            table = experiment.model.model_copy(update={"mechanisms": list(mechanisms)})
-            experiment = experiment.model_copy(update={"model": table})
-        self._set(experiment, Path(folder))
+        self.spec = spec_of(experiment, Path(folder), made, mechanisms)
+        self.settings = RunSettings()
 
-    def _set(self, experiment: Experiment, folder: Path) -> None:
-        self.experiment, self.folder = experiment, folder
-        self.robot = find_workpiece(experiment, folder)
+    @classmethod
+    def of(cls, spec: ModelSpec, settings: RunSettings | None = None) -> Model:
+        """The model that is meant, with what its experiment says beside it."""
+        model = cls.__new__(cls)
+        model.spec, model.settings = spec, settings or RunSettings()
+        return model
 
     @classmethod
     def of_experiment(cls, experiment: Experiment, folder: Path) -> Model:
         """The model that an experiment file describes; ``folder`` is that of the file."""
-        model = cls.__new__(cls)
-        model._set(experiment, folder)
-        return model
+        return cls.of(spec_of(experiment, folder), RunSettings.of(experiment))
 
     @classmethod
     def read(cls, path: Path, overrides: Sequence[str] = ()) -> tuple[Model, dict[str, Any]]:
@@ -107,12 +108,22 @@ class Model:
 
     def recordings(self, role: Literal["fit", "test"]) -> list[Trajectory]:
         """The recordings that its experiment file names."""
-        return load_data(self.experiment, self.folder, role)
+        return load_data(self.settings.data, self.folder, role)
+
+    @property
+    def robot(self) -> Workpiece:
+        """The robot, or the black box."""
+        return self.spec.robot
+
+    @property
+    def folder(self) -> Path:
+        """That paths are relative to."""
+        return self.spec.folder
 
     @cached_property
     def simulator(self) -> RobotSimulator | BlackBoxSimulator:
         """The simulator, mechanisms included."""
-        return build_simulator(self.experiment, self.robot, self.folder)
+        return build_simulator(self.spec)
 
     @property
     def name(self) -> str:
@@ -127,12 +138,11 @@ class Model:
     @property
     def parameters(self) -> pd.DataFrame:
         """Every parameter of simulator and measurement: unit, hard bounds, nominal value, prior where inferred."""
-        table = self.experiment.model
-        specs = self.simulator.parameters + measurement_specs(table)
-        given = expand_groups(table.priors, specs)
+        specs = model_specs(self.spec, self.simulator)
+        given = expand_groups(self.spec.priors, specs)
         added = {spec.name for mechanism in self.simulator.mechanisms for spec in mechanism.parameters}
-        added |= {spec.name for spec in measurement_specs(table)}
-        fixed = fixed_values(self.experiment, self.simulator)
+        added |= {spec.name for spec in measurement_specs(self.spec.noise, self.spec.channels)}
+        fixed = fixed_values(self.spec, self.simulator)
         rows = {}
         for spec in specs:
             inferred = spec.name in given or (spec.name in added and spec.name not in fixed)
@@ -143,9 +153,7 @@ class Model:
 
     def with_mechanisms(self, *names: Any) -> Model:
         """The same model with more mechanisms."""
-        table = self.experiment.model
-        table = table.model_copy(update={"mechanisms": [*table.mechanisms, *names]})
-        return Model.of_experiment(self.experiment.model_copy(update={"model": table}), self.folder)
+        return Model.of(self.spec.with_mechanisms(*names), self.settings)
 
     def numpyro(self, runs: Sequence[Trajectory]) -> TrajectoryModel:
         """The model of these recordings as a numpyro model: a callable with sample sites for all that is inferred.
@@ -153,7 +161,7 @@ class Model:
         Raises:
             InputError: unknown names, or priors outside the bounds.
         """
-        return build_model(self.experiment, self.simulator, runs)
+        return build_model(self.spec, self.simulator, runs)
 
     def problem(self, runs: Sequence[Trajectory], earlier: Batch | None = None) -> CalibrationProblem:
         """The posterior given these recordings, as the inference methods see it."""
@@ -161,17 +169,12 @@ class Model:
 
     def tables(self) -> dict[str, Any]:
         """The tables of an experiment file that says the same, as far as a file can."""
-        experiment = self.experiment
-        tables = experiment.model_dump(mode="json", exclude={"robot", "model"}, exclude_unset=True, exclude_none=True)
-        model = experiment.model.model_dump(mode="json", exclude={"mechanisms"}, exclude_unset=True, exclude_none=True)
-        names = [source_of(mechanism) for mechanism in experiment.model.mechanisms]
-        robot = ROBOT_COPY if self.texts() else str(getattr(experiment.robot, "name", experiment.robot))
-        model = {key: value for key, value in model.items() if value != {}}
-        return {"robot": robot, **tables, "model": {**model, "mechanisms": names}}
+        robot = ROBOT_COPY if self.texts() else self.spec.named or self.name
+        return {"robot": robot, **self.settings.tables(), **self.spec.tables()}
 
     def texts(self) -> dict[str, str]:
         """Files that the tables name and no folder holds: the description of a robot that was made in Python."""
-        if isinstance(self.experiment.robot, Robot):
+        if isinstance(self.robot, Robot) and not self.spec.named:
             return {ROBOT_COPY: describe(self.robot.model_dump(mode="json", exclude_none=True))}
         return {}
 
@@ -179,21 +182,3 @@ class Model:
         rows = self.parameters
         inferred = rows[[prior is not None for prior in rows["prior"]]]
         return f"<p><b>{self.name}</b>, {len(inferred)} of {len(rows)} parameters inferred</p>{inferred.to_html()}"
-
-
-def _name(robot: str | Path | Workpiece) -> str:
-    if isinstance(robot, str | Path):
-        return str(robot)
-    if not isinstance(robot, Robot | BlackBox):
-        raise InputError(
-            f"{type(robot).__name__} is no robot", where="Model", remedy="give a name, a path, a Robot or a BlackBox"
-        )
-    return robot.name
-
-
-def source_of(mechanism: str | type | Callable[..., Any]) -> str:
-    """Under which name a file would ask for a mechanism."""
-    if isinstance(mechanism, str):
-        return mechanism
-    kind = mechanism if isinstance(mechanism, type) else type(mechanism)
-    return f"{kind.__module__}:{kind.__qualname__}"

@@ -6,6 +6,7 @@ The deployment file names it: ``plant = "rfdropo_bayes.workflow.plant:trunk"``, 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,15 @@ from jaxtyping import Float
 from rfdropo_bayes.deployment.plant import PlantState
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import OBJECT, Robot
+from rfdropo_bayes.robots.robot import Command
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.session import Session
-from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values
+from rfdropo_bayes.tables import changed
+from rfdropo_bayes.workflow.assembly import build_robot_simulator, physical_values, robot_of
 from rfdropo_bayes.workflow.experiment import Experiment, load_experiment
 from rfdropo_bayes.workflow.experiment_file import override
+from rfdropo_bayes.workflow.model_spec import spec_of
 
 PERIOD = 0.01  # [s]: drums turn steadily between two states this far apart
 
@@ -45,8 +49,8 @@ def trunk(
     command = simulator.robot.command
     # Drums turn steadily from one state to the next. What ramps and delays commands stands before the plant.
     period = simulator.time_step * max(1, round(PERIOD / simulator.time_step))
-    timing = command.model_copy(update={"ramp_s": period, "dead_time_s": 0.0})
-    base = simulator.robot.model_copy(update={"command": timing})
+    timing = Command(unit=command.unit, ramp_s=period, dead_time_s=0.0)
+    base = simulator.robot.with_changes(command=timing)
     simulator, values = true_simulator(robot, experiment, changes, base)
     return SimulatedTrunk(robot, simulator, period, values, marker_noise, seed)
 
@@ -63,12 +67,13 @@ def true_simulator(
     overrides = [f"{name}={tomli_w.dumps({'x': value})[4:].strip()}" for name, value in changes.items()]
     if experiment:
         described, folder = load_experiment(Path(experiment), overrides)[0], Path(experiment).resolve().parent
-        base = base or find_robot(described, folder)
     else:
         tables: dict[str, Any] = {"robot": robot.name}
         for assignment in overrides:
             override(tables, assignment, Experiment.model_fields)
         described, folder, base = Experiment.model_validate(tables), Path(), base or robot
+    spec = spec_of(described, folder, base)
+    base = robot_of(spec)
     for what, found, wanted in (
         ("channels", base.channel_names, robot.channel_names),
         ("markers", base.marker_names, robot.marker_names),
@@ -80,17 +85,12 @@ def true_simulator(
                 where=f"plant {base.name}",
                 remedy="deploy a robot that has the same",
             )
-    table, model = described.simulator, described.model
-    held = {name: value for name, value in model.fixed.items() if table.push or name not in OBJECT}
-    described = described.model_copy(
-        update={
-            "simulator": table.model_copy(update={"drives": "robot", "threads": table.threads or 1}),
-            "model": model.model_copy(update={"fixed": held}),
-        }
-    )
-    simulator = build_simulator(described, base, folder)
-    known = {spec.name for spec in simulator.parameters}
-    return simulator, {n: v for n, v in fixed_values(described, simulator).items() if n in known}
+    table = spec.simulator
+    held = {name: value for name, value in spec.fixed.items() if table.push or name not in OBJECT}
+    alone = changed(table, where="[simulator]", drives="robot", threads=table.threads or 1)
+    spec = replace(spec, fixed=held, simulator=alone)
+    simulator = build_robot_simulator(spec)
+    return simulator, physical_values(spec, simulator)
 
 
 class SimulatedTrunk:

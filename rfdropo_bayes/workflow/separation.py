@@ -54,20 +54,22 @@ def run_separation(
         InputError: bad input, before anything long has started.
     """
     model, tables = Model.read(path, overrides)
-    experiment, folder = model.experiment, model.folder
-    table = experiment.separation
+    settings = model.settings
+    table = settings.separation
     if table is None:
         raise InputError("has no [separation]", where=str(path), remedy="name the mechanisms to tell apart")
-    both = [name for name in table.mechanisms if name in experiment.model.mechanisms]
+    both = [name for name in table.mechanisms if name in model.spec.sources]
     if both:
         raise InputError(
             f"{both[0]!r} is in the base model", where="[separation] mechanisms", remedy="leave it out of one of them"
         )
     fitted = model.recordings("fit")
     start = start_values(base)
-    question = build_question(experiment, folder, fitted, [], experiment.seed, start=start, names=table.mechanisms)
-    settings: dict[str, Any] = {"tables": tables, "folder": folder, "data": hashes(fitted), "options": {"base": base}}
-    with run_folder(out, "separate", **settings, resume=resume, overwrite=overwrite) as out:
+    seed, names = settings.seed, table.mechanisms
+    question = build_question(model.spec, settings.audit, fitted, [], seed, start=start, names=names)
+    given: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(fitted)}
+    given["options"] = {"base": base}
+    with run_folder(out, "separate", **given, resume=resume, overwrite=overwrite) as out:
         coordinates = question.coordinates
         found = separate(
             first_target(question, Journal(out / JOURNAL, resume=resume)),
@@ -78,7 +80,7 @@ def run_separation(
         )
         content = {
             **record_separation(found, question),
-            "seed": experiment.seed,
+            "seed": seed,
             "versions": software_versions(),
             "data_sha256": combined_hash([trajectory.sha256 for trajectory in fitted]),
         }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,11 +20,12 @@ from rfdropo_bayes.files import output_folder, whole, write_json
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.protocol import Result
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.tables import parse_table
-from rfdropo_bayes.workflow.assembly import AnySimulator, build_simulator, find_robot, fixed_values, load_data
+from rfdropo_bayes.workflow.assembly import AnySimulator, physical_values, robot_of
 from rfdropo_bayes.workflow.balance import append_balance
 from rfdropo_bayes.workflow.commands import random_walk
-from rfdropo_bayes.workflow.experiment import CommandsTable, Experiment, NoiseTable, load_experiment
+from rfdropo_bayes.workflow.experiment import CommandsTable, NoiseTable
 from rfdropo_bayes.workflow.files import run_folder
 from rfdropo_bayes.workflow.model import Model
 
@@ -67,28 +69,19 @@ def simulate(
     Raises:
         InputError: bad input, or a rollout that diverged.
     """
-    changes: dict[str, Any] = {"seed": seed}
-    if not isinstance(commands, Sequence):
-        changes["commands"] = parse_table(CommandsTable, commands, where="simulate, commands")
+    spec, settings = replace(model.spec, fixed={**model.spec.fixed, **(parameters or {})}), model.settings
     if noise is not None:
-        changes["noise"] = parse_table(NoiseTable, noise, where="simulate, noise")
-    if parameters:
-        fixed = {**model.experiment.model.fixed, **parameters}
-        changes["model"] = model.experiment.model.model_copy(update={"fixed": fixed})
-    experiment = model.experiment.model_copy(update=changes)
-    simulator = build_simulator(experiment, model.robot, model.folder)
-    values = _physical(experiment, simulator)
-    sources = commands if isinstance(commands, Sequence) else _sources(experiment, model.folder, simulator)
+        spec = replace(spec, stated=parse_table(NoiseTable, noise, where="simulate, noise"))
+    settings = replace(settings, seed=seed)
+    if not isinstance(commands, Sequence):
+        settings = replace(settings, commands=parse_table(CommandsTable, commands, where="simulate, commands"))
+    model = Model.of(spec, settings)
+    values = physical_values(spec, model.simulator)
+    sources = commands if isinstance(commands, Sequence) else _sources(model)
     return [
-        _as_trajectory(found, simulator, experiment, values, index)
-        for index, found in enumerate(_rollouts(simulator, values, sources))
+        _as_trajectory(found, model, values, index)
+        for index, found in enumerate(_rollouts(model.simulator, values, sources))
     ]
-
-
-def _physical(experiment: Experiment, simulator: AnySimulator) -> dict[str, float]:
-    """Fixed values that the simulator is given."""
-    known = {spec.name for spec in simulator.parameters}
-    return {name: value for name, value in fixed_values(experiment, simulator).items() if name in known}
 
 
 def _rollouts(
@@ -116,15 +109,14 @@ def run_simulation(
     Raises:
         InputError: bad input, a folder that holds a run, or a rollout that did not end well.
     """
-    experiment, tables = load_experiment(path, overrides)
-    folder = Path(path).resolve().parent
-    settings: dict[str, Any] = {"tables": tables, "folder": folder, "options": {"balance": balance}}
+    model, tables = Model.read(path, overrides)
+    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "options": {"balance": balance}}
     with run_folder(out, "simulate", **settings, overwrite=overwrite) as out:
-        return simulate_all(experiment, folder, out, balance)
+        return simulate_all(model, out, balance)
 
 
-def simulate_all(experiment: Experiment, folder: Path, out: Path, balance: bool = False) -> dict[str, Any]:
-    """Simulate every recording of the experiment, or the command sequences of its [commands] table.
+def simulate_all(model: Model, out: Path, balance: bool = False) -> dict[str, Any]:
+    """Simulate every recording of a model's experiment, or the command sequences of its [commands] table.
 
     Writes, per recording, ``<name>.nc`` (`Trajectory`) and ``<name>.csv`` (time in s, markers in mm, in the source's
     column names), called ``trajectory`` where there is only one recording. With ``balance``, forces and energies follow
@@ -137,16 +129,18 @@ def simulate_all(experiment: Experiment, folder: Path, out: Path, balance: bool 
     Raises:
         InputError: bad input, or a rollout that did not end well.
     """
-    simulator = build_simulator(experiment, find_robot(experiment, folder), folder)
-    values = _physical(experiment, simulator)
-    sources = _sources(experiment, folder, simulator)
+    robot_of(model.spec)
+    simulator, measured = model.simulator, model.settings.data is not None
+    assert isinstance(simulator, RobotSimulator)
+    values = physical_values(model.spec, simulator)
+    sources = _sources(model)
     out = output_folder(out)
     report: dict[str, Any] = {"simulator": simulator.description, "parameters": values, "recordings": {}}
     distances = []
     for index, found in enumerate(_rollouts(simulator, values, sources)):
         source, pose = found.source, found.pose
         stem = "trajectory" if len(sources) == 1 else source.name
-        simulated = _as_trajectory(found, simulator, experiment, values, index)
+        simulated = _as_trajectory(found, model, values, index)
         simulated.save(out / f"{stem}.nc")
         with whole(out / f"{stem}.csv") as partial:
             _table(source, simulated).to_csv(partial, index=False, float_format="%.6f")
@@ -154,27 +148,28 @@ def simulate_all(experiment: Experiment, folder: Path, out: Path, balance: bool 
         report["recordings"][source.name] = {
             "status": found.result.name.lower(),
             "files": [str(out / f"{stem}.nc"), str(out / f"{stem}.csv")],
-            "error_mm": _errors([distances[-1]]) if experiment.data else None,
+            "error_mm": _errors([distances[-1]]) if measured else None,
         }
         if balance:
             written = append_balance(simulator, values, found.commands, source.time, out / f"{stem}.nc")
             report["recordings"][source.name]["balance"] = written
         if pose is not None and source.object_pose is not None:
             report["recordings"][source.name]["object_error"] = _object_errors(pose, source.object_pose)
-    report["error_mm"] = _errors(distances) if experiment.data else None
+    report["error_mm"] = _errors(distances) if measured else None
     write_json(out / "simulation.json", report)
     return report
 
 
-def _sources(experiment: Experiment, folder: Path, simulator: AnySimulator) -> Sequence[Trajectory]:
-    if experiment.commands is None:
-        return [*load_data(experiment, folder, "fit"), *load_data(experiment, folder, "test")]
-    if experiment.data is not None:
+def _sources(model: Model) -> Sequence[Trajectory]:
+    table = model.settings.commands
+    if table is None:
+        return [*model.recordings("fit"), *model.recordings("test")]
+    if model.settings.data is not None:
         raise InputError("the experiment has both [data] and [commands]", remedy="replay one or make the other")
-    seeds = np.random.SeedSequence(experiment.seed).spawn(len(experiment.commands.recordings))
+    seeds = np.random.SeedSequence(model.settings.seed).spawn(len(table.recordings))
     return [
-        _generated(experiment.commands, name, simulator, np.random.default_rng(seed))
-        for name, seed in zip(experiment.commands.recordings, seeds, strict=True)
+        _generated(table, name, model.simulator, np.random.default_rng(seed))
+        for name, seed in zip(table.recordings, seeds, strict=True)
     ]
 
 
@@ -207,25 +202,20 @@ def _known_markers(names: Sequence[str], simulator: AnySimulator) -> list[str]:
     return [name for name in simulator.marker_names if name in names]
 
 
-def _as_trajectory(
-    found: Simulated,
-    simulator: AnySimulator,
-    experiment: Experiment,
-    values: Mapping[str, float],
-    index: int,
-) -> Trajectory:
+def _as_trajectory(found: Simulated, model: Model, values: Mapping[str, float], index: int) -> Trajectory:
     """The simulated motion as a recording that says it is synthetic, and how it was made."""
-    source, position = found.source, found.position
-    if experiment.noise is not None:
-        key = jax.random.fold_in(jax.random.key(experiment.seed), index)
-        position = position + _noise(experiment.noise, key, source.time, position.shape[1])
+    source, position, simulator = found.source, found.position, model.simulator
+    noise, seed = model.spec.stated, model.settings.seed
+    if noise is not None:
+        key = jax.random.fold_in(jax.random.key(seed), index)
+        position = position + _noise(noise, key, source.time, position.shape[1])
     settings: dict[str, Any] | None = {
         "simulator": simulator.description,
         "parameters": {spec.name: values.get(spec.name, spec.nominal) for spec in simulator.parameters},
-        "noise": None if experiment.noise is None else experiment.noise.model_dump(),
-        "seed": experiment.seed,
+        "noise": None if noise is None else noise.model_dump(),
+        "seed": seed,
     }
-    if experiment.commands is not None and experiment.commands.blind:
+    if model.settings.commands is not None and model.settings.commands.blind:
         settings = None
     return Trajectory.build(
         name=source.name,

@@ -21,7 +21,7 @@ from rfdropo_bayes.report.facts import LEARNING
 from rfdropo_bayes.robots import OBJECT
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
-from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.tables import changed, parse_table
 from rfdropo_bayes.training.config import TrainingTable
 from rfdropo_bayes.training.evaluation import (
     Case,
@@ -37,11 +37,11 @@ from rfdropo_bayes.training.export import ExportedPolicy, export_policy, latency
 from rfdropo_bayes.training.figures import curve_figure, save_animation, success_figure
 from rfdropo_bayes.training.parity import difference, observations
 from rfdropo_bayes.training.run import Trained, train
-from rfdropo_bayes.workflow.assembly import build_simulator, find_robot, fixed_values
+from rfdropo_bayes.workflow.assembly import build_robot_simulator, physical_values
 from rfdropo_bayes.workflow.calibrated import Calibration
-from rfdropo_bayes.workflow.experiment import Experiment
 from rfdropo_bayes.workflow.files import run_folder
 from rfdropo_bayes.workflow.model import Model
+from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 POLICY, CARD, SUMMARY, CURVE = "policy.onnx", "card.md", "summary.json", "curve.png"
 EVALUATION, TABLE, CSV, FIGURE = "evaluation.json", "evaluation.md", "episodes.csv", "success.png"
@@ -65,9 +65,9 @@ def make_vec(
     Raises:
         InputError: an unknown task or key, or a posterior of another robot.
     """
-    experiment = _with_training(model, {"task": task, **options})
-    table, chosen, simulator = _training(experiment, model.folder)
-    randomisation = _randomisation(table, experiment, simulator, model.folder, posterior)
+    model = _with_training(model, {"task": task, **options})
+    table, chosen, simulator = _training(model)
+    randomisation = _randomisation(table, model.spec, simulator, posterior)
     return TrunkVecEnv(Episodes(simulator, chosen, n, randomisation, _settings(table)))
 
 
@@ -102,19 +102,18 @@ def train_policy(
     Raises:
         InputError: bad input, before anything long has started.
     """
-    experiment = _with_training(model, options)
-    folder = model.folder
+    model = _with_training(model, options)
     if tables is None:
-        tables = {**Model.of_experiment(experiment, folder).tables(), "seed": seed}
-    table, task, simulator = _training(experiment, folder)
-    randomisation = _randomisation(table, experiment, simulator, folder, posterior)
+        tables = {**model.tables(), "seed": seed}
+    table, task, simulator = _training(model)
+    randomisation = _randomisation(table, model.spec, simulator, posterior)
     settings = _settings(table)
     known = {"randomisation": randomisation.sha256, "simulator": simulator.description["content_sha256"]}
 
     def environments(lanes: int) -> TrunkVecEnv:
         return TrunkVecEnv(Episodes(simulator, task, lanes, randomisation, settings))
 
-    record: dict[str, Any] = {"tables": tables, "folder": folder, "data": known, "texts": model.texts()}
+    record: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": known, "texts": model.texts()}
     with run_folder(Path(out), "train", **record, resume=resume, overwrite=overwrite) as out:
         found = train(
             environments, table, out, seed=seed, gamma=task.gamma, resume=resume, fingerprint=known, show=show
@@ -139,17 +138,17 @@ def train_policy(
 def run_training(path: Path, out: Path, *, overrides: Sequence[str] = (), **options: Any) -> dict[str, Any]:
     """`train_policy` on what an experiment file with a table [training] says."""
     model, tables = Model.read(path, overrides)
-    return train_policy(model, out, seed=model.experiment.seed, tables=tables, **options)
+    return train_policy(model, out, seed=model.settings.seed, tables=tables, **options)
 
 
-def _with_training(model: Model, options: Mapping[str, Any]) -> Experiment:
-    """The model's experiment with further keys of [training]."""
+def _with_training(model: Model, options: Mapping[str, Any]) -> Model:
+    """The model with further keys of [training]."""
     if not options:
-        return model.experiment
-    own = model.experiment.training
+        return model
+    own = model.settings.training
     known = {} if own is None else own.model_dump(exclude_unset=True)
     table = parse_table(TrainingTable, {**known, **options}, where="training")
-    return model.experiment.model_copy(update={"training": table})
+    return Model.of(model.spec, replace(model.settings, training=table))
 
 
 def _settings(table: TrainingTable) -> Settings:
@@ -193,15 +192,15 @@ def evaluate_policies(
     Raises:
         InputError: bad input, a policy for another layout, or one that is given twice.
     """
-    experiment, folder = _with_training(model, options), model.folder
+    model = _with_training(model, options)
     if tables is None:
-        tables = Model.of_experiment(experiment, folder).tables()
-    table, task, simulator = _training(experiment, folder)
-    randomisation = _randomisation(table, experiment, simulator, folder, posterior)
+        tables = model.tables()
+    table, task, simulator = _training(model)
+    randomisation = _randomisation(table, model.spec, simulator, posterior)
     opened = [ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies]
     loaded = dict(zip(_names(policies), opened, strict=True))
     chosen = {"episodes": episodes, "seed": seed}
-    record: dict[str, Any] = {"tables": tables, "folder": folder, "options": chosen, "texts": model.texts()}
+    record: dict[str, Any] = {"tables": tables, "folder": model.folder, "options": chosen, "texts": model.texts()}
     with run_folder(Path(out), "evaluate", **record, overwrite=overwrite) as out:
         cases: list[Case] = []
         found: dict[str, list[Episode]] = {}
@@ -229,25 +228,23 @@ def run_evaluation(
     return evaluate_policies(model, policies, out, tables=tables, **options)
 
 
-def _training(experiment: Experiment, folder: Path) -> tuple[TrainingTable, Task, RobotSimulator]:
-    if experiment.training is None:
+def _training(model: Model) -> tuple[TrainingTable, Task, RobotSimulator]:
+    table = model.settings.training
+    if table is None:
         raise InputError(
             "the experiment has no table [training]", where="training", remedy='add it, with task = "TrunkReach-v0"'
         )
-    table = experiment.training
     task = task_named(table.task)
     if table.goals is not None:
         task = replace(task, goal_low=table.goals[0], goal_high=table.goals[1])
-    simulator_table = experiment.simulator.model_copy(update={"push": task.push})
-    experiment = experiment.model_copy(update={"simulator": simulator_table})
-    return table, task, build_simulator(experiment, find_robot(experiment, folder), folder)
+    pushing = changed(model.spec.simulator, where="[simulator]", push=task.push)
+    return table, task, build_robot_simulator(replace(model.spec, simulator=pushing))
 
 
 def _randomisation(
     table: TrainingTable,
-    experiment: Experiment,
+    spec: ModelSpec,
     simulator: RobotSimulator,
-    folder: Path,
     posterior: Calibration | Path | None = None,
 ) -> Randomisation:
     """Where parameters come from: values that are held, what is randomised, and what differs between episodes.
@@ -255,17 +252,14 @@ def _randomisation(
     A task without a cube has no use for what the experiment says of one.
     """
     absent = () if "cube_mass" in {spec.name for spec in simulator.parameters} else OBJECT
-    model = experiment.model
-    held = model.model_copy(update={"fixed": {n: v for n, v in model.fixed.items() if n not in absent}})
-    fixed = fixed_values(experiment.model_copy(update={"model": held}), simulator)
-    known = {spec.name for spec in simulator.parameters}
-    parts: list[Randomisation] = [Point({name: value for name, value in fixed.items() if name in known})]
+    held = replace(spec, fixed={name: value for name, value in spec.fixed.items() if name not in absent})
+    parts: list[Randomisation] = [Point(physical_values(held, simulator))]
     if isinstance(posterior, Calibration):
         parts.append(drawn_rows(posterior.record, simulator.parameters, robot=simulator.robot))
     elif posterior is not None:
         parts.append(read_posterior(Path(posterior), simulator.parameters, simulator.robot))
     elif table.randomisation != "none":
-        parts.append(_randomised(table, simulator, folder))
+        parts.append(_randomised(table, simulator, spec.folder))
     kind = parts[-1].kind
     start = {name: ends for name, ends in table.start.items() if name not in absent}
     return Layers((*parts, Uniform(start)), kind) if start or len(parts) > 1 else parts[0]

@@ -43,7 +43,7 @@ from rfdropo_bayes.report.run_folder import CONFIG, POSTERIOR
 from rfdropo_bayes.report.trajectory_figures import draw_band
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
-from rfdropo_bayes.workflow.assembly import KNOWN, fixed_values, measurement_specs, with_groups
+from rfdropo_bayes.workflow.assembly import KNOWN, fixed_values, model_specs, with_groups
 from rfdropo_bayes.workflow.calibrated import Calibration, axes_or_new
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
@@ -129,18 +129,18 @@ def predict(
         InputError: a calibration without its model, or commands of another robot.
     """
     record, model = fit.record, model_of(fit)
-    table = model.experiment.model
-    _check_noise(record, table.noise)
+    spec = model.spec
+    _check_noise(record, spec.noise)
     unseen = first_row_only(commands) if isinstance(commands, Trajectory) else _commanded(model, *commands, start)
     group = record.attrs.get(ADAPTED_TO) if group is None else group
-    groups = table.groups if group is None else in_group(unseen.name, group, table.groups)
+    groups = spec.groups if group is None else in_group(unseen.name, group, spec.groups)
     simulator = with_groups(model.simulator, groups)
     fixed, space = fitted_parts(fit)
     recordings = gather_recordings(simulator, [unseen])
-    stated, step = model.experiment.noise, float(np.median(np.diff(unseen.time)))
-    lasts = stated.correlation_time if stated is not None and table.noise == STATED else None
+    stated, step = spec.stated, float(np.median(np.diff(unseen.time)))
+    lasts = stated.correlation_time if stated is not None and spec.noise == STATED else None
     memory = None if lasts is None else np.array([1.0, np.exp(-step / lasts)])
-    channels = (_markers(recordings, table.noise, record.attrs.get(KNOWN_NOISE), memory),)
+    channels = (_markers(recordings, spec.noise, record.attrs.get(KNOWN_NOISE), memory),)
     program = TrajectoryModel(simulator, space, fixed, recordings, channels)
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
@@ -191,8 +191,8 @@ def model_of(fit: Calibration) -> Model:
 def fitted_parts(fit: Calibration) -> tuple[dict[str, float], ParameterSpace]:
     """Values that a calibration took for known, and the parameters that it inferred."""
     model = model_of(fit)
-    fixed = {**fixed_values(model.experiment, model.simulator), **fit.record.attrs.get(HELD, {})}
-    return fixed, _fitted_space(fit.record, model.simulator.parameters + measurement_specs(model.experiment.model))
+    fixed = {**fixed_values(model.spec, model.simulator), **fit.record.attrs.get(HELD, {})}
+    return fixed, _fitted_space(fit.record, model_specs(model.spec, model.simulator))
 
 
 def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
@@ -244,13 +244,13 @@ def run_prediction(
         InputError: bad input, or a posterior that does not belong to the experiment.
     """
     model, tables = Model.read(path, overrides)
-    experiment, folder = model.experiment, model.folder
-    if experiment.data is None:
+    read, folder = model.settings, model.folder
+    if read.data is None:
         raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format the commands are")
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
-    unseen = load_unseen(experiment.data, folder, commands, start, rows, record.attrs.get(BEGUN))
+    unseen = load_unseen(read.data, folder, commands, start, rows, record.attrs.get(BEGUN))
     fit = Calibration(record, {}, "", model)
-    found = predict(fit, unseen, seed=experiment.seed if seed is None else seed, group=group)
+    found = predict(fit, unseen, seed=read.seed if seed is None else seed, group=group)
     options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
     options["group"] = group
     settings: dict[str, Any] = {"tables": tables, "folder": folder, "options": options, "data": hashes([unseen])}

@@ -16,7 +16,7 @@ from rfdropo_bayes.report.motion import Motion, cube_corners, smooth_line, uprig
 from rfdropo_bayes.report.motion_export import save_frames, save_vtk
 from rfdropo_bayes.report.motion_figures import save_animation, save_still
 from rfdropo_bayes.robots import Robot, known_robots, load_robot
-from rfdropo_bayes.workflow.assembly import find_robot
+from rfdropo_bayes.workflow.assembly import robot_of
 from rfdropo_bayes.workflow.experiment_file import ROBOT_COPY
 from rfdropo_bayes.workflow.model import Model
 from rfdropo_bayes.workflow.simulation import simulate
@@ -97,17 +97,17 @@ def _predicted(dataset: xr.Dataset, robot: Robot) -> Motion:
 def _from_experiment(path: Path, overrides: list[str], recording: str | None) -> Motion:
     """Simulate one recording of an experiment."""
     model, _ = Model.read(path, overrides)
-    table, runs = model.experiment.commands, {}
+    table, runs = model.settings.commands, {}
     if table is None:
         runs = {run.name: run for role in ("fit", "test") for run in model.recordings(role)}
     names = list(runs) if table is None else table.recordings
     name = recording or names[0]
     if name not in names:
         raise InputError(f"no recording {name!r}", where="view", remedy=f"recordings: {', '.join(names)}")
-    made = simulate(model, [runs[name]] if table is None else table.model_dump(), seed=model.experiment.seed)
+    made = simulate(model, [runs[name]] if table is None else table.model_dump(), seed=model.settings.seed)
     simulated = next(run for run in made if run.name == name)
     side = simulated.settings.get("parameters", {}).get("cube_side")
-    return _motion(simulated, find_robot(model.experiment, model.folder), runs.get(name), side)
+    return _motion(simulated, robot_of(model.spec), runs.get(name), side)
 
 
 class _Shown(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +34,7 @@ from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.workflow.assembly import build_model, build_simulator, measurement_specs
 from rfdropo_bayes.workflow.experiment import Experiment
+from rfdropo_bayes.workflow.model_spec import spec_of
 
 STEP = 0.02  # [s], of the simulation and of the recording
 LAG = REGISTRY["actuator_lag"]()
@@ -254,8 +256,8 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
         "simulator": {"engine": "numba", "drives": "direct", "time_step": 0.02},
         "model": {"motor_angle": True, "mechanisms": ["actuator_lag"]},
     }
-    experiment = Experiment.model_validate(tables)
-    simulator = build_simulator(experiment, load_robot("asl_trunk"))
+    spec = spec_of(Experiment.model_validate(tables), Path())
+    simulator = build_simulator(spec)
     time = 0.1 * np.arange(20)
     command = np.where(time > 0.55, 0.2, 0.0)[:, None] * np.ones(6)
     commands = simulator.commands(time, command, command[0], time)
@@ -273,7 +275,7 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
         cable_names=[f"motor{k}" for k in range(1, 7)],
         motor_angle=command,
     )
-    model = build_model(experiment, simulator, [trunk])
+    model = build_model(spec, simulator, [trunk])
     assert model.measured["motor_angle"].shape == (1, 20, 6)
     noise = {spec.name for spec in noise_specs("auto")}
     assert set(model.space.names) == {"actuator_lag", "motor_angle_noise"} | noise
@@ -281,7 +283,7 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
     assert calibration.physical_names == ("actuator_lag",)
     assert calibration.prior_ends.keys() == calibration.bounds.keys()
     assert calibration.prior_ends["actuator_lag"][0] == 0.0
-    measured = {spec.name for spec in measurement_specs(experiment.model)}  # what a posterior may hold beside
+    measured = {spec.name for spec in measurement_specs(spec.noise, spec.channels)}  # what a posterior may hold beside
     assert measured == {"motor_angle_noise"} | noise
 
 

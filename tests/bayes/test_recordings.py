@@ -10,12 +10,12 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.workflow.assembly import build_simulator
-from rfdropo_bayes.workflow.experiment import Experiment
+from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 
 @pytest.mark.parametrize(("unit", "message"), [("m", None), ("rad", "commands are in rad, the robot's in m")])
 def test_commands_in_another_unit_than_the_robots_are_refused(unit: str, message: str | None) -> None:
-    simulator = build_simulator(Experiment(robot="smooth_arm"), load_robot("smooth_arm"))
+    simulator = build_simulator(ModelSpec(load_robot("smooth_arm")))
     channels, time = len(simulator.channel_names), 0.05 * np.arange(6)
     trajectory = Trajectory.build(
         name="r",

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rfdropo_bayes.bayes.problem import RolloutDefaults
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.rivals import StandardPrior, cross_correlation_summary, informative, thinned_summary
@@ -21,7 +22,7 @@ KEY = jax.random.key(9)
 needs_sbi = pytest.mark.skipif(importlib.util.find_spec("sbi") is None, reason="the optional package sbi")
 
 
-class LinearRollouts(LinearGaussian):
+class LinearRollouts(RolloutDefaults, LinearGaussian):
     """The linear model seen as trajectories of one feature."""
 
     observed_mask = np.ones((12, 1), dtype=bool)

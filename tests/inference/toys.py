@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import multivariate_normal, norm
 
+from rfdropo_bayes.bayes.problem import ProblemDefaults, RolloutDefaults
 
-class LinearGaussian:
+
+class LinearGaussian(ProblemDefaults):
     """y = A x + noise with a Gaussian prior on x: posterior and evidence of every prefix in closed form.
 
     Nothing in it is symmetric or centred: rows differ in size, the prior mean is not zero, a row has its own noise.
@@ -71,7 +73,7 @@ class LinearGaussian:
         return mean, covariance
 
 
-class Decay:
+class Decay(ProblemDefaults):
     """y = amplitude exp(-rate t) + noise of unknown deviation; log-normal parameters.
 
     Nonlinear, with a noise parameter.
@@ -260,7 +262,7 @@ class Washboard(LinearGaussian):
         return sum(np.log(np.trapezoid(shape * norm.pdf(c + away, 2.0, 3.0), away)) for c in self.centre)
 
 
-class Spring:
+class Spring(RolloutDefaults):
     """Features of a damped oscillation whose frequency and damping differ from rollout to rollout, for RF-DROPO."""
 
     names = ("frequency", "damping", "noise")

@@ -15,7 +15,7 @@ from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.commands import commands_on_grid
 from rfdropo_bayes.workflow.assembly import build_simulator
-from rfdropo_bayes.workflow.experiment import Experiment
+from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.01
@@ -209,8 +209,8 @@ def test_the_code_of_a_mechanism_is_part_of_what_a_simulator_is(tmp_path):
 
     def content(robot, share):
         (tmp_path / "own.py").write_text(BASE + f"class Own(CommandGain):\n    name, share = 'own', {share}")
-        experiment = Experiment(robot="smooth_arm", model={"mechanisms": ["own.py:Own"]})
-        return build_simulator(experiment, robot, tmp_path).description["content_sha256"]
+        spec = ModelSpec(robot, folder=tmp_path).with_mechanisms("own.py:Own")
+        return build_simulator(spec).description["content_sha256"]
 
     assert content(robot, 1) == content(robot, 1)
     assert len({content(robot, 1), content(robot, 2), content(stiffer, 1)}) == 3

@@ -150,6 +150,6 @@ def test_a_model_drives_a_recording_as_its_group_does():
     assert [caution.sentence.split(":")[0][-6:] for caution in model.simulator.robot.unstated(["friday"])] == ["friday"]
     # a recording belongs to the group that is chosen for it, and to no other
     for name, group, taken in (("friday", "mondays", -0.005), ("monday_1", "today", sent)):
-        chosen = with_groups(model.simulator, in_group(name, group, model.experiment.model.groups))
+        chosen = with_groups(model.simulator, in_group(name, group, model.spec.groups))
         found = gather_recordings(chosen, [recording(name, robot)]).commands.step
         np.testing.assert_allclose(found[0, -1, 0], taken, atol=1e-12)

@@ -12,8 +12,8 @@ from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.session import Session
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
-from rfdropo_bayes.workflow.assembly import build_simulator
-from rfdropo_bayes.workflow.experiment import Experiment
+from rfdropo_bayes.workflow.assembly import build_robot_simulator
+from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 
 def test_a_notched_trunk_between_opposed_cables_stays_whole():
@@ -41,8 +41,8 @@ def test_a_notched_trunk_between_opposed_cables_stays_whole():
 def squeezed(stiffness: np.ndarray, periods: int, held: int, seed: int = 2) -> np.ndarray:
     """Markers (period, lane, marker, 3) of trunks of some moduli [Pa] whose cables go by 5 mm at random, each on its
     own, then hold. Steps of a period are odd in number: a swing of two steps shows."""
-    experiment = Experiment(robot="virtual_trunk")
-    session = Session(build_simulator(experiment, load_robot("virtual_trunk")), len(stiffness), 0.05)
+    simulator = build_robot_simulator(ModelSpec(load_robot("virtual_trunk")))
+    session = Session(simulator, len(stiffness), 0.05)
     fixed = {"poisson_ratio": 0.43, "trunk_mass": 0.4, "rayleigh_mass": 0.3, "rayleigh_stiffness": 0.05}
     session.reset(np.arange(len(stiffness)), {"young_modulus": stiffness, **fixed})
     random, level, shown = np.random.default_rng(seed), np.zeros(8), []
@@ -67,7 +67,7 @@ def test_a_squeezed_trunk_moves_smoothly_with_its_modulus_and_comes_to_rest():
 @pytest.mark.slow
 def test_a_notched_trunk_settles_between_opposed_cables():
     """Taut cables hold its necks against twist; an iteration that does not know this swings in twist for ever."""
-    simulator = build_simulator(Experiment(robot="trunk_physical"), load_robot("trunk_physical"))
+    simulator = build_robot_simulator(ModelSpec(load_robot("trunk_physical")))
     commands = simulator.commands(np.zeros(1), np.zeros((1, 8)), np.zeros(8), np.array([0.0, 0.01]))
     rng = np.random.default_rng(0)
     batch = 24

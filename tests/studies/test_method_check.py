@@ -39,12 +39,10 @@ def test_the_layered_arm_is_calibrated(tmp_path):
 def test_simulated_data_fit_their_own_truth():
     """Whitened residuals of a data set at its truth are standard normal: mean square 1 to five standard errors."""
     from rfdropo_bayes.studies.method_check import simulate_data_set
-    from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
-    from rfdropo_bayes.workflow.experiment import load_experiment
+    from rfdropo_bayes.workflow.model import Model
 
-    experiment, _ = load_experiment(EXPERIMENT)
-    simulator = build_simulator(experiment, find_robot(experiment, EXPERIMENT.parent), EXPERIMENT.parent)
-    problem = build_problem(build_model(experiment, simulator, load_data(experiment, EXPERIMENT.parent, "fit")))
+    model, _ = Model.read(EXPERIMENT)
+    problem = model.problem(model.recordings("fit"))
     truth, replica, failed = simulate_data_set(problem, jax.random.key(0))
     values = {name: np.array([value]) for name, value in truth.items()}
     white = replica.residual_batch(jax.tree.map(jax.numpy.asarray, values), problem.n_rows)[0]

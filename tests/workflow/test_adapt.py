@@ -85,13 +85,15 @@ def test_a_model_of_days_whose_spread_is_held_keeps_start_data_and_listeners():
     whole = model.problem(recorded(["day_0_a", "day_1_a"], [0.0, 0.01], 0), earlier)
     other = {name: 2.0 * measured for name, measured in whole.measured.items()}
     whole = whole.with_measured(other).counting({"markers": 0.5})
-    whole.watch = [].append
-    held = whole.holding(whole.typical_scales)
+    told: list[float] = []
+    held = whole.telling(told.append).holding(whole.typical_scales)
     assert set(whole.names) - set(held.names) == {"zero_spread"}
     starts = held.sample_starts(jax.random.key(0), 3)
     np.testing.assert_allclose(starts["gain"], 1.1 * GAIN)
     np.testing.assert_allclose(starts["zero_deviation@day_1"], 0.004)
-    assert (held.measured, held.watch, held.shares) == (whole.measured, whole.watch, whole.shares)
+    assert (held.measured, held.shares) == (whole.measured, whole.shares)
+    held.row_log_likelihood(starts, held.n_rows)
+    assert sum(told) == pytest.approx(3.0)
 
 
 @pytest.mark.slow

@@ -17,8 +17,7 @@ from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.prediction.cube_start import with_measured_starts
 from rfdropo_bayes.simulators.cube import push_table
-from rfdropo_bayes.workflow.assembly import build_simulator, find_robot
-from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.workflow.model import Model
 from rfdropo_bayes.workflow.unseen import run_prediction
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
@@ -27,8 +26,7 @@ YAW, SHIFT = 0.2, np.array([0.003, -0.002, 0.004])
 
 @pytest.fixture(scope="module")
 def simulator():
-    experiment, _ = load_experiment(EXPERIMENTS / "sim2real_trunk.toml", ["simulator.push=true"])
-    return build_simulator(experiment, find_robot(experiment, EXPERIMENTS), EXPERIMENTS)
+    return Model.read(EXPERIMENTS / "sim2real_trunk.toml", ["simulator.push=true"])[0].simulator
 
 
 def recording(simulator, rows: int = 4) -> Trajectory:

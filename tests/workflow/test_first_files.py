@@ -12,9 +12,9 @@ import pytest
 from rfdropo_bayes.cli import main
 from rfdropo_bayes.data import load_recordings
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.workflow.assembly import find_robot
 from rfdropo_bayes.workflow.column_names import guess_columns
 from rfdropo_bayes.workflow.experiment import load_experiment, matching
+from rfdropo_bayes.workflow.model_spec import find_robot
 
 ROWS = 40
 TIME = 0.05 * np.arange(ROWS)
@@ -96,7 +96,7 @@ def test_init_writes_files_that_read_the_recordings(tmp_path, monkeypatch, capsy
     assert status == 0
     assert "rfdropo check" in told
     experiment, _ = load_experiment(tmp_path / "Arm 7" / "experiment.toml")
-    robot = find_robot(experiment, tmp_path / "Arm 7")
+    robot = find_robot(experiment.robot, tmp_path / "Arm 7")
     assert robot.name == "arm_7"
     assert robot.command_unit == "rad"
     fitted = load_recordings(experiment.data, tmp_path / "Arm 7")

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.simulators.protocol import Result
-from rfdropo_bayes.workflow.assembly import build_model, build_problem, build_simulator, find_robot, load_data
-from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.workflow.model import Model
 
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo.toml"
 
@@ -19,9 +18,8 @@ DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo.toml"
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_every_draw_of_the_demos_prior_ends_well(precision) -> None:
     """Of 600 draws 43 were lost where single precision was asked for more than its rounding allows."""
-    experiment, _ = load_experiment(DEMO, [f"simulator.precision={precision}"])
-    simulator = build_simulator(experiment, find_robot(experiment, DEMO.parent), DEMO.parent)
-    problem = build_problem(build_model(experiment, simulator, load_data(experiment, DEMO.parent, "fit")))
+    model, _ = Model.read(DEMO, [f"simulator.precision={precision}"])
+    problem = model.problem(model.recordings("fit"))
     drawn = problem.sample_prior(jax.random.key(3), 300)
     status = np.ravel(problem.observe({name: np.asarray(value) for name, value in drawn.items()}).status)
     assert np.all(status == int(Result.OK))

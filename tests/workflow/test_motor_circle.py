@@ -20,7 +20,8 @@ from rfdropo_bayes.workflow.assembly import build_simulator
 from rfdropo_bayes.workflow.audit import run_audit
 from rfdropo_bayes.workflow.calibration import run_calibration
 from rfdropo_bayes.workflow.commands import random_walk
-from rfdropo_bayes.workflow.experiment import CommandsTable, Experiment
+from rfdropo_bayes.workflow.experiment import CommandsTable
+from rfdropo_bayes.workflow.model_spec import ModelSpec
 from rfdropo_bayes.workflow.plant import trunk
 
 NOISE = 2e-4  # [m]
@@ -122,7 +123,7 @@ def test_the_plant_moves_as_a_rollout_of_the_same_commands() -> None:
     robot = load_robot("motor_arm")
     robot = robot.model_copy(update={"command": robot.command.model_copy(update={"dead_time_s": 0.0})})
     command = np.array([[0.006, 0.0, 0.0, -0.002], [0.002, 0.004, 0.0, 0.001]])
-    simulator = build_simulator(Experiment(robot="motor_arm"), robot)
+    simulator = build_simulator(ModelSpec(robot))
     end = 0.3
     commands = simulator.commands(np.array([0.0, 0.05]), command, np.zeros(4), np.array([0.0, end]))
     expected = simulator.rollout({"young_modulus": np.array(3e6)}, commands)

@@ -11,7 +11,6 @@ import numpy as np
 from rfdropo_bayes.bayes.channels import Weighed, WeighedParts
 from rfdropo_bayes.data import load_recordings
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
-from rfdropo_bayes.workflow.assembly import build_model
 from rfdropo_bayes.workflow.calibration import with_ratios
 from rfdropo_bayes.workflow.model import Model
 
@@ -53,7 +52,7 @@ def test_an_unknown_payload_is_free_beside_the_one_that_was_weighed(datasets, mo
     monkeypatch.setenv("RFDROPO_DATA", str(datasets))
     for overrides, payloads in (([], {KNOWN}), (documented(), {KNOWN, UNKNOWN})):
         model, _ = Model.read(EXPERIMENT, overrides)
-        built = build_model(model.experiment, model.simulator, load_recordings(model.experiment.data, model.folder))
+        built = model.numpyro(load_recordings(model.settings.data, model.folder))
         (weighed,) = [channel for channel in built.channels if isinstance(channel, WeighedParts)]
         assert weighed.entries == (Weighed((KNOWN,), 0.1, 0.001),)
         assert {name for name in built.space.names if name.startswith("payload_mass")} == payloads

@@ -15,6 +15,7 @@ from rfdropo_bayes.cli import main
 from rfdropo_bayes.data import DATA_VARIABLE, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.workflow.model import Model
 from rfdropo_bayes.workflow.simulation import simulate_all
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
@@ -189,11 +190,11 @@ def test_a_simulated_recording_is_found_again(bar, tmp_path, monkeypatch, capsys
 def test_the_mesh_is_looked_for_beside_the_experiment(bar, bar_mesh, tmp_path, monkeypatch):
     monkeypatch.delenv(DATA_VARIABLE, raising=False)
     text = bar.read_text().replace(str(bar_mesh), "mine.vtk") + COMMANDS
-    experiment, _ = load_experiment(write(tmp_path / "mine.toml", text))
+    model, _ = Model.read(write(tmp_path / "mine.toml", text))
     with pytest.raises(InputError, match=r"mine\.vtk: no such file"):
-        simulate_all(experiment, tmp_path, tmp_path / "out")
+        simulate_all(model, tmp_path / "out")
     (tmp_path / "mine.vtk").write_bytes(bar_mesh.read_bytes())
-    report = simulate_all(experiment, tmp_path, tmp_path / "out", balance=True)["recordings"]["walk"]
+    report = simulate_all(model, tmp_path / "out", balance=True)["recordings"]["walk"]
     assert (report["status"], report["balance"]) == ("ok", "written")
     with xr.open_dataset(tmp_path / "out" / "trajectory.nc", engine="h5netcdf", group="balance") as balance:
         units = {name: variable.attrs["units"] for name, variable in balance.data_vars.items()}

@@ -29,6 +29,8 @@ from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.workflow.assembly import pooling
 from rfdropo_bayes.workflow.experiment import Experiment
+from rfdropo_bayes.workflow.model import Model
+from rfdropo_bayes.workflow.model_spec import ModelSpec
 from rfdropo_bayes.workflow.simulation import simulate_all
 from rfdropo_bayes.workflow.unseen import run_prediction
 
@@ -306,9 +308,9 @@ def test_a_first_row_far_from_the_model_s_is_found_by_the_model_s_own_error():
 
 def test_noise_is_not_pooled():
     """It is the same for all recordings: a deviation of it would be drawn and never used."""
-    experiment = Experiment(robot="smooth_arm", model={"per_group": {"observation_noise": 1e-3}})
+    spec = ModelSpec(load_robot("smooth_arm"), per_group={"observation_noise": 1e-3})
     with pytest.raises(InputError, match="unknown parameter 'observation_noise'"):
-        pooling(experiment, (ParameterSpec("mass", "kg", 0.0, 1.0, 0.1, {}, ""),), ["a"])
+        pooling(spec, (ParameterSpec("mass", "kg", 0.0, 1.0, 0.1, {}, ""),), ["a"])
 
 
 def beyond_null(spec: ParameterSpec, sign: float) -> float:
@@ -343,7 +345,7 @@ def test_a_simulated_recording_is_predicted_from_its_first_row(name, sign, tmp_p
         "commands": commands | {"recordings": ["new"]},
         "model": {"mechanisms": [name], "fixed": values},
     }
-    simulate_all(Experiment.model_validate(made), tmp_path, tmp_path)
+    simulate_all(Model.of_experiment(Experiment.model_validate(made), tmp_path), tmp_path)
     data = {"format": "netcdf", "fit": ["trajectory.nc"]}
     (tmp_path / "own.toml").write_text(tomli_w.dumps(experiment | {"data": data}))
     fixed = {"observation_noise": 1e-6} | values

@@ -25,6 +25,11 @@ class Climbable(Protocol):
         ...
 
     @property
+    def bounds(self) -> tuple[Any, Any]:
+        """Lower and upper bounds of the coordinates, (d,) or one number: a step ends on a bound that it would cross."""
+        ...
+
+    @property
     def density(self) -> Any:
         """Log posterior of a batch (n, d), unnormalised."""
         ...
@@ -120,10 +125,10 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
     """One Levenberg-Marquardt step; damping grows until the log posterior rises.
 
     Damping acts on the curvature's diagonal (Marquardt's scaling), so that units do not matter. All dampings of a step
-    are tried in one batch of rollouts. A target may have ``bounds``: a coordinate stays on one that it is drawn to.
+    are tried in one batch of rollouts.
     """
     gradient, curvature = target.quadratic(state.position)
-    low, high = getattr(target, "bounds", (-np.inf, np.inf))
+    low, high = target.bounds
     held = ((state.position <= low) & (gradient < 0.0)) | ((state.position >= high) & (gradient > 0.0))
     if held.any():
         gradient = np.where(held, 0.0, gradient)

@@ -25,10 +25,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from scipy.special import logsumexp
 
-from rfdropo_bayes.bayes.problem import Hierarchy, Problem, ResidualProblem, Values
+from rfdropo_bayes.bayes.problem import Hierarchy, Problem, ResidualProblem, TraceableProblem, WarmStart
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.modes.blocks import BlockProblem
 from rfdropo_bayes.inference.modes.climb import (
     Climbable,
     Laplace,
@@ -223,7 +224,7 @@ def screened(
     Raises:
         NoLikelihoodError: none of the draws has a positive likelihood.
     """
-    draw = getattr(problem, "sample_starts", problem.sample_prior)
+    draw = problem.sample_starts if isinstance(problem, WarmStart) else problem.sample_prior
     u = np.asarray(problem.to_unconstrained(draw(key, max(screen, count))), dtype=float)
     density = _heights(problem, u, horizon, ledger)
     order = _spread(u, density, count)
@@ -283,24 +284,6 @@ def _spread(u: Float[np.ndarray, "n d"], density: Float[np.ndarray, " n"], count
         distance = np.linalg.norm(scaled[:, None] - scaled[chosen], axis=2).min(axis=1)
         chosen.append(int(np.argmax(distance)))
     return order[chosen]
-
-
-class BlockProblem:
-    """Blocks of a problem's rows as its rows, which a sampler brings in by shares: it tempers a whole block at once."""
-
-    def __init__(self, problem: StraightProblem, horizons: tuple[int, ...]) -> None:
-        self.problem, self.horizons = problem, horizons
-        self.names, self.units, self.bounds = problem.names, problem.units, problem.bounds
-        self.status_names = problem.status_names
-        self.fingerprint = f"{problem.fingerprint} {horizons}"
-        self.n_rows = len(horizons)
-        self.sample_prior, self.log_prior = problem.sample_prior, problem.log_prior
-        self.to_unconstrained, self.from_unconstrained = problem.to_unconstrained, problem.from_unconstrained
-
-    def row_log_likelihood(self, values: Values, horizon: int) -> tuple[Float[Any, "n horizon"], Int[Any, " n"]]:
-        """Log density of the rows of each block together."""
-        rows, status = self.problem.row_log_likelihood(values, self.horizons[horizon - 1])
-        return np.add.reduceat(np.asarray(rows), [0, *self.horizons[: horizon - 1]], axis=1), status
 
 
 def survey(
@@ -486,18 +469,18 @@ def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> Climbs:
 
 def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], Callable[..., Climbable]]:
     """Horizons to climb at, and the posterior at one of them, given the ledger, a point, and noise coordinates."""
-    prior = prior_derivatives(problem)
     if isinstance(problem, ResidualProblem):
+        prior = prior_derivatives(problem)
 
         def by_residuals(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
             return make_target(problem, horizon, ledger, u, prior, config.jacobian, noise)
 
         return block_boundaries(problem.n_rows, SURVEYS if config.survey else config.blocks), by_residuals
-    if hasattr(problem, "log_likelihood_at"):
-        derivatives = log_likelihood_derivatives(problem)
+    if isinstance(problem, TraceableProblem):
+        derivatives, slopes = log_likelihood_derivatives(problem), prior_derivatives(problem)
 
         def by_hessians(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Climbable:
-            return SmoothTarget(problem, ledger, derivatives, *prior, noise=np.zeros(len(u), dtype=bool))
+            return SmoothTarget(problem, ledger, derivatives, *slopes, noise=np.zeros(len(u), dtype=bool))
 
         return (problem.n_rows,), by_hessians
     raise InputError(
@@ -567,7 +550,7 @@ def run(
     mode_key, draw_key = jax.random.split(key)
     digest = run_digest(problem, "laplace", config, key)
     checkpoint = logbook.checkpoint("laplace", digest)
-    whole, held = problem, dict(getattr(problem, "typical_scales", {}))
+    whole, held = problem, dict(problem.typical_scales) if isinstance(problem, Hierarchy) else {}
     if isinstance(whole, Hierarchy) and held:
         problem = whole.holding(held)
 

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
+from rfdropo_bayes.bayes.problem import BatchedResiduals, ClimbedProblem, ResidualProblem, TraceableProblem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.climb import positive_part
@@ -31,6 +31,8 @@ from rfdropo_bayes.inference.modes.climb import positive_part
 FLATTEST = 1e-10  # curvature that a step takes a direction to have at least, as a share of the steepest
 DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order one
 BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
+
+UNBOUNDED = (-np.inf, np.inf)
 
 
 class Target(NamedTuple):
@@ -55,6 +57,11 @@ class Target(NamedTuple):
     residuals: Callable[[np.ndarray], np.ndarray]
     noise: Bool[np.ndarray, " d"]
     differences: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """See `Climbable.bounds`: none."""
+        return UNBOUNDED
 
     def along(self, axes: Float[np.ndarray, "d d"]) -> Target | None:
         """See `Climbable.along`."""
@@ -123,9 +130,8 @@ def make_target(
         return evaluate_prior(problem, points) + likelihood(points)
 
     residuals_at, linearise, differences = _make_linearise(problem, horizon, ledger, u, jacobian)
-    physical = getattr(problem, "physical_names", problem.names)
-    if noise is None and len(physical) < len(problem.names):
-        noise = np.array([name not in physical for name in problem.names])
+    if noise is None and len(problem.physical_names) < len(problem.names):
+        noise = np.array([name not in problem.physical_names for name in problem.names])
     if noise is None:
         ledger.charge(problem, 2 * len(u) + 1, horizon)
         noise = _noise_coordinates(
@@ -139,14 +145,9 @@ def make_target(
     return Target(density, likelihood, *prior, linearise, residuals, noise, differences)
 
 
-def prior_derivatives(problem: Problem) -> tuple[Callable, Callable]:
-    """Gradient and Hessian of the log prior at one point; the same at every horizon, so compiled once."""
-
-    def single(u: Array) -> Array:
-        return jnp.asarray(problem.log_prior(u[None]))[0]
-
-    own = getattr(problem, "prior_derivatives", None)
-    gradient, hessian = own or (jax.jit(jax.grad(single)), jax.jit(jax.hessian(single)))
+def prior_derivatives(problem: ClimbedProblem) -> tuple[Callable, Callable]:
+    """Gradient and Hessian of the log prior at one point, as arrays of NumPy; the same at every horizon."""
+    gradient, hessian = problem.prior_derivatives
     return (lambda u: np.asarray(gradient(u))), (lambda u: np.asarray(hessian(u)))
 
 
@@ -161,8 +162,8 @@ def _make_linearise(
         return problem.residuals({name: value[0] for name, value in values.items()}, horizon)
 
     if jacobian == "auto":
-        jacobian = getattr(problem, "jacobian", "auto")
-    in_batches = getattr(problem, "residual_batch", None) if jacobian == "central" else None
+        jacobian = problem.jacobian
+    in_batches = problem.residual_batch if jacobian == "central" and isinstance(problem, BatchedResiduals) else None
     width = BATCH_DIFFERENCE if in_batches else DIFFERENCE
     batched = None
     if in_batches is None and _works(lambda f, u: f(u), residuals, u):
@@ -253,19 +254,24 @@ class SmoothTarget(NamedTuple):
     """All rows of a problem, with the derivatives of its log posterior.
 
     Attributes:
-        problem: with ``log_likelihood_at``.
+        problem: whose posterior it is.
         ledger: every evaluation is charged to it; a Hessian in d directions counts as d + 1.
         derivatives: gradient and Hessian of the log likelihood at one point, see `log_likelihood_derivatives`.
         prior_gradient, prior_hessian: of the log prior.
         noise: no coordinate is one: the Hessian knows about scales.
     """
 
-    problem: Problem
+    problem: TraceableProblem
     ledger: Ledger
     derivatives: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     prior_gradient: Callable[[np.ndarray], np.ndarray]
     prior_hessian: Callable[[np.ndarray], np.ndarray]
     noise: Bool[np.ndarray, " d"]
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """See `Climbable.bounds`: none."""
+        return UNBOUNDED
 
     def density(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
         """Log posterior, unnormalised; minus infinity where it is not a number."""
@@ -294,13 +300,13 @@ class SmoothTarget(NamedTuple):
         return np.where(lost, 0.0, gradient), np.where(lost[:, None] | lost, 0.0, hessian)
 
 
-def log_likelihood_derivatives(problem: Problem) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+def log_likelihood_derivatives(problem: TraceableProblem) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Gradient and Hessian of the log likelihood of all rows at one unconstrained point, compiled once.
 
     Raises:
         InputError: a likelihood that JAX cannot differentiate twice, as one that integrates an equation with `odeint`.
     """
-    density = problem.log_likelihood_at  # type: ignore[attr-defined]
+    density = problem.log_likelihood_at
     both = jax.jit(lambda u: (jax.grad(density)(u), jax.hessian(density)(u)))
     try:
         jax.eval_shape(both, np.zeros(len(problem.names)))

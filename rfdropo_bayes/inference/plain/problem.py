@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -33,6 +34,7 @@ from numpyro.infer import init_to_uniform
 from numpyro.infer.util import compute_log_probs, constrain_fn, potential_energy, unconstrain_fn
 from numpyro.primitives import Messenger
 
+from rfdropo_bayes.bayes.problem import ProblemDefaults
 from rfdropo_bayes.errors import InputError
 
 CENTRING_DRAWS = 64  # at which the data's information is looked at
@@ -54,7 +56,7 @@ class _JaxData(Messenger):
             msg["value"] = jnp.asarray(msg["value"])
 
 
-class NumpyroProblem:
+class NumpyroProblem(ProblemDefaults):
     """Posterior of a numpyro model given the data it was called with.
 
     Parameters are the components of the model's latent sites: site ``tau`` is ``tau``, the second component of a vector
@@ -194,7 +196,8 @@ class NumpyroProblem:
         flat = self._join({name: jnp.ravel(jnp.asarray(draws[name])) for name in self.names})
         return {name: np.asarray(value).reshape(*batch, *value.shape[1:]) for name, value in self._follow(flat).items()}
 
-    status_names: Mapping[int, str] = {1: "not_a_number"}
+    status_names: Mapping[int, str] = MappingProxyType({1: "not_a_number"})
+    earlier: Mapping[str, Float[Any, " n"]] = MappingProxyType({})
 
     @cached_property
     def _draw(self) -> Callable:
@@ -397,7 +400,7 @@ def _sum_rows(log_prob: Array) -> Float[Array, " rows"]:
     return log_prob.reshape(log_prob.shape[0], -1).sum(axis=1) if log_prob.ndim else log_prob[None]
 
 
-class CentredProblem:
+class CentredProblem(ProblemDefaults):
     """A plain model in coordinates between centred and non-centred: ``v = (u - l) / s^(1 - c) + c l``.
 
     Effects with a common, unknown spread make a funnel: where the spread is small, so are the effects, and no step

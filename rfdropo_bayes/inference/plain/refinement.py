@@ -24,7 +24,7 @@ from numpyro.distributions import MultivariateStudentT
 from scipy.linalg import solve_triangular
 from scipy.special import expit, logit, logsumexp
 
-from rfdropo_bayes.bayes.problem import Values
+from rfdropo_bayes.bayes.problem import ProblemDefaults, Values
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
@@ -74,7 +74,7 @@ class SlopedBridge(BridgedProblem):
         return mixture + shares[0] * (posterior - mixture)
 
 
-class WholeProblem:
+class WholeProblem(ProblemDefaults):
     """A plain model whose data come in together: what its rows say is one row.
 
     Data that are many, or speak of one parameter after the other, as groups of a hierarchy do, make prefixes a longer
@@ -84,8 +84,8 @@ class WholeProblem:
     def __init__(self, problem: SlopedProblem) -> None:
         self.problem, self.n_rows = problem, 1
         self.names, self.units, self.bounds = problem.names, problem.units, problem.bounds
-        self.fingerprint = f"{getattr(problem, 'fingerprint', '')} whole"
-        self.status_names = getattr(problem, "status_names", {})
+        self.fingerprint = f"{problem.fingerprint} whole"
+        self.status_names = problem.status_names
         self.sample_prior, self.log_prior = problem.sample_prior, problem.log_prior
         self.to_unconstrained, self.from_unconstrained = problem.to_unconstrained, problem.from_unconstrained
 

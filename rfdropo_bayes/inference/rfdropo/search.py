@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from rfdropo_bayes.bayes.problem import Problem, RolloutProblem
+from rfdropo_bayes.bayes.problem import Problem, RolloutProblem, with_rollouts
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.progress import UNRECORDED, Checkpoint, Logbook, run_digest
@@ -112,7 +112,7 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
         InputError: the budget does not allow a single generation, or the search space is ill-defined.
     """
     prior = {name: np.asarray(values) for name, values in problem.sample_prior(key, 1000).items()}
-    names = config.parameters or tuple(getattr(problem, "physical_names", problem.names))
+    names = config.parameters or problem.physical_names
     space = search_space(problem, names, config.search, prior)
     population = config.population or default_population(config.optimiser, space.dimension)
     fixed = {name: float(np.median(prior[name])) for name in problem.names if name not in names}
@@ -123,7 +123,7 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
         generations = _affordable_generations(problem.n_rows, population, finalists, config)
     horizons = _horizons(generations, problem.n_rows, config)
     floor = np.full(np.asarray(problem.observed_mask).shape[1], config.variance_floor)
-    if config.mended and hasattr(problem, "noise_deviation"):
+    if config.mended:
         middle = {name: float(np.median(values)) for name, values in prior.items()}
         floor = floor + (np.asarray(problem.noise_deviation(middle), dtype=float) / scale) ** 2
     return Plan(space, population, horizons, min(finalists, generations + 1), fixed, scale, floor)
@@ -214,8 +214,7 @@ def run(
     Raises:
         InputError: a problem without rollouts, a budget that is too small, every rollout of the search failed.
     """
-    if not isinstance(problem, RolloutProblem):
-        raise InputError("this problem has no rollouts", where="[inference] method", remedy='use method = "smc"')
+    problem = with_rollouts(problem)
     prior_key, search_key = jax.random.split(key)
     plan = make_plan(problem, config, prior_key)
     digest = run_digest(problem, "rfdropo", config, key)

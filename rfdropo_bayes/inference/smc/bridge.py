@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.special import gammaln, logsumexp
 
-from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, Values
+from rfdropo_bayes.bayes.problem import Problem, ProblemDefaults, ResidualProblem, Values
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import evaluate_prior
@@ -93,7 +93,7 @@ class BridgeConfig:
         )
 
 
-class BridgedProblem:
+class BridgedProblem(ProblemDefaults):
     """A problem whose "prior" is a `ModeMixture` of another, in its coordinates.
 
     Its one row is ``log prior + log likelihood - log mixture``, so that its evidence is the other's.
@@ -106,8 +106,7 @@ class BridgedProblem:
         self.units = dict.fromkeys(self.names, "1")
         self.bounds = dict.fromkeys(self.names, (-np.inf, np.inf))
         self.n_rows = 1
-        self.fingerprint = getattr(problem, "fingerprint", "")
-        self.status_names = getattr(problem, "status_names", {})
+        self.fingerprint, self.status_names = problem.fingerprint, problem.status_names
 
     def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
         """Draws of the mixture."""

@@ -258,8 +258,8 @@ class StraightProblem:
     def __init__(self, problem: ResidualProblem, key: PRNGKeyArray) -> None:
         self.problem = problem
         self.names, self.units, self.bounds, self.n_rows = problem.names, problem.units, problem.bounds, problem.n_rows
-        self.fingerprint = getattr(problem, "fingerprint", "")
-        self.status_names = getattr(problem, "status_names", {})
+        self.fingerprint, self.status_names = problem.fingerprint, problem.status_names
+        self.prior_ends = problem.prior_ends
         drawn = problem.sample_prior(key, POSITIVE_DRAWS)
         self.logarithmic = np.array([np.min(np.asarray(drawn[name])) > 0.0 for name in self.names])
         self._stand_in = {name: float(np.median(np.asarray(drawn[name]))) for name in self.names}

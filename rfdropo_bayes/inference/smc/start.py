@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from scipy.special import logsumexp
 
-from rfdropo_bayes.bayes.problem import Problem, ResidualProblem
+from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, WarmStart
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.climb import Laplace, laplace, maximise
@@ -118,7 +118,7 @@ def _climbing(problem: Problem, config: SmcConfig) -> LaplaceConfig:
     if config.rollouts is None:
         return LaplaceConfig()
     surveyors = min(int(SURVEY_OF_ALL * config.rollouts / PER_SURVEYOR), MOST_SURVEYORS)
-    if surveyors < FEWEST_SURVEYORS or getattr(problem, "earlier", None):
+    if surveyors < FEWEST_SURVEYORS or (isinstance(problem, WarmStart) and problem.earlier):
         surveyors = 0
     budget = CLIMBING * config.rollouts
     # Three horizons that double cost 1.75 times the last. A step is a Jacobian by differences and 6 dampings.

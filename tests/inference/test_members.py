@@ -1,0 +1,79 @@
+"""What a problem must have is checked before a method runs."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from rfdropo_bayes.bayes.problem import (
+    Problem,
+    ProblemDefaults,
+    ResidualProblem,
+    RolloutProblem,
+    TraceableProblem,
+    WarmStart,
+    check_problem,
+)
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.inference import methods
+
+from .toys import Decay, LinearGaussian, Spring
+
+KEY = jax.random.key(0)
+LEAST = ("names", "units", "bounds", "n_rows", "sample_prior", "log_prior", "row_log_likelihood")
+OF_EVERY = (*LEAST, "to_unconstrained", "from_unconstrained")
+
+
+def alone(problem, *further):
+    """An object with members of a problem, and nothing of the defaults that it derives from."""
+    bare = type("Bare", (), {})()
+    for name in (*OF_EVERY, *further):
+        setattr(bare, name, getattr(problem, name))
+    return bare
+
+
+@pytest.mark.parametrize(
+    ("problem", "said"),
+    [
+        (alone(LinearGaussian()), r"Bare lacks fingerprint, prior_ends, status_names .*define what Problem asks for"),
+        (
+            alone(LinearGaussian(), "fingerprint", "prior_ends", "status_names", "residuals"),
+            r"Bare has 'residuals' but lacks jacobian, physical_names, prior_derivatives .*ResidualProblem",
+        ),
+        (
+            alone(Spring(), "fingerprint", "prior_ends", "status_names", "rollouts", "physical_names", "observed"),
+            r"Bare has 'rollouts' but lacks actions, noise_deviation, noisy_rollouts, observed_mask .*RolloutProblem",
+        ),
+    ],
+)
+def test_a_problem_that_lacks_a_member_is_refused_by_name(problem, said):
+    """And not taken for one that can do less."""
+    with pytest.raises(InputError, match=said):
+        methods.run(problem, "udr", {}, KEY)
+
+
+def test_what_has_the_defaults_lacks_nothing():
+    for problem in (LinearGaussian(), Decay(), Spring()):
+        check_problem(problem)
+        assert isinstance(problem, Problem)
+        assert not isinstance(problem, WarmStart | TraceableProblem)
+    assert isinstance(LinearGaussian(), ResidualProblem)
+    assert not isinstance(LinearGaussian(), RolloutProblem)
+    assert isinstance(Spring(), RolloutProblem)
+    assert not isinstance(Spring(), ResidualProblem)
+
+
+def test_derivatives_of_the_prior_are_those_of_its_density():
+    problem, u = LinearGaussian(), np.array([0.3, -1.0, 2.0])
+    gradient, hessian = ProblemDefaults.prior_derivatives.func(problem)
+    np.testing.assert_allclose(gradient(u), (problem.mean - u) / problem.sd**2, rtol=1e-5)
+    np.testing.assert_allclose(hessian(u), -np.diag(problem.sd**-2.0), rtol=1e-5, atol=1e-12)
+
+
+def test_rollouts_without_noise_are_their_own_noisy_ones():
+    problem = Spring()
+    values = problem.sample_prior(KEY, 3)
+    np.testing.assert_array_equal(problem.noisy_rollouts(KEY, values)[0], problem.rollouts(values, problem.n_rows)[0])
+    np.testing.assert_array_equal(problem.noise_deviation({}), [0.0, 0.0])
+    assert problem.actions.shape == (problem.n_rows, 0)
