@@ -240,22 +240,24 @@ class ProblemDefaults:
     Its derivatives of the prior are JAX's.
     """
 
+    # ``self`` is no `Problem` to a run-time check of types: asking for all its members would ask for these in turn.
+
     fingerprint: str = ""
     status_names: Mapping[int, str] = MappingProxyType({})
     jacobian: str = "auto"
 
     @cached_property
-    def prior_ends(self: Problem) -> Mapping[str, tuple[float, float]]:
+    def prior_ends(self: Any) -> Mapping[str, tuple[float, float]]:
         """The hard bounds."""
         return self.bounds
 
     @cached_property
-    def physical_names(self: Problem) -> tuple[str, ...]:
+    def physical_names(self: Any) -> tuple[str, ...]:
         """All."""
         return self.names
 
     @cached_property
-    def prior_derivatives(self: Problem) -> Derivatives:
+    def prior_derivatives(self: Any) -> Derivatives:
         """Gradient and Hessian of the log prior at one unconstrained point, compiled."""
 
         def single(u: Array) -> Array:
@@ -268,17 +270,17 @@ class RolloutDefaults(ProblemDefaults):
     """The same of a problem with rollouts: neither noise nor commands."""
 
     @cached_property
-    def actions(self: Problem) -> Float[np.ndarray, "n_rows 0"]:
+    def actions(self: Any) -> Float[np.ndarray, "n_rows 0"]:
         """None."""
         return np.zeros((self.n_rows, 0))
 
     def noisy_rollouts(
-        self: RolloutProblem, key: PRNGKeyArray, values: Values
+        self: Any, key: PRNGKeyArray, values: Values
     ) -> tuple[Float[Any, "n n_rows feature"], Int[Any, " n"]]:
         """The rollouts as they are."""
         return self.rollouts(values, self.n_rows)
 
-    def noise_deviation(self: RolloutProblem, values: Mapping[str, float]) -> Float[np.ndarray, " feature"]:
+    def noise_deviation(self: Any, values: Mapping[str, float]) -> Float[np.ndarray, " feature"]:
         """Zero."""
         return np.zeros(np.shape(self.observed)[1])
 

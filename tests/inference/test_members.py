@@ -36,20 +36,26 @@ def alone(problem, *further):
 @pytest.mark.parametrize(
     ("problem", "said"),
     [
-        (alone(LinearGaussian()), r"Bare lacks fingerprint, prior_ends, status_names .*define what Problem asks for"),
+        (alone(LinearGaussian()), r"Bare lacks fingerprint, prior_ends, status_names; .*define what Problem asks for"),
         (
             alone(LinearGaussian(), "fingerprint", "prior_ends", "status_names", "residuals"),
-            r"Bare has 'residuals' but lacks jacobian, physical_names, prior_derivatives .*ResidualProblem",
+            r"Bare has 'residuals' but lacks jacobian, physical_names, prior_derivatives; .*ResidualProblem",
         ),
         (
             alone(Spring(), "fingerprint", "prior_ends", "status_names", "rollouts", "physical_names", "observed"),
-            r"Bare has 'rollouts' but lacks actions, noise_deviation, noisy_rollouts, observed_mask .*RolloutProblem",
+            r"Bare has 'rollouts' but lacks actions, noise_deviation, noisy_rollouts, observed_mask; .*RolloutProblem",
         ),
     ],
 )
 def test_a_problem_that_lacks_a_member_is_refused_by_name(problem, said):
     """And not taken for one that can do less."""
     with pytest.raises(InputError, match=said):
+        check_problem(problem)
+
+
+def test_a_method_looks_through_its_problem_first():
+    problem = alone(LinearGaussian(), "fingerprint", "prior_ends", "status_names", "residuals")
+    with pytest.raises(InputError, match="has 'residuals' but lacks"):
         methods.run(problem, "udr", {}, KEY)
 
 
