@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rfdropo_bayes.audit.bootstrap import null_residuals, tail
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.fit import Fit, widened
@@ -25,6 +24,7 @@ from rfdropo_bayes.audit.gain import (
 )
 from rfdropo_bayes.audit.omnibus import joint_test, statistics
 from rfdropo_bayes.audit.score import Signature, joint_statistic, likeness, project_out, signature, span, statistic
+from rfdropo_bayes.audit.screen import null_residuals, tail
 from rfdropo_bayes.audit.verdict import decide
 from rfdropo_bayes.bayes.noise.autoregression import (
     REPEATS,

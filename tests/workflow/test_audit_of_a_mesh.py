@@ -10,7 +10,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.mechanisms import bodies_of
-from rfdropo_bayes.workflow.audit import build_question
+from rfdropo_bayes.workflow.audit import build_problem
 from rfdropo_bayes.workflow.experiment import Experiment
 
 ROBOT = load_robot("trunk_sofa_mesh")
@@ -72,7 +72,7 @@ def recording(rows: int = 12) -> Trajectory:
 def test_candidates_that_do_not_run_on_a_mesh_are_left_out_and_listed(bar_mesh, tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     own = ["own.py:Glue", "own.py:Fur"]
-    asked = build_question(
+    asked = build_problem(
         experiment(bar_mesh, candidates=own, exclude=["softening"]), tmp_path, [recording()], [], seed=0
     )
     layered = {name for name, kind in REGISTRY.items() if bodies_of(kind) == ("layered",)}
@@ -96,6 +96,6 @@ def test_candidates_that_do_not_run_on_a_mesh_are_left_out_and_listed(bar_mesh, 
 def test_beside_a_cube_every_candidate_runs():
     tables = experiment(Path()).model_dump(exclude_none=True, exclude_defaults=True)
     tables |= {"robot": "trunk_sofa", "simulator": {"push": True}}
-    asked = build_question(Experiment.model_validate(tables), Path(), [recording()], [], seed=0)
+    asked = build_problem(Experiment.model_validate(tables), Path(), [recording()], [], seed=0)
     assert not asked.left_out
     assert {c.name for c in asked.candidates} == set(REGISTRY) | {"initial_displacement"}
