@@ -224,14 +224,8 @@ def build_problem(
         names = [name for name in names if name not in left_out]
     simulator = build_simulator(_with(experiment, names), robot, folder)
     model, base = _model(experiment, simulator, trajectories, len(fitted), names)
-    added = simulator.mechanisms[len(experiment.model.mechanisms) :]
-    index = {p.spec.name: i for i, p in enumerate(model.space.parameters)}
-    candidates = [
-        Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
-        for name, m in zip(names, added, strict=True)
-        if name not in experiment.audit.exclude
-    ]
-    specs = simulator.parameters
+    added, specs = simulator.mechanisms[len(experiment.model.mechanisms) :], simulator.parameters
+    candidates = _named(experiment, model, names, added)
     if library:
         of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
         plain, stated = [s for s in specs if s.name not in of_candidates], expand_groups(spreads, specs)
@@ -241,15 +235,16 @@ def build_problem(
     coordinates = Coordinates(model.space, base, tuple(nominal), nominal, model.fixed, limits)
     workshop = {} if workshop is None else workshop
     lanes = partial(_lanes, names=names, robot=robot, folder=folder, model=model, coordinates=coordinates)
-    finer = None
-    if not isinstance(robot, BlackBox):
-        further = _finer(experiment, robot)
-        half = build_simulator(_with(further, names), robot, folder)
-        commands = stack_commands([commands_of(half, trajectory) for trajectory in trajectories])
-        finer = lanes(further, half, workshop), commands
+
+    def half() -> tuple[Lanes, Commands]:
+        finer = _finer(experiment, robot)
+        whole = build_simulator(_with(finer, names), robot, folder)
+        commands = stack_commands([commands_of(whole, trajectory) for trajectory in trajectories])
+        return lanes(finer, whole, workshop), commands
+
     return AuditProblem(
         lanes(experiment, simulator, workshop),
-        finer,
+        None if isinstance(robot, BlackBox) else half(),
         coordinates,
         model,
         list(fitted),
@@ -261,6 +256,18 @@ def build_problem(
         {name: why for name, why in left_out.items() if name not in experiment.audit.exclude},
         groups,
     )
+
+
+def _named(
+    experiment: Experiment, model: TrajectoryModel, names: Sequence[str], added: Sequence[Mechanism]
+) -> list[Candidate]:
+    """Mechanisms as candidates, less those that the experiment excludes."""
+    index = {p.spec.name: i for i, p in enumerate(model.space.parameters)}
+    return [
+        Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
+        for name, m in zip(names, added, strict=True)
+        if name not in experiment.audit.exclude
+    ]
 
 
 def _with_own(
