@@ -58,7 +58,8 @@ def audit(
     if separate:
         from rfdropo_bayes.workflow.separation import TABLE, run_separation
 
-        said = {"overrides": overrides or [], "base": base, "seed": seed, "resume": resume, "overwrite": overwrite}
+        said: dict[str, Any] = {"overrides": overrides or [], "base": base, "seed": seed}
+        said |= {"resume": resume, "overwrite": overwrite}
         told = run_separation(experiment, folder, **said, report=say_progress(quiet))
         say(told, (folder / TABLE).read_text(encoding="utf-8"), quiet=quiet, as_json=as_json)
         return

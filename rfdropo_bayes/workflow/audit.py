@@ -236,7 +236,7 @@ def build_problem(
     workshop = {} if workshop is None else workshop
     lanes = partial(_lanes, names=names, robot=robot, folder=folder, model=model, coordinates=coordinates)
 
-    def half() -> tuple[Lanes, Commands]:
+    def half(robot: Robot) -> tuple[Lanes, Commands]:
         finer = _finer(experiment, robot)
         whole = build_simulator(_with(finer, names), robot, folder)
         commands = stack_commands([commands_of(whole, trajectory) for trajectory in trajectories])
@@ -244,7 +244,7 @@ def build_problem(
 
     return AuditProblem(
         lanes(experiment, simulator, workshop),
-        None if isinstance(robot, BlackBox) else half(),
+        None if isinstance(robot, BlackBox) else half(robot),
         coordinates,
         model,
         list(fitted),
