@@ -40,7 +40,7 @@ def test_two_effects_that_pay_only_together_are_named_together(opposed):
 
 def test_without_pairs_neither_of_the_two_is_named(opposed, monkeypatch):
     monkeypatch.setattr(ExtensionSearch, "_pair", lambda *given: [])
-    assert audit(opposed).steps == []
+    assert audit(opposed).causes.steps == []
 
 
 def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drums_does_the_same(monkeypatch):
