@@ -186,7 +186,7 @@ def test_a_killed_audit_goes_on_where_it_was_and_says_the_same(tmp_path, monkeyp
     assert again < 0.7 * len(calls)
     # What the first part took counts: a resumed audit that looks nearly all up has a longer account than its own time.
     assert sum(resumed.cost.profile.values()) == resumed.cost.seconds
-    assert {"base model", "screening", "joint test", "refits", "gain"} <= set(resumed.profile)
+    assert {"base model", "screening", "joint test", "refits", "gain"} <= set(resumed.cost.profile)
     began = time.monotonic()
     once_more = audit(asked, journal=Journal(tmp_path, resume=True))
     assert once_more.seconds > 1.2 * (time.monotonic() - began)
