@@ -7,16 +7,17 @@ coordinate would be infinite; a parameter that means nothing at null (a time con
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.special import expit, logit
+from jaxtyping import Array, Float, Int
 
+from rfdropo_bayes.bayes.batches import padded
 from rfdropo_bayes.bayes.priors import log_density
 from rfdropo_bayes.bayes.space import Parameter, ParameterSpace
 
@@ -25,47 +26,6 @@ PRIOR_DRAWS = 4000
 # Prior deviations from its mean at which an unconstrained coordinate ends: a logistic is flat there.
 FAR = 8.0
 STEP = 1e-3  # of differences of log priors, in these coordinates
-
-
-@dataclass(frozen=True)
-class Support:
-    """Where a prior is positive, and the map from the real line to it: logistic, exponential or none.
-
-    The same maps as numpyro's, without a compilation for every number of points.
-    """
-
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, parameter: Parameter) -> Support:
-        """That of a parameter's prior."""
-        support = parameter.prior.support
-        return cls(float(getattr(support, "lower_bound", -np.inf)), float(getattr(support, "upper_bound", np.inf)))
-
-    def value(self, x: np.ndarray) -> np.ndarray:
-        """Physical values of coordinates."""
-        if np.isfinite(self.low) and np.isfinite(self.high):
-            return self.low + (self.high - self.low) * expit(x)
-        if np.isfinite(self.low):
-            return self.low + np.exp(x)
-        return self.high - np.exp(x) if np.isfinite(self.high) else x
-
-    def free(self, value: np.ndarray) -> np.ndarray:
-        """Coordinates of physical values."""
-        if np.isfinite(self.low) and np.isfinite(self.high):
-            return logit((value - self.low) / (self.high - self.low))
-        if np.isfinite(self.low):
-            return np.log(value - self.low)
-        return np.log(self.high - value) if np.isfinite(self.high) else value
-
-    def slope(self, x: np.ndarray) -> np.ndarray:
-        """Derivatives of the values."""
-        if np.isfinite(self.low) and np.isfinite(self.high):
-            return (self.high - self.low) * expit(x) * expit(-x)
-        if np.isfinite(self.low):
-            return np.exp(x)
-        return -np.exp(x) if np.isfinite(self.high) else np.ones_like(x)
 
 
 @dataclass(frozen=True)
@@ -133,11 +93,7 @@ class Coordinates:
 
     @cached_property
     def _free_draws(self) -> list[np.ndarray]:
-        return [s.free(self._draws[name]) for s, name in zip(self._supports, self.names, strict=True)]
-
-    @cached_property
-    def _supports(self) -> list[Support]:
-        return [Support.of(p) for p in self.space.parameters]
+        return [np.asarray(p.transform.inv(self._draws[p.name])) for p in self.space.parameters]
 
     @cached_property
     def bounds(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
@@ -161,7 +117,7 @@ class Coordinates:
         """Physical values of one parameter as coordinates."""
         if self.affine[index]:
             return (np.asarray(values, dtype=float) - self._null[index]) / self._scale[index]
-        return self._supports[index].free(np.asarray(values, dtype=float))
+        return np.asarray(self.space.parameters[index].transform.inv(np.asarray(values, dtype=float)))
 
     @cached_property
     def null(self) -> Float[np.ndarray, " d"]:
@@ -174,8 +130,7 @@ class Coordinates:
 
     def values(self, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Physical values."""
-        free = [support.value(column) for support, column in zip(self._supports, x.T, strict=True)]
-        return np.where(self.affine, self._null + self._scale * x, np.stack(free, axis=1))
+        return self._with_moved(self._null + self._scale * x, x, 0)
 
     def named(self, x: Float[np.ndarray, " d"]) -> dict[str, float]:
         """Physical values of one point by name."""
@@ -191,15 +146,28 @@ class Coordinates:
 
     def slopes(self, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Derivative of each physical value with respect to its coordinate."""
-        free = [support.slope(column) for support, column in zip(self._supports, x.T, strict=True)]
-        return np.where(self.affine, self._scale, np.stack(free, axis=1))
+        return self._with_moved(np.tile(self._scale, (len(x), 1)), x, 1)
 
     def log_prior(self, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Log density of each coordinate's prior in these coordinates."""
-        values, found = self.values(x), np.empty(x.shape)
-        for i, p in enumerate(self.space.parameters):
-            slope = self._scale[i] if self.affine[i] else self._supports[i].slope(x[:, i])
-            found[:, i] = log_density(p.spec, p.table or p.spec.prior, values[:, i]) + np.log(np.abs(slope))
+        own = zip(self.space.parameters, self.values(x).T, strict=True)
+        density = [log_density(p.spec, p.table or p.spec.prior, value) for p, value in own]
+        return np.stack(density, axis=1) + np.log(np.abs(self.slopes(x)))
+
+    @cached_property
+    def _moved(self) -> Callable[[Float[Any, "n moved"]], tuple[Float[Any, "n moved"], Float[Any, "n moved"]]]:
+        """Values of the parameters that are moved unconstrained, and their derivatives."""
+        transforms = [p.transform for p, affine in zip(self.space.parameters, self.affine, strict=True) if not affine]
+
+        def values(u: Float[Array, "n moved"]) -> Float[Array, "n moved"]:
+            return jnp.stack([transform(column) for transform, column in zip(transforms, u.T, strict=True)], axis=1)
+
+        return jax.jit(lambda u: jax.jvp(values, (u,), (jnp.ones_like(u),)))
+
+    def _with_moved(self, found: Float[np.ndarray, "n d"], x: Float[np.ndarray, "n d"], which: int) -> np.ndarray:
+        """``found`` with values (0) or slopes (1) of the parameters that are moved unconstrained in their places."""
+        if not self.affine.all():
+            found[:, ~self.affine] = padded(self._moved, x[:, ~self.affine])[which]
         return found
 
     def prior_slopes(self, x: Float[np.ndarray, " d"]) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import MEASURED_FROM_NULL, PRIOR_DRAWS
-from rfdropo_bayes.audit.held import OwnParameter, families, stem
+from rfdropo_bayes.audit.fixed_quantities import OwnParameter, families, stem
 from rfdropo_bayes.bayes.pooling import deviation_spec
 from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace

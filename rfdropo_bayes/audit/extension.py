@@ -1,4 +1,4 @@
-"""Naming causes: the leading classes are refitted, the best joins the model, and the question is asked again."""
+"""Naming causes: the leading classes are refitted, the best joins the model, and the next screen follows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import (
     Candidate,
     Probe,
@@ -24,10 +23,10 @@ from rfdropo_bayes.audit.deadline import OutOfTime, about
 from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb, climb_rollouts, heights
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.gain import noise_distance
-from rfdropo_bayes.audit.inadequacy import as_measured, far_off, judged
+from rfdropo_bayes.audit.inadequacy import as_measured, far_off, fit_with_noise
 from rfdropo_bayes.audit.omnibus import Omnibus
 from rfdropo_bayes.audit.score import joint_statistic, likeness, project_out, span
-from rfdropo_bayes.audit.screen import Look, Row, look
+from rfdropo_bayes.audit.screen import Row, Screen, p_in_words, screen
 
 DISCRETISATION = "discretisation"
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])
@@ -76,7 +75,7 @@ class Step:
     Attributes:
         name: of the mechanism.
         members: its equivalence class, itself first.
-        before: the look at the model without it.
+        before: the screen of the model without it.
         fit: of the model with it.
         log_bayes_factor: of the model with against that without it, by Laplace.
         refits: log Bayes factors of all candidates that were refitted at this step.
@@ -86,7 +85,7 @@ class Step:
 
     name: str
     members: tuple[str, ...]
-    before: Look
+    before: Screen
     fit: Fit
     log_bayes_factor: float
     refits: dict[str, float]
@@ -94,8 +93,8 @@ class Step:
 
 
 @dataclass
-class Inquiry:
-    """The question put to a data set: which of the candidates does the base model lack?
+class ExtensionSearch:
+    """The search over extensions of the base model: which of the candidates does it lack?
 
     Attributes:
         target: data, noise and simulator; every candidate is in the simulator, at its null value. Its noise
@@ -104,7 +103,7 @@ class Inquiry:
         rules: see `Rules`.
         seed: of all bootstraps.
         finer: the simulator on a finer mesh and time step, for the candidate `DISCRETISATION`; None without it.
-        report: called with a line of words as the inquiry goes on.
+        report: called with a line of words as the search goes on.
     """
 
     target: Target
@@ -114,7 +113,7 @@ class Inquiry:
     finer: Forward | None = None
     report: Callable[[str], None] = lambda line: None
 
-    def look_at(self, fit: Fit, without: Sequence[str] = ()) -> tuple[Look, list[Probe]]:
+    def screened(self, fit: Fit, without: Sequence[str] = ()) -> tuple[Screen, list[Probe]]:
         """Test a fit and screen the candidates that are not in it.
 
         An error of the mesh or time step that is too small to be named is no discrepancy either: where the residuals
@@ -142,7 +141,7 @@ class Inquiry:
             probes.append(discretisation_probe(fit, DISCRETISATION, finer, span(fit.jacobian)))
             names.append(DISCRETISATION)
         with clock.stage("joint test"):
-            found = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer)
+            found = screen(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer)
             if self.target.known is not None:  # whether anything is wrong, the noise of the measurement says
                 return replace(found, omnibus=self._tested(fit, len(without)), finer=None), probes
             if found.finer is None:
@@ -150,7 +149,7 @@ class Inquiry:
             seen = found.row(DISCRETISATION).adjusted_p <= self.rules.family
             if seen and self._below_the_noise(fit):
                 exact = _without_numerical_error(fit, probes[-1])
-                again = look(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, exact)
+                again = screen(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, exact)
                 found, seen = replace(found, finer=again.finer), False
         if not seen and found.finer is not None:
             found = replace(found, omnibus=max(found.omnibus, found.finer, key=lambda test: test.p))
@@ -166,22 +165,22 @@ class Inquiry:
         shift = numerical_shift(self.target, self.finer, fit)
         return shift is not None and shift <= noise_distance(self.target.measured.noise.first)
 
-    def tested(self, fit: Fit, number: int) -> Look:
+    def tested(self, fit: Fit, number: int) -> Screen:
         """The joint test of a model, which screens no candidates and takes no rollouts."""
-        found = look(self.target, fit, [], [], [self.seed, number], self.rules.bootstraps)
+        found = screen(self.target, fit, [], [], [self.seed, number], self.rules.bootstraps)
         return replace(found, omnibus=self._tested(fit, number))
 
     def _tested(self, fit: Fit, number: int) -> Omnibus:
         """The joint test of a fit under the noise of the measurement."""
         known = self.target.measured
         measured = as_measured(self.target, fit)
-        return look(known, measured, [], [], [self.seed, number], self.rules.bootstraps).omnibus
+        return screen(known, measured, [], [], [self.seed, number], self.rules.bootstraps).omnibus
 
-    def name_causes(self, base: Fit) -> tuple[Fit, list[Step], Look]:
-        """Forward-stepwise extension: the base model, the steps taken, and the look at the final model.
+    def name_causes(self, base: Fit) -> tuple[Fit, list[Step], Screen]:
+        """Forward-stepwise extension: the base model, the steps taken, and the screen of the final model.
 
         The base model is another one where a candidate has led to a better optimum of it. When the time is up: the
-        steps so far, and a look without candidates.
+        steps so far, and a joint test without candidates.
         """
         bases, steps = [base], list[Step]()
         try:
@@ -190,16 +189,16 @@ class Inquiry:
             found = self.tested(steps[-1].fit if steps else bases[-1], len(steps))
         return bases[-1], steps, found
 
-    def _name_causes(self, bases: list[Fit], steps: list[Step]) -> Look:
-        """Append steps until no more are called for, and better base models; the look at the final model."""
+    def _name_causes(self, bases: list[Fit], steps: list[Step]) -> Screen:
+        """Append steps until no more are called for, and better base models; the screen of the final model."""
         fit = bases[-1]
         renewed: set[int] = set()  # numbers of steps at which the model was climbed again: once at each
         while True:
             named = [step.name for step in steps]
             if steps:
-                self.target, fit = judged(self.target.measured, fit.x, fit.free)
+                self.target, fit = fit_with_noise(self.target.measured, fit.x, fit.free)
                 steps[-1] = replace(steps[-1], fit=fit, judge=self.target)
-            found, _ = self.look_at(fit, named)
+            found, _ = self.screened(fit, named)
             if not steps and found.omnibus.p > self.rules.base_passes:
                 return found
             p = p_in_words(found.omnibus.p, self.rules.bootstraps)
@@ -245,7 +244,7 @@ class Inquiry:
         as few keep out what only imitates them."""
         return len(self.candidates) if self.target.known is not None else self.rules.effects - len(steps)
 
-    def _extend(self, found: Look, named: Sequence[str]) -> Step | None:
+    def _extend(self, found: Screen, named: Sequence[str]) -> Step | None:
         """Refit the leading classes and add the best of them, if it is worth it."""
         significant = [row for row in found.rows if row.adjusted_p <= self.rules.family and row.probe is not None]
         if any(row.name == DISCRETISATION for row in significant) and self._below_the_noise(found.fit):
@@ -280,7 +279,7 @@ class Inquiry:
         judge = self.target.on(self.finer) if best == DISCRETISATION and self.finer else self.target
         return Step(best, members, found, fits[best], refits[best], refits, judge)
 
-    def _pair(self, found: Look, named: Sequence[str], single: Step | None) -> list[Step]:
+    def _pair(self, found: Screen, named: Sequence[str], single: Step | None) -> list[Step]:
         """Two mechanisms at once, where the best one leaves most of a large misfit; none where they do not pay.
 
         Of compliance and pretension of cables neither does much without the other. Pairs are ranked by what the linear
@@ -314,7 +313,7 @@ class Inquiry:
             return []
         alone = {name: self.refit(fit, rows[name]) for name in best}
         first, second = sorted(best, key=lambda name: -alone[name].log_evidence)
-        between, _ = self.look_at(alone[first], [*named, first])
+        between, _ = self.screened(alone[first], [*named, first])
         gains = [alone[first].log_evidence - fit.log_evidence, fits[best].log_evidence - alone[first].log_evidence]
         return [
             Step(first, (first,), found, alone[first], gains[0], single.refits if single else {}, self.target),
@@ -473,7 +472,7 @@ class Inquiry:
         emptied[others] = self.target.forward.coordinates.null[others]
         bare[list(candidate.indices)] = last.fit.x[list(candidate.indices)]
         alone = max((climb(self.target, start, indices) for start in (emptied, bare)), key=lambda fit: fit.log_evidence)
-        found, _ = self.look_at(alone, [last.name])
+        found, _ = self.screened(alone, [last.name])
         again = self._extend(found, [last.name])
         if again is None or again.name in (first.name, *first.members) or again.name == DISCRETISATION:
             return steps

@@ -1,16 +1,22 @@
-"""Posterior modes of the base model and its extensions within bounds, with Laplace's evidence."""
+"""Posterior modes of the base model and its extensions within bounds, with Laplace's evidence.
+
+Under a long recording the likelihood has many small summits, on which climbs of the whole end. The base model's optimum
+is looked for as `calibrate` looks for it: the climbs of `inference.find_modes` start at screened draws, and at short
+prefixes. `better_nearby` then asks rollouts, not derivatives, whether the summit that was found is one.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.stats import norm
 
 from rfdropo_bayes.audit.coordinates import Coordinates
@@ -19,13 +25,22 @@ from rfdropo_bayes.audit.journal import Arrays, Journal, digest
 from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.bayes.channels import Seen
 from rfdropo_bayes.bayes.noise.stacked import Stacked
-from rfdropo_bayes.inference import LevenbergState, maximise, normal_at
+from rfdropo_bayes.bayes.problem import ProblemDefaults
+from rfdropo_bayes.bayes.space import Parameter, ParameterSpace
+from rfdropo_bayes.inference import LaplaceConfig, climb_cost, find_modes, maximise, normal_at
+from rfdropo_bayes.inference import Target as Climbed
+from rfdropo_bayes.simulators.differences import usable_difference
 from rfdropo_bayes.simulators.protocol import Observation
 
 FIRST, ALL = 8, 40  # steps of a short climb, and most of one to its end
 USUAL = 12  # steps of a climb, each with a Jacobian
 TOLERANCE = 0.01  # nats that a step promises at the end of a climb
 CLOSE = 1e-3  # of the squared misfit: climbs end where steps bring less than a thousandth of that
+SEARCHED = 3  # steps of a climb of a search: of a linear model one or two, of the demonstration's arm five
+CLIMBED = 0.1  # nats that a step of a search's climbs promises at their end; the audit's own climb goes on from there
+POLLED = (0.3, 0.03, 0.003)  # prior deviations to each side of a summit that are tried
+ALONG = (4.0, 2.0, 1.0, 0.3)  # deviations of the posterior along its principal axes, likewise
+WITHIN = 0.5 * max(ALONG) ** 2  # nats that a step of slopes promises which is no longer than those tried
 FAILED = 1e6  # whitened residual of a rollout that did not end well: no step is ever taken there
 
 
@@ -140,6 +155,11 @@ class Target:
         white = self._whitened(np.stack([errors for errors, _ in each]), self.weighed(points)[0])
         return np.where(fine[:, None], white, FAILED), np.array([float(size) for _, size in each]), fine
 
+    def log_likelihood(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
+        """Of a batch of points, up to the noise's normaliser; minus infinity where a rollout did not end well."""
+        white, sizes, fine = self.evaluate(points)
+        return np.where(fine, -0.5 * np.sum(white**2, axis=1) - sizes, -np.inf)
+
     def errors(self, x: Float[np.ndarray, " d"]) -> Float[np.ndarray, "group time column"]:
         """Measured less simulated readings at one point, in the unit of the noise.
 
@@ -218,62 +238,140 @@ def _seen(shown: Fields) -> Seen:
     return Seen(Observation(**{**parts, "status": 0}), shown, shown["offset"])  # type: ignore[arg-type]
 
 
-@dataclass
-class _Climb:
-    """The posterior over some coordinates, the others held, as `inference.maximise` climbs it."""
+@dataclass(frozen=True)
+class Posterior(ProblemDefaults):
+    """The posterior over some coordinates, the others held, as inference methods see it; see `bayes.problem`.
+
+    A row is one row of every group of repeats, whitened given those before it. The noise is known.
+
+    Attributes:
+        target: what is fitted.
+        start: all coordinates.
+        free: those that are not held.
+    """
 
     target: Target
     start: Float[np.ndarray, " d"]
     free: Int[np.ndarray, " free"]
+    jacobian: str = "central"
 
-    def __post_init__(self) -> None:
-        self.noise = np.zeros(len(self.free), dtype=bool)
-        self.bounds = tuple(bound[self.free] for bound in self.target.forward.coordinates.bounds)
-        self.linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None
+    @property
+    def _coordinates(self) -> Coordinates:
+        return self.target.forward.coordinates
 
-    def place(self, u: Float[np.ndarray, "n free"]) -> Float[np.ndarray, "n d"]:
-        """Points of all coordinates."""
+    @cached_property
+    def _parameters(self) -> tuple[Parameter, ...]:
+        return tuple(self._coordinates.space.parameters[i] for i in self.free)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Free parameters."""
+        return tuple(p.name for p in self._parameters)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Of the parameters."""
+        return {p.name: p.spec.unit for p in self._parameters}
+
+    @property
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """Hard bounds."""
+        return {p.name: (p.spec.low, p.spec.high) for p in self._parameters}
+
+    @property
+    def n_rows(self) -> int:
+        """Rows of the longest recording."""
+        return int(self.target.measurements.count.shape[1])
+
+    def place(self, u: Float[Any, "n free"]) -> Float[np.ndarray, "n d"]:
+        """Points of all coordinates, within their bounds."""
         points = np.repeat(self.start[None], len(u), axis=0)
-        points[:, self.free] = np.clip(u, *self.bounds)
-        return points
+        points[:, self.free] = np.asarray(u)
+        return np.clip(points, *self._coordinates.bounds)
 
-    def density(self, u: Float[np.ndarray, "n free"]) -> Float[np.ndarray, " n"]:
-        """Log posterior, up to the noise's normaliser."""
-        points = self.place(u)
-        white, sizes, fine = self.target.evaluate(points)
-        prior = self.target.forward.coordinates.log_prior(points)[:, self.free].sum(axis=1)
-        return np.where(fine, -0.5 * np.sum(white**2, axis=1) - sizes + prior, -np.inf)
+    def sample_prior(self, key: PRNGKeyArray, n: int) -> dict[str, Float[Any, " n"]]:
+        """Independent prior draws."""
+        drawn = ParameterSpace(self._parameters).sample(key, n)
+        return {name: np.asarray(column, dtype=float) for name, column in drawn.items()}
 
-    def linearise(self, u: Float[np.ndarray, " free"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residuals, the Jacobian of the prediction, and the slopes of the logarithms of sizes."""
-        if self.linear is None or not np.array_equal(self.linear[0], u):
-            x = self.place(u[None])
-            directions = np.eye(x.shape[1])[self.free]
-            slopes, sizes = self.target.slopes(np.repeat(x, len(self.free), axis=0), directions)
-            self.linear = u.copy(), self.target.residual(x)[0], slopes.T, sizes
-        return self.linear[1:]
+    def to_unconstrained(self, values: Mapping[str, Any]) -> Float[Any, "n free"]:
+        """Coordinates of values."""
+        own = zip(self.free, self.names, strict=True)
+        return np.stack([self._coordinates.encode_one(i, np.asarray(values[name])) for i, name in own], axis=1)
 
-    def quadratic(self, u: Float[np.ndarray, " free"]) -> tuple[np.ndarray, np.ndarray]:
-        """See `modes.climb.Climbable`."""
-        residual, jacobian, sizes = self.linearise(u)
-        gradient = jacobian.T @ residual - sizes + self.prior_gradient(u)
-        return gradient, jacobian.T @ jacobian + np.diag(np.maximum(-np.diag(self.prior_hessian(u)), 0.0))
+    def from_unconstrained(self, u: Float[Any, "n free"]) -> dict[str, Float[Any, " n"]]:
+        """Values of coordinates."""
+        values = self._coordinates.values(self.place(u))
+        return {name: values[:, i] for i, name in zip(self.free, self.names, strict=True)}
 
-    def information(self, u: Float[np.ndarray, " free"]) -> Float[np.ndarray, "free free"]:
-        """See `modes.climb.Climbable`."""
-        jacobian = self.linearise(u)[1]
-        return jacobian.T @ jacobian
+    def log_prior(self, u: Float[Any, "n free"]) -> Float[Any, " n"]:
+        """Log prior density of the free coordinates."""
+        return self._coordinates.log_prior(self.place(u))[:, self.free].sum(axis=1)
 
-    def along(self, axes: Float[np.ndarray, "free free"]) -> None:
-        """Its derivatives stay as they are."""
+    @property
+    def prior_derivatives(self) -> tuple[Any, Any]:
+        """Gradient and Hessian of the log prior."""
 
-    def prior_gradient(self, u: Float[np.ndarray, " free"]) -> Float[np.ndarray, " free"]:
-        """Of the log prior."""
-        return self.target.forward.coordinates.prior_slopes(self.place(u[None])[0])[0][self.free]
+        def at(u: np.ndarray, order: int) -> np.ndarray:
+            return self._coordinates.prior_slopes(self.place(np.asarray(u)[None])[0])[order][self.free]
 
-    def prior_hessian(self, u: Float[np.ndarray, " free"]) -> Float[np.ndarray, "free free"]:
-        """Of the log prior."""
-        return np.diag(self.target.forward.coordinates.prior_slopes(self.place(u[None])[0])[1][self.free])
+        return (lambda u: at(u, 0)), (lambda u: np.diag(at(u, 1)))
+
+    def row_log_likelihood(
+        self, values: Mapping[str, Any], horizon: int
+    ) -> tuple[Float[Any, "n horizon"], Int[Any, " n"]]:
+        """Of each row given those before it, up to the noise's normaliser; status 1 for a rollout that was lost."""
+        white, weighed, fine = self._rows(values, horizon)
+        rows = -0.5 * np.sum(white**2, axis=(1, 3))
+        rows[:, 0] -= 0.5 * np.sum(weighed**2, axis=1)
+        return np.where(fine[:, None], rows, -np.inf), np.where(fine, 0, 1)
+
+    def residual_batch(self, values: Mapping[str, Any], horizon: int) -> Float[Any, "n m"]:
+        """Whitened residuals of a prefix."""
+        white, weighed, fine = self._rows(values, horizon)
+        return np.where(fine[:, None], np.concatenate([white.reshape(len(white), -1), weighed], axis=1), np.inf)
+
+    def residuals(self, values: Mapping[str, Any], horizon: int) -> Float[Any, " m"]:
+        """The same of one set of values."""
+        return self.residual_batch({name: np.atleast_1d(value) for name, value in values.items()}, horizon)[0]
+
+    def _rows(self, values: Mapping[str, Any], horizon: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whitened residuals of a prefix, those of weighed parts, and where rollouts ended well.
+
+        What the sizes of relative errors add to the likelihood is left to the climb of the whole.
+        """
+        white, _, fine = self.target.evaluate(self.place(self.to_unconstrained(values)), horizon)
+        white = np.where(fine[:, None], white, 0.0)
+        series = self.target.measurements.series(white)
+        return series[:, :, :horizon], white[:, self.target.measurements.count.size :], fine
+
+    def whole(self) -> Climbed:
+        """All rows, as climbs want them: with the simulator's own derivatives, and those of the sizes of errors."""
+        known: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+
+        def at(u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            if u.tobytes() not in known:
+                known.clear()
+                x = self.place(u[None])
+                directions = np.eye(x.shape[1])[self.free]
+                slopes, sizes = self.target.slopes(np.repeat(x, len(self.free), axis=0), directions)
+                known[u.tobytes()] = self.target.residual(x)[0], -slopes.T, -sizes
+            return known[u.tobytes()]
+
+        def likelihood(u: np.ndarray) -> np.ndarray:
+            return self.target.log_likelihood(self.place(u))
+
+        low, high = self._coordinates.bounds
+        return Climbed(
+            lambda u: likelihood(u) + self.log_prior(u),
+            likelihood,
+            *self.prior_derivatives,
+            lambda u: at(u)[:2],
+            lambda u: self.target.residual(self.place(u)),
+            np.zeros(len(self.free), dtype=bool),
+            beside=lambda u: at(u)[2],
+            bounds=(low[self.free], high[self.free]),
+        )
 
 
 def climb(
@@ -291,19 +389,13 @@ def climb(
 
 
 def _climb(target: Target, start: np.ndarray, free: np.ndarray, evaluations: int) -> Fit:
-    climbed = _Climb(target, start, free)
+    """A climb, and the normal approximation around where it ends."""
+    posterior = Posterior(target, start, free)
+    climbed = posterior.whole()
     low, high = climbed.bounds
-    inside = np.clip(start[free], low, high)
-    state, _ = maximise(climbed, inside, max_steps=evaluations, tolerance=TOLERANCE)
-    return _around(climbed, state)
-
-
-def _around(climbed: _Climb, state: LevenbergState) -> Fit:
-    """The normal approximation around a point that is taken for the mode."""
-    low, high = climbed.bounds
-    u, x = state.position, climbed.place(state.position[None])[0]
-    found = normal_at(climbed, state)
-    residual, jacobian, _ = climbed.linearise(u)
+    state, _ = maximise(climbed, np.clip(start[free], low, high), max_steps=evaluations, tolerance=TOLERANCE)
+    u, found = state.position, normal_at(climbed, state)
+    residual, jacobian = climbed.linearise(u)
     spread = np.sqrt(np.diag(found.covariance))
     # Only part of a peak at a bound is inside.
     inside = np.log(np.maximum(norm.cdf((high - u) / spread) - norm.cdf((low - u) / spread), 1e-12))
@@ -311,7 +403,7 @@ def _around(climbed: _Climb, state: LevenbergState) -> Fit:
     slope = np.where(((u <= low) & (slope < 0)) | ((u >= high) & (slope > 0)), 0.0, slope)
     promise = 0.5 * float(slope @ found.covariance @ slope) if np.isfinite(state.log_density) else np.inf
     evidence = found.log_evidence + float(np.sum(inside))
-    return Fit(x, climbed.free, residual, jacobian, found.covariance, evidence, promise)
+    return Fit(posterior.place(u[None])[0], free, residual, -jacobian, found.covariance, evidence, promise)
 
 
 def climb_rollouts(target: Target, parameters: int) -> int:
@@ -339,11 +431,8 @@ def best_between(
 def heights(target: Target, points: Float[np.ndarray, "n d"], what: str) -> Float[np.ndarray, " n"]:
     """Log posteriors of points, up to the noise's normaliser; kept in the journal by the name of ``what``."""
 
-    def compute() -> Arrays:
-        white, sizes, _ = target.evaluate(points)
-        return {"height": -0.5 * np.sum(white**2, axis=1) - sizes}
-
-    return target.recall(what, [points], compute)["height"] + target.forward.coordinates.log_prior(points).sum(axis=1)
+    found = target.recall(what, [points], lambda: {"height": target.log_likelihood(points)})
+    return found["height"] + target.forward.coordinates.log_prior(points).sum(axis=1)
 
 
 def widened(fit: Fit, coordinates: Coordinates) -> Fit:
@@ -367,3 +456,74 @@ def widening(fit: Fit, coordinates: Coordinates) -> Float[np.ndarray, " d"]:
     """By how much the scale of each prior is widened for a fit's sizes; 1 where it stays as it is."""
     free = np.isin(np.arange(len(fit.x)), fit.free) & coordinates.affine
     return np.where(free, np.maximum(np.abs(fit.x / coordinates.prior_sd), 1.0), 1.0)
+
+
+def base_optimum(target: Target, key: PRNGKeyArray) -> Float[np.ndarray, " d"]:
+    """Where the best of `calibrate`'s climbs ends.
+
+    Raises:
+        NoLikelihoodError: all prior draws are lost.
+    """
+
+    def compute() -> dict[str, np.ndarray]:
+        own = target.forward.coordinates
+        posterior = Posterior(target, own.null, np.arange(own.base))
+        # Its normal approximation is not used: the coarse differences of short climbs suffice.
+        mode = find_modes(posterior, LaplaceConfig(tolerance=CLIMBED), key).modes[0]
+        return {"x": posterior.place(mode.mean[None])[0]}
+
+    return target.recall("search", [np.asarray(jax.random.key_data(key))], compute)["x"]
+
+
+def optimum_rollouts(target: Target) -> int:
+    """Rollouts that `base_optimum` usually takes: draws that are screened, at each horizon, and climbs, of which the
+    better half goes on to the next."""
+    config, own = LaplaceConfig(), target.forward.coordinates
+    beginning, step = climb_cost(own.base, 0)
+    climbs = sum(max(config.starts >> level, 1) for level in range(config.blocks))
+    return target.forward.count * int(config.blocks * config.screen + climbs * (beginning + SEARCHED * step))
+
+
+def poll_rollouts(target: Target) -> int:
+    """Rollouts that `better_nearby` takes."""
+    return target.forward.count * (1 + 2 * (len(POLLED) + len(ALONG)) * target.forward.coordinates.base)
+
+
+def with_usable_differences(target: Target, x: Float[np.ndarray, " d"]) -> Target:
+    """The target with derivatives over steps on whose scale its motion is smooth around a point.
+
+    Slopes over the steps of a ladder, in prior deviations, are compared, of all base parameters at once; rollouts say
+    which steps agree.
+    """
+    usual, coordinates = target.forward.lanes.difference, target.forward.coordinates
+    if usual is None:
+        return target
+    directions = np.diag(coordinates.prior_sd)[: coordinates.base]
+
+    def slope(step: float) -> np.ndarray:
+        points = np.clip(np.concatenate([x + step * directions, x - step * directions]), *coordinates.bounds)
+        found = target.recall("ladder", [points], lambda: {"residual": target.residual(points)})["residual"]
+        ahead, behind = np.split(found, 2)
+        return (ahead - behind) / (2.0 * step)
+
+    step = usable_difference(slope)
+    return target if step <= usual else replace(target, forward=target.forward.with_difference(step))
+
+
+def better_nearby(target: Target, fit: Fit) -> Float[np.ndarray, " d"] | None:
+    """A point beside a fit that is clearly better; None where rollouts confirm that it is a summit.
+
+    Derivatives cannot tell: of a motion that is rough on the scale of their steps they are noise, and promise nothing.
+    """
+    coordinates = target.forward.coordinates
+    own = coordinates.prior_sd[fit.free]
+    values, vectors = np.linalg.eigh(fit.covariance / np.outer(own, own))
+    axes = (vectors * np.sqrt(np.maximum(values, 0.0))).T * own
+    moves = [step * np.diag(own) for step in POLLED] + [step * axes for step in ALONG]
+    moved = np.concatenate([sign * move for move in moves for sign in (-1.0, 1.0)])
+    points = np.repeat(fit.x[None], 1 + len(moved), axis=0)
+    points[1:, fit.free] += moved
+    tried = np.clip(points, *coordinates.bounds)
+    height = heights(target, tried, "poll")
+    best = int(np.argmax(height))
+    return tried[best] if height[best] > height[0] + 1.0 + CLOSE * float(fit.residual @ fit.residual) else None

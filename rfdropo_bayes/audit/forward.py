@@ -17,8 +17,10 @@ from jaxtyping import Float
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.deadline import Deadline
 from rfdropo_bayes.audit.journal import digest
+from rfdropo_bayes.bayes.batches import in_chunks
 from rfdropo_bayes.bayes.channels.object_pose import OFFSETS, Placing
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.callbacks import distinct
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.differences import DIFFERENCE, FORWARD
 from rfdropo_bayes.simulators.protocol import Result, Simulator
@@ -130,7 +132,8 @@ class Lanes:
         raise. After ``steps`` time steps, all by default, rows hold no meaning.
         """
         limit = jnp.asarray(commands.step.shape[1] if steps is None else steps)
-        return self._chunks(lambda *given: self._rolled(*given, limit), commands, check, theta, start)
+        lanes = (theta, start, commands)
+        return in_chunks(lambda own: self._rolled(*own, limit), lanes, (self.width,), before=check)
 
     def differentiate(
         self,
@@ -141,15 +144,8 @@ class Lanes:
         check: Callable[[], None] = _no_limit,
     ) -> Fields:
         """Derivatives along tangents of those parts of an observation that are data."""
-        return self._chunks(self._derived, commands, check, theta, tangent, start)
-
-    def _chunks(self, function: Any, commands: Commands, check: Callable[[], None], *arrays: np.ndarray) -> Any:
-        parts, count = [], len(arrays[0])
-        for first in range(0, count, self.width):
-            check()
-            index = np.minimum(np.arange(first, first + self.width), count - 1)
-            parts.append(jax.device_get(function(*(a[index] for a in arrays), commands.of(index))))
-        return jax.tree.map(lambda *pieces: np.concatenate(pieces)[:count], *parts)
+        lanes = (theta, tangent, start, commands)
+        return in_chunks(lambda own: self._derived(*own), lanes, (self.width,), before=check)
 
 
 class RoutedLanes(Lanes):
@@ -290,7 +286,7 @@ class Forward:
         points = np.atleast_2d(points)
         theta = self.coordinates.physical_values(points, self.slots)
         flat, start, commands = self._per_lane(theta)
-        once, again = self._different(flat)
+        once, again = distinct([np.tile(np.arange(self.count), len(theta)), flat])
         began = time.monotonic()
         every = self.commands.step.shape[1]
         steps = None if rows is None else min(int(self.commands.sample_step[:, :rows].max()) + 1, every)
@@ -338,13 +334,6 @@ class Forward:
             every[moved] = np.nan_to_num(part)
             shown[name] = every.reshape(len(points), self.count, *part.shape[1:])
         return shown | {"offset": self._offset(tangent), **self.coordinates.gain_tangents(points, directions)}
-
-    def _different(self, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lanes of which none repeats another, in their order, and which of them each lane is."""
-        lane = np.tile(np.arange(self.count), len(flat) // self.count)
-        _, first, inverse = np.unique(np.column_stack([lane, flat]), axis=0, return_index=True, return_inverse=True)
-        once = np.sort(first)
-        return once, np.searchsorted(once, first[inverse.ravel()])
 
     def _offset(self, theta: np.ndarray) -> np.ndarray:
         found = np.zeros((*theta.shape[:2], 3))

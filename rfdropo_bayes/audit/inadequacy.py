@@ -34,7 +34,7 @@ def far_off(target: Target, x: Float[np.ndarray, " d"]) -> bool:
     return bool(residual @ residual > POOR * np.count_nonzero(residual))
 
 
-def judged(known: Target, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]) -> tuple[Target, Fit]:
+def fit_with_noise(known: Target, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]) -> tuple[Target, Fit]:
     """The target under which a model is judged, and its fit, climbed from a point."""
     if not far_off(known, x):
         return known, climb(known, x, free)

@@ -11,28 +11,31 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.deadline import Deadline, OutOfTime, about
 from rfdropo_bayes.audit.differences import Groups
-from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry, Rules, Step, numerical_shift
-from rfdropo_bayes.audit.fit import Fit, Target, climb, climb_rollouts, widened
+from rfdropo_bayes.audit.extension import DISCRETISATION, ExtensionSearch, Rules, Step, numerical_shift
+from rfdropo_bayes.audit.fit import (
+    WITHIN,
+    Fit,
+    Target,
+    base_optimum,
+    better_nearby,
+    climb,
+    climb_rollouts,
+    optimum_rollouts,
+    poll_rollouts,
+    widened,
+    with_usable_differences,
+)
 from rfdropo_bayes.audit.forward import Forward, Lanes
 from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
-from rfdropo_bayes.audit.inadequacy import as_measured, judged, spread
+from rfdropo_bayes.audit.inadequacy import as_measured, fit_with_noise, spread
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
-from rfdropo_bayes.audit.screen import Look, look
-from rfdropo_bayes.audit.search import (
-    WITHIN,
-    better_nearby,
-    poll_rollouts,
-    search,
-    search_rollouts,
-    with_usable_differences,
-)
+from rfdropo_bayes.audit.screen import Screen, p_in_words, screen
 from rfdropo_bayes.audit.verdict import NO_VERDICT, PARTLY, UNEXPLAINED, decide
 from rfdropo_bayes.bayes.channels import ObjectPose, Series
 from rfdropo_bayes.bayes.model import TrajectoryModel
@@ -51,7 +54,7 @@ HELD_OUT_ROWS = 0.6  # of a single recording, which is all that is fitted of it 
 
 
 @dataclass(frozen=True)
-class Question:
+class AuditProblem:
     """What is audited.
 
     Attributes:
@@ -87,94 +90,152 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What an audit found; see the attributes' own classes.
+class Causes:
+    """What the search over extensions has named.
 
-    ``unsupported`` names mechanisms that the fitted recordings asked for and unseen ones do not support; ``looks`` are
-    the looks at the base model and after each step; ``stages`` the explained fraction after each step; ``sizes`` is the
-    last model's fit under priors that do not pull, and ``draws`` are from it; ``suspected`` is a noise under which the
-    base model would pass, where a stated one leaves a discrepancy that is not explained; ``shift`` is the distance by
-    which constants tell repeats apart [m]; ``numerical`` is how far half the time step and a finer mesh
-    move the markers of the last model [m], None where that is not known or the finer one is the model; ``stopped``
-    says that the time was up before all was done; ``profile`` are the seconds of each stage.
+    Attributes:
+        steps: that unseen recordings support, all of them where these support none.
+        unsupported: mechanisms that the fitted recordings asked for and unseen ones do not support.
+        screens: of the base model, and after each step.
     """
 
-    verdict: str
-    question: Question
-    target: Target
-    base: Fit
     steps: list[Step]
     unsupported: list[str]
-    looks: list[Look]
-    gain: Gain | None
-    stages: list[float]
-    held_out: str
-    remainder: Remainder
-    predictions: tuple[Prediction, Prediction] | None
-    unseen: Unseen | None
-    sizes: Fit
-    draws: Float[np.ndarray, "draw d"]
+    screens: list[Screen]
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What the extension is worth on recordings that no fit has seen.
+
+    Attributes:
+        gain: of all steps; None where it could not be measured.
+        stages: explained fraction after each step.
+        recordings: which they are, in words.
+        predictions: of the base model and of the last one.
+        unseen: the measurements.
+    """
+
+    gain: Gain | None = None
+    stages: list[float] = field(default_factory=list)
+    recordings: str = ""
+    predictions: tuple[Prediction, Prediction] | None = None
+    unseen: Unseen | None = None
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """What speaks against the noise, or against the simulation.
+
+    Attributes:
+        suspected: a noise under which the base model would pass, where a stated one leaves a discrepancy that is not
+            explained.
+        shift: distance by which constants tell repeats apart [m]; None without repeats.
+        numerical: how far half the time step and a finer mesh move the markers of the last model [m]; None where that
+            is not known, or the finer one is the model.
+    """
+
     suspected: Stacked | None
     shift: float | None
     numerical: float | None
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What an audit took.
+
+    Attributes:
+        stopped: whether the time was up before all was done.
+        rollouts: of the whole run.
+        profile: seconds of each stage, of all parts of an audit that was resumed.
+    """
+
     stopped: bool
     rollouts: int
     profile: dict[str, float]
 
     @property
     def seconds(self) -> float:
-        """Of all parts of an audit that was resumed."""
+        """Of all stages."""
         return sum(self.profile.values())
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What an audit found.
+
+    Attributes:
+        verdict: see `decide`.
+        problem: what was audited.
+        target: data, noise of the measurement, and simulator.
+        base: fit of the base model.
+        causes, validation, doubts, cost: see their own classes.
+        remainder: what no candidate explains.
+        sizes: the last model's fit under priors that do not pull; ``draws`` are from it.
+    """
+
+    verdict: str
+    problem: AuditProblem
+    target: Target
+    base: Fit
+    causes: Causes
+    validation: Validation
+    remainder: Remainder
+    sizes: Fit
+    draws: Float[np.ndarray, "draw d"]
+    doubts: Doubts
+    cost: Cost
 
     @property
     def fitted(self) -> bool:
         """Whether the base fit came to an end; where it did not, its parameters are where the search had come to."""
-        return self.base.converged or not self.stopped
+        return self.base.converged or not self.cost.stopped
 
     @property
     def extended(self) -> Fit:
         """The last model."""
-        return self.steps[-1].fit if self.steps else self.base
+        return self.causes.steps[-1].fit if self.causes.steps else self.base
 
     @property
     def adopted(self) -> list[Step]:
         """Steps that join the model for good: those that unseen recordings clearly support, in a model that explains
         more than next to nothing."""
-        return self.steps if self.gain is not None and self.gain.clear and self.verdict != UNEXPLAINED else []
+        gain = self.validation.gain
+        return self.causes.steps if gain is not None and gain.clear and self.verdict != UNEXPLAINED else []
 
 
 def audit(
-    question: Question,
+    problem: AuditProblem,
     report: Callable[[str], None] = lambda line: None,
     journal: Journal | None = None,
     deadline: Deadline | None = None,
 ) -> Answer:
-    """Run the audit. Same question, same answer.
+    """Run the audit. Same problem, same answer.
 
     Args:
-        question: see `Question`.
+        problem: see `AuditProblem`.
         report: called with a line of words now and then.
         journal: keeps what was computed, for an audit that is interrupted.
-        deadline: of a run that has begun before; by default the question's minutes from now on.
+        deadline: of a run that has begun before; by default the problem's minutes from now on.
 
     Raises:
         InputError: rollouts at the optimum do not end well.
     """
-    deadline = deadline or Deadline(question.rules.minutes)
+    deadline = deadline or Deadline(problem.rules.minutes)
     with deadline.stage("base model"):
-        target, base = _fitted_or_not(question, journal, report, deadline)
+        target, base = _fitted_or_not(problem, journal, report, deadline)
     fitted = not deadline.reached
-    question = _with_differences_of(question, target)
+    problem = _with_differences_of(problem, target)
     if fitted:
         noise = target.measured.noise.first
         shared = "" if noise.correlation is None else ", shared between coordinates"
         report(f"base model fitted; noise from {noise.source}, AR({noise.order}){shared}{_far_off(target, base)}")
-    finer = _forward(question, True, target.measurements, deadline) if fitted and question.finer else None
-    judge, inquiry = target, Inquiry(target, question.candidates, question.rules, question.seed, finer, report)
-    inquiry, base, steps, last = _inquired(inquiry, base)
-    judge = judge if judge.known is not None else inquiry.target.on(judge.forward)
+    finer = _forward(problem, True, target.measurements, deadline) if fitted and problem.finer else None
+    judge, search = target, ExtensionSearch(target, problem.candidates, problem.rules, problem.seed, finer, report)
+    search, base, steps, last = _searched(search, base)
+    judge = judge if judge.known is not None else search.target.on(judge.forward)
     asked = [step.name for step in steps]
-    steps, last, held_out = _supported(question, judge, inquiry, base, steps, last)
+    steps, last, held_out = _supported(problem, judge, search, base, steps, last)
     base, steps = as_measured(judge, base), [replace(s, fit=as_measured(s.judge, s.fit)) for s in steps]
     unsupported = [name for name in asked if name not in [step.name for step in steps]]
     if unsupported:
@@ -182,51 +243,50 @@ def audit(
     extended, target = steps[-1].fit if steps else base, judge.measured
     if steps and target.noise.source == RESIDUALS:
         with suppress(OutOfTime):
-            last = _final_look(replace(inquiry, target=steps[-1].judge), extended, steps)
-    looks = [*(step.before for step in steps), last]
-    stages = [held_out.gain(0, k) for k in range(1, len(steps) + 1)] if held_out else []
-    gain = stages[-1] if stages else None
-    verdict, suspected = _judged(replace(inquiry, target=judge), base, steps, looks, gain, deadline)
+            last = _final_screen(replace(search, target=steps[-1].judge), extended, steps)
+    screens = [*(step.before for step in steps), last]
+    validation = _validation(held_out, len(steps))
+    verdict, suspected = _verdict(replace(search, target=judge), base, steps, screens, validation.gain, deadline)
     stopped = deadline.reached
     deadline.lift()  # what is left are single rollouts, for the report
-    sizes = widened(extended, question.coordinates)
-    low, high = question.coordinates.bounds
+    sizes = widened(extended, problem.coordinates)
+    shown = None if DISCRETISATION in asked or finer is None else numerical_shift(target, finer, extended)
     return Answer(
         verdict,
-        question,
+        problem,
         target,
         base,
-        steps,
-        unsupported,
-        looks,
-        gain,
-        [stage.explained for stage in stages],
-        held_out.which if held_out else "",
+        Causes(steps, unsupported, screens),
+        validation,
         describe_remainder(target.measurements, extended.residual, target.noise.first),
-        (held_out.predictions[0], held_out.predictions[len(steps)]) if held_out else None,
-        held_out.unseen if held_out else None,
         sizes,
-        sizes.draws(np.random.default_rng([question.seed, 5]), 1000, low, high),
-        suspected,
-        target.measurements.shift,
-        None if DISCRETISATION in asked or finer is None else numerical_shift(target, finer, extended),
-        stopped,
-        judge.forward.rollouts + (finer.rollouts if finer else 0),
-        deadline.profile,
+        sizes.draws(np.random.default_rng([problem.seed, 5]), 1000, *problem.coordinates.bounds),
+        Doubts(suspected, target.measurements.shift, shown),
+        Cost(stopped, judge.forward.rollouts + (finer.rollouts if finer else 0), deadline.profile),
     )
 
 
+def _validation(held_out: HeldOut | None, steps: int) -> Validation:
+    """What unseen recordings say of the model after so many steps, and after each of them."""
+    if held_out is None:
+        return Validation()
+    gains = [held_out.gain(0, k) for k in range(1, steps + 1)]
+    explained, predictions = [gain.explained for gain in gains], held_out.predictions
+    last = gains[-1] if gains else None
+    return Validation(last, explained, held_out.which, (predictions[0], predictions[steps]), held_out.unseen)
+
+
 def _supported(
-    question: Question, judge: Target, inquiry: Inquiry, base: Fit, steps: list[Step], last: Look
-) -> tuple[list[Step], Look, HeldOut | None]:
-    """The steps that recordings which no fit has seen support, all of them where these support none; the look at the
-    model with them; and the predictions of these recordings."""
-    held_out = _held_out(question, judge, inquiry, base, steps)
+    problem: AuditProblem, judge: Target, search: ExtensionSearch, base: Fit, steps: list[Step], last: Screen
+) -> tuple[list[Step], Screen, HeldOut | None]:
+    """The steps that recordings which no fit has seen support, all of them where these support none; the screen
+    of the model with them; and the predictions of these recordings."""
+    held_out = _held_out(problem, judge, search, base, steps)
     if held_out is None or not (kept := held_out.supported()):
         return steps, last, held_out
     last = steps[kept].before if kept < len(steps) else last
-    steps, held_out = _without_carried(question, judge, inquiry, base, steps[:kept], held_out.after(kept))
-    return steps, last if len(steps) == kept else inquiry.tested(steps[-1].fit, len(steps)), held_out
+    steps, held_out = _without_carried(problem, judge, search, base, steps[:kept], held_out.after(kept))
+    return steps, last if len(steps) == kept else search.tested(steps[-1].fit, len(steps)), held_out
 
 
 def _far_off(target: Target, fit: Fit) -> str:
@@ -239,73 +299,78 @@ def _far_off(target: Target, fit: Fit) -> str:
     return f"; it is far off: judged under white noise of the {size:.2g} mm that it leaves; a row counts {share:.2g}"
 
 
-def _judged(
-    inquiry: Inquiry, base: Fit, steps: Sequence[Step], looks: Sequence[Look], gain: Gain | None, deadline: Deadline
+def _verdict(
+    search: ExtensionSearch,
+    base: Fit,
+    steps: Sequence[Step],
+    screens: Sequence[Screen],
+    gain: Gain | None,
+    deadline: Deadline,
 ) -> tuple[str, Stacked | None]:
     """The verdict, and the noise under which the base model would pass where something is left unexplained."""
-    rules, last = inquiry.rules, looks[-1].omnibus.p
-    members, noise = [len(step.members) for step in steps], inquiry.target.measured.noise
-    verdict = decide(rules, looks[0].omnibus.p, last if steps else None, members, gain, noise.doubtful)
+    rules, last = search.rules, screens[-1].omnibus.p
+    members, noise = [len(step.members) for step in steps], search.target.measured.noise
+    verdict = decide(rules, screens[0].omnibus.p, last if steps else None, members, gain, noise.doubtful)
     if not base.converged or (verdict == UNEXPLAINED and deadline.reached):
         verdict = NO_VERDICT
     suspected = None
     if verdict in (PARTLY, UNEXPLAINED) and last <= rules.extended_passes:
         with suppress(OutOfTime):
-            suspected = _suspected(inquiry, base)
+            suspected = _suspected(search, base)
     return verdict, suspected
 
 
-def _inquired(inquiry: Inquiry, base: Fit) -> tuple[Inquiry, Fit, list[Step], Look]:
-    """Named causes, and the look at the model with them; asked once more where the noise is that of residuals.
+def _searched(search: ExtensionSearch, base: Fit) -> tuple[ExtensionSearch, Fit, list[Step], Screen]:
+    """Named causes, and the screen of the model with them; asked once more where the noise is that of residuals.
 
     Returns:
-        the inquiry and the base fit that they are of, the steps, and the look.
+        the search and the base fit that they are of, the steps, and the screen.
     """
     if not base.converged:
-        return inquiry, base, [], look(inquiry.target, base, [], [], [inquiry.seed, 0], inquiry.rules.bootstraps)
-    own = inquiry.target.forward
-    base, steps, last = inquiry.name_causes(base)
-    if steps and inquiry.target.noise.source == RESIDUALS:
+        return search, base, [], screen(search.target, base, [], [], [search.seed, 0], search.rules.bootstraps)
+    own = search.target.forward
+    base, steps, last = search.name_causes(base)
+    if steps and search.target.noise.source == RESIDUALS:
         with suppress(OutOfTime):
-            again, renewed = _asked_again(inquiry, own, base, steps[-1].fit)
+            again, renewed = _asked_again(search, own, base, steps[-1].fit)
             found = again.name_causes(renewed)
-            if not inquiry.target.forward.deadline.reached:
+            if not search.target.forward.deadline.reached:
                 return again, *found
-    return inquiry, base, steps, last
+    return search, base, steps, last
 
 
-def _with_differences_of(question: Question, target: Target) -> Question:
-    """The question with derivatives over the steps that the base fit has found usable."""
+def _with_differences_of(problem: AuditProblem, target: Target) -> AuditProblem:
+    """The problem with derivatives over the steps that the base fit has found usable."""
     step = target.forward.lanes.difference
-    if step is None or step == question.lanes.difference:
-        return question
-    finer = question.finer and (question.finer[0].with_difference(step), question.finer[1])
-    return replace(question, lanes=target.forward.lanes, finer=finer)
+    if step is None or step == problem.lanes.difference:
+        return problem
+    finer = problem.finer and (problem.finer[0].with_difference(step), problem.finer[1])
+    return replace(problem, lanes=target.forward.lanes, finer=finer)
 
 
-def _forward(question: Question, finer: bool, measurements: Measurements, deadline: Deadline | None) -> Forward:
-    return simulated(question, finer, measurements, [group[0] for group in measurements.members], deadline)
+def _forward(problem: AuditProblem, finer: bool, measurements: Measurements, deadline: Deadline | None) -> Forward:
+    return simulated(problem, finer, measurements, [group[0] for group in measurements.members], deadline)
 
 
 def simulated(
-    question: Question,
+    problem: AuditProblem,
     finer: bool,
     measurements: Measurements,
     chosen: Sequence[int],
     deadline: Deadline | None = None,
 ) -> Forward:
     """Some of the recordings, on the simulator itself or on the finer one; an object starts where they measured it."""
-    lanes, commands = question.lanes, question.model.recordings.commands
-    if finer and question.finer is not None:
-        lanes, commands = question.finer
-    names = {question.model.recordings.names[i]: i for i in chosen}
-    rows = int(question.model.recordings.rows[list(chosen)].max())
+    lanes, commands = problem.lanes, problem.model.recordings.commands
+    if finer and problem.finer is not None:
+        lanes, commands = problem.finer
+    names = {problem.model.recordings.names[i]: i for i in chosen}
+    rows = int(problem.model.recordings.rows[list(chosen)].max())
     start = next((c.readings[:, 0] for c in measurements.channels if isinstance(c, ObjectPose)), None)
-    return Forward(lanes, question.coordinates, commands, names, rows, deadline, start)
+    return Forward(lanes, problem.coordinates, commands, names, rows, deadline, start)
 
 
 def base_model(
-    question: Question,
+    problem: AuditProblem,
     seed: int,
     journal: Journal | None = None,
     report: Callable[[str], None] = lambda line: None,
@@ -316,9 +381,9 @@ def base_model(
     Raises:
         InputError: the time was up before the base model was fitted.
     """
-    target = first_target(question, journal or Journal(), deadline)
+    target = first_target(problem, journal or Journal(), deadline)
     try:
-        return _fitted(target, question.start, seed, report, [])
+        return _fitted(target, problem.start, seed, report, [])
     except OutOfTime:
         raise InputError(
             "the time was up before the base model was fitted",
@@ -342,15 +407,15 @@ def _fitted(
 
 
 def _fitted_or_not(
-    question: Question, journal: Journal | None, report: Callable[[str], None], deadline: Deadline
+    problem: AuditProblem, journal: Journal | None, report: Callable[[str], None], deadline: Deadline
 ) -> tuple[Target, Fit]:
     """The base model's noise and fit; where the time is up before, the last point that the search has come to, which
     counts as not converged. The deadline is lifted then: what is left is a rollout of each recording."""
-    target = first_target(question, journal or Journal(), deadline)
+    target = first_target(problem, journal or Journal(), deadline)
     coordinates = target.forward.coordinates
-    reached = [(target, coordinates.null if question.start is None else coordinates.encode(question.start))]
+    reached = [(target, coordinates.null if problem.start is None else coordinates.encode(problem.start))]
     try:
-        return _fitted(target, question.start, question.seed, report, reached)
+        return _fitted(target, problem.start, problem.seed, report, reached)
     except OutOfTime:
         report("the time was up before the base model was fitted")
         deadline.lift()
@@ -381,30 +446,30 @@ def _announce(target: Target, start: dict[str, float] | None, report: Callable[[
         forward.observe(np.clip(points, *own.bounds))
         took.append(time.monotonic() - began)
     rollouts = climb_rollouts(target, own.base) + poll_rollouts(target)
-    rollouts += search_rollouts(target) if start is None else 0
+    rollouts += optimum_rollouts(target) if start is None else 0
     words = about(rollouts * forward.pace + max(took[0] - took[1], 0.0))
     report(f"fitting the base model: {own.base} parameters, {counted}; about {rollouts} rollouts, {words}")
 
 
-def first_target(question: Question, journal: Journal, deadline: Deadline | None = None) -> Target:
+def first_target(problem: AuditProblem, journal: Journal, deadline: Deadline | None = None) -> Target:
     """The fitted recordings under the noise of repeats or of the experiment file, or a first guess."""
-    measurements = measurements_of(question, range(len(question.trajectories)), question.trajectories)
-    noise = question.stated_noise
+    measurements = measurements_of(problem, range(len(problem.trajectories)), problem.trajectories)
+    noise = problem.stated_noise
     if measurements.has_repeats:
         noise = measurements.noise(measurements.spread, 0)
     if noise is None:
         scales = [np.full(c.valid.shape[-1], GUESSES[c.name]) for c in measurements.channels]
         noise = Stacked(tuple(Autoregression(scale, np.ones(1), RESIDUALS, np.inf) for scale in scales))
-    return Target(_forward(question, False, measurements, deadline), measurements, noise, journal)
+    return Target(_forward(problem, False, measurements, deadline), measurements, noise, journal)
 
 
-def measurements_of(question: Question, chosen: Sequence[int], repeats: Sequence[Trajectory] = ()) -> Measurements:
+def measurements_of(problem: AuditProblem, chosen: Sequence[int], repeats: Sequence[Trajectory] = ()) -> Measurements:
     """Some of the recordings, no more rows than the longest of them has; repeats are joined where they are given."""
     index = list(chosen)
-    kinds = [tuple(slots) for slots in question.coordinates.slots([question.model.recordings.names[i] for i in index])]
-    rows = int(question.model.recordings.rows[index].max())
-    channels = [c.of_recordings(index, rows) if isinstance(c, Series) else c for c in question.model.channels]
-    return gather_measurements(question.model.recordings.of(index, rows), channels, repeats, kinds)
+    kinds = [tuple(slots) for slots in problem.coordinates.slots([problem.model.recordings.names[i] for i in index])]
+    rows = int(problem.model.recordings.rows[index].max())
+    channels = [c.of_recordings(index, rows) if isinstance(c, Series) else c for c in problem.model.channels]
+    return gather_measurements(problem.model.recordings.of(index, rows), channels, repeats, kinds)
 
 
 def _base_fit(
@@ -418,12 +483,12 @@ def _base_fit(
     rollouts beside it are better."""
     coordinates = target.forward.coordinates
     free = np.arange(coordinates.base)
-    first = search(target, jax.random.key(seed)) if start is None else coordinates.encode(start)
+    first = base_optimum(target, jax.random.key(seed)) if start is None else coordinates.encode(start)
     reached.append((target, first))
     usual, target = target.forward.lanes.difference, with_usable_differences(target, first)
     if target.forward.lanes.difference != usual:
         report(f"motion is rough: derivatives over relative steps of {target.forward.lanes.difference:g}")
-    target, fit = judged(target, first, free)
+    target, fit = fit_with_noise(target, first, free)
     for _ in range(AGAIN):
         reached.append((target, fit.x))
         better = better_nearby(target, fit)
@@ -452,32 +517,32 @@ def residual_noise(target: Target, fit: Fit) -> Stacked:
     return measured.noise(np.where(measured.single_valid, left, 0.0), len(fit.free))
 
 
-def _asked_again(inquiry: Inquiry, own: Forward, base: Fit, extended: Fit) -> tuple[Inquiry, Fit]:
-    """The inquiry, on the base model's own simulator, with the noise of what a first extension leaves: that of the base
+def _asked_again(search: ExtensionSearch, own: Forward, base: Fit, extended: Fit) -> tuple[ExtensionSearch, Fit]:
+    """The search, on the base model's own simulator, with the noise of what a first extension leaves: that of the base
     model holds the discrepancy itself, and whitens away what would tell its causes apart."""
-    target = replace(inquiry.target, noise=residual_noise(inquiry.target, extended)).on(own)
-    inquiry.report(f"once more with the noise that the extended model leaves, AR({target.noise.first.order})")
-    return replace(inquiry, target=target), climb(target, base.x, base.free)
+    target = replace(search.target, noise=residual_noise(search.target, extended)).on(own)
+    search.report(f"once more with the noise that the extended model leaves, AR({target.noise.first.order})")
+    return replace(search, target=target), climb(target, base.x, base.free)
 
 
-def _final_look(inquiry: Inquiry, extended: Fit, steps: Sequence[Step]) -> Look:
-    """The look at the extended model under the noise that it leaves itself."""
-    renewed = replace(inquiry.target, noise=residual_noise(inquiry.target, extended))
+def _final_screen(search: ExtensionSearch, extended: Fit, steps: Sequence[Step]) -> Screen:
+    """The screen of the extended model under the noise that it leaves itself."""
+    renewed = replace(search.target, noise=residual_noise(search.target, extended))
     fit = climb(renewed, extended.x, extended.free)
-    found, _ = replace(inquiry, target=renewed).look_at(fit, [step.name for step in steps])
-    p = p_in_words(found.omnibus.p, inquiry.rules.bootstraps)
-    inquiry.report(f"joint test under the noise that it leaves: p {p}")
+    found, _ = replace(search, target=renewed).screened(fit, [step.name for step in steps])
+    p = p_in_words(found.omnibus.p, search.rules.bootstraps)
+    search.report(f"joint test under the noise that it leaves: p {p}")
     return found
 
 
-def _suspected(inquiry: Inquiry, base: Fit) -> Stacked | None:
+def _suspected(search: ExtensionSearch, base: Fit) -> Stacked | None:
     """Noise fitted to what the base model leaves, where it passes under that, though not under the noise stated."""
-    known = inquiry.target.measured
+    known = search.target.measured
     if known.noise.source != STATED:
         return None
     target, fit = _under_residual_noise(known, base)
-    found, _ = replace(inquiry, target=target).look_at(fit)
-    passes = found.omnibus.p > inquiry.rules.base_passes and not target.noise.doubtful
+    found, _ = replace(search, target=target).screened(fit)
+    passes = found.omnibus.p > search.rules.base_passes and not target.noise.doubtful
     return target.noise if passes else None
 
 
@@ -541,7 +606,7 @@ class HeldOut:
 
 
 def _without_carried(
-    question: Question, judge: Target, inquiry: Inquiry, base: Fit, steps: list[Step], held_out: HeldOut
+    problem: AuditProblem, judge: Target, search: ExtensionSearch, base: Fit, steps: list[Step], held_out: HeldOut
 ) -> tuple[list[Step], HeldOut]:
     """Steps less those that were supported beside a later one only, and without which that one does as well.
 
@@ -549,15 +614,15 @@ def _without_carried(
     it were the last step, must clearly predict unseen recordings better than the model without it. Where the time is
     up, the steps stay that were supported together.
     """
-    index, clock = 0, inquiry.target.forward.deadline
+    index, clock = 0, search.target.forward.deadline
     with clock.stage("gain"), clock.reserve(), suppress(OutOfTime):
         while index < len(steps) - 1:
             if held_out.gain(index, index + 1).clear or steps[index].name == DISCRETISATION:
                 index += 1
                 continue
-            inquiry.report(f"is {steps[index].name} needed? The model without it")
-            fewer = inquiry.without(steps, index, base)
-            other = _predicted(question, judge, inquiry, base, fewer)
+            search.report(f"is {steps[index].name} needed? The model without it")
+            fewer = search.without(steps, index, base)
+            other = _predicted(problem, judge, search, base, fewer)
             if held_out.beside(other).clear:
                 index += 1
             else:
@@ -565,37 +630,41 @@ def _without_carried(
     return steps, held_out
 
 
-def _held_out(question: Question, judge: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step]) -> HeldOut | None:
+def _held_out(
+    problem: AuditProblem, judge: Target, search: ExtensionSearch, base: Fit, steps: Sequence[Step]
+) -> HeldOut | None:
     """The test recordings, or fitted ones that are left out in turn; None where the model was not extended, or the time
     was up."""
     if not steps:
         return None
-    inquiry.report("measuring the gain on recordings that no fit has seen")
-    with inquiry.target.forward.deadline.stage("gain"), suppress(OutOfTime):
-        return _predicted(question, judge, inquiry, base, steps)
+    search.report("measuring the gain on recordings that no fit has seen")
+    with search.target.forward.deadline.stage("gain"), suppress(OutOfTime):
+        return _predicted(problem, judge, search, base, steps)
     return None
 
 
-def _predicted(question: Question, judge: Target, inquiry: Inquiry, base: Fit, steps: Sequence[Step]) -> HeldOut:
+def _predicted(
+    problem: AuditProblem, judge: Target, search: ExtensionSearch, base: Fit, steps: Sequence[Step]
+) -> HeldOut:
     """Predictions of the base model, fitted under ``judge``, and of the model after each step."""
-    target, judges = inquiry.target.measured, [judge, *(step.judge for step in steps)]
-    count, every = len(question.trajectories), len(question.model.recordings.names)
+    target, judges = search.target.measured, [judge, *(step.judge for step in steps)]
+    count, every = len(problem.trajectories), len(problem.model.recordings.names)
     fits = [base, *(step.fit for step in steps)]
     names = ["", *(step.name for step in steps)]
     if every > count:
         which = "test recordings"
-        tested = measurements_of(question, range(count, every))
-        unseen = _unseen(tested, tested.valid, question.model.recordings.names[count:])
+        tested = measurements_of(problem, range(count, every))
+        unseen = _unseen(tested, tested.valid, problem.model.recordings.names[count:])
         predictions = []
         for i, fit in enumerate(fits):
-            forward = simulated(question, DISCRETISATION in names[: i + 1], tested, range(count, every))
-            predictions.append(_predict(replace(target, forward=forward, measurements=tested), fit, [question.seed, 3]))
+            forward = simulated(problem, DISCRETISATION in names[: i + 1], tested, range(count, every))
+            predictions.append(_predict(replace(target, forward=forward, measurements=tested), fit, [problem.seed, 3]))
     else:
-        which, unseen, predictions = _left_out(question, judges, inquiry, fits)
+        which, unseen, predictions = _left_out(problem, judges, search, fits)
     seen = list(zip(judges, fits, strict=True))
     patterns = [target.measurements.series(as_measured(judge, fit).residual) for judge, fit in seen]
     spreads, noises = [spread(judge, fit) for judge, fit in seen], [judge.noise for judge in judges]
-    return HeldOut(which, unseen, predictions, patterns, target.noise, noises, spreads, question.seed)
+    return HeldOut(which, unseen, predictions, patterns, target.noise, noises, spreads, problem.seed)
 
 
 def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) -> Unseen:
@@ -605,11 +674,11 @@ def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) 
 
 
 def _left_out(
-    question: Question, judges: Sequence[Target], inquiry: Inquiry, fits: Sequence[Fit]
+    problem: AuditProblem, judges: Sequence[Target], search: ExtensionSearch, fits: Sequence[Fit]
 ) -> tuple[str, Unseen, list[Prediction]]:
     """Predict each group of repeats from the others; where one has parameters that no other tells (a single one has),
     the later rows of all from the earlier ones."""
-    target = inquiry.target.measured
+    target = search.target.measured
     measured = target.measurements
     groups = len(measured.members)
     kinds = [tuple(slots) for slots in target.forward.slots]
@@ -627,7 +696,7 @@ def _left_out(
         for i, (judge, fit) in enumerate(zip(judges, fits, strict=True)):
             kept = replace(judge.measurements, count=np.where(mask, 0.0, judge.measurements.count))
             refitted = climb(replace(judge, measurements=kept), fit.x, fit.free, evaluations=15)
-            parts[i].append(_predict(target.on(judge.forward), refitted, [question.seed, 3]).errors)
+            parts[i].append(_predict(target.on(judge.forward), refitted, [problem.seed, 3]).errors)
     draws = min(len(part) for row in parts for part in row)
     predictions = []
     for row in parts:
@@ -636,4 +705,4 @@ def _left_out(
             joined = np.where(mask, part[:draws], joined)
         predictions.append(Prediction(joined))
     valid = measured.valid & np.any(np.broadcast_arrays(*masks, measured.valid)[:-1], axis=0)
-    return held_out, _unseen(measured, valid, question.model.recordings.names), predictions
+    return held_out, _unseen(measured, valid, problem.model.recordings.names), predictions

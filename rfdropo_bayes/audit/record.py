@@ -13,7 +13,7 @@ from rfdropo_bayes.audit.gain import LEVELS, noise_distance
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.prequential import in_words, prequential
 from rfdropo_bayes.audit.score import likeness
-from rfdropo_bayes.audit.screen import Look, Row
+from rfdropo_bayes.audit.screen import Row, Screen
 from rfdropo_bayes.audit.sentence import sentence
 from rfdropo_bayes.audit.verdict import NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS
@@ -30,8 +30,8 @@ SHORTEN = "shorten [simulator] time_step"  # of a mesh, whose finer simulation h
 
 def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_experiment: Any) -> dict[str, Any]:
     """Everything an audit found, in the names that /audit.json/ promises; lengths in mm where a name says so."""
-    findings = [_finding(answer, step, stage) for step, stage in zip(answer.steps, _shares(answer), strict=True)]
-    gain, noise = answer.gain, answer.target.noise.first
+    findings = [_finding(answer, step, stage) for step, stage in zip(answer.causes.steps, _shares(answer), strict=True)]
+    gain, noise = answer.validation.gain, answer.target.noise.first
     base_rms = _rms(answer, answer.base.residual)
     return {
         "verdict": answer.verdict,
@@ -40,12 +40,12 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         "candidates": _candidates(answer),
         "between": _between(answer, findings),
         "base_fit_converged": answer.base.converged,
-        "out_of_time": answer.stopped,
-        "left_out": dict(answer.question.left_out),
+        "out_of_time": answer.cost.stopped,
+        "left_out": dict(answer.problem.left_out),
         "adopted": [step.name for step in answer.adopted],
-        "unsupported": list(answer.unsupported),
-        "bootstraps": answer.question.rules.bootstraps,
-        "omnibus": [{"after": n, **_omnibus(look)} for n, look in enumerate(answer.looks)],
+        "unsupported": list(answer.causes.unsupported),
+        "bootstraps": answer.problem.rules.bootstraps,
+        "omnibus": [{"after": n, **_omnibus(screen)} for n, screen in enumerate(answer.causes.screens)],
         "gain": None
         if gain is None
         else {
@@ -65,11 +65,11 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
                 }
                 for name, each in gain.differences.items()
             },
-            "measured_on": answer.held_out,
+            "measured_on": answer.validation.recordings,
         },
         "coverage": {} if gain is None else {f"{level:g}": gain.coverage[level] for level in LEVELS},
         "noise_floor_mm": MILLIMETRES * noise_distance(noise) if noise.source == REPEATS else None,
-        "numerical_error_mm": None if answer.numerical is None else MILLIMETRES * answer.numerical,
+        "numerical_error_mm": None if answer.doubts.numerical is None else MILLIMETRES * answer.doubts.numerical,
         "noise": _noise(answer),
         "channels": list(answer.target.measurements.names_of_channels),
         "residual_in_noise_deviations": base_rms,
@@ -81,10 +81,10 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         "where": _where(answer),
         "base_parameters": _parameters(answer, answer.base.free, answer.base.x),
         "next_experiment": next_experiment,
-        "rollouts": answer.rollouts,
-        "seconds": round(answer.seconds, 2),
-        "profile": {stage: round(seconds, 2) for stage, seconds in answer.profile.items()},
-        "seed": answer.question.seed,
+        "rollouts": answer.cost.rollouts,
+        "seconds": round(answer.cost.seconds, 2),
+        "profile": {stage: round(seconds, 2) for stage, seconds in answer.cost.profile.items()},
+        "seed": answer.problem.seed,
         "versions": versions,
         "data_sha256": data_sha256,
         "schema_version": SCHEMA_VERSION,
@@ -92,7 +92,7 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
 
 
 def _noise(answer: Answer) -> dict[str, Any]:
-    noise = answer.target.noise.first
+    noise, shift, suspected = answer.target.noise.first, answer.doubts.shift, answer.doubts.suspected
     return {
         "source": noise.source,
         "order": noise.order,
@@ -100,25 +100,25 @@ def _noise(answer: Answer) -> dict[str, Any]:
         "standard_deviation_mm": (MILLIMETRES * noise.scale).tolist(),
         "correlation_between_channels": None if noise.correlation is None else np.round(noise.correlation, 3).tolist(),
         "other_channels": _other_noise(answer),
-        "shift_between_repeats_mm": None if answer.shift is None else MILLIMETRES * answer.shift,
-        "suspected_mm": None if answer.suspected is None else (MILLIMETRES * answer.suspected.first.scale).tolist(),
+        "shift_between_repeats_mm": None if shift is None else MILLIMETRES * shift,
+        "suspected_mm": None if suspected is None else (MILLIMETRES * suspected.first.scale).tolist(),
     }
 
 
 def next_experiment(answer: Answer) -> dict[str, Any]:
     """What to do at the robot next, in a sentence, and the candidates that this tells apart."""
-    apart = next((step for step in answer.steps if len(step.members) > 1), None)
+    apart = next((step for step in answer.causes.steps if len(step.members) > 1), None)
     if answer.verdict == NO_DISCREPANCY:
         words = "Nothing is to be mended for commands like these; record larger and faster ones, and audit them."
     elif not answer.fitted:
         words = "Nothing yet: raise [audit] minutes and go on with --resume, or start anew from a calibration (--base)."
     elif not answer.base.converged:
         words = "Run `rfdropo calibrate`, look at its fit, and start the audit from it with --base."
-    elif answer.suspected is not None:
+    elif answer.doubts.suspected is not None:
         words = "Repeat one command sequence three times: then it shows whether the noise is what [noise] states."
     elif answer.target.noise.doubtful:
         words = "Repeat one command sequence three times, or state the noise in [noise]: then a slow discrepancy shows."
-    elif answer.verdict == UNEXPLAINED and answer.steps:
+    elif answer.verdict == UNEXPLAINED and answer.causes.steps:
         words = f"No candidate explains it: {_watch(answer)}, for a cause that docs/mechanisms.md says how to add."
     elif answer.verdict == NO_VERDICT:
         words = "Nothing yet: raise [audit] minutes, and go on with --resume."
@@ -127,14 +127,14 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         both = " from ".join(spoken(member) for member in apart.members[:2])
         words = f"To tell {both}: {checks}. Or let `rfdropo design` propose commands that differ."
         return {"sentence": words, "separates": list(apart.members)}
-    elif not answer.steps:
-        leading = [row.name for row in answer.looks[0].rows[:2]]
+    elif not answer.causes.steps:
+        leading = [row.name for row in answer.causes.screens[0].rows[:2]]
         asked = " and ".join(spoken(each) for each in leading) or "candidates of your own"
         words = f"Send what `rfdropo design` proposes to separate {asked}, each three times; {_watch(answer)}."
         return {"sentence": words, "separates": leading}
     else:
         name, share = _largest(answer)
-        most = f", {100 * share:.0f} % of what is wrong" if share and len(answer.steps) > 1 else ""
+        most = f", {100 * share:.0f} % of what is wrong" if share and len(answer.causes.steps) > 1 else ""
         where = "Refine the simulation" if name == DISCRETISATION else f"Check {spoken(name)} on the robot"
         words = f"{where}{most}: {_remedy(answer, name)}."
         if not answer.adopted:
@@ -145,31 +145,31 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
 
 def _doubt(answer: Answer) -> str:
     """What shows whether a mechanism that is not adopted is there."""
-    gain = answer.gain
-    if gain is None or not gain.opposed or gain.worse or answer.question.groups:
+    gain = answer.validation.gain
+    if gain is None or not gain.opposed or gain.worse or answer.problem.groups:
         return f"record {MORE_TESTS} more test recordings: they show whether the model needs it"
     return f"see whether it was otherwise in {' and '.join(gain.against)}: compare groups of recordings with --between"
 
 
 def _largest(answer: Answer) -> tuple[str, float | None]:
     """The step that explains most of the discrepancy, and the share; the first one where no share is known."""
-    shares = zip(answer.steps, _shares(answer), strict=True)
+    shares = zip(answer.causes.steps, _shares(answer), strict=True)
     step, share = max(shares, key=lambda entry: -np.inf if entry[1] is None else entry[1])
     return step.name, share
 
 
 def _remedy(answer: Answer, name: str) -> str:
-    candidate = answer.question.candidate(name)
+    candidate = answer.problem.candidate(name)
     if candidate is not None:
         return candidate.mechanism.remedy
-    layered = "layers" in answer.question.lanes.simulator.description
+    layered = "layers" in answer.problem.lanes.simulator.description
     return REFINE if layered else SHORTEN
 
 
 def _watch(answer: Answer) -> str:
     """Where on the robot to look: when and at which marker the base model fails most."""
     found = prequential(answer.target, answer.base)
-    worst, markers = int(np.argmax(found.surprise)), answer.question.model.recordings.markers
+    worst, markers = int(np.argmax(found.surprise)), answer.problem.model.recordings.markers
     marker = markers[int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))]
     first, last = found.edges[worst : worst + 2]
     return f"watch {marker} while what was sent from {first:.2g} to {last:.2g} s is sent again"
@@ -192,15 +192,15 @@ def _rms(answer: Answer, white: np.ndarray) -> float:
 
 def _shares(answer: Answer) -> list[float | None]:
     """Explained fraction that each step brought."""
-    if not answer.stages:
-        return [None] * len(answer.steps)
-    return [float(v) for v in np.diff([0.0, *answer.stages])]
+    if not answer.validation.stages:
+        return [None] * len(answer.causes.steps)
+    return [float(v) for v in np.diff([0.0, *answer.validation.stages])]
 
 
 def _finding(answer: Answer, step: Step, share: float | None) -> dict[str, Any]:
-    only = len(answer.steps) == 1 and answer.gain is not None
+    gain = answer.validation.gain if len(answer.causes.steps) == 1 else None
     row = step.before.row(step.name)
-    candidate = answer.question.candidate(step.name)
+    candidate = answer.problem.candidate(step.name)
     mechanism = candidate.mechanism if candidate else None
     parameters: dict[str, Any] = {}
     relative: dict[str, Any] = {}
@@ -216,7 +216,7 @@ def _finding(answer: Answer, step: Step, share: float | None) -> dict[str, Any]:
         "cause": getattr(mechanism, "cause", "the mesh or the time step of the simulator is too coarse"),
         "remedy": _remedy(answer, step.name),
         "explained_fraction": share,
-        "explained_fraction_interval": list(answer.gain.interval) if only and answer.gain else None,
+        "explained_fraction_interval": None if gain is None else list(gain.interval),
         "adjusted_p": row.adjusted_p,
         "log_bayes_factor": step.log_bayes_factor,
         "refits": step.refits,
@@ -225,11 +225,11 @@ def _finding(answer: Answer, step: Step, share: float | None) -> dict[str, Any]:
 
 def _between(answer: Answer, findings: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """What differs between two groups of recordings, and what both lack; None where none are compared."""
-    groups = answer.question.groups
+    groups = answer.problem.groups
     if groups is None:
         return None
     keys = ("mechanism", "group", "parameters", "relative", "log_bayes_factor")
-    alike = [list(step.members[1:]) for step in answer.steps]
+    alike = [list(step.members[1:]) for step in answer.causes.steps]
     found = [
         {**{key: finding[key] for key in keys}, "not_told_from": others}
         for finding, others in zip(findings, alike, strict=True)
@@ -244,7 +244,7 @@ def _between(answer: Answer, findings: Sequence[dict[str, Any]]) -> dict[str, An
 
 def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any]:
     """Posterior of parameters in physical units, from the extended model's normal approximation."""
-    coordinates = answer.question.coordinates
+    coordinates = answer.problem.coordinates
     values = coordinates.values(answer.draws)
     found = {}
     for i in indices:
@@ -262,7 +262,7 @@ def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any
 def _relative_sizes(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any]:
     """Masses, forces and stiffnesses over Young's modulus: cables that impose lengths leave their common scale free,
     so that only the ratio is known where no force was measured. First-order error propagation in logarithms."""
-    coordinates, fit = answer.question.coordinates, answer.sizes
+    coordinates, fit = answer.problem.coordinates, answer.sizes
     if STIFFNESS not in coordinates.names[: coordinates.base]:
         return {}
     place = {int(i): k for k, i in enumerate(fit.free)}
@@ -294,26 +294,26 @@ def _relative_sizes(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any]:
 
 
 def _parameters(answer: Answer, free: np.ndarray, x: np.ndarray) -> dict[str, float]:
-    named = answer.question.coordinates.named(x)
-    return {answer.question.coordinates.names[i]: named[answer.question.coordinates.names[i]] for i in free}
+    named = answer.problem.coordinates.named(x)
+    return {answer.problem.coordinates.names[i]: named[answer.problem.coordinates.names[i]] for i in free}
 
 
-def _omnibus(look: Look) -> dict[str, Any]:
+def _omnibus(screen: Screen) -> dict[str, Any]:
     return {
-        "p": look.omnibus.p,
-        "finer_mesh": look.refined,
-        "tests": look.omnibus.single,
-        "blocks": look.omnibus.blocks.tolist(),
+        "p": screen.omnibus.p,
+        "finer_mesh": screen.refined,
+        "tests": screen.omnibus.single,
+        "blocks": screen.omnibus.blocks.tolist(),
     }
 
 
 def _where(answer: Answer) -> dict[str, Any]:
     """When and where the base model fails."""
-    found, question = prequential(answer.target, answer.base), answer.question
-    markers = question.model.recordings.markers
+    found, problem = prequential(answer.target, answer.base), answer.problem
+    markers = problem.model.recordings.markers
     misfit = np.sqrt(found.misfit.reshape(-1, 3).mean(axis=1))
     return {
-        "sentence": in_words(found, markers, question.rules.base_passes),
+        "sentence": in_words(found, markers, problem.rules.base_passes),
         "block_edges_s": found.edges.tolist(),
         "prequential_score": found.score.tolist(),
         "block_p": found.p.tolist(),
@@ -323,19 +323,19 @@ def _where(answer: Answer) -> dict[str, Any]:
 
 def _candidates(answer: Answer) -> list[dict[str, Any]]:
     """Every candidate as the screen of the base model saw it, best first."""
-    first = answer.looks[0]
-    refits = answer.steps[0].refits if answer.steps else {}
+    first = answer.causes.screens[0]
+    refits = answer.causes.steps[0].refits if answer.causes.steps else {}
     return [_candidate(answer, row, first, refits.get(row.name)) for row in first.rows]
 
 
-def _candidate(answer: Answer, row: Row, look: Look, refit: float | None) -> dict[str, Any]:
-    coordinates = answer.question.coordinates
+def _candidate(answer: Answer, row: Row, screen: Screen, refit: float | None) -> dict[str, Any]:
+    coordinates = answer.problem.coordinates
     alike: list[tuple[float, str]] = []
     at: dict[str, float] = {}
     if row.probe is not None:
         alike = [
             (round(likeness(row.probe.mark, other.probe.mark), 4), other.name)
-            for other in look.rows
+            for other in screen.rows
             if other is not row and other.probe is not None
         ]
         point = answer.base.x.copy()
@@ -352,6 +352,6 @@ def _candidate(answer: Answer, row: Row, look: Look, refit: float | None) -> dic
         "adjusted_p": row.adjusted_p,
         "tried_at": at,
         "log_bayes_factor": refit,
-        "named": any(step.name == row.name for step in answer.steps),
+        "named": any(step.name == row.name for step in answer.causes.steps),
         "cosines": [{"mechanism": name, "cosine": cosine} for cosine, name in sorted(alike, reverse=True)[:6]],
     }

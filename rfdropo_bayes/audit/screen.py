@@ -1,4 +1,9 @@
-"""One look at a model: is anything wrong with it, and which candidates say what."""
+"""The screen of a model: is anything wrong with it, and which candidates say what.
+
+All p-values are taken from residuals as they would be if the model were right (a parametric bootstrap): noise is drawn
+for every recording, its model is estimated from it as it was from the data, and the base model is refitted linearly. No
+rollouts are needed.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +14,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.bootstrap import null_residuals, tail
 from rfdropo_bayes.audit.candidates import Probe
 from rfdropo_bayes.audit.fit import Fit, Target
+from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.omnibus import Omnibus, block_means, joint_test, statistics
 from rfdropo_bayes.audit.score import project_out, span, statistic
-from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS
+from rfdropo_bayes.bayes.noise.autoregression import MISFIT, RESIDUALS, STATED
+from rfdropo_bayes.bayes.noise.stacked import Stacked
 
 CHUNK_NUMBERS = 2e7  # of simulated residuals in memory at a time
 DIRECTED = "candidates"
@@ -43,7 +49,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Look:
+class Screen:
     """A model, the joint test of its residuals, and the screen of what it might lack (best first).
 
     ``finer`` is the joint test of the residuals on a finer mesh and time step, None where there is none; ``omnibus``
@@ -65,7 +71,7 @@ class Look:
         return next(row for row in self.rows if row.name == name)
 
 
-def look(
+def screen(
     target: Target,
     fit: Fit,
     probes: Sequence[Probe],
@@ -73,7 +79,7 @@ def look(
     seed: Any,
     bootstraps: int,
     finer: Float[np.ndarray, " n"] | None = None,
-) -> Look:
+) -> Screen:
     """Test a fitted model and screen candidates against it, calibrated by parametric bootstrap.
 
     Args:
@@ -103,7 +109,7 @@ def look(
         blocks = np.nanmean(block_means(white) ** 2, axis=(0, 2))
         tests.append(joint_test({name: float(v[index]) for name, v in observed.items()}, simulated, blocks))
     rows = [_row(name, seen, surprises[0], most, fit) for name in names]
-    return Look(fit, tests[0], tuple(sorted(rows, key=lambda row: -row.score)), tests[1] if len(tests) > 1 else None)
+    return Screen(fit, tests[0], tuple(sorted(rows, key=lambda row: -row.score)), tests[1] if len(tests) > 1 else None)
 
 
 def _row(name: str, seen: Sequence[Probe], surprises: np.ndarray, most: np.ndarray, fit: Fit) -> Row:
@@ -142,3 +148,58 @@ def _simulated(
         parts.append(_statistics(target, residuals, probes))
     joined = {name: np.concatenate([part[0][name] for part in parts]) for name in parts[0][0]}
     return joined, np.concatenate([part[1] for part in parts])
+
+
+def null_residuals(
+    measurements: Measurements,
+    noise: Stacked,
+    base: Float[np.ndarray, "n rank"],
+    parameters: int,
+    rng: np.random.Generator,
+    count: int,
+) -> Float[np.ndarray, "count n"]:
+    """Whitened residuals of ``count`` data sets without discrepancy, after the base model is fitted to each.
+
+    Args:
+        measurements: the data, for their times, gaps and repeats.
+        noise: that is drawn.
+        base: orthonormal basis of what the base parameters do to whitened data.
+        parameters: how many of them were fitted.
+        rng: of the noise.
+        count: data sets.
+    """
+    found = np.empty((count, len(base)))
+    drawn = noise.draw(rng, (count, *measurements.spread.shape))
+    if noise.source == RESIDUALS:
+        drawn = _fitted(measurements, noise, base, drawn)
+    for row, single in enumerate(drawn):
+        estimated = noise
+        if noise.source not in (STATED, MISFIT):
+            estimated = measurements.noise(single, parameters, noise)
+        found[row, : measurements.count.size] = measurements.whiten(measurements.mean_of(single), estimated)
+    weighed = measurements.size - measurements.count.size  # whose errors are known
+    found[:, measurements.count.size :] = rng.standard_normal((count, weighed))
+    return project_out(base, found.T).T
+
+
+def _fitted(measurements: Measurements, noise: Stacked, base: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """What the base model leaves of data sets without repeats: where the noise is estimated from that, it is estimated
+    from that here, too; the noise before a fit would be a little larger in most of them, and give itself away."""
+    order = [group[0] for group in measurements.members]
+    white = measurements.whiten(drawn[:, order], noise)
+    rows = base[: measurements.count.size]
+    left = (white - white @ rows @ rows.T).reshape(len(drawn), *measurements.count.shape)
+    fitted = np.empty_like(drawn)
+    fitted[:, order] = noise.colour(left, measurements.valid)
+    return fitted
+
+
+def tail(observed: float, simulated: Float[np.ndarray, " count"]) -> float:
+    """Share of simulated statistics at least as large, the observed one among them."""
+    return float((1 + np.sum(simulated >= observed)) / (1 + len(simulated)))
+
+
+def p_in_words(p: float, simulated: int) -> str:
+    """A bootstrap's p-value, "= 0.02"; "< 0.001" where none of the simulated statistics was as large."""
+    least = 1.0 / (1 + simulated)
+    return f"= {p:.2g}" if p > 1.5 * least else f"< {least:.2g}"

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import spoken
 from rfdropo_bayes.audit.extension import DISCRETISATION, TOLD_APART
 from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.prequential import BEGINNING, begins_wrong, prequential
+from rfdropo_bayes.audit.screen import p_in_words
 from rfdropo_bayes.audit.verdict import EXPLAINED, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED, unclear
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
 
@@ -37,7 +37,7 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
 
 def _compared(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     """What two groups of recordings have in common, where they are compared."""
-    groups = answer.question.groups
+    groups = answer.problem.groups
     if groups is None or answer.verdict == NO_VERDICT:
         return ""
     names = " and ".join(groups.names)
@@ -50,15 +50,15 @@ def _compared(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
 
 
 def _left_out(answer: Answer) -> str:
-    count = len(answer.question.left_out)
+    count = len(answer.problem.left_out)
     does = "candidate does" if count == 1 else "candidates do"
     return f" Left out: {count} {does} not run on this body or engine." if count else ""
 
 
 def _stopped(answer: Answer) -> str:
-    if not answer.stopped:
+    if not answer.cost.stopped:
         return ""
-    minutes = answer.question.rules.minutes
+    minutes = answer.problem.rules.minutes
     return (
         f" The time was up after {minutes:g} minutes ([audit] minutes), before every question was asked: raise it and "
         "go on with --resume."
@@ -66,7 +66,7 @@ def _stopped(answer: Answer) -> str:
 
 
 def _suspicion(answer: Answer) -> str:
-    noise = answer.suspected
+    noise = answer.doubts.suspected
     if noise is None:
         return ""
     stated, other = (1e3 * noise_distance(n.first) for n in (answer.target.noise, noise))
@@ -78,17 +78,17 @@ def _suspicion(answer: Answer) -> str:
 
 
 def _shifted(answer: Answer) -> str:
-    if answer.shift is None:
+    if answer.doubts.shift is None:
         return ""
     return (
-        f" Repeats differ by constants of {1e3 * answer.shift:.2g} mm, which pass for noise here: a frame or a start "
-        "that was not the same each time? Let camera_offset differ in [model.per_recording]."
+        f" Repeats differ by constants of {1e3 * answer.doubts.shift:.2g} mm, which pass for noise here: a frame or a "
+        "start that was not the same each time? Let camera_offset differ in [model.per_recording]."
     )
 
 
 def _numerical(answer: Answer) -> str:
     """What is said of a simulation that half the time step changes by more than the noise."""
-    error, noise = answer.numerical, noise_distance(answer.target.noise.first)
+    error, noise = answer.doubts.numerical, noise_distance(answer.target.noise.first)
     if error is None or error <= noise:
         return ""
     return (
@@ -102,7 +102,7 @@ def _beginning(answer: Answer) -> str:
     if answer.verdict == NO_DISCREPANCY or not answer.base.converged:
         return ""
     found = prequential(answer.target, answer.base)
-    return f" {BEGINNING}" if begins_wrong(found, answer.question.rules.base_passes) else ""
+    return f" {BEGINNING}" if begins_wrong(found, answer.problem.rules.base_passes) else ""
 
 
 def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
@@ -120,7 +120,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
             f"No discrepancy: what the base model leaves is noise as far as these data can tell "
             f"(joint test p {_p(answer)}{_resolution(answer)}{_assumption(answer)}).{_invisible(answer)}"
         )
-    if not findings and answer.looks[0].omnibus.p > answer.question.rules.base_passes:
+    if not findings and answer.causes.screens[0].omnibus.p > answer.problem.rules.base_passes:
         distance = 1e3 * noise_distance(answer.target.noise.first)
         return (
             f"What the base model leaves, {distance:.2g} mm, changes too slowly to be the noise of a measurement, but "
@@ -133,12 +133,12 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         tail = f"what remains has a standard deviation of {1e3 * answer.remainder.amplitude:.2g} mm"
         return f"Something is wrong with the base model, and no candidate of the library says what: {tail}."
     named = " and ".join(_named(finding) for finding in findings)
-    gain = answer.gain
+    gain = answer.validation.gain
     if gain is None:
         return f"{named}; how much it explains could not be measured."
     low, high = (100.0 * min(max(x, 0.0), 1.0) for x in gain.interval)
     share = f"{100 * max(gain.explained, 0.0):.0f} % [{low:.0f}, {high:.0f}] of the discrepancy"
-    if unclear(answer.question.rules, gain):
+    if unclear(answer.problem.rules, gain):
         verb, likelier = "is" if len(findings) == 1 else "are", "" if gain.elpd_difference > 0.0 else "no "
         head = (
             f"{named} {verb} named, but unseen recordings do not say how much of the discrepancy that explains "
@@ -151,7 +151,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         head = f"Unexplained: the best of the library, {named}, explains only {share}"
     elif answer.verdict in (EXPLAINED, "equivalent"):
         head = f"{named} explain{'s' if len(findings) == 1 else ''} {share}"
-    elif answer.looks[-1].omnibus.p > answer.question.rules.extended_passes:
+    elif answer.causes.screens[-1].omnibus.p > answer.problem.rules.extended_passes:
         head = f"The best of the library, {named}, explains {share}; the rest may be noise, but that is not certain"
     else:
         head = f"The best of the library, {named}, explains {share}, but {_pattern(answer)}"
@@ -160,7 +160,9 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
 
 def _invisible(answer: Answer) -> str:
     """Candidates that could be there all the same, as nothing that was measured shows them."""
-    names = [row.name.replace("_", " ") for row in answer.looks[0].rows if row.probe is None and "@" not in row.name]
+    names = [
+        row.name.replace("_", " ") for row in answer.causes.screens[0].rows if row.probe is None and "@" not in row.name
+    ]
     if not names:
         return ""
     which = ", ".join(names[:MOST_EXCLUDED]) + (" ..." if len(names) > MOST_EXCLUDED else "")
@@ -169,19 +171,20 @@ def _invisible(answer: Answer) -> str:
 
 
 def _p(answer: Answer) -> str:
-    return p_in_words(answer.looks[0].omnibus.p, answer.question.rules.bootstraps)
+    return p_in_words(answer.causes.screens[0].omnibus.p, answer.problem.rules.bootstraps)
 
 
 def _adoption(answer: Answer) -> str:
     """What of the findings joins the model for good."""
-    if not answer.adopted and answer.gain is not None and answer.gain.opposed and not answer.gain.worse:
-        worst, found = min(answer.gain.against.items(), key=lambda item: item[1].elpd)
+    gain = answer.validation.gain
+    if not answer.adopted and gain is not None and gain.opposed and not gain.worse:
+        worst, found = min(gain.against.items(), key=lambda item: item[1].elpd)
         errors = f"{1e3 * found.rmse_base:.3g} mm without, {1e3 * found.rmse_extended:.3g} mm with it"
         return f" {worst} is clearly less likely with this ({errors}): extended.toml keeps the base model."
     if not answer.adopted:
         return " Unseen recordings do not clearly support this: extended.toml keeps the base model."
-    if answer.unsupported:
-        names = " and ".join(map(spoken, answer.unsupported))
+    if answer.causes.unsupported:
+        names = " and ".join(map(spoken, answer.causes.unsupported))
         return f" The fitted recordings asked for {names}, too, which unseen ones do not support: not adopted."
     return ""
 
@@ -209,36 +212,34 @@ def _size(name: str, row: dict[str, Any]) -> str:
 
 def _excluded(answer: Answer) -> str:
     """Candidates that were refitted in the first step and are much less likely."""
-    step = answer.steps[0]
+    step = answer.causes.steps[0]
     worse = [
         spoken(name)
         for name, value in step.refits.items()
         if name not in step.members
         and value < step.log_bayes_factor - TOLD_APART
-        and all(name != other.name for other in answer.steps)
+        and all(name != other.name for other in answer.causes.steps)
     ]
     return f"; {', '.join(worse[:MOST_EXCLUDED])} excluded" if worse else ""
 
 
 def _only_noise(answer: Answer) -> bool:
     """Whether unseen recordings are missed by no more than repeats differ by."""
-    noise = answer.target.noise
-    return (
-        noise.source == REPEATS and answer.gain is not None and noise_distance(noise.first) >= answer.gain.rmse_extended
-    )
+    noise, gain = answer.target.noise, answer.validation.gain
+    return noise.source == REPEATS and gain is not None and noise_distance(noise.first) >= gain.rmse_extended
 
 
 def _pattern(answer: Answer) -> str:
     """What the joint test says of an extended model that does not pass it."""
-    rules, last = answer.question.rules, answer.looks[-1].omnibus.p
+    rules, last = answer.problem.rules, answer.causes.screens[-1].omnibus.p
     words = f"the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
     sure = last <= rules.base_passes and not _only_noise(answer)
     return f"{words}: something else is at work" if sure else words
 
 
 def _remains(answer: Answer) -> str:
-    assert answer.gain is not None
-    remain = f"{1e3 * answer.gain.rmse_extended:.2g} mm remain"
+    assert answer.validation.gain is not None
+    remain = f"{1e3 * answer.validation.gain.rmse_extended:.2g} mm remain"
     if _only_noise(answer):
         return f"{remain}, no more than repeats differ by"
     if answer.target.noise.source != REPEATS:
@@ -247,7 +248,7 @@ def _remains(answer: Answer) -> str:
 
 
 def _resolution(answer: Answer) -> str:
-    if answer.looks[0].refined:
+    if answer.causes.screens[0].refined:
         return " on a mesh and time step twice as fine, which differ too little to be named"
     return ""
 

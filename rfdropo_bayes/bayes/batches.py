@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -23,9 +23,45 @@ def padded(function: Callable[[Any], Any], given: Any) -> Any:
     size = SMALLEST
     while size < count:
         size *= GROWTH
-    index = np.minimum(np.arange(size), count - 1)
-    found = function(jax.tree.map(lambda array: np.asarray(array, dtype=float)[index], given))
-    return jax.tree.map(lambda array: jnp.asarray(np.asarray(array)[:count]), found)  # sliced by JAX, it would compile
+    floats = jax.tree.map(lambda array: np.asarray(array, dtype=float), given)
+    return jax.tree.map(jnp.asarray, in_chunks(function, floats, (size,)))  # sliced by JAX, it would compile
+
+
+def in_chunks(
+    function: Callable[[Any], Any],
+    given: Any,
+    sizes: Sequence[int],
+    *,
+    before: Callable[[], None] = lambda: None,
+    after: Callable[[int], None] = lambda count: None,
+) -> Any:
+    """A function of arrays with a common first axis, evaluated chunk by chunk.
+
+    Args:
+        function: of a tree of arrays, to a tree of arrays.
+        given: the tree.
+        sizes: of chunks, ascending. All chunks but the last one are of the largest; the last one is padded to the
+            smallest that holds it. The padding repeats the last entry.
+        before: called before every chunk; it may raise.
+        after: called with the number of entries after every chunk.
+    """
+    count, parts = len(jax.tree.leaves(given)[0]), []
+    for start in range(0, count, sizes[-1]):
+        before()
+        left = min(count - start, sizes[-1])
+        index = np.minimum(np.arange(start, start + next(size for size in sizes if size >= left)), count - 1)
+        chunk = jax.tree.map(lambda array, index=index: np.asarray(array)[index], given)
+        parts.append(jax.device_get(function(chunk)))
+        after(left)
+    return jax.tree.map(lambda *pieces: np.concatenate(pieces)[:count], *parts)
+
+
+def chunk_sizes(largest: int) -> tuple[int, ...]:
+    """Sizes of chunks, ascending: a quarter of the next, down to the lanes of one SIMD register."""
+    sizes = [largest]
+    while sizes[-1] >= GROWTH * SMALLEST:
+        sizes.append(sizes[-1] // GROWTH)
+    return tuple(reversed(sizes))
 
 
 def is_batch(given: Any, axes: int) -> bool:

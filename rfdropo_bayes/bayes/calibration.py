@@ -14,14 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
-from rfdropo_bayes.bayes.batches import is_batch, padded
+from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks, is_batch, padded
 from rfdropo_bayes.bayes.channels import Channel, FeatureChannel, Series
 from rfdropo_bayes.bayes.model import Measured, TrajectoryModel
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 Batch = Mapping[str, Float[Array | np.ndarray, " n"]]
-
-SMALLEST_CHUNK = 8
 
 
 class CalibrationProblem:
@@ -360,19 +358,15 @@ class CalibrationProblem:
         return jax.jit(jax.vmap(observations, in_axes=(0, None)))
 
     def _chunked(self, evaluate: Callable, values: Batch, horizon: int, *rest: Any) -> Any:
-        """Evaluate a batch chunk by chunk; the padding of the last chunk repeats its last set and is dropped."""
+        """Evaluate a batch chunk by chunk, see `in_chunks`."""
         steps = jnp.asarray(self.steps_for(horizon))
         columns = {name: np.asarray(values[name], dtype=float) for name in self.names}
-        n = len(next(iter(columns.values())))
-        parts = []
-        for start in range(0, n, self.chunk):
-            size = next(size for size in chunk_sizes(self.chunk) if size >= min(n - start, self.chunk))
-            index = np.minimum(np.arange(start, start + size), n - 1)
-            chunk = {name: column[index] for name, column in columns.items()}
-            parts.append(jax.device_get(evaluate(chunk, steps, *rest)))
+
+        def told(count: int) -> None:
             if self._told is not None:
-                self._told(min(n - start, self.chunk) * horizon / self.n_rows)
-        return jax.tree.map(lambda *column: np.concatenate(column)[:n], *parts)
+                self._told(count * horizon / self.n_rows)
+
+        return in_chunks(lambda own: evaluate(own, steps, *rest), columns, chunk_sizes(self.chunk), after=told)
 
     def _flat(self, white: Mapping[str, Any], horizon: int) -> Any:
         """Residuals by rollout, cut to the horizon where they have a time axis, and flattened."""
@@ -387,11 +381,3 @@ def _plain(channel: Channel) -> str:
         known = channel.known
         return repr(None if known is None else (known.scale, known.autocorrelation, known.correlation))
     return repr(channel)
-
-
-def chunk_sizes(largest: int) -> tuple[int, ...]:
-    """Sizes that chunks are padded to, ascending: a quarter of the next, down to the lanes of one SIMD register."""
-    sizes = [largest]
-    while sizes[-1] >= 4 * SMALLEST_CHUNK:
-        sizes.append(sizes[-1] // 4)
-    return tuple(reversed(sizes))

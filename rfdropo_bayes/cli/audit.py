@@ -38,6 +38,10 @@ def audit(
             "--between", metavar="GROUP GROUP", help="two of [model.groups]: say what differs, all else being shared"
         ),
     ] = None,
+    separate: Annotated[
+        bool,
+        typer.Option("--separate", help="say which mechanisms of [separation] the recordings tell apart, and no more"),
+    ] = False,
     seed: Seed = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -47,7 +51,18 @@ def audit(
 ) -> None:
     """Say what the simulator lacks, by name: writes audit.json, extended.toml and report.html."""
     see_calibration(base, "--base")
-    folder = folder_for("audit", experiment, out, overrides, resume=resume, overwrite=overwrite)
+    if separate and between is not None:
+        raise InputError("groups are compared by the search only", where="--separate", remedy="leave --between out")
+    command = "separate" if separate else "audit"
+    folder = folder_for(command, experiment, out, overrides, resume=resume, overwrite=overwrite)
+    if separate:
+        from rfdropo_bayes.workflow.separation import TABLE, run_separation
+
+        said: dict[str, Any] = {"overrides": overrides or [], "base": base, "seed": seed}
+        said |= {"resume": resume, "overwrite": overwrite}
+        told = run_separation(experiment, folder, **said, report=say_progress(quiet))
+        say(told, (folder / TABLE).read_text(encoding="utf-8"), quiet=quiet, as_json=as_json)
+        return
     from rfdropo_bayes.workflow.audit import run_audit
 
     found = run_audit(
@@ -62,33 +77,6 @@ def audit(
         report=say_progress(quiet),
     )
     show_audit(found, folder, quiet=quiet, as_json=as_json)
-
-
-def separate(
-    experiment: ExperimentFile,
-    out: OutFolder = None,
-    base: Base = None,
-    resume: Resume = False,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    as_json: AsJson = False,
-    overrides: Overrides = None,
-) -> None:
-    """Say which mechanisms the recordings tell apart: writes separation.json, separation.md and separation.png."""
-    see_calibration(base, "--base")
-    folder = folder_for("separate", experiment, out, overrides, resume=resume, overwrite=overwrite)
-    from rfdropo_bayes.workflow.separation import TABLE, run_separation
-
-    found = run_separation(
-        experiment,
-        folder,
-        overrides=overrides or [],
-        base=base,
-        resume=resume,
-        overwrite=overwrite,
-        report=say_progress(quiet),
-    )
-    say(found, (folder / TABLE).read_text(encoding="utf-8"), quiet=quiet, as_json=as_json)
 
 
 def design(

@@ -122,7 +122,6 @@ def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a ca
 app.command("init")(init.init)
 app.command("check")(check.check)
 app.command()(audit.audit)
-app.command()(audit.separate)
 app.command()(audit.design)
 app.command()(inference.export)
 app.command()(pictures.view)

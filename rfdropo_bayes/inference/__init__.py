@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.methods import METHODS as METHODS
     from rfdropo_bayes.inference.methods import make_config as make_config
     from rfdropo_bayes.inference.methods import method_named as method_named
-    from rfdropo_bayes.inference.modes.climb import LevenbergState as LevenbergState
     from rfdropo_bayes.inference.modes.climb import climb_cost as climb_cost
     from rfdropo_bayes.inference.modes.climb import maximise as maximise
     from rfdropo_bayes.inference.modes.climb import normal_at as normal_at
     from rfdropo_bayes.inference.modes.lasting import lasting_series as lasting_series
     from rfdropo_bayes.inference.modes.search import LaplaceConfig as LaplaceConfig
     from rfdropo_bayes.inference.modes.search import find_modes as find_modes
+    from rfdropo_bayes.inference.modes.targets import Target as Target
     from rfdropo_bayes.inference.nested import NestedConfig as NestedConfig
     from rfdropo_bayes.inference.nuts import NutsConfig as NutsConfig
     from rfdropo_bayes.inference.plain.problem import problem_from_numpyro as problem_from_numpyro
@@ -49,13 +49,13 @@ PUBLIC = {
     "METHODS": "methods",
     "make_config": "methods",
     "method_named": "methods",
-    "LevenbergState": "modes.climb",
     "climb_cost": "modes.climb",
     "maximise": "modes.climb",
     "normal_at": "modes.climb",
     "lasting_series": "modes.lasting",
     "LaplaceConfig": "modes.search",
     "find_modes": "modes.search",
+    "Target": "modes.targets",
     "NestedConfig": "nested",
     "NutsConfig": "nuts",
     "problem_from_numpyro": "plain.problem",

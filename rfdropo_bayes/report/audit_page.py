@@ -79,20 +79,20 @@ def residuals_of(answer: Answer) -> figures.Residuals:
         (position - position[:, :1])[rows] @ pattern,
         tuple(forward.lanes.simulator.channel_names),
         tuple(forward.lanes.simulator.cable_names),
-        answer.question.trajectories[0].command_unit,
+        answer.problem.trajectories[0].command_unit,
     )
 
 
 def shown(answer: Answer) -> figures.Shown:
     """What the figures of an audit show."""
     step = float(np.median(np.diff(answer.target.measurements.time[0])))
-    probed = [row for row in answer.looks[0].rows if row.probe is not None][:MOST_COSINES]
+    probed = [row for row in answer.causes.screens[0].rows if row.probe is not None][:MOST_COSINES]
     marks = [row.probe.mark for row in probed if row.probe is not None]
-    unseen = None
-    if answer.predictions is not None and answer.unseen is not None and answer.gain is not None:
-        recordings, (base, extended) = answer.unseen, map(answer.unseen.predicted, answer.predictions)
+    unseen, found = None, answer.validation
+    if found.predictions is not None and found.unseen is not None and found.gain is not None:
+        recordings, (base, extended) = found.unseen, map(found.unseen.predicted, found.predictions)
         valid = recordings.valid[..., : recordings.markers]
-        worst = int(np.argmax([each.rmse_base for each in answer.gain.differences.values()]))
+        worst = int(np.argmax([each.rmse_base for each in found.gain.differences.values()]))
         seen = valid[worst].any(axis=1)
         measured = np.where(valid, recordings.position, np.nan)
         series = {"measured": measured, "base model": base, "extended model": extended}
@@ -100,9 +100,9 @@ def shown(answer: Answer) -> figures.Shown:
     rest = answer.remainder
     return figures.Shown(
         residuals_of(answer),
-        [look.omnibus.blocks.tolist() for look in answer.looks],
+        [screen.omnibus.blocks.tolist() for screen in answer.causes.screens],
         BLOCK * step,
-        ["base model", *(f"with {display_name(step.name)}" for step in answer.steps)],
+        ["base model", *(f"with {display_name(step.name)}" for step in answer.causes.steps)],
         [row.name for row in probed],
         np.array([[likeness(a, b) for b in marks] for a in marks]),
         unseen,

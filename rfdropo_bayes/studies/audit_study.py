@@ -192,7 +192,7 @@ def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path)
     content = run_audit(
         hidden.experiment, place / "audit", workshop=_WORKSHOP, overrides=given, inspect=answers.append, overwrite=True
     )
-    prior = answers[0].question.coordinates.prior_deviations
+    prior = answers[0].problem.coordinates.prior_deviations
     judged = {
         **judge(content, names, hidden, prior),
         "error_over_oracle": error_over_oracle(answers[0], names, hidden),
@@ -299,21 +299,21 @@ def judge(
 def error_over_oracle(answer: Answer, names: Sequence[str], hidden: Hidden) -> float | None:
     """Root mean square error of the extended model against the noise-free truth of untouched commands, over that of the
     model that knows which mechanisms are hidden; None where nothing is hidden or named."""
-    if not names or answer.predictions is None:
+    unseen, predictions = answer.validation.unseen, answer.validation.predictions
+    if not names or predictions is None or unseen is None:
         return None
-    question, coordinates = answer.question, answer.question.coordinates
-    own = [i for c in question.candidates if c.name in names for i in c.indices]
+    problem, coordinates = answer.problem, answer.problem.coordinates
+    own = [i for c in problem.candidates if c.name in names for i in c.indices]
     start = coordinates.encode(hidden.values)
     oracle = climb(answer.target, start, np.array([*range(coordinates.base), *own]))
-    untouched = range(len(question.trajectories), len(question.model.recordings.names))
-    tested = measurements_of(question, untouched)
-    assert answer.unseen is not None
-    predicted = simulated(question, False, tested, untouched).observe_one(oracle.x)["position"]
+    untouched = range(len(problem.trajectories), len(problem.model.recordings.names))
+    tested = measurements_of(problem, untouched)
+    predicted = simulated(problem, False, tested, untouched).observe_one(oracle.x)["position"]
 
     def error(position: np.ndarray) -> float:
         return float(np.sqrt(np.mean((position - hidden.clean) ** 2)))
 
-    return error(answer.unseen.predicted(answer.predictions[1])) / error(predicted.reshape(hidden.clean.shape))
+    return error(unseen.predicted(predictions[1])) / error(predicted.reshape(hidden.clean.shape))
 
 
 def summarise(condition: Condition, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.workflow.assembly import build_simulator
-from rfdropo_bayes.workflow.audit import Workshop, build_question
+from rfdropo_bayes.workflow.audit import Workshop, build_problem
 from rfdropo_bayes.workflow.commands import random_walk
 from rfdropo_bayes.workflow.experiment import AuditTable, CommandsTable, Experiment, SimulatorTable
 from rfdropo_bayes.workflow.experiment_file import describe
@@ -127,14 +127,14 @@ def hide(
     experiment = _experiment(setting, exclude)
     blank = _blank_recordings(setting, rng)
     fitted, untouched = blank[: REPEATS + 1], blank[REPEATS + 1 :]
-    question = build_question(spec_of(experiment, out), AuditTable(), fitted, untouched, seed, workshop=workshop)
-    coordinates = question.coordinates
+    problem = build_problem(spec_of(experiment, out), AuditTable(), fitted, untouched, seed, workshop=workshop)
+    coordinates = problem.coordinates
     truth = coordinates.null.copy()
     truth[: coordinates.base] += (
         setting.spread * coordinates.prior_sd[: coordinates.base] * rng.standard_normal(coordinates.base)
     )
-    measurements = measurements_of(question, range(len(fitted)), fitted)
-    forward = simulated(question, False, measurements, [group[0] for group in measurements.members])
+    measurements = measurements_of(problem, range(len(fitted)), fitted)
+    forward = simulated(problem, False, measurements, [group[0] for group in measurements.members])
     widths = [channel.valid.shape[-1] for channel in measurements.channels]
     sizes_of = zip(widths, (NOISE, TENSION_NOISE), strict=False)
     white = Stacked(tuple(Autoregression(np.full(n, size), np.ones(1), STATED, np.inf) for n, size in sizes_of))
@@ -145,13 +145,13 @@ def hide(
     target = Target(forward, plain, white)
     sizes = {}
     for name in mechanisms:
-        index = next(c.indices for c in question.candidates if c.name == name)
+        index = next(c.indices for c in problem.candidates if c.name == name)
         moved = _sized(target, truth, index, rho, rng)
         if moved is None:
             return None
         truth = moved
         sizes[name] = rho
-    values = {n: v for n, v in coordinates.named(truth).items() if _belongs(question, n, mechanisms)}
+    values = {n: v for n, v in coordinates.named(truth).items() if _belongs(problem, n, mechanisms)}
     made = _made(setting, mechanisms, values, blank)
     sizes["discretisation"] = _discretisation(target, truth, made, measurements.members)
     _write(setting, experiment, blank, made, seed, out)
@@ -159,11 +159,11 @@ def hide(
     return Hidden(values, sizes, out, untouched_rows.reshape(*untouched_rows.shape[:2], -1))
 
 
-def _belongs(question: Any, name: str, mechanisms: Sequence[str]) -> bool:
-    hidden = [c for c in question.candidates if c.name in mechanisms]
-    names = question.coordinates.names
+def _belongs(problem: Any, name: str, mechanisms: Sequence[str]) -> bool:
+    hidden = [c for c in problem.candidates if c.name in mechanisms]
+    names = problem.coordinates.names
     own = {names[i] for c in hidden for i in c.indices}
-    return name in own or names.index(name) < question.coordinates.base
+    return name in own or names.index(name) < problem.coordinates.base
 
 
 def _experiment(setting: Setting, exclude: Sequence[str]) -> Experiment:

@@ -17,17 +17,17 @@ from rfdropo_bayes.audit.deadline import Deadline
 from rfdropo_bayes.audit.differences import Groups, with_differences
 from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
 from rfdropo_bayes.audit.fit import widening
+from rfdropo_bayes.audit.fixed_quantities import OwnParameter, with_fixed_quantities
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
-from rfdropo_bayes.audit.held import OwnParameter, with_held
 from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.pipeline import Answer, Question
+from rfdropo_bayes.audit.pipeline import Answer, AuditProblem
 from rfdropo_bayes.audit.pipeline import audit as ask
 from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.bayes.channels import Series
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise.stacked import Stacked
-from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.bayes.recordings import commands_of, gather_recordings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
@@ -38,7 +38,7 @@ from rfdropo_bayes.report.run_folder import SUMMARY
 from rfdropo_bayes.report.summary import combined_hash, read_summary
 from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.simulators.black_box import BlackBox
-from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechanism, obstacle
 from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
@@ -101,7 +101,7 @@ def audit(
         title: heading of the report; the robot's name by default.
         resume: go on from what an interrupted audit has left in ``out``.
         overwrite: start anew whatever ``out`` holds.
-        workshop: see `build_question`.
+        workshop: see `build_problem`.
         report: called with a line of words now and then.
         inspect: called with the answer.
         tables: of the experiment file that the model was read from, for the record.
@@ -121,12 +121,12 @@ def audit(
     if between is not None:
         groups, runs, test = find_groups(between, spec.groups, runs, test)
     start = start_values(base)
-    question = build_question(spec, table, runs, test, seed, start=start, workshop=workshop, groups=groups)
+    problem = build_problem(spec, table, runs, test, seed, start=start, workshop=workshop, groups=groups)
     tables = {**model.tables(), "title": title, "seed": seed} if tables is None else tables
 
     def found(out: Path | None) -> Audit:
         journal = None if out is None else Journal(out / JOURNAL, resume=resume)
-        answer = ask(question, report, journal, deadline)
+        answer = ask(problem, report, journal, deadline)
         inspect(answer)
         data = combined_hash([trajectory.sha256 for trajectory in [*runs, *test]])
         return _audited(answer, model, tables, title, data, out)
@@ -195,7 +195,7 @@ def run_audit(
     return dict(found.content)
 
 
-def build_question(
+def build_problem(
     spec: ModelSpec,
     table: AuditTable,
     fitted: Sequence[Trajectory],
@@ -206,7 +206,7 @@ def build_question(
     workshop: Workshop | None = None,
     names: Sequence[str] | None = None,
     groups: Groups | None = None,
-) -> Question:
+) -> AuditProblem:
     """The base model with every candidate of the library in it, at its null value.
 
     ``table`` is [audit]; ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names``
@@ -224,14 +224,8 @@ def build_question(
         names = [name for name in names if name not in left_out]
     simulator = build_simulator(spec.with_mechanisms(*names))
     model, base = _model(spec, simulator, trajectories, len(fitted))
-    added = simulator.mechanisms[len(spec.mechanisms) :]
-    index = {p.spec.name: i for i, p in enumerate(model.space.parameters)}
-    candidates = [
-        Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
-        for name, m in zip(names, added, strict=True)
-        if name not in table.exclude
-    ]
-    specs = simulator.parameters
+    added, specs = simulator.mechanisms[len(spec.mechanisms) :], simulator.parameters
+    candidates = _named(table, model, names, added)
     if library:
         of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
         plain, stated = [s for s in specs if s.name not in of_candidates], expand_groups(spreads, specs)
@@ -239,10 +233,18 @@ def build_question(
         candidates = [c for c in candidates if c.name not in table.exclude]
     nominal, limits = {s.name: s.nominal for s in specs}, {s.name: (s.low, s.high) for s in specs}
     coordinates = Coordinates(model.space, base, tuple(nominal), nominal, model.fixed, limits)
-    made = partial(_lanes_in, {} if workshop is None else workshop, names, trajectories, model, coordinates)
-    return Question(
-        made(spec)[0],
-        None if isinstance(robot, BlackBox) else made(_finer(spec, robot)),
+    workshop = {} if workshop is None else workshop
+    lanes = partial(_lanes, names=names, model=model, coordinates=coordinates, workshop=workshop)
+
+    def half(robot: Robot) -> tuple[Lanes, Commands]:
+        finer = _finer(spec, robot)
+        whole = build_simulator(finer.with_mechanisms(*names))
+        commands = stack_commands([commands_of(whole, trajectory) for trajectory in trajectories])
+        return lanes(finer, whole), commands
+
+    return AuditProblem(
+        lanes(spec, simulator),
+        None if isinstance(robot, BlackBox) else half(robot),
         coordinates,
         model,
         list(fitted),
@@ -256,6 +258,18 @@ def build_question(
     )
 
 
+def _named(
+    table: AuditTable, model: TrajectoryModel, names: Sequence[str], added: Sequence[Mechanism]
+) -> list[Candidate]:
+    """Mechanisms as candidates, less those that [audit] excludes."""
+    index = {p.spec.name: i for i, p in enumerate(model.space.parameters)}
+    return [
+        Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
+        for name, m in zip(names, added, strict=True)
+        if name not in table.exclude
+    ]
+
+
 def _with_own(
     model: TrajectoryModel,
     base: int,
@@ -265,7 +279,7 @@ def _with_own(
     spreads: Mapping[str, float],
 ) -> tuple[TrajectoryModel, list[Candidate]]:
     """The model with the robot's own parameters among its candidates, and all that may differ between groups."""
-    space, own = with_held(model.space, plain, tuple(model.fixed))
+    space, own = with_fixed_quantities(model.space, plain, tuple(model.fixed))
     if groups is not None:
         space, candidates = with_differences(
             space, base, plain, candidates, groups, spreads=spreads, held=tuple(model.fixed)
@@ -296,7 +310,7 @@ def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> d
     """
     simulator = build_simulator(spec)
     engine = str(simulator.description["engine"])
-    commands = gather_recordings(simulator, [recording]).commands
+    commands = stack_commands([commands_of(simulator, recording)])
     found = {}
     for name in names:
         (mechanism,) = mechanisms_named([name], spec.robot, folder=spec.folder, where="[audit] candidates")
@@ -318,44 +332,31 @@ def _refusal(simulator: AnySimulator, commands: Commands) -> str | None:
     return None
 
 
-def _lanes_in(
-    workshop: Workshop,
-    names: Sequence[str],
-    trajectories: Sequence[Trajectory],
-    model: TrajectoryModel,
-    coordinates: Coordinates,
-    spec: ModelSpec,
-) -> tuple[Lanes, Commands]:
-    """As `_lanes`; those that the workshop has are not made again."""
-    fields, markers = _fields(model), model.recordings.marker_index.tolist()
-    key = repr((spec.robot, spec.simulator, names, markers, coordinates.fixed, fields))
-    found, commands = _lanes(spec, names, trajectories, coordinates, workshop.get(key), fields)
-    workshop[key] = found
-    return found, commands
-
-
 def _lanes(
     spec: ModelSpec,
+    whole: AnySimulator,
+    *,
     names: Sequence[str],
-    trajectories: Sequence[Trajectory],
+    model: TrajectoryModel,
     coordinates: Coordinates,
-    made: Lanes | None,
-    fields: Sequence[str],
-) -> tuple[Lanes, Commands]:
-    """The simulator with all candidates; those that would slow every rollout down get a simulator of their own."""
-    whole = build_simulator(spec.with_mechanisms(*names))
-    recordings = gather_recordings(whole, trajectories)
-    if made is not None:
-        return made, recordings.commands
-    slow = {m.name for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _costly(whole, m)}
-    added = whole.mechanisms[len(spec.mechanisms) :]
-    kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
-    if len(kept) == len(names):
-        return _brisk(whole, recordings.marker_index, fields), recordings.commands
-    fast = _brisk(build_simulator(spec.with_mechanisms(*kept)), recordings.marker_index, fields)
-    null = dict(coordinates.nominal) | dict(coordinates.fixed) | coordinates.named(coordinates.null)
-    routed = RoutedLanes(fast, _brisk(whole, recordings.marker_index, fields), null)
-    return routed, recordings.commands
+    workshop: Workshop,
+) -> Lanes:
+    """The simulator with all candidates; those that would slow every rollout down get a simulator of their own. Lanes
+    that the workshop has are not made again."""
+    fields, markers = _fields(model), model.recordings.marker_index
+    made = (spec.robot, spec.simulator, spec.drives, spec.sources, names)
+    key = repr((*made, markers.tolist(), coordinates.fixed, fields))
+    if key not in workshop:
+        every = _brisk(whole, markers, fields)
+        slow = {m.name for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _costly(whole, m)}
+        added = whole.mechanisms[len(spec.mechanisms) :]
+        kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
+        if len(kept) < len(names):
+            fast = _brisk(build_simulator(spec.with_mechanisms(*kept)), markers, fields)
+            null = dict(coordinates.nominal) | dict(coordinates.fixed) | coordinates.named(coordinates.null)
+            every = RoutedLanes(fast, every, null)
+        workshop[key] = every
+    return workshop[key]
 
 
 def _brisk(simulator: AnySimulator, marker_index: np.ndarray, fields: Sequence[str]) -> Lanes:
@@ -445,14 +446,14 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path, out: P
     simulator = extended.setdefault("simulator", {})
     for step in answer.adopted:
         if step.name == DISCRETISATION:
-            assert answer.question.finer is not None
+            assert answer.problem.finer is not None
             if simulator.get("body", "layered") == "layered":
                 simulator["refine"] = FINER * int(simulator.get("refine", 1))
             elif "drive_rate" in simulator["tetrahedra"]:
                 simulator["tetrahedra"]["drive_rate"] /= FINER
-            simulator["time_step"] = answer.question.finer[0].simulator.description["time_step_s"]
+            simulator["time_step"] = answer.problem.finer[0].simulator.description["time_step_s"]
             continue
-        candidate = answer.question.candidate(step.name)
+        candidate = answer.problem.candidate(step.name)
         assert candidate is not None
         if candidate.group:
             extend_groups(model, answer, candidate)
@@ -467,14 +468,14 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path, out: P
     audit = extended.get("audit", {})
     if "candidates" in audit:
         adopted = {step.name for step in answer.adopted}
-        taken = {code_placed(c.source, folder, out) for c in answer.question.candidates if c.name in adopted}
+        taken = {code_placed(c.source, folder, out) for c in answer.problem.candidates if c.name in adopted}
         audit["candidates"] = [source for source in audit["candidates"] if source not in taken]
     return extended
 
 
 def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, Any]]:
     """The priors under which the sizes of a mechanism were found: no narrower than these sizes, see `widened`."""
-    coordinates = answer.question.coordinates
+    coordinates = answer.problem.coordinates
     factor = widening(answer.extended, coordinates)
     found = {}
     for index in candidate.indices:

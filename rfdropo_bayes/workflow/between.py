@@ -11,7 +11,7 @@ import numpy as np
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.differences import WHERE, Groups
 from rfdropo_bayes.audit.fit import widening
-from rfdropo_bayes.audit.held import OwnParameter
+from rfdropo_bayes.audit.fixed_quantities import OwnParameter
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
@@ -96,10 +96,10 @@ def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -
 
     A mechanism that one group only has is free in its recordings, and absent in all others. What both have is pooled.
     """
-    coordinates, groups = answer.question.coordinates, answer.question.groups
+    coordinates, groups = answer.problem.coordinates, answer.problem.groups
     assert groups is not None
     factor = widening(answer.extended, coordinates)
-    fitted = {trajectory.name for trajectory in answer.question.trajectories}
+    fitted = {trajectory.name for trajectory in answer.problem.trajectories}
     scopes = {step.name for step in answer.adopted if step.name.partition("@")[0] == candidate.title}
     alone = len(scopes) == 1 and not isinstance(candidate.mechanism, OwnParameter)
     for index in candidate.indices:

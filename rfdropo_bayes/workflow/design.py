@@ -17,16 +17,16 @@ from jaxtyping import Float
 
 from rfdropo_bayes.audit.deadline import Deadline, OutOfTime
 from rfdropo_bayes.audit.experiment_design import Hypothesis, Outlook, at_hand, best, outlooks
-from rfdropo_bayes.audit.extension import DISCRETISATION, Inquiry
+from rfdropo_bayes.audit.extension import DISCRETISATION, ExtensionSearch
 from rfdropo_bayes.audit.fit import Fit, Target
-from rfdropo_bayes.audit.pipeline import Question, base_model
+from rfdropo_bayes.audit.pipeline import AuditProblem, base_model
 from rfdropo_bayes.bayes.recordings import commands_after
 from rfdropo_bayes.data import DataSpec, Trajectory, asl_csv
 from rfdropo_bayes.data.asl_csv import FORMAT as ASL
 from rfdropo_bayes.data.plain_csv import command_columns
 from rfdropo_bayes.files import whole, write_json
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
-from rfdropo_bayes.workflow.audit import build_question, start_values
+from rfdropo_bayes.workflow.audit import build_problem, start_values
 from rfdropo_bayes.workflow.calibrated import Calibration
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
@@ -118,15 +118,17 @@ def design(
         InputError: bad input, or a base model that was not fitted in the time.
     """
     settings = model.settings
-    question = build_question(model.spec, settings.audit, runs, [], seed, start=start_values(base))
+    problem = build_problem(model.spec, settings.audit, runs, [], seed, start=start_values(base))
     clock = Clock(settings.design.minutes if minutes is None else minutes)
-    rng = np.random.default_rng(question.seed)
+    rng = np.random.default_rng(problem.seed)
     clock.share = 1.0
-    target, fitted = base_model(question, question.seed, report=report, deadline=clock)
+    target, fitted = base_model(problem, problem.seed, report=report, deadline=clock)
     report("base model fitted")
-    hypotheses = _hypotheses(Inquiry(target, question.candidates, question.rules, question.seed), fitted, clock, report)
+    hypotheses = _hypotheses(
+        ExtensionSearch(target, problem.candidates, problem.rules, problem.seed), fitted, clock, report
+    )
     tried = list(proposals(runs[0], runs, rng))
-    outlook = _outlooks(question, target, fitted, hypotheses, runs[0], tried, clock, report)
+    outlook = _outlooks(problem, target, fitted, hypotheses, runs[0], tried, clock, report)
     chosen = best(outlook, len(hypotheses) > 1)
     kind, times, value = tried[chosen]
     now = at_hand(target, hypotheses)
@@ -146,7 +148,7 @@ def design(
         ],
         "not_finished": clock.missed,
         "minutes": round((time.monotonic() - clock.began) / 60.0, 2),
-        "seed": question.seed,
+        "seed": problem.seed,
         "schema_version": 1,
     }
     return Design(content, command_table(settings.data, runs[0], times, value, float(runs[0].time[-1])))
@@ -173,26 +175,26 @@ def run_design(
         return {**found.content, "commands": str(found.save(out))}
 
 
-def _hypotheses(inquiry: Inquiry, base: Fit, clock: Clock, report: Callable[[str], None]) -> list[Hypothesis]:
+def _hypotheses(search: ExtensionSearch, base: Fit, clock: Clock, report: Callable[[str], None]) -> list[Hypothesis]:
     """The leading significant candidates, each refitted."""
     found = None
     with clock.part(SCREENED_BY, SCREENING):
-        found, _ = inquiry.look_at(base)
+        found, _ = search.screened(base)
     if found is None:
         return []
-    rows = [row for row in found.rows if row.adjusted_p <= inquiry.rules.family and row.name != DISCRETISATION]
+    rows = [row for row in found.rows if row.adjusted_p <= search.rules.family and row.name != DISCRETISATION]
     report(f"{len(rows)} candidates are significant")
     hypotheses = []
     for row in rows[: 2 * HYPOTHESES]:
         with clock.part(REFITTED_BY, f"refit with {row.name}"):
-            hypotheses.append(Hypothesis(row.name, inquiry.refit(found.fit, row)))
+            hypotheses.append(Hypothesis(row.name, search.refit(found.fit, row)))
             report(f"hypothesis {row.name}")
     hypotheses.sort(key=lambda h: -h.fit.log_evidence)
     return hypotheses[:HYPOTHESES]
 
 
 def _outlooks(
-    question: Question,
+    problem: AuditProblem,
     target: Target,
     base: Fit,
     hypotheses: Sequence[Hypothesis],
@@ -202,9 +204,9 @@ def _outlooks(
     report: Callable[[str], None],
 ) -> list[Outlook]:
     """Outlooks of the proposals, one of each kind at a time; of the first few, whatever the time."""
-    simulator = question.lanes.simulator
+    simulator = problem.lanes.simulator
     sequences = [commands_after(simulator, first, t, v) for _, t, v in proposals]
-    shaped = _shaped(sequences, question.model.recordings.commands)
+    shaped = _shaped(sequences, problem.model.recordings.commands)
     outlook = outlooks(target, base, hypotheses, shaped[:KINDS])
     for start in range(KINDS, len(shaped), KINDS):
         report(f"{start} of {len(shaped)} command sequences")

@@ -209,7 +209,7 @@ class DesignTable(Table):
 
 
 class SeparationTable(Table):
-    """[separation]: mechanisms that ``rfdropo separate`` compares."""
+    """[separation]: mechanisms that ``rfdropo audit --separate`` compares."""
 
     mechanisms: list[str] = Field(
         min_length=2,
@@ -268,7 +268,7 @@ class Experiment(Table):
     audit: AuditTable = Field(default_factory=AuditTable, description="candidates and effort of rfdropo audit")
     design: DesignTable = Field(default_factory=DesignTable, description="effort of rfdropo design")
     training: TrainingTable | None = Field(default=None, description="what rfdropo train learns, and how")
-    separation: SeparationTable | None = Field(default=None, description="what rfdropo separate compares")
+    separation: SeparationTable | None = Field(default=None, description="what rfdropo audit --separate compares")
 
 
 def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experiment, dict[str, Any]]:

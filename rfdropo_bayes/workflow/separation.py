@@ -1,4 +1,4 @@
-"""``rfdropo separate``: which of several mechanisms the recordings tell apart; separation.json, .md and .png."""
+"""``rfdropo audit --separate``: which mechanisms the recordings tell apart; separation.json, .md and .png."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 from rfdropo_bayes.audit.fit import Fit
 from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.pipeline import Question, first_target
+from rfdropo_bayes.audit.pipeline import AuditProblem, first_target
 from rfdropo_bayes.audit.separation import Separation, separate
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json, write_text
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.separation_table import separation_figure, separation_markdown
 from rfdropo_bayes.report.summary import combined_hash
-from rfdropo_bayes.workflow.audit import build_question, start_values
+from rfdropo_bayes.workflow.audit import build_problem, start_values
 from rfdropo_bayes.workflow.files import hashes, run_folder
 from rfdropo_bayes.workflow.model import Model
 
@@ -32,6 +32,7 @@ def run_separation(
     *,
     overrides: Sequence[str] = (),
     base: Path | None = None,
+    seed: int | None = None,
     resume: bool = False,
     overwrite: bool = False,
     report: Callable[[str], None] = lambda line: None,
@@ -43,6 +44,7 @@ def run_separation(
         out: folder to write to.
         overrides: assignments that replace entries of the file.
         base: folder of an earlier calibration, from whose posterior means the model without mechanisms starts.
+        seed: of the intervals of sizes; that of the file by default.
         resume: go on from what an interrupted run has left in ``out``.
         overwrite: start anew whatever ``out`` holds.
         report: called with a line of words now and then.
@@ -64,22 +66,22 @@ def run_separation(
             f"{both[0]!r} is in the base model", where="[separation] mechanisms", remedy="leave it out of one of them"
         )
     fitted = model.recordings("fit")
-    start = start_values(base)
-    seed, names = settings.seed, table.mechanisms
-    question = build_question(model.spec, settings.audit, fitted, [], seed, start=start, names=names)
+    start, seed = start_values(base), settings.seed if seed is None else seed
+    names = table.mechanisms
+    problem = build_problem(model.spec, settings.audit, fitted, [], seed, start=start, names=names)
     given: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(fitted)}
-    given["options"] = {"base": base}
+    given["options"] = {"base": base, "seed": seed}
     with run_folder(out, "separate", **given, resume=resume, overwrite=overwrite) as out:
-        coordinates = question.coordinates
+        coordinates = problem.coordinates
         found = separate(
-            first_target(question, Journal(out / JOURNAL, resume=resume)),
-            question.candidates,
+            first_target(problem, Journal(out / JOURNAL, resume=resume)),
+            problem.candidates,
             table.groups,
             coordinates.null if start is None else coordinates.encode(start),
             report,
         )
         content = {
-            **record_separation(found, question),
+            **record_separation(found, problem),
             "seed": seed,
             "versions": software_versions(),
             "data_sha256": combined_hash([trajectory.sha256 for trajectory in fitted]),
@@ -90,7 +92,7 @@ def run_separation(
     return content
 
 
-def record_separation(found: Separation, question: Question) -> dict[str, Any]:
+def record_separation(found: Separation, problem: AuditProblem) -> dict[str, Any]:
     """What was found as plain values; evidences in nats, lengths in mm where a name says so."""
     noise, names = found.target.noise.first, list(found.groups)
     return {
@@ -111,8 +113,8 @@ def record_separation(found: Separation, question: Question) -> dict[str, Any]:
                 "rmse_without_mm": MILLIMETRES * found.without[name].rmse,
                 "needed": found.needed(name),
                 "own_share": found.own[name],
-                "sizes_with_all": _sizes(found.whole.fit, found.groups[name], question),
-                "sizes_alone": _sizes(found.alone[name].fit, found.groups[name], question),
+                "sizes_with_all": _sizes(found.whole.fit, found.groups[name], problem),
+                "sizes_alone": _sizes(found.alone[name].fit, found.groups[name], problem),
             }
             for name in names
         },
@@ -121,12 +123,12 @@ def record_separation(found: Separation, question: Question) -> dict[str, Any]:
     }
 
 
-def _sizes(fit: Fit, members: Sequence[str], question: Question) -> dict[str, Any]:
+def _sizes(fit: Fit, members: Sequence[str], problem: AuditProblem) -> dict[str, Any]:
     """Medians and 90 % intervals of mechanisms' parameters, from the normal approximation."""
-    coordinates = question.coordinates
-    draws = fit.draws(np.random.default_rng([question.seed, 5]), DRAWS, *coordinates.bounds)
+    coordinates = problem.coordinates
+    draws = fit.draws(np.random.default_rng([problem.seed, 5]), DRAWS, *coordinates.bounds)
     values = coordinates.values(draws)
-    indices = [i for c in question.candidates if c.name in members for i in c.indices]
+    indices = [i for c in problem.candidates if c.name in members for i in c.indices]
     quantiles = {i: np.quantile(values[:, i], [0.05, 0.5, 0.95]) for i in indices}
     return {
         coordinates.names[i]: {

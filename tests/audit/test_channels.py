@@ -9,17 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfdropo_bayes.audit.bootstrap import null_residuals
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.audit.score import span
+from rfdropo_bayes.audit.screen import null_residuals
 from rfdropo_bayes.bayes.channels import Weighed
 
-from .toys import question_of_cables
+from .toys import problem_of_cables
 
 
 def found(truth: dict, seed: int, tension: bool):
-    answer = audit(question_of_cables(truth, seed, tension))
+    answer = audit(problem_of_cables(truth, seed, tension))
     return json.loads(json.dumps(record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))))
 
 
@@ -49,7 +49,7 @@ def test_where_nothing_is_wrong_tensions_raise_no_alarm_and_positions_are_still_
 
 def test_a_weighed_part_holds_its_parameter_where_it_was_weighed():
     """A gain weighed 10 of its deviations off pulls the base fit there, and is one more residual of every data set."""
-    free, held = (base_model(question_of_cables({}, 34, True, weighed), 0) for weighed in ((), WEIGHED))
+    free, held = (base_model(problem_of_cables({}, 34, True, weighed), 0) for weighed in ((), WEIGHED))
     target, base = held
     value = target.forward.coordinates.named(base.x)["gain"]
     assert target.forward.coordinates.named(free[1].x)["gain"] == pytest.approx(1.3, abs=0.02)
@@ -70,7 +70,7 @@ WEIGHED = (Weighed(("gain",), 1.4, 1e-4),)
 
 
 def test_without_repeats_each_channel_s_noise_is_that_of_its_own_residuals():
-    asked = question_of_cables({}, 35, True)
+    asked = problem_of_cables({}, 35, True)
     single = [0, *range(3, 10)]
     recordings = asked.model.recordings.of(single)
     channels = tuple(channel.of_recordings(single) for channel in asked.model.channels)

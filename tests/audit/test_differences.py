@@ -11,9 +11,9 @@ import pytest
 
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.differences import Groups, with_differences
-from rfdropo_bayes.audit.held import families
+from rfdropo_bayes.audit.fixed_quantities import families
 from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.pipeline import Question, audit, first_target
+from rfdropo_bayes.audit.pipeline import AuditProblem, audit, first_target
 from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.model import TrajectoryModel
@@ -22,7 +22,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.workflow.between import find_groups
 
-from .toys import BASE, Toy, question, recordings
+from .toys import BASE, Toy, problem, recordings
 
 TRUTH = {"gain": 1.3, "bend": -0.4}
 MONTHS = {"january": ("r0", "r1", "r3", "r5", "r7"), "april": ("r2", "r4", "r6", "r8")}
@@ -31,9 +31,9 @@ GROUPS = Groups(MONTHS, ("r9",))
 COORDINATES: list[Coordinates] = []  # whose priors are sampled once
 
 
-def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> Question:
+def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> AuditProblem:
     """A data set of the toy, half of it with another truth."""
-    asked, toy = question(TRUTH, seed), Toy()
+    asked, toy = problem(TRUTH, seed), Toy()
     days = [recordings({**TRUTH, **truth}, seed, toy) for truth in (january, april)]
     chosen = [days[first.name in MONTHS["april"]][k] for k, first in enumerate(days[0][:9])]
     gathered = gather_recordings(toy, chosen)
@@ -53,7 +53,7 @@ def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> 
     )
 
 
-def found(asked: Question) -> dict:
+def found(asked: AuditProblem) -> dict:
     answer = audit(asked)
     return json.loads(json.dumps(record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))))
 

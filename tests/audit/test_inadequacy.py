@@ -7,21 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfdropo_bayes.audit.extension import Inquiry
+from rfdropo_bayes.audit.extension import ExtensionSearch
 from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.inadequacy import POOR, as_measured, far_off, spread
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.bayes.noise.autoregression import MISFIT, REPEATS
 
-from .toys import NOISE, question
+from .toys import NOISE, problem
 
 TRUTH = {"gain": 1.3, "bend": -0.4}
 
 
 @pytest.fixture(scope="module")
 def far():
-    """A question whose base model lacks a large play, its judge and its fit."""
-    asked = question({**TRUTH, "play": 8.0}, 3)
+    """A problem whose base model lacks a large play, its judge and its fit."""
+    asked = problem({**TRUTH, "play": 8.0}, 3)
     return asked, *base_model(asked, 0)
 
 
@@ -34,7 +34,7 @@ def test_a_model_that_is_far_off_is_judged_by_the_size_of_what_it_leaves_and_no_
     np.testing.assert_allclose(spread(judge, fit), size, rtol=1e-6)
     # Rows that last count as fewer: the judge's noise is that of white rows that would tell as much.
     assert np.all(judge.noise.scale >= size * (1 - 0.1))
-    right, found = base_model(question(TRUTH, 3), 0)
+    right, found = base_model(problem(TRUTH, 3), 0)
     assert right.known is None
     np.testing.assert_array_equal(spread(right, found), right.noise.scale)
 
@@ -51,10 +51,10 @@ def test_a_fit_seen_under_the_measurements_noise_is_what_that_noise_makes_of_its
 def test_a_step_of_a_model_that_is_far_off_brings_nats_by_rows_that_count(far):
     """Under the measurement's noise the same step brings a hundred times as much."""
     asked, judge, fit = far
-    inquiry = Inquiry(judge, asked.candidates, asked.rules, 0)
-    look, _ = inquiry.look_at(fit)
-    assert look.omnibus.p == 1 / (1 + asked.rules.bootstraps)
-    better = inquiry.refit(fit, look.row("play"))
+    search = ExtensionSearch(judge, asked.candidates, asked.rules, 0)
+    screen, _ = search.screened(fit)
+    assert screen.omnibus.p == 1 / (1 + asked.rules.bootstraps)
+    better = search.refit(fit, screen.row("play"))
     rows = np.count_nonzero(fit.residual)
     assert asked.rules.evidence < better.log_evidence - fit.log_evidence < 0.5 * rows
     known = judge.measured
@@ -66,8 +66,8 @@ def test_a_step_of_a_model_that_is_far_off_brings_nats_by_rows_that_count(far):
 def test_an_audit_ends_under_the_measurements_noise_where_the_extended_model_is_right(far):
     asked, *_ = far
     answer = audit(replace(asked, rules=replace(asked.rules, bootstraps=199)))
-    assert [step.name for step in answer.steps] == ["play"]
-    assert answer.steps[0].judge.known is None
+    assert [step.name for step in answer.causes.steps] == ["play"]
+    assert answer.causes.steps[0].judge.known is None
     assert answer.verdict == "explained"
     assert answer.target.noise.source == REPEATS
     assert np.mean(answer.extended.residual**2) < 1.2 < POOR < np.mean(answer.base.residual**2)

@@ -13,11 +13,10 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.audit import pipeline
-from rfdropo_bayes.audit.bootstrap import p_in_words
 from rfdropo_bayes.audit.candidates import lead
 from rfdropo_bayes.audit.deadline import Deadline
 from rfdropo_bayes.audit.experiment_design import Hypothesis, at_hand, outlooks
-from rfdropo_bayes.audit.extension import Inquiry, Rules, Step
+from rfdropo_bayes.audit.extension import ExtensionSearch, Rules, Step
 from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
 from rfdropo_bayes.audit.gain import Difference, Gain
@@ -25,6 +24,7 @@ from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import gather_measurements
 from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.audit.record import _doubt, next_experiment, record
+from rfdropo_bayes.audit.screen import p_in_words
 from rfdropo_bayes.audit.sentence import _adoption, _named
 from rfdropo_bayes.audit.verdict import decide
 from rfdropo_bayes.bayes.channels import Markers
@@ -37,13 +37,13 @@ from rfdropo_bayes.report.audit_page import render_audit, shown
 from rfdropo_bayes.report.page import p_value
 from rfdropo_bayes.simulators.commands import Commands
 
-from .toys import CANDIDATES, NOISE, ROWS, STEP, Toy, question, recordings
+from .toys import CANDIDATES, NOISE, ROWS, STEP, Toy, problem, recordings
 
 TRUTH = {"gain": 1.3, "bend": -0.4}
 
 
 def found(truth: dict, seed: int, without: tuple[str, ...] = ()):
-    answer = audit(question({**TRUTH, **truth}, seed, without))
+    answer = audit(problem({**TRUTH, **truth}, seed, without))
     content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
     assert json.loads(json.dumps(content, allow_nan=False))["verdict"] == answer.verdict
     return content
@@ -131,7 +131,7 @@ LARGE, SMALL = 12.0, 3.0  # of which the first moves the markers by more than th
 
 
 def on_a_coarse_mesh(asked, error=LARGE, left=0.0):
-    """A question whose simulator is coarse; the error ``left`` stays on the finer one."""
+    """A problem whose simulator is coarse; the error ``left`` stays on the finer one."""
     finer = Lanes(Coarse(left), np.arange(4)) if left else asked.lanes
     commands = asked.model.recordings.commands
     return replace(asked, lanes=Lanes(Coarse(error), np.arange(4)), finer=(finer, commands))
@@ -139,23 +139,23 @@ def on_a_coarse_mesh(asked, error=LARGE, left=0.0):
 
 def test_what_an_error_of_the_mesh_hides_is_found_on_the_finer_one():
     """Once the finer simulator is the model, candidates are refitted, and recordings predicted, with it."""
-    answer = audit(on_a_coarse_mesh(question({**TRUTH, "play": 0.15}, 102)))
-    assert [step.name for step in answer.steps] == ["discretisation", "play"]
+    answer = audit(on_a_coarse_mesh(problem({**TRUTH, "play": 0.15}, 102)))
+    assert [step.name for step in answer.causes.steps] == ["discretisation", "play"]
     assert answer.verdict == "explained"
-    assert answer.steps[1].judge.forward is answer.steps[0].judge.forward is not answer.target.forward
-    index = answer.question.coordinates.names.index("play")
-    sizes = answer.question.coordinates.values(answer.draws)[:, index]
+    assert answer.causes.steps[1].judge.forward is answer.causes.steps[0].judge.forward is not answer.target.forward
+    index = answer.problem.coordinates.names.index("play")
+    sizes = answer.problem.coordinates.values(answer.draws)[:, index]
     assert abs(sizes.mean() - 0.15) < 4 * sizes.std()
 
 
 @pytest.mark.parametrize(("error", "family", "named"), [(LARGE, 0.02, ["discretisation"]), (SMALL, 0.0, [])])
 def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(error, family, named):
     """Where nothing may be named, an error of the mesh is let pass."""
-    asked = on_a_coarse_mesh(question(TRUTH, 102), error)
+    asked = on_a_coarse_mesh(problem(TRUTH, 102), error)
     answer = audit(replace(asked, rules=replace(asked.rules, family=family)))
-    assert [step.name for step in answer.steps] == named
+    assert [step.name for step in answer.causes.steps] == named
     assert answer.verdict == ("explained" if named else "no_discrepancy")
-    assert answer.looks[0].refined is not bool(named)
+    assert answer.causes.screens[0].refined is not bool(named)
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
     if named:  # the finer simulator is the model now
         assert content["numerical_error_mm"] is None
@@ -169,9 +169,9 @@ def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(error, family, nam
 @pytest.mark.parametrize("left", [0.0, SMALL / 2])
 def test_an_error_of_the_mesh_below_the_noise_is_no_finding_however_sure_it_is(left):
     """Also where the finer simulator has half of the error itself, as with time steps of first order."""
-    answer = audit(on_a_coarse_mesh(question(TRUTH, 102), SMALL, left))
-    assert answer.looks[0].row("discretisation").adjusted_p < 0.02
-    assert answer.steps == []
+    answer = audit(on_a_coarse_mesh(problem(TRUTH, 102), SMALL, left))
+    assert answer.causes.screens[0].row("discretisation").adjusted_p < 0.02
+    assert answer.causes.steps == []
     assert answer.verdict == "no_discrepancy"
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
     assert content["numerical_error_mm"] < content["noise_floor_mm"]
@@ -179,12 +179,12 @@ def test_an_error_of_the_mesh_below_the_noise_is_no_finding_however_sure_it_is(l
 
 
 def test_beside_an_error_of_the_mesh_below_the_noise_causes_are_named():
-    answer = audit(on_a_coarse_mesh(question({**TRUTH, "play": 1.0}, 102), SMALL))
-    assert [step.name for step in answer.steps] == ["play"]
+    answer = audit(on_a_coarse_mesh(problem({**TRUTH, "play": 1.0}, 102), SMALL))
+    assert [step.name for step in answer.causes.steps] == ["play"]
 
 
 def test_the_next_step_about_the_mesh_is_at_the_simulation():
-    answer = audit(on_a_coarse_mesh(question(TRUTH, 102)))
+    answer = audit(on_a_coarse_mesh(problem(TRUTH, 102)))
     words = next_experiment(answer)["sentence"]
     assert words.startswith("Refine the simulation: shorten [simulator] time_step")
     assert "robot" not in words
@@ -196,7 +196,7 @@ def test_the_same_seed_gives_the_same_audit():
 
 
 def test_a_killed_audit_goes_on_where_it_was_and_says_the_same(tmp_path, monkeypatch):
-    asked = question({**TRUTH, "play": 1.0}, 1)
+    asked = problem({**TRUTH, "play": 1.0}, 1)
 
     def killed(line: str) -> None:
         if line.startswith("refit"):
@@ -213,17 +213,17 @@ def test_a_killed_audit_goes_on_where_it_was_and_says_the_same(tmp_path, monkeyp
     whole = audit(asked, journal=Journal(tmp_path / "other"))
     assert again < 0.7 * len(calls)
     # What the first part took counts: a resumed audit that looks nearly all up has a longer account than its own time.
-    assert sum(resumed.profile.values()) == resumed.seconds
-    assert {"base model", "screening", "joint test", "refits", "gain"} <= set(resumed.profile)
+    assert sum(resumed.cost.profile.values()) == resumed.cost.seconds
+    assert {"base model", "screening", "joint test", "refits", "gain"} <= set(resumed.cost.profile)
     for path in set(tmp_path.glob("*.npz")) - {tmp_path / "broken.npz"}:
         with np.load(path) as kept:
             np.savez(path, **{**kept, **({"seconds": np.asarray(1e6)} if "seconds" in kept else {})})
     once_more = audit(asked, journal=Journal(tmp_path, resume=True))
-    assert once_more.seconds > 1e6
+    assert once_more.cost.seconds > 1e6
     first, second = (record(a, versions={}, data_sha256="", next_experiment=None) for a in (resumed, whole))
     assert untimed(first) == untimed(second)
     # Other data share nothing with what was kept; without resume, what was kept is gone.
-    other = audit(question({**TRUTH, "play": 1.0}, 2), journal=Journal(tmp_path, resume=True))
+    other = audit(problem({**TRUTH, "play": 1.0}, 2), journal=Journal(tmp_path, resume=True))
     assert other.base.log_evidence != whole.base.log_evidence
     Journal(tmp_path)
     assert not list(tmp_path.iterdir())
@@ -231,11 +231,11 @@ def test_a_killed_audit_goes_on_where_it_was_and_says_the_same(tmp_path, monkeyp
 
 def test_commands_that_excite_only_one_of_two_effects_separate_them():
     """Hypotheses play (first cable) and delay (second): a recording that moves both separates, one at rest does not."""
-    asked = question({**TRUTH, "play": 1.0}, 1)
+    asked = problem({**TRUTH, "play": 1.0}, 1)
     target, base = base_model(asked, 0)
-    inquiry = Inquiry(target, asked.candidates, asked.rules, 0)
-    look, _ = inquiry.look_at(base)
-    hypotheses = [Hypothesis(name, inquiry.refit(base, look.row(name))) for name in ("play", "delay")]
+    search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
+    screen, _ = search.screened(base)
+    hypotheses = [Hypothesis(name, search.refit(base, screen.row(name))) for name in ("play", "delay")]
     like = Commands(*(np.asarray(part)[0] for part in asked.model.recordings.commands))
     still = like._replace(step=np.zeros_like(like.step))
     moving, resting = outlooks(target, base, hypotheses, [like, still])
@@ -265,12 +265,12 @@ class Hurried(Deadline):
 @pytest.mark.parametrize("share", [0.1, 0.4, 0.7, 0.95])
 def test_an_audit_whose_time_is_up_finishes_with_what_it_knows(monkeypatch, share):
     """Play of ten times the size that is sure, and the time is up between the base fit and the end."""
-    asked = question({**TRUTH, "play": 1.0}, 1)
+    asked = problem({**TRUTH, "play": 1.0}, 1)
     first, clock = Hurried(10**9), Hurried(10**9)
     base_model(asked, asked.seed, deadline=first)
     monkeypatch.setattr(pipeline, "Deadline", lambda minutes: clock)
     whole = audit(asked)
-    assert not whole.stopped
+    assert not whole.cost.stopped
     before, used = 10**9 - first.looks, 10**9 - clock.looks
     clock = Hurried(int(before + share * (used - before)))
     answer = audit(asked)
@@ -286,14 +286,14 @@ def test_an_audit_whose_time_is_up_finishes_with_what_it_knows(monkeypatch, shar
 @pytest.mark.parametrize("start", [None, {"gain": 1.0, "bend": 0.0}])
 def test_the_rollouts_that_are_announced_for_the_base_model_are_about_those_it_takes(start):
     lines: list[str] = []
-    target, _ = base_model(replace(question(TRUTH, 1), start=start), 1, report=lines.append)
+    target, _ = base_model(replace(problem(TRUTH, 1), start=start), 1, report=lines.append)
     (announced,) = [int(found[1]) for line in lines if (found := re.search(r"about (\d+) rollouts", line))]
     assert 0.5 < announced / target.forward.rollouts < 2.0
 
 
 def test_the_pace_is_that_of_different_rollouts_that_fill_a_call():
     """A call of few is filled with copies, which a compiled engine simulates for nothing."""
-    asked = question(TRUTH, 1)
+    asked = problem(TRUTH, 1)
     forward = pipeline.first_target(asked, Journal()).forward
     null = forward.coordinates.null
     forward.observe(null[None])
@@ -307,7 +307,7 @@ def test_the_pace_is_that_of_different_rollouts_that_fill_a_call():
 
 
 def test_a_base_model_without_the_time_for_its_fit_is_refused():
-    asked = question(TRUTH, 1)
+    asked = problem(TRUTH, 1)
     with pytest.raises(InputError, match=r"\[audit\] minutes: the time was up before the base model was fitted"):
         base_model(asked, asked.seed, deadline=Deadline(1e-6))
 
@@ -316,7 +316,7 @@ def test_a_base_model_without_the_time_for_its_fit_is_refused():
 @pytest.mark.parametrize("stated", [True, False])
 def test_an_audit_without_the_time_for_a_base_fit_has_no_verdict_and_goes_on(tmp_path, share, stated):
     """The time is up at the start, in the search and in the last climb; with and without a noise that is known."""
-    asked = question({**TRUTH, "play": 1.0}, 1)
+    asked = problem({**TRUTH, "play": 1.0}, 1)
     if not stated:
         asked = asked_of(asked, recordings({**TRUTH, "play": 1.0}, 1)[2:6], 2)
     clock = Hurried(10**9)
@@ -346,7 +346,7 @@ class Rough(Toy):
 
 
 def test_a_base_fit_that_has_not_converged_is_said_and_gives_no_verdict():
-    answer = audit(replace(question({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Rough(), np.arange(4))))
+    answer = audit(replace(problem({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Rough(), np.arange(4))))
     assert answer.verdict == "no_verdict"
     content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))
     assert not content["base_fit_converged"]
@@ -367,7 +367,7 @@ def test_rollouts_go_to_the_simulator_that_knows_their_candidates():
     theta[:, 0] = 1.3
     theta[2, play] = 0.7
     tangent = np.eye(theta.shape[1])[[0, play, 0, 1]]
-    commands, start = question(TRUTH, 1).model.recordings.of(range(4)).commands, np.zeros((4, 7))
+    commands, start = problem(TRUTH, 1).model.recordings.of(range(4)).commands, np.zeros((4, 7))
     slow = routed._needs_slow(theta)
     np.testing.assert_array_equal(slow, [False, False, True, False])
     (shown, status), (other, _) = (lanes.roll(theta, start, commands) for lanes in (routed, whole))
@@ -387,15 +387,15 @@ def test_a_refit_finds_back_from_an_extrapolation_at_which_rollouts_fail(monkeyp
             observed = super().rollout(parameters, commands, steps)
             return observed._replace(status=jnp.where(jnp.abs(parameters["play"]) > 4.0, 1, 0))
 
-    asked = replace(question({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Brittle(), np.arange(4)))
+    asked = replace(problem({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Brittle(), np.arange(4)))
     target, base = base_model(asked, 0)
-    inquiry = Inquiry(target, asked.candidates, asked.rules, 0)
-    look, _ = inquiry.look_at(base)
+    search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
+    screen, _ = search.screened(base)
     index = asked.coordinates.space.names.index("play")
     far = base.x.copy()
     far[index] += 45.0
-    monkeypatch.setattr(Inquiry, "_lead", lambda *given: (1.0, far))
-    fit = inquiry.refit(base, look.row("play"))
+    monkeypatch.setattr(ExtensionSearch, "_lead", lambda *given: (1.0, far))
+    fit = search.refit(base, screen.row("play"))
     assert fit.log_evidence > base.log_evidence + 10.0
     assert asked.coordinates.named(fit.x)["play"] == pytest.approx(1.0, abs=0.2)
 
@@ -410,34 +410,36 @@ class Turning(Toy):
 
 
 def test_a_large_effect_is_found_though_its_slope_at_null_points_elsewhere():
-    asked = replace(question({**TRUTH, "delay": 1.0}, 2), lanes=Lanes(Turning(), np.arange(4)))
+    asked = replace(problem({**TRUTH, "delay": 1.0}, 2), lanes=Lanes(Turning(), np.arange(4)))
     target, base = base_model(asked, 0)
     target = target.measured  # under whose noise so small a slope is seen
     base = climb(target, base.x, base.free)
-    look, _ = Inquiry(target, asked.candidates, asked.rules, 0).look_at(base)
-    row = look.row("lag")
+    screen, _ = ExtensionSearch(target, asked.candidates, asked.rules, 0).screened(base)
+    row = screen.row("lag")
     drop, start = lead(target, base, row.probe, row.lm)
     assert drop > 10.0 * row.lm
-    assert drop > 0.8 * look.row("delay").lm  # of which it can do the same at its size 1 or -1
+    assert drop > 0.8 * screen.row("delay").lm  # of which it can do the same at its size 1 or -1
     assert abs(start[asked.coordinates.space.names.index("lag")]) == pytest.approx(1.0, abs=0.35)
 
 
 def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it():
-    asked = question({**TRUTH, "play": 1.0}, 1)
+    asked = problem({**TRUTH, "play": 1.0}, 1)
     target, base = base_model(asked, 0)
-    inquiry = Inquiry(target, asked.candidates, asked.rules, 0)
-    look, _ = inquiry.look_at(base)
+    search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
+    screen, _ = search.screened(base)
     play, creep = (next(c for c in asked.candidates if c.name == name) for name in ("play", "creep"))
     with_play = np.array([*base.free, *play.indices], dtype=int)
     early = climb(target, base.x, with_play, evaluations=0)
     whole = climb(target, base.x, with_play)
     assert early.log_evidence < whole.log_evidence - 100.0  # what it is about
     both = climb(target, whole.x, np.array([*with_play, *creep.indices], dtype=int))
-    step = Step("creep", ("creep",), replace(look, fit=early), both, both.log_evidence - early.log_evidence, {}, target)
-    again = inquiry._climbed_again(step)
+    step = Step(
+        "creep", ("creep",), replace(screen, fit=early), both, both.log_evidence - early.log_evidence, {}, target
+    )
+    again = search._climbed_again(step)
     assert again is not None
     assert again.log_evidence == pytest.approx(whole.log_evidence, abs=0.1)
-    assert inquiry._climbed_again(replace(step, before=replace(look, fit=whole))) is None
+    assert search._climbed_again(replace(step, before=replace(screen, fit=whole))) is None
 
 
 def test_repeats_whose_clocks_differ_are_not_joined_and_named():
@@ -457,12 +459,12 @@ def unrepeated(truth: dict, seed: int):
     """Two recordings of different commands to fit, six to test."""
     trajectories = recordings({**TRUTH, **truth}, seed)
     single = [trajectories[index] for index in (0, 3, 4, 5, 6, 7, 8, 9)]
-    asked = question(TRUTH, seed)
+    asked = problem(TRUTH, seed)
     return asked_of(asked, single, 2)
 
 
 def asked_of(asked, trajectories, fitted: int):
-    """The same question about other recordings."""
+    """The same problem with other recordings."""
     gathered = gather_recordings(Toy(), trajectories)
     model = replace(asked.model, recordings=gathered, channels=(Markers.gather(gathered, "white"),))
     return replace(asked, model=model, trajectories=trajectories[:fitted])
@@ -475,7 +477,7 @@ def test_without_repeats_the_noise_is_what_the_extended_model_leaves():
     before, _ = base_model(asked, 0)
     assert np.mean(before.noise.scale) > 2.0 * NOISE
     answer = audit(asked)
-    assert [step.name for step in answer.steps] == ["play"]
+    assert [step.name for step in answer.causes.steps] == ["play"]
     assert answer.verdict == "explained"
     np.testing.assert_allclose(answer.target.noise.scale, NOISE, rtol=0.1)
 
@@ -498,7 +500,7 @@ def test_where_nothing_is_wrong_a_stated_noise_is_not_suspected_however_low_the_
     strict = replace(asked, rules=replace(asked.rules, extended_passes=1.0))
     answer = audit(strict)
     assert answer.verdict == "no_discrepancy"
-    assert answer.suspected is None
+    assert answer.doubts.suspected is None
 
 
 def test_what_predicts_unseen_recordings_worse_is_named_and_not_adopted():
@@ -507,7 +509,7 @@ def test_what_predicts_unseen_recordings_worse_is_named_and_not_adopted():
     single = [*fitted.trajectories, *recordings({**TRUTH, "delay": -1.0}, 7)[4:]]
     answer = audit(asked_of(fitted, single, 2))
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
-    assert answer.steps
+    assert answer.causes.steps
     assert answer.adopted == []
     assert answer.verdict == "unexplained"
     assert "predicted worse" in content["sentence"]
@@ -521,7 +523,7 @@ def test_what_only_the_fitted_recordings_have_is_not_adopted_beside_what_all_hav
     single = [*fitted.trajectories, *recordings({**TRUTH, "play": 3.0}, 7)[4:]]
     answer = audit(asked_of(fitted, single, 2))
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
-    assert [step.name for step in answer.steps] == ["play"]
+    assert [step.name for step in answer.causes.steps] == ["play"]
     assert [step.name for step in answer.adopted] == ["play"]
     assert content["unsupported"][0] in ("delay", "lag")
     assert "unseen ones do not support: not adopted" in content["sentence"]
@@ -530,22 +532,22 @@ def test_what_only_the_fitted_recordings_have_is_not_adopted_beside_what_all_hav
 
 
 def test_a_step_that_a_later_one_carries_is_not_adopted():
-    """An inquiry that named a useless step first, then play: only play is left, refitted, with the size that it has."""
+    """A search that named a useless step first, then play: only play is left, refitted, with the size that it has."""
     asked = unrepeated({"play": 3.0}, 7)
     target, base = base_model(asked, asked.seed)
-    inquiry = Inquiry(target, asked.candidates, asked.rules, asked.seed)
-    look, _ = inquiry.look_at(base)
+    search = ExtensionSearch(target, asked.candidates, asked.rules, asked.seed)
+    screen, _ = search.screened(base)
     useless, play = (next(c for c in asked.candidates if c.name == name) for name in ("creep", "play"))
     first = climb(target, base.x, np.array([*base.free, *useless.indices]))
     both = climb(target, first.x, np.array([*first.free, *play.indices]))
     steps = [
-        Step("creep", ("creep",), look, first, 0.0, {}, target),
-        Step("play", ("play",), look, both, 9.0, {}, target),
+        Step("creep", ("creep",), screen, first, 0.0, {}, target),
+        Step("play", ("play",), screen, both, 9.0, {}, target),
     ]
-    held_out = pipeline._held_out(asked, target, inquiry, base, steps)
+    held_out = pipeline._held_out(asked, target, search, base, steps)
     assert held_out.supported() == 2
     assert not held_out.gain(0, 1).clear
-    kept, measured = pipeline._without_carried(asked, target, inquiry, base, steps, held_out)
+    kept, measured = pipeline._without_carried(asked, target, search, base, steps, held_out)
     assert [step.name for step in kept] == ["play"]
     assert set(kept[0].fit.free) == {*base.free, *play.indices}
     assert measured.gain(0, 1).clear
@@ -553,7 +555,7 @@ def test_a_step_that_a_later_one_carries_is_not_adopted():
     swapped = [replace(steps[0], name="play", fit=climb(target, base.x, np.array([*base.free, *play.indices])))]
     pair = [*swapped, replace(steps[1], name="creep")]
     always = replace(held_out, predictions=[held_out.predictions[k] for k in (0, 0, 2)])
-    stayed, _ = pipeline._without_carried(asked, target, inquiry, base, pair, always)
+    stayed, _ = pipeline._without_carried(asked, target, search, base, pair, always)
     assert [step.name for step in stayed] == ["play", "creep"]
 
 
@@ -561,16 +563,16 @@ def test_a_step_that_a_later_one_makes_needless_is_taken_out():
     """A useless delay before play goes; play before a delay stays."""
     asked = unrepeated({"play": 3.0}, 7)
     target, base = base_model(asked, asked.seed)
-    inquiry = Inquiry(target, asked.candidates, asked.rules, asked.seed)
-    look, _ = inquiry.look_at(base)
+    search = ExtensionSearch(target, asked.candidates, asked.rules, asked.seed)
+    screen, _ = search.screened(base)
     delay, play = (next(c for c in asked.candidates if c.name == name) for name in ("delay", "play"))
     order = {"delay": delay, "play": play}
     for first, second, left in (("delay", "play", ["play"]), ("play", "delay", ["play", "delay"])):
         one = climb(target, base.x, np.array([*base.free, *order[first].indices]))
         both = climb(target, one.x, np.array([*one.free, *order[second].indices]))
         fits = {first: one, second: both}
-        steps = [Step(name, (name,), look, fit, 1.0, {}, target) for name, fit in fits.items()]
-        kept = inquiry._without_needless(base, steps)
+        steps = [Step(name, (name,), screen, fit, 1.0, {}, target) for name, fit in fits.items()]
+        kept = search._without_needless(base, steps)
         assert [step.name for step in kept] == left
         assert set(kept[-1].fit.free) == {*base.free, *(index for name in left for index in order[name].indices)}
         assert kept[-1].fit.log_evidence >= both.log_evidence
@@ -578,13 +580,13 @@ def test_a_step_that_a_later_one_makes_needless_is_taken_out():
 
 def test_a_family_takes_the_place_of_a_cause_only_if_it_wins_under_wider_priors_too():
     """Ten parameters more must bring 3 nats and ten times log 2; as many or fewer parameters, 3 nats."""
-    asked = question(TRUTH, 1)
+    asked = problem(TRUTH, 1)
     target, old = base_model(asked, 0)
-    inquiry = Inquiry(target, asked.candidates, asked.rules, 0)
+    search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
     family = np.arange(len(old.free) + 10)
     for free, gain, wins in ((old.free, 2.9, False), (old.free, 3.1, True), (family, 9.8, False), (family, 10.0, True)):
         new = replace(old, free=free, log_evidence=old.log_evidence + gain)
-        assert inquiry._surpasses(new, old, asked.rules.evidence) == wins
+        assert search._surpasses(new, old, asked.rules.evidence) == wins
 
 
 def test_what_unseen_recordings_clearly_support_is_adopted_and_no_p_value_is_zero():
@@ -633,7 +635,8 @@ def test_a_verdict_agrees_with_the_errors(changes, worse, clear):
 def test_the_recording_that_speaks_against_an_extension_is_named(groups):
     """Groups are to be compared where they have not been."""
     gain = replace(GAIN, elpd_p=None, differences=OPPOSED)
-    answer = SimpleNamespace(adopted=[], gain=gain, unsupported=[], question=SimpleNamespace(groups=groups))
+    said = {"validation": SimpleNamespace(gain=gain), "causes": SimpleNamespace(unsupported=[])}
+    answer = SimpleNamespace(adopted=[], problem=SimpleNamespace(groups=groups), **said)
     assert _adoption(answer).startswith(" b is clearly less likely with this (2e+03 mm without, 2.1e+03 mm with it)")
     assert ("otherwise in b: compare groups of recordings with --between" in _doubt(answer)) == (groups is None)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rfdropo_bayes.audit.held import with_held
+from rfdropo_bayes.audit.fixed_quantities import with_fixed_quantities
 from rfdropo_bayes.audit.omnibus import BLOCK
 from rfdropo_bayes.audit.pipeline import Answer, audit
 from rfdropo_bayes.audit.record import next_experiment, record
@@ -15,16 +15,19 @@ from rfdropo_bayes.bayes.space import ParameterSpace
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.parameters import specs_of
 
-from .toys import NOISE, question
+from .toys import NOISE, problem
 
 
 @pytest.fixture(scope="module")
 def answer() -> Answer:
     """Play, then creep, both adopted; the first of them given the lesser share, and a joint test that is not passed."""
-    found = audit(question({"gain": 1.3, "bend": -0.4, "play": 1.0, "creep": 0.6, "creep_time": 0.6}, 4))
+    found = audit(problem({"gain": 1.3, "bend": -0.4, "play": 1.0, "creep": 0.6, "creep_time": 0.6}, 4))
     assert len(found.adopted) == 2
-    last = replace(found.looks[-1], omnibus=replace(found.looks[-1].omnibus, p=0.005))
-    return replace(found, verdict="partly_explained", looks=[*found.looks[:-1], last], stages=[-0.01, 0.98])
+    *before, last = found.causes.screens
+    screens = [*before, replace(last, omnibus=replace(last.omnibus, p=0.005))]
+    validation = replace(found.validation, stages=[-0.01, 0.98])
+    causes = replace(found.causes, screens=screens)
+    return replace(found, verdict="partly_explained", causes=causes, validation=validation)
 
 
 def said(answer: Answer) -> str:
@@ -33,9 +36,10 @@ def said(answer: Answer) -> str:
 
 def test_nothing_else_is_at_work_where_all_that_remains_is_noise(answer):
     """Errors 1 % below and 10 % above what the noise makes of a marker's distance."""
-    floor = answer.gain.floor
-    assert floor == pytest.approx(3**0.5 * NOISE, rel=0.1)
-    noise, more = (said(replace(answer, gain=replace(answer.gain, rmse_extended=k * floor))) for k in (0.99, 1.1))
+    gain = answer.validation.gain
+    assert gain.floor == pytest.approx(3**0.5 * NOISE, rel=0.1)
+    gains = (replace(gain, rmse_extended=k * gain.floor) for k in (0.99, 1.1))
+    noise, more = (said(replace(answer, validation=replace(answer.validation, gain=each))) for each in gains)
     assert "the fitted recordings keep a pattern (joint test p < 0.005)" in noise
     assert "something else" not in noise
     assert "no more than repeats differ by" in noise
@@ -44,16 +48,17 @@ def test_nothing_else_is_at_work_where_all_that_remains_is_noise(answer):
 
 
 def test_the_next_step_is_about_the_largest_share(answer):
-    first, second = (step.name for step in answer.steps)
+    first, second = (step.name for step in answer.causes.steps)
     following = next_experiment(answer)
     assert following["separates"] == [second]
     assert following["sentence"] == f"Check {second} on the robot, 99 % of what is wrong: a remedy."
-    assert next_experiment(replace(answer, stages=[]))["separates"] == [first]
+    without = replace(answer, validation=replace(answer.validation, stages=[]))
+    assert next_experiment(without)["separates"] == [first]
 
 
 def test_what_is_held_at_nominal_values_says_what_to_do_at_the_robot():
     specs = specs_of(load_robot("asl_trunk").parameter_table())
-    _, candidates = with_held(ParameterSpace(()), specs, ())
+    _, candidates = with_fixed_quantities(ParameterSpace(()), specs, ())
     remedies = {candidate.name: candidate.mechanism.remedy for candidate in candidates}
     assert "turn each until its cable just begins to move the body" in remedies["initial_displacement"]
     assert remedies["disk_mass"].startswith("measure the disk mass at each place (base, middle, tip)")

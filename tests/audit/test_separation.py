@@ -18,7 +18,7 @@ from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.workflow.experiment import SeparationTable
 from rfdropo_bayes.workflow.separation import record_separation
 
-from .toys import NOISE, question
+from .toys import NOISE, problem
 
 TRUTH = {"gain": 1.3, "bend": -0.4, "delay": 0.8, "play": 0.6}
 ASKED = ("play", "delay", "lag", "creep")
@@ -28,7 +28,7 @@ GROUPS = {"lateness": ("delay", "lag")}
 @pytest.fixture(scope="module")
 def asked():
     """Seed fixed; a mechanism that is absent is called needed for less than one seed in a thousand (10 nats)."""
-    whole = question(TRUTH, 21)
+    whole = problem(TRUTH, 21)
     target, base = base_model(whole, 0)
     candidates = [c for c in whole.candidates if c.name in ASKED]
     return target, base, candidates, whole

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from rfdropo_bayes.audit.bootstrap import null_residuals, tail
 from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.omnibus import statistics
 from rfdropo_bayes.audit.score import project_out, span
+from rfdropo_bayes.audit.screen import null_residuals, tail
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED, Autoregression
 from rfdropo_bayes.bayes.noise.repeat_shifts import repeat_shift
 from rfdropo_bayes.bayes.noise.shared import mixed, shrunk_correlation

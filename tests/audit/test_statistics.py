@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rfdropo_bayes.audit.bootstrap import null_residuals, tail
-from rfdropo_bayes.audit.coordinates import Support
+from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.fit import Fit, widened
 from rfdropo_bayes.audit.gain import (
@@ -25,6 +24,7 @@ from rfdropo_bayes.audit.gain import (
 )
 from rfdropo_bayes.audit.omnibus import joint_test, statistics
 from rfdropo_bayes.audit.score import Signature, joint_statistic, likeness, project_out, signature, span, statistic
+from rfdropo_bayes.audit.screen import null_residuals, tail
 from rfdropo_bayes.audit.verdict import decide
 from rfdropo_bayes.bayes.noise.autoregression import (
     REPEATS,
@@ -233,13 +233,13 @@ PRIORS = (
 @pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: prior["distribution"])
 def test_coordinates_are_those_of_the_prior_s_own_transform(prior, low, high):
     spec = ParameterSpec("size", "m", low, high, 0.5, prior, "a size")
-    (parameter,) = build_space([spec], {"size": prior}, {}, ["r"]).parameters
-    own = Support.of(parameter)
-    x = np.linspace(-2.0, 2.0, 9)
-    values = np.asarray(parameter.transform(x))
-    np.testing.assert_allclose(own.value(x), values, rtol=1e-12)
-    np.testing.assert_allclose(own.free(values), x, atol=1e-9)
-    np.testing.assert_allclose(own.slope(x), (own.value(x + 1e-6) - own.value(x - 1e-6)) / 2e-6, rtol=1e-6)
+    space = build_space([spec], {"size": prior}, {}, ["r"])
+    own = Coordinates(space, 1, ("size",), {"size": 0.5}, {})
+    x = np.linspace(-2.0, 2.0, 9)[:, None]
+    values = np.asarray(space.parameters[0].transform(x))
+    np.testing.assert_allclose(own.values(x), values, rtol=1e-12)
+    np.testing.assert_allclose(own.encode_one(0, values), x, atol=1e-9)
+    np.testing.assert_allclose(own.slopes(x), (own.values(x + 1e-6) - own.values(x - 1e-6)) / 2e-6, rtol=1e-6)
 
 
 def gain(explained: float, low: float) -> Gain:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.audit import extension
-from rfdropo_bayes.audit.extension import Inquiry, Step
+from rfdropo_bayes.audit.extension import ExtensionSearch, Step
 from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.pipeline import audit, base_model
 
-from .toys import Geared, Opposed, question_of
+from .toys import Geared, Opposed, problem_of
 
 TRUTH = {"gain": 1.3, "bend": -0.4}
 
@@ -21,15 +21,15 @@ TRUTH = {"gain": 1.3, "bend": -0.4}
 @pytest.fixture(scope="module")
 def opposed():
     """Stretch and slack of opposite signs, each of which alone takes next to nothing of what the base model leaves."""
-    return question_of(Opposed(), {**TRUTH, "stretch": 25.0, "slack": -25.0}, 3)
+    return problem_of(Opposed(), {**TRUTH, "stretch": 25.0, "slack": -25.0}, 3)
 
 
 def test_two_effects_that_pay_only_together_are_named_together(opposed):
     lines: list[str] = []
     answer = audit(opposed, lines.append)
-    assert {step.name for step in answer.steps} == {"stretch", "slack"}
+    assert {step.name for step in answer.causes.steps} == {"stretch", "slack"}
     assert any(line.startswith("refit with slack and stretch: ") for line in lines)
-    alone, beside = (step.log_bayes_factor for step in answer.steps)
+    alone, beside = (step.log_bayes_factor for step in answer.causes.steps)
     assert alone < opposed.rules.evidence < 30.0 < beside
     assert answer.verdict == "explained"
     values = opposed.coordinates.values(answer.draws)
@@ -39,16 +39,16 @@ def test_two_effects_that_pay_only_together_are_named_together(opposed):
 
 
 def test_without_pairs_neither_of_the_two_is_named(opposed, monkeypatch):
-    monkeypatch.setattr(Inquiry, "_pair", lambda *given: [])
-    assert audit(opposed).steps == []
+    monkeypatch.setattr(ExtensionSearch, "_pair", lambda *given: [])
+    assert audit(opposed).causes.steps == []
 
 
 def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drums_does_the_same(monkeypatch):
     """A base fit that stopped at half the radius, and gains of the cables that make up for it. Climbs that do not move
     at all show where they start: the base model at what imitates the gains, which is as good as they are."""
-    asked = question_of(Geared(), {"radius": 1.0, **TRUTH}, 4, base=3)
+    asked = problem_of(Geared(), {"radius": 1.0, **TRUTH}, 4, base=3)
     target, right = base_model(asked, 0)
-    look, _ = Inquiry(target, asked.candidates, asked.rules, 0).look_at(right)
+    screen, _ = ExtensionSearch(target, asked.candidates, asked.rules, 0).screened(right)
     radius, *gains = (asked.coordinates.names.index(name) for name in ("radius", "gain_a", "gain_b"))
     stuck = partial(climb, evaluations=0)
     half = 0.5 * asked.coordinates.named(right.x)["radius"]
@@ -58,12 +58,12 @@ def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drum
     stopped, extended = stuck(target, halved, right.free), stuck(target, made_up, np.array([*right.free, *gains]))
     gained = extended.log_evidence - stopped.log_evidence
     assert gained > 100.0
-    step = Step("cable_gains", ("cable_gains",), replace(look, fit=stopped), extended, gained, {}, target)
+    step = Step("cable_gains", ("cable_gains",), replace(screen, fit=stopped), extended, gained, {}, target)
     monkeypatch.setattr(extension, "climb", stuck)
-    inquiry = Inquiry(target, asked.candidates, asked.rules, 0)
-    again = inquiry._climbed_again(step)
+    search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
+    again = search._climbed_again(step)
     assert again is not None
     assert again.x[radius] == pytest.approx(right.x[radius], rel=1e-3)
     assert again.log_evidence > extended.log_evidence
     # Where the base model is at its optimum, none is better.
-    assert inquiry._climbed_again(replace(step, before=replace(look, fit=right))) is None
+    assert search._climbed_again(replace(step, before=replace(screen, fit=right))) is None

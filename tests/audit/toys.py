@@ -13,7 +13,7 @@ from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.forward import Lanes
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.pipeline import Question
+from rfdropo_bayes.audit.pipeline import AuditProblem
 from rfdropo_bayes.bayes.channels import Markers, MotorAngle, Tension, Weighed, WeighedParts
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.recordings import gather_recordings
@@ -193,7 +193,7 @@ LANES = Lanes(Toy(), np.arange(4))
 COORDINATES: dict = {}  # whose priors are compiled once
 
 
-def question(truth: dict, seed: int, without: tuple[str, ...] = ()) -> Question:
+def problem(truth: dict, seed: int, without: tuple[str, ...] = ()) -> AuditProblem:
     """A data set of the toy with ``truth`` in it, and a library that lacks ``without``."""
     toy, trajectories = Toy(), recordings(truth, seed)
     gathered = gather_recordings(toy, trajectories)
@@ -212,13 +212,13 @@ def question(truth: dict, seed: int, without: tuple[str, ...] = ()) -> Question:
         if name not in without
     ]
     rules = Rules(bootstraps=199)
-    return Question(LANES, None, coordinates, model, trajectories[:4], candidates, None, None, rules, seed)
+    return AuditProblem(LANES, None, coordinates, model, trajectories[:4], candidates, None, None, rules, seed)
 
 
-def question_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Weighed, ...] = ()) -> Question:
+def problem_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Weighed, ...] = ()) -> AuditProblem:
     """A data set of the toy with cables, whose tensions are data or not."""
     toy = Pulling()
-    asked, trajectories = question(TRUTH_OF_CABLES, seed), recordings({**TRUTH_OF_CABLES, **truth}, seed, toy)
+    asked, trajectories = problem(TRUTH_OF_CABLES, seed), recordings({**TRUTH_OF_CABLES, **truth}, seed, toy)
     gathered = gather_recordings(toy, trajectories)
     space = build_space(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
     channels: tuple = (Markers.gather(gathered, "repeats"),)
@@ -240,9 +240,9 @@ def question_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Wei
 TRUTH_OF_CABLES = {"gain": 1.3, "bend": -0.4}
 
 
-def question_of(toy: Opposed | Geared, truth: dict, seed: int, base: int = len(BASE)) -> Question:
+def problem_of(toy: Opposed | Geared, truth: dict, seed: int, base: int = len(BASE)) -> AuditProblem:
     """A data set of a toy with further candidates, which are all that may be named."""
-    asked, trajectories = question({}, seed), recordings(truth, seed, toy)
+    asked, trajectories = problem({}, seed), recordings(truth, seed, toy)
     gathered = gather_recordings(toy, trajectories)
     space = build_space(toy.parameters, {s.name: {} for s in toy.parameters}, {}, gathered.names)
     nominal = {s.name: s.nominal for s in toy.parameters}

@@ -10,7 +10,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.mechanisms import bodies_of
-from rfdropo_bayes.workflow.audit import build_question
+from rfdropo_bayes.workflow.audit import build_problem
 from rfdropo_bayes.workflow.experiment import Experiment
 from rfdropo_bayes.workflow.model_spec import spec_of
 
@@ -74,7 +74,7 @@ def test_candidates_that_do_not_run_on_a_mesh_are_left_out_and_listed(bar_mesh, 
     (tmp_path / "own.py").write_text(OWN)
     own = ["own.py:Glue", "own.py:Fur"]
     read = experiment(bar_mesh, candidates=own, exclude=["softening"])
-    asked = build_question(spec_of(read, tmp_path), read.audit, [recording()], [], seed=0)
+    asked = build_problem(spec_of(read, tmp_path), read.audit, [recording()], [], seed=0)
     layered = {name for name, kind in REGISTRY.items() if bodies_of(kind) == ("layered",)}
     assert len(layered) == 10
     assert set(asked.left_out) == layered - {"softening"} | {"own.py:Glue"}
@@ -97,6 +97,6 @@ def test_beside_a_cube_every_candidate_runs():
     tables = experiment(Path()).model_dump(exclude_none=True, exclude_defaults=True)
     tables |= {"robot": "trunk_sofa", "simulator": {"push": True}}
     read = Experiment.model_validate(tables)
-    asked = build_question(spec_of(read, Path()), read.audit, [recording()], [], seed=0)
+    asked = build_problem(spec_of(read, Path()), read.audit, [recording()], [], seed=0)
     assert not asked.left_out
     assert {c.name for c in asked.candidates} == set(REGISTRY) | {"initial_displacement"}

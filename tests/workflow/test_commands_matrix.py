@@ -270,6 +270,7 @@ def test_design_proposes_commands_that_determine_a_day(bench, tmp_path) -> None:
 @pytest.mark.slow
 def test_separate_says_what_the_recordings_tell_apart(bench, tmp_path) -> None:
     rfdropo(
-        *("separate", bench.experiment, "--base", bench.run, "--out", tmp_path / "apart"), overrides=bench.overrides
+        *("audit", bench.experiment, "--separate", "--base", bench.run, "--out", tmp_path / "apart"),
+        overrides=bench.overrides,
     )
     assert (tmp_path / "apart" / "separation.md").exists()

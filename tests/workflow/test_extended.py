@@ -25,7 +25,7 @@ def answered(candidate: Candidate, x: list[float]) -> Any:
     return SimpleNamespace(
         adopted=[SimpleNamespace(name=candidate.name)],
         extended=SimpleNamespace(x=np.array(x), free=np.arange(2)),
-        question=SimpleNamespace(candidates=[candidate], candidate=lambda name: candidate, coordinates=coordinates),
+        problem=SimpleNamespace(candidates=[candidate], candidate=lambda name: candidate, coordinates=coordinates),
     )
 
 

@@ -151,7 +151,7 @@ def test_files_that_are_named_and_missing_are_found_out_at_once(tmp_path, monkey
         ["calibrate", "none.toml"],
         ["audit", "none.toml"],
         ["design", "none.toml"],
-        ["separate", "none.toml"],
+        ["audit", "none.toml", "--separate"],
         ["simulate", "none.toml"],
         ["predict", str(DEMO), "--posterior", "none", "--commands", "x.nc", "--out", "next"],
         ["calibrate", str(DEMO), "--set", 'data.fit=["none.nc"]'],
@@ -159,7 +159,7 @@ def test_files_that_are_named_and_missing_are_found_out_at_once(tmp_path, monkey
         ["report", "none"],
         ["export", "none", "--phi"],
     ],
-    ids=lambda arguments: arguments[0],
+    ids=" ".join,
 )
 def test_nothing_heavy_is_imported_before_inputs_are_looked_at(arguments, tmp_path):
     program = (

@@ -46,7 +46,10 @@ class Target(NamedTuple):
         residuals: of a batch (n, d), as (n, m); zero where there are no data.
         noise: coordinates along which the log determinant changes.
         differences: residuals (m,), and half of what they change by (m, d) from one step against each column of a
-            matrix (d, d) to one step along it; None where derivatives are exact.
+            matrix (d, d) to one step along it; None where derivatives are not taken anew.
+        beside: gradient of what the log likelihood holds beside half the sum of squares, whose curvature is left out;
+            None where that changes along noise coordinates only.
+        bounds: lowest and highest value of each coordinate.
     """
 
     density: Callable[[np.ndarray], np.ndarray]
@@ -57,11 +60,8 @@ class Target(NamedTuple):
     residuals: Callable[[np.ndarray], np.ndarray]
     noise: Bool[np.ndarray, " d"]
     differences: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
-
-    @property
-    def bounds(self) -> tuple[float, float]:
-        """See `Climbable.bounds`: none."""
-        return UNBOUNDED
+    beside: Callable[[np.ndarray], np.ndarray] | None = None
+    bounds: tuple[Any, Any] = UNBOUNDED
 
     def along(self, axes: Float[np.ndarray, "d d"]) -> Target | None:
         """See `Climbable.along`."""
@@ -83,6 +83,8 @@ class Target(NamedTuple):
         residual, jacobian = self.linearise(u)
         jacobian = _known(jacobian)
         gradient = -jacobian.T @ residual
+        if self.beside is not None:
+            gradient += self.beside(u)
         curvature = jacobian.T @ jacobian
         if self.noise.any():
             slope = _slope(self.likelihood, u, self.noise)

@@ -29,7 +29,7 @@ class OwnParameter:
     stage: str = ""
 
 
-def with_held(
+def with_fixed_quantities(
     space: ParameterSpace, simulated: Sequence[ParameterSpec], known: Sequence[str]
 ) -> tuple[ParameterSpace, list[Candidate]]:
     """Parameters and candidates beyond those of the library.
