@@ -69,7 +69,7 @@ def _forces(system: System, prepared: Prepared, iterate: _Iterate) -> _Forces:
     length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, iterate.position)
     cable = -jnp.einsum("cni,c->ni", jacobian, iterate.tension)
     stiffening = lateral_stiffening(system.body, frame, layer_tension(system.body, local_force, cable, frame))
-    packed = packed + strings(system, prepared, frame, iterate.position, iterate.tension)
+    packed = packed + corotational.pack(strings(system, prepared, frame, iterate.position, iterate.tension))
     tangent = jax.tree.map(jnp.add, corotational.tangent(packed, frame), stiffening)
     centre = section_means(system, iterate.position)
     around = section_load(system.body, prepared.effects, centre, jnp.zeros_like(centre))

@@ -50,13 +50,15 @@ def turn_cube(touch, token):
 
 @kernel
 def free_cube(touch, gravity, drag, time_step, token):
-    """Twist of the cube at the end of a step without contacts; see ``fem.rigid_body.free_twist``."""
+    """Twist of the cube at the end of a stage without contacts; see ``fem.rigid_body.free_twist``."""
     one = fill(1.0, touch.cube, token)
     shrink = one / fma(load(drag, 0, token), time_step, one)
     for i in range(3):
-        velocity = fma(load(gravity, i, token), time_step, load(touch.cube, 7 + i, token))
+        velocity = load(touch.cube, 7 + i, token) + load(touch.carried, i, token)
+        velocity = fma(load(gravity, i, token), time_step, velocity)
+        spin = load(touch.cube, 10 + i, token) + load(touch.carried, 3 + i, token)
         store(touch.twist, i, velocity * shrink)
-        store(touch.twist, 3 + i, load(touch.cube, 10 + i, token) * shrink)
+        store(touch.twist, 3 + i, spin * shrink)
 
 
 @kernel
@@ -313,8 +315,9 @@ def _near(touch, slot, value, token):
 
 
 @kernel
-def find_candidates(scene, position, velocity, gravity, drag, touch, time_step, token):
-    """The candidates of a step, and which of them the velocities of its start would close."""
+def find_candidates(scene, position, velocity, gravity, drag, touch, stage, token):
+    """The candidates of a stage, and which of them the velocities of its start would close."""
+    time_step = stage.length
     zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
     turn_cube(touch, token)
     free_cube(touch, gravity, drag, time_step, token)
@@ -329,6 +332,8 @@ def find_candidates(scene, position, velocity, gravity, drag, touch, time_step, 
         u, v, w = trunk_velocity(scene, touch, slot, kind, velocity, token)
         store(touch.rate, 3 * slot, u, v, w)
         u, v, w = add_cube_velocity(touch, slot, kind, u, v, w, touch.cube, 7, token)
+        if stage.predicted:  # the velocity of the start has closed the gap already
+            store(touch.gap, slot, fnma(u, time_step, load(touch.gap, slot, token)))
         closing = where_greater(_closing(touch, slot, u, v, w, time_step, token), -EAGER * one, one, zero)
         # What touched before may hold on by its friction.
         x, y, z = load3(touch.memory, 3 * touch.pair[slot], token)

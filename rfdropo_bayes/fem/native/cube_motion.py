@@ -1,4 +1,4 @@
-"""Cubes of a lane block: their part of a step's constraints, their motion, and the record."""
+"""Cubes of a lane block: their part of a stage's constraints, their motion, and the record."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rfdropo_bayes.fem.constraints import APART
 from rfdropo_bayes.fem.native.contact_geometry import cube_row, kind_of
 from rfdropo_bayes.fem.native.contact_records import CORNERS, CUBE_STATE, CUBE_VALUES
 from rfdropo_bayes.fem.native.fields import fill_lanes
-from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store, where_greater
 
 
 @kernel
@@ -92,12 +92,55 @@ def remember_impulses(scene, touch, p, lines, contacts, accepted, token):
 
 
 @kernel
-def _move_cube(touch, time_step, lane, lanes):
-    """Let the cube move on with ``after``; see ``fem.rigid_body.moved``. Returns False if that leads nowhere."""
+def find_sudden(touch, p, lines, contacts, token):
+    """Impulses of contacts in ``before`` as far as they exceed those in ``memory`` along the normal."""
+    zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
+    for c in range(contacts):
+        slot, i, lasting = touch.contact[c], lines + 3 * c, zero
+        for k in range(3):
+            remembered = load(touch.memory, 3 * touch.pair[slot] + k, token)
+            lasting = fma(remembered, load(touch.frame, 9 * slot + k, token), lasting)
+        lasting = where_greater(load(touch.chosen, slot, token), zero, lasting, zero)
+        normal = load(p.impulse, i, token)
+        share = lasting / where_greater(normal, zero, normal, one)
+        share = where_greater(share, zero, where_greater(share, one, one, share), zero)
+        for r in range(3):
+            store(p.before, i + r, (one - share) * load(p.impulse, i + r, token))
+
+
+@kernel
+def carry_cube(touch, p, lines, contacts, going, accepted, token):
+    """With which share ``going`` of its change of twist the cube goes on, without what contacts did suddenly."""
+    zero, taken = fill(0.0, touch.cube, token), load(accepted, 0, token)
+    light = fill(1.0, touch.cube, token) / load(touch.values, 0, token)
+    gyration = load(touch.values, 2, token)
+    for k in range(6):
+        total = zero
+        for i in range(3 * contacts):
+            total = fma(load(touch.on_cube, 6 * i + k, token), load(p.before, lines + i, token), total)
+        share = light if k < 3 else light / (gyration * gyration)
+        change = load(touch.after, k, token) - load(touch.cube, 7 + k, token)
+        store(touch.carried, k, where_greater(taken, zero, going * fnma(share, total, change), zero))
+
+
+@kernel
+def predict_cubes(touch, time, token):
+    """Let the cubes move on at their velocity and spin."""
+    lanes = len(token)
+    for lane in range(lanes):
+        for i in range(6):
+            touch.after[i * lanes + lane] = touch.cube[(7 + i) * lanes + lane]
+        _move_cube(touch, time, 0.0, lane, lanes)
+
+
+@kernel
+def _move_cube(touch, time_step, moved, lane, lanes):
+    """Let the cube move on with ``after``, less the share of its velocity and spin with which it has ``moved`` already;
+    see ``fem.rigid_body.moved``. Returns False if that leads nowhere."""
     wx, wy, wz = (
-        0.5 * time_step * touch.after[3 * lanes + lane],
-        0.5 * time_step * touch.after[4 * lanes + lane],
-        0.5 * time_step * touch.after[5 * lanes + lane],
+        0.5 * time_step * (touch.after[3 * lanes + lane] - moved * touch.cube[10 * lanes + lane]),
+        0.5 * time_step * (touch.after[4 * lanes + lane] - moved * touch.cube[11 * lanes + lane]),
+        0.5 * time_step * (touch.after[5 * lanes + lane] - moved * touch.cube[12 * lanes + lane]),
     )
     square = wx * wx + wy * wy + wz * wz
     angle = math.sqrt(square)
@@ -110,9 +153,12 @@ def _move_cube(touch, time_step, lane, lanes):
     qz = scalar * z + w * wz + wx * y - wy * x
     qw = scalar * w - wx * x - wy * y - wz * z
     length = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
-    px = touch.cube[lane] + time_step * touch.after[lane]
-    py = touch.cube[lanes + lane] + time_step * touch.after[lanes + lane]
-    pz = touch.cube[2 * lanes + lane] + time_step * touch.after[2 * lanes + lane]
+    vx = touch.after[lane] - moved * touch.cube[7 * lanes + lane]
+    vy = touch.after[lanes + lane] - moved * touch.cube[8 * lanes + lane]
+    vz = touch.after[2 * lanes + lane] - moved * touch.cube[9 * lanes + lane]
+    px = touch.cube[lane] + time_step * vx
+    py = touch.cube[lanes + lane] + time_step * vy
+    pz = touch.cube[2 * lanes + lane] + time_step * vz
     if not math.isfinite(px + py + pz + length):
         return False
     touch.cube[lane], touch.cube[lanes + lane], touch.cube[2 * lanes + lane] = px, py, pz
@@ -124,13 +170,14 @@ def _move_cube(touch, time_step, lane, lanes):
 
 
 @kernel
-def take_cube_step(touch, accepted, lost, time_step, token):
-    """Move the cube on where the body's step was taken, else stop it; marks lanes where that leads nowhere."""
-    lanes = len(token)
+def take_cube_stage(touch, accepted, lost, length, predicted, token):
+    """Move the cube on where the body's stage was taken, else stop it; marks lanes where that leads nowhere."""
+    lanes, moved = len(token), 1.0 if predicted else 0.0
     for lane in range(lanes):
-        if not (accepted[lane] > 0.0 and _move_cube(touch, time_step, lane, lanes)):
+        if not (accepted[lane] > 0.0 and _move_cube(touch, length, moved, lane, lanes)):
             for i in range(6):
                 touch.cube[(7 + i) * lanes + lane] = 0.0
+                touch.carried[i * lanes + lane] = 0.0
             lost[lane] = 1.0
 
 

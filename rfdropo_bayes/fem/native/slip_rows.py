@@ -148,14 +148,21 @@ def add_friction(tables, friction, field, token):
 
 
 @kernel
-def remember_slip(tables, friction, p, work, rows, time_step, token):
-    """Friction mobilised and tensions along the cables after a step that was taken."""
+def remember_slip(tables, friction, p, work, rows, time_step, going, token):
+    """Friction mobilised and tensions along the cables after a stage that was taken.
+
+    ``going`` is the share of its change with which mobilised friction goes on into the next stage.
+    """
     zero, one, accepted = fill(0.0, work.tension, token), fill(1.0, work.tension, token), load(work.accepted, 0, token)
     for i in range(rows):
         line, before = tables.cables + i, load(friction.mobilised, i, token)
         share = fnma(load(p.velocity, line, token), time_step / PRESLIDING, before)
         share = where_greater(share, one, one, share)
         share = where_greater(-one, share, -one, share)
+        if going > 0.0:
+            share = fma(share - before, going, share)
+            share = where_greater(share, one, one, share)
+            share = where_greater(-one, share, -one, share)
         store(friction.mobilised, i, where_greater(accepted, zero, share, before))
     for c in range(tables.cables):
         left = load(work.tension, c, token)
