@@ -1,18 +1,20 @@
-"""Implicit Euler for a layered corotational body pulled by unilateral cables: one linear solve a step.
+"""Time steps of a layered corotational body pulled by unilateral cables: one linear solve a stage.
 
-    A dv = h (f(x) + M g + f_ext - (h + b) K v - a M v) - h J' T,    A = (1 + h a) M + h (h + b) K,    x += h (v + dv)
+    A d = q (f(x) + M g + f_ext - (r + b) K v - a M v) - q J' T,    A = (1 + q a) M + q (q + b) K,    v1 = v + d
 
 with Rayleigh damping a M + b K, the corotational tangent K, cable Jacobian J = dl/dx and tensions T >= 0 (Baraff and
-Witkin 1998; the same linearised step as SOFA's EulerImplicitSolver). What taut cables and layers hold against lateral
-motion (`cable_strings`, `tension_stiffening`) is implicit too: under opposed cables it exceeds the body's own
-stiffness, and steps that leave it out swing. What ``effects`` add is implicit in the same way: their force, linearised,
-at the end of the step. Everything is a pure function of arrays: batch with ``jax.vmap``, differentiate with
-``jax.jvp`` or ``jax.grad``. A ``System`` is static and is closed over, never traced.
+Witkin 1998). Implicit Euler takes its forces where the step starts, with q = r = h: the linearised step of SOFA's
+EulerImplicitSolver. SDIRK2 takes them where the velocity leads, r = 0, see ``integrators``. What taut cables and
+layers hold against lateral motion (`cable_strings`, `tension_stiffening`) is implicit too: under opposed cables it
+exceeds the body's own stiffness, and steps that leave it out swing. What ``effects`` add is implicit in the same way:
+their force, linearised, at the end of the stage. Everything is a pure function of arrays: batch with ``jax.vmap``,
+differentiate with ``jax.jvp`` or ``jax.grad``. A ``System`` is static and is closed over, never traced.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -411,17 +413,27 @@ def step(
     tension, and says so: a batch goes on. Where there is a scene, the material has effects with a memory, or a step has
     several stages, the state comes from ``remembering``.
     """
-    stages, around = STAGES[integrator], (external_force, scene, cube)
-    if len(stages) == 1 or state.commanded is None:
-        moved, info, _ = _take_stage(system, prepared, state, displacement, time_step, stages[0], *around)
-        return moved, info
-    start, elapsed, codes, carried = state.commanded, 0.0, StepInfo(jnp.array(False), jnp.array(True)), None
+    take = partial(_take_stage, system, prepared, time_step=time_step, external=external_force, scene=scene, cube=cube)
+    return in_stages(take, state, displacement, STAGES[integrator])
+
+
+def in_stages(
+    take: Callable[[Any, Float[Array, " cables"], Stage, Carried | None], tuple[Any, StepInfo, Carried | None]],
+    state: AnyState,
+    displacement: Float[Array, " cables"],
+    stages: Sequence[Stage],
+) -> tuple[AnyState, StepInfo]:
+    """A step of any body, given how it takes a stage; commands within the step lie on the way to those at its end."""
+    here: Any = state
+    start = here.commanded
+    if start is None:
+        return take(here, displacement, stages[0], None)[:2]
+    elapsed, codes, carried = 0.0, StepInfo(jnp.array(False), jnp.array(True)), None
     for stage in stages:
         elapsed += stage.elapsed
-        target = start + elapsed * (displacement - start)
-        state, info, carried = _take_stage(system, prepared, state, target, time_step, stage, *around, carried=carried)
+        here, info, carried = take(here, start + elapsed * (displacement - start), stage, carried)
         codes = StepInfo(codes.diverged | info.diverged, codes.converged & info.converged)
-    return state._replace(commanded=displacement), codes
+    return here._replace(commanded=displacement), codes
 
 
 def _take_stage(
@@ -429,19 +441,20 @@ def _take_stage(
     prepared: Prepared,
     state: State,
     displacement: Float[Array, " cables"],
-    time_step: Scalar,
     stage: Stage,
-    external_force: Float[Array, "nodes 3"] | float,
+    carried: Carried | None,
+    *,
+    time_step: Scalar,
+    external: Float[Array, "nodes 3"] | float,
     scene: PushScene | None,
     cube: Cube | None,
-    carried: Carried | None = None,
 ) -> tuple[State, StepInfo, Carried | None]:
     """One stage of a step, see ``fem.integrators``."""
     length, ahead = stage.length * time_step, stage.elapsed * time_step
     at = state._replace(memory=within(system, prepared, state, time_step, stage))
     if stage.predicted:
         at = at._replace(position=state.position + ahead * state.velocity)
-    matrix, right = linearised(system, prepared, at, time_step, external_force, stage)
+    matrix, right = linearised(system, prepared, at, time_step, external, stage)
     if carried is not None:
         going = mass_times(system, prepared, carried.velocity) - carried.sudden
         right = right + stage.carried * going
@@ -466,11 +479,11 @@ def _take_stage(
     position = at.position + length * (found.increment if stage.predicted else velocity)
     moved = State(position, velocity, tension, memory, found.cube, found.touch, state.commanded)
     taken, info = accept(system, prepared, state, moved, found.impulses.converged)
-    return taken, info, _carried(state, taken, found, info) if stage.predicted else None
+    return taken, info, carried_from(state, taken, found, info) if stage.predicted else None
 
 
-def _carried(before: State, after: State, found: ConstrainedStep, info: StepInfo) -> Carried:
-    """What a stage that was taken did; nothing where it was not."""
+def carried_from(before: Any, after: Any, found: ConstrainedStep, info: StepInfo) -> Carried:
+    """What a stage of any body did that was taken; nothing where it was not."""
     twist = slip = None
     if before.cube is not None and after.cube is not None and found.sudden_twist is not None:
         parts = after.cube.velocity - before.cube.velocity, after.cube.spin - before.cube.spin

@@ -40,3 +40,11 @@ STAGES: dict[str, tuple[Stage, ...]] = {
     "sdirk2": (Stage(GAMMA, GAMMA, 0.0, True), Stage(1.0 - GAMMA, GAMMA, (1.0 - 2.0 * GAMMA) / GAMMA, True)),
 }
 EULER = STAGES["euler"][0]
+
+
+def timed_stages(integrator: Integrator, time_step: float) -> tuple[int, tuple[Stage, Stage]]:
+    """How many stages a step has, and the stages in seconds; as many for each integrator, so that one kernel serves
+    all of them."""
+    stages = STAGES[integrator]
+    timed = [s._replace(elapsed=s.elapsed * time_step, length=s.length * time_step) for s in stages]
+    return len(stages), (timed[0], timed[-1])

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
 from rfdropo_bayes.fem.equilibrium import ITERATIONS
-from rfdropo_bayes.fem.integrators import STAGES, Integrator
+from rfdropo_bayes.fem.integrators import STAGES, Integrator, timed_stages
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native.compilation import kernel_sources
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
@@ -37,7 +37,7 @@ from rfdropo_bayes.fem.native.contact_records import (
 from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, law_rows
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.layered_records import KINDS, Factors, Friction, Samples, Work, friction_storage, runs_of
-from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, compile_rollout, storage, timed_stages
+from rfdropo_bayes.fem.native.layered_rollout import Batch, Output, Schedule, compile_rollout, storage
 from rfdropo_bayes.fem.native.section_modes import border_panels, layered_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
 from rfdropo_bayes.fem.pushing import PushScene

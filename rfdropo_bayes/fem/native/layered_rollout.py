@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from rfdropo_bayes.fem.integrators import EULER, STAGES, Integrator, Stage
+from rfdropo_bayes.fem.integrators import EULER, Stage
 from rfdropo_bayes.fem.native.compilation import named_by
 from rfdropo_bayes.fem.native.cube_motion import predict_cubes, record_cubes, start_cubes
 from rfdropo_bayes.fem.native.fields import clear, fill_lanes, point
@@ -68,14 +68,6 @@ class Schedule(NamedTuple):
     count: int = 1  # stages of a step
     stages: tuple[Stage, Stage] = (EULER, EULER)  # in seconds; the first ``count`` of them
     resumed: int = 0  # 1 goes on from the state in ``Work`` instead of starting anew
-
-
-def timed_stages(integrator: Integrator, time_step: float) -> tuple[int, tuple[Stage, Stage]]:
-    """How many stages a step has, and the stages in seconds; as many for each integrator, so that one kernel serves
-    all of them."""
-    stages = STAGES[integrator]
-    timed = [s._replace(elapsed=s.elapsed * time_step, length=s.length * time_step) for s in stages]
-    return len(stages), (timed[0], timed[-1])
 
 
 def storage(tables: LayeredTables, lanes: int, dtype: type) -> tuple[Samples, Factors, Work]:
