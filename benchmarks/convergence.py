@@ -12,6 +12,7 @@ points of error against time, in logarithms.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
 from functools import cache
@@ -83,8 +84,7 @@ def inputs(robot: str, step_ms: float, motions: int, seconds: float) -> Any:
     model = simulator(load_robot(robot), "euler", step_ms)
     clock, values = PERIOD * np.arange(round(seconds / PERIOD) + 1), model.complete({})
     grid = [
-        model.commands(clock[:-1], rows, np.zeros(rows.shape[1]), clock)
-        for rows in walk(model.robot, motions, seconds)
+        model.commands(clock[:-1], rows, np.zeros(rows.shape[1]), clock) for rows in walk(model.robot, motions, seconds)
     ]
     stacked = Commands(*(np.stack(parts) for parts in zip(*grid, strict=True)))
     material, start, displacement = jax.jit(jax.vmap(lambda c: model.inputs(values, c)))(stacked)
@@ -117,10 +117,8 @@ def error(path: np.ndarray, converged: np.ndarray) -> float:
 
 def cost_of(allowed: float, errors: dict[str, float], costs: dict[str, float]) -> float:
     """Processor time [s] at which the error is the allowed one, by the line between its neighbours."""
-    steps = list(errors)
-    for first, second in zip(steps, steps[1:], strict=False):
-        if errors[second] <= allowed:
-            break
+    pairs = list(itertools.pairwise(errors))
+    first, second = next((pair for pair in pairs if errors[pair[1]] <= allowed), pairs[-1])
     at = np.log([errors[first], errors[second]])
     slope = (np.log(costs[second]) - np.log(costs[first])) / (at[1] - at[0])
     return float(np.exp(np.log(costs[first]) + slope * (np.log(allowed) - at[0])))
@@ -152,7 +150,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="of every motion")
     parser.add_argument("--json", type=Path, help="also write the rows here")
     chosen = parser.parse_args()
-    steps = " | ".join(f"{step:g} ms" for step in (*STEPS_MS, *FURTHER_MS))
+    names = [f"{step:g}" for step in (*STEPS_MS, *FURTHER_MS)]
+    steps = " | ".join(f"{name} ms" for name in names)
     print(f"| robot | damping [s] | integrator | {steps} | CPU ms for 1 mm |")
     print("|" + "---|" * (4 + len(STEPS_MS) + len(FURTHER_MS)))
     rows = []
@@ -160,7 +159,7 @@ def main() -> None:
         for damping in (None, SMALL_DAMPING):
             for row in rows_of(robot, damping, chosen.motions, chosen.seconds):
                 rows.append(row)
-                shown = [f"{row.error_mm[k]:.2f}" if k in row.error_mm else "" for k in map("{:g}".format, (*STEPS_MS, *FURTHER_MS))]
+                shown = [f"{row.error_mm[k]:.2f}" if k in row.error_mm else "" for k in names]
                 cells = [row.robot, f"{row.damping_s:g}", row.integrator, *shown, f"{1e3 * row.cpu_s_for_1_mm:.1f}"]
                 print("| " + " | ".join(cells) + " |", flush=True)
     if chosen.json:

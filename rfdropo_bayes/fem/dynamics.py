@@ -302,10 +302,10 @@ def within(system: System, prepared: Prepared, state: State, time_step: Scalar, 
 
 def _elastic(system: System, prepared: Prepared, state: State, stage: Stage, time_step: Scalar) -> _Elastic:
     """Elastic force with what viscoelasticity and softening make of it."""
-    length, memory = stage.length * time_step, state.memory
+    length, memory = stage.span * time_step, state.memory
     frame, local = frames_and_displacements(system, prepared, state.position)
     force, packed = resistance(prepared, local)
-    gain, left = _gain(prepared, length)[1], jnp.ones(())
+    gain, left = _gain(prepared, stage.length * time_step)[1], jnp.ones(())
     if memory.branch is not None:
         force = force + gain * jnp.einsum("lij,lj->li", prepared.stiffness, local - memory.branch)
     if prepared.effects.softening_rate is not None and memory.clock is not None:
@@ -336,7 +336,7 @@ def _surround(
     """Matrix and right-hand side of a stage with the loads on its sections."""
     if load is None:
         return matrix, right
-    length, force = stage.length * time_step, load.force
+    length, force = stage.span * time_step, load.force
     if not stage.predicted:
         force = force - length * jnp.einsum("sij,sj->si", load.stiffness, velocity)
     added = length * load.damping + length**2 * load.stiffness
@@ -367,7 +367,7 @@ def linearised(
     stage: Stage = EULER,
 ) -> Linear:
     """Linearise the body, its effects and its surroundings about a state, with the memory of the stage."""
-    elastic, length = _elastic(system, prepared, state, stage, time_step), stage.length * time_step
+    elastic, length = _elastic(system, prepared, state, stage, time_step), stage.span * time_step
     stations = len(system.body.station)
     strained = multiply(elastic.tangent, state.velocity.reshape(stations, -1, 1)).reshape(-1, 3)
     dragged = prepared.rayleigh_mass * mass_times(system, prepared, state.velocity)
@@ -390,7 +390,7 @@ class Carried(NamedTuple):
     """What the stage before did, with a share of which the motion goes on; nothing before the first stage."""
 
     velocity: Float[Array, "nodes 3"]  # change in it [m/s]
-    sudden: Float[Array, "nodes 3"]  # impulses of contacts that began in it [N s]: no share of them
+    sudden: Float[Array, "nodes 3"]  # impacts in it [N s]: no share of them
     twist: Float[Array, "6"] | None  # change of the cube's velocity and spin, without these
     slip: Float[Array, "kinds cables cable_runs"] | None  # change of the friction mobilised
 
@@ -450,19 +450,20 @@ def _take_stage(
     cube: Cube | None,
 ) -> tuple[State, StepInfo, Carried | None]:
     """One stage of a step, see ``fem.integrators``."""
-    length, ahead = stage.length * time_step, stage.elapsed * time_step
     at = state._replace(memory=within(system, prepared, state, time_step, stage))
     if stage.predicted:
-        at = at._replace(position=state.position + ahead * state.velocity)
+        at = at._replace(position=state.position + stage.elapsed * time_step * state.velocity)
+    push = None
+    if scene is not None and cube is not None and state.cube is not None and state.touch is not None:
+        around = prepared.gravity, prepared.rayleigh_mass
+        change = None if carried is None else carried.twist
+        place = at.position, at.velocity, around
+        push, stage = meet(scene, cube, state.cube, state.touch, *place, stage, time_step, change)
+    length = stage.span * time_step
     matrix, right = linearised(system, prepared, at, time_step, external, stage)
     if carried is not None:
         going = mass_times(system, prepared, carried.velocity) - carried.sudden
-        right = right + stage.carried * going
-    push = None
-    if scene is not None and cube is not None and state.cube is not None and state.touch is not None:
-        twist = None if carried is None else stage.carried * carried.twist
-        surroundings = at.position, prepared.gravity, prepared.rayleigh_mass
-        push = meet(scene, cube, state.cube, state.touch, *surroundings, stage, time_step, twist)
+        right = right + stage.going * going
     slip = None
     mobilised, segment = state.memory.slip, state.memory.segment
     if mobilised is not None and segment is not None:
@@ -470,7 +471,7 @@ def _take_stage(
             mobilised = jnp.clip(mobilised + stage.carried * carried.slip, -1.0, 1.0)
         slip = slip_problem(system.cables, prepared.effects, mobilised, segment, prepared.guides, at.position)
     pull = _pull(system, prepared, at, displacement, length)
-    found = constrained_step(free_solve(system, matrix), right, at.velocity, pull, length, slip, push, stage.predicted)
+    found = constrained_step(free_solve(system, matrix), right, at.velocity, pull, stage, time_step, slip, push)
     velocity, tension = at.velocity + found.increment, found.impulses.cable / length
     memory = at.memory
     if slip is not None:

@@ -103,7 +103,7 @@ def static_equilibrium(
         slack = prepared.rest_length - displacement - forces.length
         pull = Pull(forces.jacobian, slack, current.tension, give)
         still = jnp.zeros_like(current.position)
-        found = constrained_step(free_solve(system, forces.tangent), forces.body + load, still, pull, 1.0)
+        found = constrained_step(free_solve(system, forces.tangent), forces.body + load, still, pull)
         increment, tension, converged = found.increment, found.impulses.cable, found.impulses.converged
         now, before = lax.stop_gradient((increment, current.increment))
         along = jnp.sum(now * before)

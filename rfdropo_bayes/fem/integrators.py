@@ -12,18 +12,29 @@ SDIRK2 is the L-stable scheme of second order with g = 1 - 1 / sqrt(2) (Alexande
     stage 2: M (v1 - v0) = (1 - g) h F(X, V, T) + g h F(x1, v1, T1)         x1 = x0 + (1 - g) h V + g h v1, at t0 + h
 
 F of stage 1 is M (V - v0) / (g h): carried is (1 - g) / g - 1. What has a rate, as the dashpot of a Prony branch and
-mobilised friction have, goes on in the same way. Contact impulses that begin in stage 1 do not: a body that an impact
-stopped would rebound.
+mobilised friction have, goes on in the same way.
+
+An impact is no smooth force: a body that it stopped would rebound. Impulses of contacts that stop surfaces in stage 1
+are not carried on. Where surfaces close in stage 2, the velocity of stage 1 has taken them through each other for most of
+the step, which that of stage 2 must not make good in the g h that it acts for. There stage 2 is implicit over all the
+time since they met, as far as the (1 - g) h since stage 1, and carries on less: p = (1 - g) h with nothing carried on
+is implicit Euler from the end of stage 1. p is a continuous function of the motion, and all in between is of first
+order at least.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 Integrator = Literal["euler", "sdirk2"]
 GAMMA = 1.0 - 1.0 / math.sqrt(2.0)
 """Of SDIRK2: the root that makes it L-stable."""
+
+
+REBOUND = 0.02
+"""[m/s] Change of the speed at which surfaces close that counts half as an impact. They rebound with less than that, by
+20 um under gravity."""
 
 
 class Stage(NamedTuple):
@@ -31,8 +42,19 @@ class Stage(NamedTuple):
 
     elapsed: float  # that passes in it
     length: float  # p
-    carried: float  # share of the change of velocity in the stage before with which the motion goes on
+    carried: float  # share of the change in the stage before with which all goes on
     predicted: bool  # whether forces are those where the velocity leads, else those where the stage starts
+    wide: Any = 1.0  # of a stage with impacts: its p for the motion, in ``length``; what has a memory keeps its own
+
+    @property
+    def span(self) -> Any:
+        """p of the motion."""
+        return self.length * self.wide
+
+    @property
+    def going(self) -> Any:
+        """Share of the change of velocity in the stage before with which the motion goes on."""
+        return self.carried + 1.0 - self.wide
 
 
 STAGES: dict[str, tuple[Stage, ...]] = {

@@ -97,7 +97,7 @@ def linearised(
     stage: Stage = EULER,
 ) -> tuple[LevelMatrix, Float[Array, "nodes 3"]]:
     """Matrix A and right-hand side of a stage's linear system without cables, A d = r, about a state."""
-    body, levels, length = system.body, system.levels, stage.length * time_step
+    body, levels, length = system.body, system.levels, stage.span * time_step
     first, shear = lame_constants(material.young_modulus, material.poisson_ratio)
     lame = first * material.stiffness_scale, shear * material.stiffness_scale
     turn = element_rotations(body, state.position)
@@ -143,12 +143,18 @@ def _take_stage(
     cube: Cube | None,
 ) -> tuple[TetrahedralState, StepInfo, Carried | None]:
     """One stage of a step, see ``fem.integrators``."""
-    levels, length, at = system.levels, stage.length * time_step, state
+    levels, at, push = system.levels, state, None
     if stage.predicted:
         at = at._replace(position=state.position + stage.elapsed * time_step * state.velocity)
+    if scene is not None and cube is not None and state.cube is not None and state.touch is not None:
+        around = material.gravity, material.rayleigh_mass
+        change = None if carried is None else carried.twist
+        place = at.position, at.velocity, around
+        push, stage = meet(scene, cube, state.cube, state.touch, *place, stage, time_step, change)
+    length = stage.span * time_step
     matrix, right = linearised(system, material, at, time_step, stage)
     if carried is not None:
-        right = right + stage.carried * (material.node_mass[:, None] * carried.velocity - carried.sudden)
+        right = right + stage.going * (material.node_mass[:, None] * carried.velocity - carried.sudden)
     reach, jacobian = lengths_and_jacobian(system.cables, jnp.asarray(system.guides), at.position)
     shortening = jnp.asarray(system.rest_length) - reach
     slack = (shortening - system.limits.apply(displacement, state.measured)) / length
@@ -158,13 +164,8 @@ def _take_stage(
         solution = level_systems.solve(matrix, columns).T.reshape(len(fields), -1, 3)
         return jnp.zeros_like(fields).at[:, levels.order].set(solution)
 
-    push = None
-    if scene is not None and cube is not None and state.cube is not None and state.touch is not None:
-        twist = None if carried is None else stage.carried * carried.twist
-        surroundings = at.position, material.gravity, material.rayleigh_mass
-        push = meet(scene, cube, state.cube, state.touch, *surroundings, stage, time_step, twist)
     pull = Pull(jacobian, slack, state.tension * length)
-    found = constrained_step(solved, right, state.velocity, pull, length, push=push, predicted=stage.predicted)
+    found = constrained_step(solved, right, state.velocity, pull, stage, time_step, push=push)
     velocity = state.velocity + found.increment
     tension = found.impulses.cable / length
     position = at.position + length * (found.increment if stage.predicted else velocity)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from rfdropo_bayes.fem.constraints import APART
-from rfdropo_bayes.fem.native.contact_geometry import cube_row, kind_of
+from rfdropo_bayes.fem.native.contact_geometry import cube_rate, cube_row, impact, kind_of
 from rfdropo_bayes.fem.native.contact_records import CORNERS, CUBE_STATE, CUBE_VALUES
 from rfdropo_bayes.fem.native.fields import fill_lanes
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store, where_greater
@@ -21,7 +21,7 @@ def start_cubes(scene, cubes, count, touch, first, token):
 
 
 @kernel
-def add_cube(touch, p, lines, contacts, time_step, token):
+def add_cube(touch, p, lines, contacts, time_step, wide, narrow, token):
     """Add the cube to the problem of a step: W, the velocities without impulses, openings, and where to start."""
     zero, one, n = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token), lines + 3 * contacts
     light = one / load(touch.values, 0, token)
@@ -31,7 +31,7 @@ def add_cube(touch, p, lines, contacts, time_step, token):
     for c in range(contacts):
         slot = touch.contact[c]
         kind, chosen = kind_of(touch, slot), load(touch.chosen, slot, token)
-        opening = load(touch.gap, slot, token) * (1.0 / time_step)
+        opening = load(touch.gap, slot, token) * (1.0 / time_step) * narrow
         store(p.opening, c, where_greater(chosen, zero, opening, one * APART))
         for r in range(3):
             i = lines + 3 * c + r
@@ -45,7 +45,7 @@ def add_cube(touch, p, lines, contacts, time_step, token):
             for k in range(3):
                 remembered = load(touch.memory, 3 * touch.pair[slot] + k, token)
                 before = fma(remembered, load(touch.frame, 9 * slot + 3 * r + k, token), before)
-            before = where_greater(chosen, zero, before, zero)
+            before = where_greater(chosen, zero, before * wide, zero)
             store(p.impulse, i, before)
             if r > 0:
                 store(p.held, 2 * c + r - 1, before)
@@ -76,7 +76,7 @@ def stop_cube(touch, p, lines, contacts, token):
 
 
 @kernel
-def remember_impulses(scene, touch, p, lines, contacts, accepted, token):
+def remember_impulses(scene, touch, p, lines, contacts, narrow, accepted, token):
     """Keep the impulses of a step that was taken, in space: the next one starts from them, and friction goes on."""
     zero, taken = fill(0.0, touch.cube, token), load(accepted, 0, token)
     for i in range(3 * (CORNERS + 2 * scene.spheres)):
@@ -88,39 +88,35 @@ def remember_impulses(scene, touch, p, lines, contacts, accepted, token):
             for r in range(3):
                 impulse = load(p.impulse, lines + 3 * c + r, token)
                 total = fma(impulse, load(touch.frame, 9 * slot + 3 * r + k, token), total)
-            store(touch.memory, 3 * touch.pair[slot] + k, where_greater(taken, zero, total, zero))
+            store(touch.memory, 3 * touch.pair[slot] + k, where_greater(taken, zero, total * narrow, zero))
 
 
 @kernel
-def find_sudden(touch, p, lines, contacts, token):
-    """Impulses of contacts in ``before`` as far as they exceed those in ``memory`` along the normal."""
-    zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
+def find_impacts(touch, p, lines, contacts, token):
+    """Impulses of contacts into ``before``, as far as they are impacts: as they change the closing speed."""
     for c in range(contacts):
-        slot, i, lasting = touch.contact[c], lines + 3 * c, zero
-        for k in range(3):
-            remembered = load(touch.memory, 3 * touch.pair[slot] + k, token)
-            lasting = fma(remembered, load(touch.frame, 9 * slot + k, token), lasting)
-        lasting = where_greater(load(touch.chosen, slot, token), zero, lasting, zero)
-        normal = load(p.impulse, i, token)
-        share = lasting / where_greater(normal, zero, normal, one)
-        share = where_greater(share, zero, where_greater(share, one, one, share), zero)
+        slot, i = touch.contact[c], lines + 3 * c
+        start = load(touch.rate, 3 * slot, token)
+        start = start + cube_rate(touch, slot, kind_of(touch, slot), 0, touch.cube, 7, token)
+        share = impact(load(p.velocity, i, token) - start, token)
         for r in range(3):
-            store(p.before, i + r, (one - share) * load(p.impulse, i + r, token))
+            store(p.before, i + r, share * load(p.impulse, i + r, token))
 
 
 @kernel
-def carry_cube(touch, p, lines, contacts, going, accepted, token):
-    """With which share ``going`` of its change of twist the cube goes on, without what contacts did suddenly."""
+def carry_cube(touch, p, lines, contacts, later, accepted, token):
+    """The change of the cube's twist without impacts, where a later stage carries a share of it on."""
     zero, taken = fill(0.0, touch.cube, token), load(accepted, 0, token)
     light = fill(1.0, touch.cube, token) / load(touch.values, 0, token)
     gyration = load(touch.values, 2, token)
     for k in range(6):
         total = zero
-        for i in range(3 * contacts):
+        for i in range(3 * contacts if later > 0.0 else 0):
             total = fma(load(touch.on_cube, 6 * i + k, token), load(p.before, lines + i, token), total)
         share = light if k < 3 else light / (gyration * gyration)
         change = load(touch.after, k, token) - load(touch.cube, 7 + k, token)
-        store(touch.carried, k, where_greater(taken, zero, going * fnma(share, total, change), zero))
+        change = where_greater(taken, zero, fnma(share, total, change), zero)
+        store(touch.carried, k, change if later > 0.0 else zero)
 
 
 @kernel
@@ -170,11 +166,11 @@ def _move_cube(touch, time_step, moved, lane, lanes):
 
 
 @kernel
-def take_cube_stage(touch, accepted, lost, length, predicted, token):
+def take_cube_stage(touch, accepted, lost, length, wide, predicted, token):
     """Move the cube on where the body's stage was taken, else stop it; marks lanes where that leads nowhere."""
     lanes, moved = len(token), 1.0 if predicted else 0.0
     for lane in range(lanes):
-        if not (accepted[lane] > 0.0 and _move_cube(touch, length, moved, lane, lanes)):
+        if not (accepted[lane] > 0.0 and _move_cube(touch, length * wide[lane], moved, lane, lanes)):
             for i in range(6):
                 touch.cube[(7 + i) * lanes + lane] = 0.0
                 touch.carried[i * lanes + lane] = 0.0

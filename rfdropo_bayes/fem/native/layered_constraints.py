@@ -12,11 +12,18 @@ from jaxtyping import Float
 
 from rfdropo_bayes.fem.native.chain_cholesky import condense_rows, extend_border
 from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
-from rfdropo_bayes.fem.native.contact_geometry import add_missed, find_candidates, list_contacts, sphere_of, weights
+from rfdropo_bayes.fem.native.contact_geometry import (
+    add_missed,
+    choose_closing,
+    find_candidates,
+    list_contacts,
+    sphere_of,
+    weights,
+)
 from rfdropo_bayes.fem.native.cube_motion import (
     add_cube,
     carry_cube,
-    find_sudden,
+    find_impacts,
     remember_impulses,
     stop_cube,
     take_cube_stage,
@@ -25,6 +32,7 @@ from rfdropo_bayes.fem.native.fields import clear
 from rfdropo_bayes.fem.native.layered_step import (
     condense_increment,
     refine_increment,
+    set_factors,
     start_problem,
     substitute_increment,
     take_stage,
@@ -141,13 +149,14 @@ def _hold(
     if runs is not None or scene is not None:
         clear(rows.border, 0, 3 * (top + 1) * panels * size if panels > 0 else 0, token)
         if runs is not None:
-            gather_slip(tables, runs, samples, friction, rows.border, panels, p, work, length, token)
+            gather_slip(tables, runs, samples, factors, friction, rows.border, panels, p, work, length, token)
         if scene is not None:
             _gather_contacts(tables, scene, touch, rows, p, lines, contacts, slip_panels, panels, token)
         if panels > 0:
             _condense(tables, rows, work, p, n, panels, slips, corners, top, token)
         if scene is not None:
-            add_cube(touch, p, lines, contacts, length, token)
+            wide, narrow = load(factors.wide, 0, token), load(factors.narrow, 0, token)
+            add_cube(touch, p, lines, contacts, length, wide, narrow, token)
     soften(p, cables, slips, contacts, length, schedule.softness, token)
     solve_problem(p, cables, slips, contacts, schedule.settled, token)
     weigh_border(cables, work, p, token)
@@ -191,11 +200,11 @@ def _add_forces(scene, touch, impulses, lines, contacts, accepted, field, token)
 
 
 @kernel
-def _carry_contacts(tables, scene, touch, work, p, lines, contacts, going, token):
-    """What the next stage goes on with: a share of what contacts did to the cube, but not what they did suddenly."""
-    find_sudden(touch, p, lines, contacts, token)
-    carry_cube(touch, p, lines, contacts, going, work.accepted, token)
-    if going > 0.0:
+def _carry_contacts(tables, scene, touch, work, p, lines, contacts, later, token):
+    """What the next stage goes on with of what contacts did: nothing of their impacts."""
+    find_impacts(touch, p, lines, contacts, token)
+    carry_cube(touch, p, lines, contacts, later, work.accepted, token)
+    if later > 0.0:
         clear(work.sudden, 0, 3 * tables.modes * tables.stations, token)
         accepted = load(work.accepted, 0, token)
         _add_forces(scene, touch, p.before, lines, contacts, accepted, work.sudden, token)
@@ -205,12 +214,16 @@ def _carry_contacts(tables, scene, touch, work, p, lines, contacts, going, token
 def constrained_stage(tables, runs, scene, samples, factors, work, friction, touch, rows, p, schedule, number, token):
     """One stage of a body, its cables' friction and its cube."""
     stage, slips, contacts, cables = schedule.stages[number], 0, 0, tables.cables
-    length, going = stage.length, schedule.stages[number + 1].carried if number + 1 < schedule.count else 0.0
+    length, later = stage.length, schedule.stages[number + 1].carried if number + 1 < schedule.count else 0.0
+    if scene is not None:
+        wide = find_candidates(scene, work.position, work.velocity, touch, stage, token)
+        if stage.carried > 0.0:
+            set_factors(samples, factors, work, stage, wide, token)
+        going, narrow = load(factors.going, 0, token), load(factors.narrow, 0, token)
+        choose_closing(touch, samples.gravity, samples.damping, stage, wide, narrow, going, token)
     condense_increment(tables, samples, factors, work, stage, token)
     if runs is not None:
         slips = kinds_present(samples)[0] * runs.count
-    if scene is not None:
-        find_candidates(scene, work.position, work.velocity, samples.gravity, samples.damping, touch, stage, token)
     again = True
     while again:
         again = False
@@ -222,8 +235,8 @@ def constrained_stage(tables, runs, scene, samples, factors, work, friction, tou
         )  # fmt: skip
         if scene is not None:
             stop_cube(touch, p, cables + slips, contacts, token)
-            again = add_missed(scene, touch, work.solution, length, schedule.missed, token)
-    take_tensions(cables, work, 1.0 / length, token)
+            again = add_missed(scene, touch, work.solution, length, narrow, schedule.missed, token)
+    take_tensions(cables, factors, work, 1.0 / length, token)
     if runs is not None:
         sum_losses(tables, runs, samples, friction, p, token)
     if schedule.refinements > 0:
@@ -234,11 +247,11 @@ def constrained_stage(tables, runs, scene, samples, factors, work, friction, tou
             _add_forces(scene, touch, p.impulse, cables + slips, contacts, one, work.field, token)
     for _ in range(schedule.refinements):
         refine_increment(tables, samples, factors, work, token)
-    take_stage(tables, work, stage, token)
+    take_stage(tables, factors, work, stage, token)
     if runs is not None:
-        remember_slip(tables, friction, p, work, slips, length, going, token)
+        remember_slip(tables, factors, friction, p, work, slips, length, later, token)
     if scene is not None:
         if schedule.count > 1:
-            _carry_contacts(tables, scene, touch, work, p, cables + slips, contacts, going, token)
-        remember_impulses(scene, touch, p, cables + slips, contacts, work.accepted, token)
-        take_cube_stage(touch, work.accepted, work.lost, length, stage.predicted, token)
+            _carry_contacts(tables, scene, touch, work, p, cables + slips, contacts, later, token)
+        remember_impulses(scene, touch, p, cables + slips, contacts, narrow, work.accepted, token)
+        take_cube_stage(touch, work.accepted, work.lost, length, factors.wide, stage.predicted, token)

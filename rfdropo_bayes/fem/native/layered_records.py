@@ -46,6 +46,9 @@ class Factors(NamedTuple):
     branch: Float[np.ndarray, "1 lanes"]  # of the elastic force of the Prony branch
     share: Float[np.ndarray, "1 lanes"]  # of its strain that its dashpot follows
     give: Float[np.ndarray, "1 lanes"]  # of a cable's length per impulse, over the time step
+    wide: Float[np.ndarray, "1 lanes"]  # length of the stage for its impacts, in that of the others
+    narrow: Float[np.ndarray, "1 lanes"]  # its inverse
+    going: Float[np.ndarray, "1 lanes"]  # share of the change of velocity in the stage before that is carried on
 
 
 class Work(NamedTuple):

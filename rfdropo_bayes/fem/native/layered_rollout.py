@@ -14,10 +14,10 @@ from rfdropo_bayes.fem.native.cube_motion import predict_cubes, record_cubes, st
 from rfdropo_bayes.fem.native.fields import clear, fill_lanes, point
 from rfdropo_bayes.fem.native.layered_assembly import follow_branch, layer_frame
 from rfdropo_bayes.fem.native.layered_constraints import constrained_stage
-from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, GAIN, GIVE, LAW, SHARE
+from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, LAW
 from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
-from rfdropo_bayes.fem.native.layered_step import solve_statics
+from rfdropo_bayes.fem.native.layered_step import set_factors, solve_statics
 from rfdropo_bayes.fem.native.section_modes import LayeredTables, border_panels
 from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store, whole
 from rfdropo_bayes.fem.native.slip_rows import start_slip
@@ -165,28 +165,6 @@ def _follow_branches(tables, factors, work, token):
 
 
 @kernel
-def _stage_factors(samples, factors, work, stage, number, token):
-    """Factors of a stage."""
-    length, drag = fill(stage.length, samples.damping, token), load(samples.damping, 0, token)
-    one, gain = fill(1.0, drag, token), load(samples.effects, GAIN, token)
-    softness = load(work.softness, 0, token) * load(samples.effects, DECAY + number, token)
-    store(work.softness, 0, softness)
-    damping = load(samples.damping, 1, token)
-    lookahead = length * (one + gain) + damping
-    behind = damping if stage.predicted else lookahead
-    store(factors.elasticity, 0, length * lookahead * softness)
-    store(factors.inertia, 0, fma(length, drag, one))
-    store(factors.force, 0, length)
-    store(factors.strain, 0, length * softness)
-    store(factors.strain_rate, 0, length * behind * softness)
-    store(factors.drag, 0, length * drag)
-    store(factors.fluid, 0, length)
-    store(factors.branch, 0, length * softness * gain)
-    store(factors.share, 0, load(samples.effects, SHARE, token) * (1.0 + stage.carried))
-    store(factors.give, 0, load(samples.effects, GIVE, token) / (length * length))
-
-
-@kernel
 def _take_commands(tables, batch, work, step, share, first, token):
     """Commands at the end of a stage: a share of the way from those before to those of the step."""
     pitch, offset, cables = batch.displacement_pitch, step * tables.cables, tables.cables
@@ -203,7 +181,8 @@ def _take_commands(tables, batch, work, step, share, first, token):
 def begin_stage(tables, batch, samples, factors, work, touch, schedule, step, number, first, token):
     """Factors and commands of a stage, and the place where its forces are taken."""
     stage = schedule.stages[number]
-    _stage_factors(samples, factors, work, stage, number, token)
+    store(work.softness, 0, load(work.softness, 0, token) * load(samples.effects, DECAY + number, token))
+    set_factors(samples, factors, work, stage, fill(1.0, work.softness, token), token)
     share = 1.0 if number + 1 == schedule.count else stage.elapsed / schedule.time_step
     _take_commands(tables, batch, work, step, share, first, token)
     if samples.present[BRANCH]:

@@ -87,7 +87,7 @@ def _imbalance(tables, samples, factors, work, token):
     modes, zero = tables.modes, fill(0.0, work.position, token)
     panels = (tables.cables + 3) // 3
     clear(work.border, 0, 9 * tables.stations * panels * modes, token)
-    gather_cables(tables, work, 1.0, False, token)
+    gather_cables(tables, work, fill(1.0, zero, token), False, token)
     start_loads(tables, samples, factors, work, token)
     loads, largest = zero, zero
     for station in range(tables.stations):
@@ -125,6 +125,8 @@ def start_settling(tables, samples, factors, work, token):
     store(factors.fluid, 0, zero)
     store(factors.branch, 0, zero)
     store(factors.share, 0, zero)
+    store(factors.wide, 0, one)
+    store(factors.narrow, 0, one)
     store(factors.give, 0, load(samples.effects, GIVE, token))
     clear(work.before, 0, 3 * tables.modes * tables.stations, token)
     store(work.relaxation, 0, one)

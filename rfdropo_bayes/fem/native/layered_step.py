@@ -16,12 +16,35 @@ from rfdropo_bayes.fem.native.layered_assembly import (
     start_loads,
     subtract_tangent_product,
 )
-from rfdropo_bayes.fem.native.layered_effects import SURROUNDED, add_surroundings
+from rfdropo_bayes.fem.native.layered_effects import GAIN, GIVE, SHARE, SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, square_root, store, where_greater
 from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral, stiffen, sum_cable_forces
 
 LARGEST = 1e30
 """Tensions beyond this [N] are not finite."""
+
+
+@kernel
+def set_factors(samples, factors, work, stage, wide, token):
+    """Factors of a stage, which impacts make so much longer."""
+    length, drag = fill(stage.length, samples.damping, token) * wide, load(samples.damping, 0, token)
+    one, gain = fill(1.0, drag, token), load(samples.effects, GAIN, token)
+    softness, damping = load(work.softness, 0, token), load(samples.damping, 1, token)
+    lookahead = length * (one + gain) + damping
+    behind = damping if stage.predicted else lookahead
+    store(factors.elasticity, 0, length * lookahead * softness)
+    store(factors.inertia, 0, fma(length, drag, one))
+    store(factors.force, 0, length)
+    store(factors.strain, 0, length * softness)
+    store(factors.strain_rate, 0, length * behind * softness)
+    store(factors.drag, 0, length * drag)
+    store(factors.fluid, 0, length)
+    store(factors.branch, 0, length * softness * gain)
+    store(factors.share, 0, load(samples.effects, SHARE, token) * (1.0 + stage.carried))
+    store(factors.wide, 0, wide)
+    store(factors.narrow, 0, one / wide)
+    store(factors.going, 0, (one - wide) + stage.carried)
+    store(factors.give, 0, load(samples.effects, GIVE, token) / (length * length))
 
 
 @kernel
@@ -94,9 +117,9 @@ def _condensed_entry(condensed, i, j, panels, token):
 def start_problem(tables, factors, work, p, n, rate, token):
     """The cables' part of a problem of ``n`` rows: their tensions before, W, and the velocities without impulses."""
     cables, panels = tables.cables, (tables.cables + 3) // 3
-    give = load(factors.give, 0, token)
+    give, wide = load(factors.give, 0, token), load(factors.wide, 0, token)
     for c in range(cables):
-        store(p.impulse, c, load(work.tension, c, token) * (1.0 / rate))
+        store(p.impulse, c, load(work.tension, c, token) * (1.0 / rate) * wide)
         store(p.free, c, load(work.slack, c, token) - _condensed_entry(work.condensed, c + 1, 0, panels, token))
         for d in range(c + 1):
             value = _condensed_entry(work.condensed, c + 1, d + 1, panels, token)
@@ -117,17 +140,17 @@ def weigh_border(cables, work, p, token):
 
 
 @kernel
-def take_tensions(cables, work, rate, token):
+def take_tensions(cables, factors, work, rate, token):
     """Tensions [N] from the impulses in ``weight``."""
     for c in range(cables):
-        store(work.tension, c, -rate * load(work.weight, c + 1, token))
+        store(work.tension, c, -rate * load(work.weight, c + 1, token) * load(factors.narrow, 0, token))
 
 
 @kernel
-def _go_on(tables, samples, share, work, token):
-    """Add to ``field`` a share of what the stage before did, without impulses of contacts that began in it."""
-    zero = fill(0.0, work.field, token)
-    add_momentum(tables, samples, zero, zero - share, work.before, work.field, token)
+def _go_on(tables, samples, factors, work, token):
+    """Add to ``field`` a share of what the stage before did, without the impacts in it."""
+    zero, share = fill(0.0, work.field, token), load(factors.going, 0, token)
+    add_momentum(tables, samples, zero, -share, work.before, work.field, token)
     for row in range(3 * tables.modes * tables.stations):
         store(work.field, row, fnma(load(work.sudden, row, token), share, load(work.field, row, token)))
 
@@ -136,6 +159,8 @@ def _go_on(tables, samples, share, work, token):
 def condense_increment(tables, samples, factors, work, stage, token):
     """Assemble and eliminate the matrix station by station."""
     rate, predicted = 1.0 / stage.length, stage.predicted
+    wide, narrow = load(factors.wide, 0, token), load(factors.narrow, 0, token)
+    square = fill(1.0 / (rate * rate), wide, token) * (wide * wide)
     tiles, stations, cables, held = tables.modes, tables.stations, tables.cables, tables.held
     size, panels = 3 * tiles, (cables + 3) // 3
     frame, block = 3 * panels * size, 3 * tiles * size
@@ -143,16 +168,16 @@ def condense_increment(tables, samples, factors, work, stage, token):
     clear(work.border, 0, stations * frame, token)
     clear(work.condensed, 0, 9 * panels * panels, token)
     clear(work.pivot, (stations - 1) * block, stations * block, token)
-    gather_cables(tables, work, rate, predicted, token)
+    gather_cables(tables, work, fill(rate, wide, token) * narrow, predicted, token)
     start_loads(tables, samples, factors, work, token)
     if stage.carried > 0.0:
-        _go_on(tables, samples, stage.carried, work, token)
+        _go_on(tables, samples, factors, work, token)
     sum_cable_forces(tables, work, token)
     for station in range(stations - 1, held - 1, -1):
         last = station == held
         if station > 0:
-            assemble_layer(tables, samples, factors, station - 1, rate, not predicted, work, not last, token)
-            stiffen(tables, station - 1, rate, work, not last, token)
+            assemble_layer(tables, samples, factors, station - 1, square, not predicted, work, not last, token)
+            stiffen(tables, factors, station - 1, rate, work, not last, token)
             if not predicted:
                 resist_lateral(tables, station - 1, work.velocity, work.field, work, token)
         entry, t = station * tables.pairs, station * block
@@ -189,7 +214,7 @@ def solve_statics(tables, samples, factors, work, p, schedule, token):
     soften(p, tables.cables, 0, 0, 1.0, schedule.softness, token)
     solve_problem(p, tables.cables, 0, 0, schedule.settled, token)
     weigh_border(tables.cables, work, p, token)
-    take_tensions(tables.cables, work, 1.0, token)
+    take_tensions(tables.cables, factors, work, 1.0, token)
     weigh_rows(tables, work, token)
     substitute_increment(tables, work, token)
 
@@ -266,10 +291,11 @@ def near(tables, work, length, predicted, token):
 
 
 @kernel
-def take_stage(tables, work, stage, token):
+def take_stage(tables, factors, work, stage, token):
     """Take the stage: velocity + solution, and where that leads; where it is lost, stay in place at rest without
     tension. ``before`` is the change of velocity."""
-    zero, length = fill(0.0, work.position, token), fill(stage.length, work.position, token)
+    zero = fill(0.0, work.position, token)
+    length = fill(stage.length, work.position, token) * load(factors.wide, 0, token)
     accepted = near(tables, work, length, stage.predicted, token)
     store(work.accepted, 0, accepted)
     for row in range(3 * tables.modes * tables.stations):

@@ -76,6 +76,9 @@ class Work(NamedTuple):
     accepted: Float[np.ndarray, "1 lanes"]
     lost: Float[np.ndarray, "1 lanes"]
     unsolved: Float[np.ndarray, "1 lanes"]
+    wide: Float[np.ndarray, "1 lanes"]  # length of the stage for its impacts, in that of the others
+    narrow: Float[np.ndarray, "1 lanes"]  # its inverse
+    going: Float[np.ndarray, "1 lanes"]  # share of the change of velocity in the stage before that is carried on
     axes: Float[np.ndarray, "9 lanes"]
     turned: Float[np.ndarray, "12 lanes"]
 
@@ -254,9 +257,9 @@ def elastic_forces(mesh, samples, work, stage, token):
     """``work.force`` at the positions of the end of the stage, and for its velocity, in the frames of x."""
     clear(work.force, token)
     damping = load(samples.rayleigh_stiffness, 0, token)
-    lookahead = damping + stage.length
-    share = stage.length if stage.predicted else 0.0
-    moved = fill(share, work.force, token) / lookahead
+    length = stage.length * load(work.wide, 0, token)
+    lookahead = damping + length
+    moved = length / lookahead if stage.predicted else fill(0.0, work.force, token)
     for i in range(work.moving.shape[0]):
         store(work.moving, i, fnma(moved, load(work.begun, i, token), load(work.velocity, i, token)))
     for e in range(mesh.node.shape[0]):
@@ -264,10 +267,10 @@ def elastic_forces(mesh, samples, work, stage, token):
 
 
 @mesh_part
-def gone_on(samples, work, stage, node, i, token):
+def gone_on(samples, work, node, i, token):
     """Component i of the impulse with which a node goes on from the stage before."""
     going = load(samples.mass, node, token) * load(work.before, 3 * node + i, token)
-    return (going - load(work.sudden, 3 * node + i, token)) * stage.carried
+    return (going - load(work.sudden, 3 * node + i, token)) * load(work.going, 0, token)
 
 
 @mesh_part
@@ -277,7 +280,7 @@ def assemble(pattern, mesh, samples, work, stage, token):
     clear(work.pivot, token)
     clear(work.lower, token)
     clear(work.force, token)
-    length, damping = stage.length, load(samples.rayleigh_stiffness, 0, token)
+    length, damping = stage.length * load(work.wide, 0, token), load(samples.rayleigh_stiffness, 0, token)
     lookahead = damping + length
     scale = length * lookahead
     behind = damping if stage.predicted else lookahead
@@ -294,5 +297,5 @@ def assemble(pattern, mesh, samples, work, stage, token):
             acceleration = load(samples.gravity, i, token) - drag * load(work.velocity, 3 * node + i, token)
             right = length * (load(work.force, 3 * node + i, token) + mass * acceleration)
             if stage.carried > 0.0:
-                right = right + gone_on(samples, work, stage, node, i, token)
+                right = right + gone_on(samples, work, node, i, token)
             store(work.lower, 9 * (pattern.first[node + 1] - pattern.border) + i, right)

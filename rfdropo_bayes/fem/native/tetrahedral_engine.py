@@ -172,7 +172,7 @@ class TetrahedralEngine:
             "slack": cables, "tension": cables, "measured": cables,
             "load": 9 * self._pattern.border * free,
             "commanded": cables, "target": cables, "accepted": 1, "lost": 1,
-            "unsolved": 1, "axes": 9, "turned": 12,
+            "unsolved": 1, "wide": 1, "narrow": 1, "going": 1, "axes": 9, "turned": 12,
         }  # fmt: skip
         work = Work(**{name: aligned_zeros((size, self.lanes), self.dtype) for name, size in sizes.items()})
         work.position[...] = self._rest[:, None]

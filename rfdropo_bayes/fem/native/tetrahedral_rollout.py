@@ -23,7 +23,7 @@ from rfdropo_bayes.fem.native.block_cholesky import (
 from rfdropo_bayes.fem.native.compilation import named_by
 from rfdropo_bayes.fem.native.cube_motion import (
     carry_cube,
-    find_sudden,
+    find_impacts,
     predict_cubes,
     record_cubes,
     remember_impulses,
@@ -42,7 +42,7 @@ from rfdropo_bayes.fem.native.simd import (
     whole,
 )
 from rfdropo_bayes.fem.native.tetrahedral import assemble, clear, elastic_forces, gone_on
-from rfdropo_bayes.fem.native.tetrahedral_constraints import add_forces, add_sudden, hold, hold_again
+from rfdropo_bayes.fem.native.tetrahedral_constraints import add_forces, add_sudden, hold, hold_again, meet
 
 LARGEST = 1e12
 """[N] A tension beyond means that the rollout has diverged."""
@@ -182,7 +182,7 @@ def _keep_border(pattern, work, token):
 def unbalance(pattern, mesh, samples, work, count, stage, token):
     """Write what the stage leaves unbalanced to border row 0, and the slack that it leaves the cables."""
     elastic_forces(mesh, samples, work, stage, token)
-    time_step = stage.length
+    time_step = stage.length * load(work.wide, 0, token)
     drag, size = load(samples.rayleigh_mass, 0, token), 9 * pattern.border
     for c in range(count):
         store(work.slack, c, load(work.measured, c, token) - load(work.target, c, token))
@@ -200,16 +200,17 @@ def unbalance(pattern, mesh, samples, work, count, stage, token):
                 store(work.slack, c, fma(row, time_step * moving, load(work.slack, c, token)))
             right = time_step * force - mass * load(work.solution, 3 * node + i, token)
             if stage.carried > 0.0:
-                right = right + gone_on(samples, work, stage, node, i, token)
+                right = right + gone_on(samples, work, node, i, token)
             store(work.lower, 9 * (pattern.first[node + 1] - pattern.border) + i, right)
 
 
 @mesh_part
 def _moved(work, i, stage, token):
     """How far a stage moves a coordinate."""
+    length = stage.length * load(work.wide, 0, token)
     if stage.predicted:
-        return stage.length * (load(work.velocity, i, token) - load(work.begun, i, token))
-    return stage.length * load(work.velocity, i, token)
+        return length * (load(work.velocity, i, token) - load(work.begun, i, token))
+    return length * load(work.velocity, i, token)
 
 
 @mesh_part
@@ -236,14 +237,23 @@ def accept(rest, count, work, schedule, stage, token):
 
 
 @mesh_part
-def condense_stage(pattern, mesh, cables, samples, work, schedule, stage, token):
-    """Assemble and factorise the matrix of a stage, and set up the problem of its tensions."""
-    count, rows = len(cables.limit), 3 * pattern.border
+def begin_stage(work, stage, token):
+    """Where a stage takes its forces."""
+    one = fill(1.0, work.wide, token)
+    store(work.wide, 0, one)
+    store(work.narrow, 0, one)
+    store(work.going, 0, stage.carried * one)
     for i in range(work.begun.shape[0]):
         velocity = load(work.velocity, i, token)
         store(work.begun, i, velocity)
         if stage.predicted:
             store(work.position, i, load(work.position, i, token) + stage.elapsed * velocity)
+
+
+@mesh_part
+def condense_stage(pattern, mesh, cables, samples, work, schedule, stage, token):
+    """Assemble and factorise the matrix of a stage, and set up the problem of its tensions."""
+    count, rows = len(cables.limit), 3 * pattern.border
     assemble(pattern, mesh, samples, work, stage, token)
     gather_cables(pattern, mesh, cables, work, stage, token)
     if schedule.refined:
@@ -251,7 +261,7 @@ def condense_stage(pattern, mesh, cables, samples, work, schedule, stage, token)
     factor(pattern, work.pivot, work.lower, token)
     condense(pattern, work.lower, work.condensed, token)
     for i in range(count):
-        free = load(work.slack, i, token) * (1.0 / stage.length)
+        free = load(work.slack, i, token) * (1.0 / stage.length) * load(work.narrow, 0, token)
         store(work.slack, i, free + load(work.condensed, (i + 1) * rows, token))
 
 
@@ -293,8 +303,11 @@ def compile_rollout(sources: str) -> Callable:
                 stage, last = schedule.stages[number], number + 1 == schedule.count
                 going = 0.0 if last else schedule.stages[number + 1].carried
                 share = 1.0 if last else stage.elapsed / schedule.time_step
-                if scene is not None and stage.predicted:
-                    predict_cubes(meeting, stage.elapsed, token)
+                begin_stage(work, stage, token)
+                if scene is not None:
+                    if stage.predicted:
+                        predict_cubes(meeting, stage.elapsed, token)
+                    meet(around, bare_samples, meeting, bare, stage, token)
                 set_targets(cables, commands[step], share, work, token)
                 condense_stage(pattern, mesh, cables, samples, work, schedule, stage, token)
                 contacts = hold(
@@ -319,7 +332,7 @@ def compile_rollout(sources: str) -> Callable:
                         add_forces(bare_pattern, around, meeting, bare, p, drives, contacts, mesh.free, token)
                     forward_substitute(pattern, work.pivot, work.lower, token)
                     for i in range(drives):
-                        free = load(work.slack, i, token) * (1.0 / stage.length)
+                        free = load(work.slack, i, token) * (1.0 / stage.length) * load(work.narrow, 0, token)
                         store(work.slack, i, free + condensed_entry(pattern, work.lower, i + 1, 0, token))
                     hold_again(
                         bare_pattern,
@@ -340,12 +353,13 @@ def compile_rollout(sources: str) -> Callable:
                 accept(rest, drives, work, schedule, stage, token)
                 if scene is not None:
                     if schedule.count > 1:
-                        find_sudden(meeting, p, drives, contacts, token)
+                        find_impacts(meeting, p, drives, contacts, token)
                         carry_cube(meeting, p, drives, contacts, going, bare.accepted, token)
                         clear(work.sudden, token)
                         add_sudden(around, meeting, bare, p, drives, contacts, mesh.free, token)
-                    remember_impulses(around, meeting, p, drives, contacts, bare.accepted, token)
-                    take_cube_stage(meeting, bare.accepted, bare.lost, stage.length, stage.predicted, token)
+                    narrow = load(bare.narrow, 0, token)
+                    remember_impulses(around, meeting, p, drives, contacts, narrow, bare.accepted, token)
+                    take_cube_stage(meeting, bare.accepted, bare.lost, stage.length, bare.wide, stage.predicted, token)
             if (step + 1) % schedule.stride == 0:
                 row = (step + 1) // schedule.stride
                 record_body(work, output, row - 1, token)
