@@ -15,10 +15,10 @@ F of stage 1 is M (V - v0) / (g h): carried is (1 - g) / g - 1. What has a rate,
 mobilised friction have, goes on in the same way.
 
 An impact is no smooth force: a body that it stopped would rebound. Impulses of contacts that stop surfaces in stage 1
-are not carried on. Where surfaces close in stage 2, the velocity of stage 1 has taken them through each other for most of
-the step, which that of stage 2 must not make good in the g h that it acts for. There stage 2 is implicit over all the
-time since they met, as far as the (1 - g) h since stage 1, and carries on less: p = (1 - g) h with nothing carried on
-is implicit Euler from the end of stage 1. p is a continuous function of the motion, and all in between is of first
+are not carried on. Where surfaces close in stage 2, the velocity of stage 1 has taken them through each other for most
+of the step, which that of stage 2 must not make good in the g h that it acts for. There stage 2 is implicit over all
+the time since they met, as far as the (1 - g) h since stage 1, and carries on less: p = (1 - g) h with nothing carried
+on is implicit Euler from the end of stage 1. p is a continuous function of the motion, and all in between is of first
 order at least.
 """
 
