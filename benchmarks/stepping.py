@@ -1,6 +1,6 @@
-"""Solves per second of sessions, one control period of 5 solves at a time, beside whole rollouts in the same run.
+"""Steps per second of sessions, one control period of 5 steps at a time, beside whole rollouts in the same run.
 
-    python benchmarks/stepping.py [--lanes N [N ...]] [--seconds S] [--json FILE]
+    python benchmarks/stepping.py [--lanes N [N ...]] [--seconds S] [--integrator NAME] [--json FILE]
 
 The trunk of TrunkReach, and that of TrunkPush which presses on its cube, go through commands, drives, body and cameras,
 with parameters that differ from lane to lane.
@@ -45,9 +45,11 @@ class Row(NamedTuple):
     kib_per_lane: float | None
 
 
-def simulator(precision: str, threads: int | None, state: str = "rest", *, push: bool = False) -> TrunkSimulator:
+def simulator(
+    precision: str, threads: int | None, state: str = "rest", *, push: bool = False, integrator: str = "euler"
+) -> TrunkSimulator:
     """The trunk of the paper on the compiled engine, alone or with its cube."""
-    options = {"engine": "numba", "precision": precision, "threads": threads, "push": push}
+    options = {"engine": "numba", "precision": precision, "threads": threads, "push": push, "integrator": integrator}
     table = SimulatorTable.model_validate(options)
     built = build_simulator(ModelSpec(load_robot(ROBOT).with_changes(initial_state=state), simulator=table))
     assert isinstance(built, TrunkSimulator)
@@ -123,6 +125,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lanes", type=int, nargs="+", default=[128, 256])
     parser.add_argument("--seconds", type=float, default=4.0, help="for each line")
+    parser.add_argument("--integrator", choices=["euler", "sdirk2"], default="euler")
     parser.add_argument("--json", type=Path, help="also write the rows here")
     chosen = parser.parse_args()
     rows = []
@@ -130,13 +133,13 @@ def main() -> None:
         scene = "push" if push else "reach"
         for precision in ("float32", "float64"):
             for threads in sorted({1, available_threads()}):
-                model = simulator(precision, threads, push=push)
+                model = simulator(precision, threads, push=push, integrator=chosen.integrator)
                 for lanes in chosen.lanes:
                     wall, cpu, memory = sessions(model, lanes, chosen.seconds)
                     rows.append(Row("session", scene, precision, threads, lanes, wall, cpu, memory))
                     wall, cpu = whole(model, lanes, chosen.seconds)
                     rows.append(Row("whole", scene, precision, threads, lanes, wall, cpu, None))
-    print("| | scene | precision | threads | lanes | solves/s | solves per CPU s | KiB per lane |")
+    print("| | scene | precision | threads | lanes | steps/s | steps per CPU s | KiB per lane |")
     print("|---|---|---|---|---|---|---|---|")
     for row in rows:
         memory = "" if row.kib_per_lane is None else f"{row.kib_per_lane:.1f}"

@@ -12,7 +12,7 @@ from rfdropo_bayes.envs.tasks import task_named
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.robots import Robot, load_robot
-from rfdropo_bayes.simulators.engine import Backend, Engine
+from rfdropo_bayes.simulators.engine import Backend, Engine, Integrator
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
@@ -25,6 +25,7 @@ def trunk_simulator(
     precision: Literal["float32", "float64"] = "float32",
     threads: int | None = None,
     time_step: float | None = None,
+    integrator: Integrator = "euler",
     folder: Path = Path(),
 ) -> RobotSimulator:
     """The layered trunk on the compiled engine, as episodes want it.
@@ -35,11 +36,13 @@ def trunk_simulator(
         precision: of the body's motion; single precision is twice as fast and moves the tip by 0.01 mm.
         threads: that the engine may use; all processors by default.
         time_step: [s]; the robot's own by default.
+        integrator: how a time step is taken.
     """
     discretisation = Discretisation(time_step or robot.time_step_s)
     assembly = assemble(robot, discretisation)
     backend = Backend("numba", precision, threads)
-    engine = Engine(assembly, discretisation.time_step, backend, robot.initial_state == "equilibrium")
+    settled = robot.initial_state == "equilibrium"
+    engine = Engine(assembly, discretisation.time_step, backend, settled, integrator=integrator)
     found = mechanisms_named(list(mechanisms), robot, folder=folder)
     trunk = TrunkSimulator(robot, engine, assembly, discretisation, found)
     return trunk.pushing() if push else trunk

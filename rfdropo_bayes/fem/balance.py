@@ -28,6 +28,7 @@ from rfdropo_bayes.fem.dynamics import (
     mass_times,
     remembering,
     resistance,
+    within,
 )
 from rfdropo_bayes.fem.effects import BodyEffects, Scalar
 from rfdropo_bayes.fem.tetrahedra import elastic_energy, element_rotations, lame_constants, nodal_force
@@ -178,7 +179,8 @@ def layered_balance(
 
     def one(state: State, reached: tuple[Array, Array, Array]) -> tuple[State, _Step]:
         after, moving, pulling = reached
-        linear = linearised(system, prepared, state, time_step)
+        memory = within(system, prepared, state, time_step)
+        linear = linearised(system, prepared, state._replace(memory=memory), time_step)
         change = (moving - state.velocity).reshape(stations, -1, 1)
         cable = _pull(system.cables, prepared.guides, state.position, pulling)
         residual = (multiply(linear.matrix, change).reshape(-1, 3) - linear.right) / time_step - cable
@@ -187,7 +189,7 @@ def layered_balance(
         strained = multiply(tangent, moving.reshape(stations, -1, 1)).reshape(-1, 3)
         dragged = prepared.rayleigh_mass * mass_times(system, prepared, moving)
         damping = jnp.sum(moving * (dragged + prepared.rayleigh_stiffness * strained))
-        return State(after, moving, pulling, linear.memory), _Step(residual, jnp.sum(cable * moving), damping)
+        return State(after, moving, pulling, memory), _Step(residual, jnp.sum(cable * moving), damping)
 
     first = remembering(system, prepared, State(position[0], velocities[0], tension[0]))
     begin = one(first, (position[0], velocities[0], tension[0]))[1]

@@ -1,18 +1,20 @@
-"""Implicit Euler for a layered corotational body pulled by unilateral cables: one linear solve a step.
+"""Time steps of a layered corotational body pulled by unilateral cables: one linear solve a stage.
 
-    A dv = h (f(x) + M g + f_ext - (h + b) K v - a M v) - h J' T,    A = (1 + h a) M + h (h + b) K,    x += h (v + dv)
+    A d = q (f(x) + M g + f_ext - (r + b) K v - a M v) - q J' T,    A = (1 + q a) M + q (q + b) K,    v1 = v + d
 
 with Rayleigh damping a M + b K, the corotational tangent K, cable Jacobian J = dl/dx and tensions T >= 0 (Baraff and
-Witkin 1998; the same linearised step as SOFA's EulerImplicitSolver). What taut cables and layers hold against lateral
-motion (`cable_strings`, `tension_stiffening`) is implicit too: under opposed cables it exceeds the body's own
-stiffness, and steps that leave it out swing. What ``effects`` add is implicit in the same way: their force, linearised,
-at the end of the step. Everything is a pure function of arrays: batch with ``jax.vmap``, differentiate with
-``jax.jvp`` or ``jax.grad``. A ``System`` is static and is closed over, never traced.
+Witkin 1998). Implicit Euler takes its forces where the step starts, with q = r = h: the linearised step of SOFA's
+EulerImplicitSolver. SDIRK2 takes them where the velocity leads, r = 0, see ``integrators``. What taut cables and
+layers hold against lateral motion (`cable_strings`, `tension_stiffening`) is implicit too: under opposed cables it
+exceeds the body's own stiffness, and steps that leave it out swing. What ``effects`` add is implicit in the same way:
+their force, linearised, at the end of the stage. Everything is a pure function of arrays: batch with ``jax.vmap``,
+differentiate with ``jax.jvp`` or ``jax.grad``. A ``System`` is static and is closed over, never traced.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -26,8 +28,9 @@ from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, at_stations, mu
 from rfdropo_bayes.fem.cable_friction import slip_problem, slipped, start_slip
 from rfdropo_bayes.fem.cable_strings import crossing_weights, string_stiffness
 from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian
-from rfdropo_bayes.fem.constrained_step import Pull, Solve, constrained_step, meet
+from rfdropo_bayes.fem.constrained_step import ConstrainedStep, Pull, Solve, constrained_step, meet
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
+from rfdropo_bayes.fem.integrators import EULER, STAGES, Integrator, Stage
 from rfdropo_bayes.fem.layered import LayeredBody
 from rfdropo_bayes.fem.pushing import PushScene, unchanged, untouched
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
@@ -88,7 +91,8 @@ class State(NamedTuple):
     tension: Float[Array, " cables"]  # [N]
     memory: Memory = Memory()  # of the effects; see ``remembering``
     cube: CubeState | None = None  # that the body pushes
-    touch: Float[Array, "pairs 3"] | None = None  # impulses of the step before between the pairs that can touch [N s]
+    touch: Float[Array, "pairs 3"] | None = None  # impulses of the stage before between the pairs that can touch [N s]
+    commanded: Float[Array, " cables"] | None = None  # displacements [m]; where a step has several stages
 
 
 AnyState = TypeVar("AnyState")
@@ -220,12 +224,20 @@ def with_section_matrix(
     return BlockTridiagonal(matrix.diagonal + blocks, matrix.lower)
 
 
-def remembering(system: System, prepared: Prepared, state: State, scene: PushScene | None = None) -> State:
+def remembering(
+    system: System,
+    prepared: Prepared,
+    state: State,
+    scene: PushScene | None = None,
+    integrator: Integrator = "euler",
+) -> State:
     """The state with the memory that effects and contacts start from: clock at zero, branches relaxed, no friction.
 
-    A memory that is there is kept.
+    A memory that is there is kept. Cables of which it is not said were not pulled.
     """
     effects, memory = prepared.effects, state.memory
+    if len(STAGES[integrator]) > 1 and state.commanded is None:
+        state = state._replace(commanded=jnp.zeros(len(system.cables.anchor)))
     if scene is not None and state.touch is None:
         state = state._replace(touch=untouched(scene))
     if jax.tree.leaves(memory):
@@ -244,53 +256,72 @@ def strings(
     frame: Float[Array, "layers 3 3"],
     position: Float[Array, "nodes 3"],
     tension: Float[Array, " cables"],
-) -> Float[Array, "layers 9 pairs"]:
-    """What taut cables add to the stiffness of every layer in its frame, packed."""
+) -> Float[Array, "layers dofs dofs"]:
+    """What taut cables add to the stiffness of every layer in its frame."""
     turned = corotational.turned_back(frame, layered.layer_positions(system.body, position))
     weights, nodes = crossing_weights(system.body, system.cables), 2 * system.body.section_nodes
-    added = string_stiffness(system.body, weights, prepared.gradient, turned.reshape(-1, nodes, 3), tension)
-    return corotational.pack(added)
+    return string_stiffness(system.body, weights, prepared.gradient, turned.reshape(-1, nodes, 3), tension)
 
 
 class _Elastic(NamedTuple):
-    """Elastic forces of a step: what acts at its start, and how that changes to its end."""
+    """Elastic forces of a stage: those where it is linearised, and how they change to its end."""
 
     frame: Float[Array, "layers 3 3"]
     resistance: Float[Array, "layers dofs"]  # in the frames, to strain and its rate
     force: Float[Array, "nodes 3"]
     tangent: BlockTridiagonal
-    lookahead: Scalar  # [s] times the tangent times the velocity is the change of force
-    memory: Memory
+    lookahead: Scalar  # [s] times the tangent times the change of velocity is the change of force
+    behind: Scalar  # [s] times the tangent times the velocity is what the force lacks
 
 
-def _elastic(system: System, prepared: Prepared, state: State, time_step: Scalar) -> _Elastic:
-    """Elastic force with what viscoelasticity and softening make of it.
+def _gain(prepared: Prepared, length: Scalar) -> tuple[Scalar, Scalar]:
+    """Share of its strain that the dashpot of a Prony branch follows in a stage, and stiffness of the branch."""
+    viscous = prepared.effects.viscoelasticity
+    if viscous is None:
+        return jnp.zeros(()), jnp.zeros(())
+    share = length / (viscous.time + length)
+    return share, viscous.fraction * (1.0 - share)
 
-    The strain q of a Prony branch's dashpot follows q' = (u - q) / tau by implicit Euler, so that its force at the end
-    of a step is gamma K (u - q) with gamma = fraction tau / (tau + h) and q of the start (Simo and Hughes 1998,
-    Computational Inelasticity, ch. 10).
+
+def within(system: System, prepared: Prepared, state: State, time_step: Scalar, stage: Stage = EULER) -> Memory:
+    """Memory of the effects within a stage that starts from a state: the clock at its end, dashpots at its start.
+
+    The strain q of a Prony branch's dashpot follows q' = (u - q) / tau as the velocity follows the forces. In implicit
+    Euler its force at the end of a step is gamma K (u - q) with gamma = fraction tau / (tau + h) and q of the start
+    (Simo and Hughes 1998, Computational Inelasticity, ch. 10). It follows when the place it follows to is known.
     """
+    memory = state.memory
+    if memory.branch is not None:
+        share = (1.0 + stage.carried) * _gain(prepared, stage.length * time_step)[0]
+        local = frames_and_displacements(system, prepared, state.position)[1]
+        memory = memory._replace(branch=memory.branch + share * (local - memory.branch))
+    if memory.clock is not None:
+        memory = memory._replace(clock=memory.clock + stage.elapsed * time_step)
+    return memory
+
+
+def _elastic(system: System, prepared: Prepared, state: State, stage: Stage, time_step: Scalar) -> _Elastic:
+    """Elastic force with what viscoelasticity and softening make of it."""
+    length, memory = stage.span * time_step, state.memory
     frame, local = frames_and_displacements(system, prepared, state.position)
     force, packed = resistance(prepared, local)
-    memory, gain, left = state.memory, jnp.zeros(()), jnp.ones(())
-    viscous, rate = prepared.effects.viscoelasticity, prepared.effects.softening_rate
-    if viscous is not None and memory.branch is not None:
-        share = time_step / (viscous.time + time_step)
-        branch = memory.branch + share * (local - memory.branch)
-        gain = gain + viscous.fraction * (1.0 - share)
-        force = force + gain * jnp.einsum("lij,lj->li", prepared.stiffness, local - branch)
-        memory = memory._replace(branch=branch)
-    if rate is not None and memory.clock is not None:
-        clock = memory.clock + time_step
-        left = jnp.exp(-rate * clock)
-        force, packed, memory = left * force, left * packed, memory._replace(clock=clock)
-    lookahead = time_step * (1.0 + gain) + prepared.rayleigh_stiffness
+    gain, left = _gain(prepared, stage.length * time_step)[1], jnp.ones(())
+    if memory.branch is not None:
+        force = force + gain * jnp.einsum("lij,lj->li", prepared.stiffness, local - memory.branch)
+    if prepared.effects.softening_rate is not None and memory.clock is not None:
+        left = jnp.exp(-prepared.effects.softening_rate * memory.clock)
+        force, packed = left * force, left * packed
+    lookahead = length * (1.0 + gain) + prepared.rayleigh_stiffness
+    behind = prepared.rayleigh_stiffness if stage.predicted else lookahead
     taut = strings(system, prepared, frame, state.position, state.tension)
-    tangent = corotational.tangent(packed + time_step / lookahead * taut, frame)
+    tangent = corotational.tangent(packed + length / lookahead * corotational.pack(taut), frame)
     moving = corotational.turned_back(frame, layered.layer_positions(system.body, state.velocity))
-    viscous_force = left * lookahead * jnp.einsum("lij,lj->li", prepared.stiffness, moving)
-    nodal = corotational.internal_force(frame, force).reshape(-1, 3)
-    return _Elastic(frame, force + viscous_force, nodal, tangent, lookahead, memory)
+    viscous_force = left * behind * jnp.einsum("lij,lj->li", prepared.stiffness, moving)
+    acting = force
+    if stage.predicted:  # cables hold against motion from here on; the tangent knows nothing of that
+        acting = force - behind * length / lookahead * jnp.einsum("lij,lj->li", taut, moving)
+    nodal = corotational.internal_force(frame, acting).reshape(-1, 3)
+    return _Elastic(frame, force + viscous_force, nodal, tangent, lookahead, behind)
 
 
 def _surround(
@@ -299,30 +330,32 @@ def _surround(
     matrix: BlockTridiagonal,
     right: Float[Array, "nodes 3"],
     velocity: Float[Array, "stations 3"],
+    stage: Stage,
     time_step: Scalar,
 ) -> tuple[BlockTridiagonal, Float[Array, "nodes 3"]]:
-    """Matrix and right-hand side of a step with the loads on its sections."""
+    """Matrix and right-hand side of a stage with the loads on its sections."""
     if load is None:
         return matrix, right
-    force = load.force - time_step * jnp.einsum("sij,sj->si", load.stiffness, velocity)
-    added = time_step * load.damping + time_step**2 * load.stiffness
-    return with_section_matrix(system, matrix, added), right + time_step * shared(system, force)
+    length, force = stage.span * time_step, load.force
+    if not stage.predicted:
+        force = force - length * jnp.einsum("sij,sj->si", load.stiffness, velocity)
+    added = length * load.damping + length**2 * load.stiffness
+    return with_section_matrix(system, matrix, added), right + length * shared(system, force)
 
 
-def _taut(system: System, prepared: Prepared, state: State, elastic: _Elastic, time_step: Scalar) -> BlockTridiagonal:
-    """What layers in tension hold against lateral motion, times the time step squared."""
+def _taut(system: System, prepared: Prepared, state: State, elastic: _Elastic, length: Scalar) -> BlockTridiagonal:
+    """What layers in tension hold against lateral motion, times the length of the stage squared."""
     jacobian = lengths_and_jacobian(system.cables, prepared.guides, state.position)[1]
     cable = -jnp.einsum("cni,c->ni", jacobian, state.tension)
     tension = layer_tension(system.body, elastic.resistance, cable, elastic.frame)
-    return lateral_stiffening(system.body, elastic.frame, time_step**2 * tension)
+    return lateral_stiffening(system.body, elastic.frame, length**2 * tension)
 
 
 class Linear(NamedTuple):
-    """A step's linear system A dv = r without cables, and what the effects remember after the step."""
+    """A stage's linear system A d = r without cables, for the change d of the velocity."""
 
     matrix: BlockTridiagonal
     right: Float[Array, "nodes 3"]
-    memory: Memory
 
 
 def linearised(
@@ -331,24 +364,35 @@ def linearised(
     state: State,
     time_step: Scalar,
     external_force: Float[Array, "nodes 3"] | float = 0.0,
+    stage: Stage = EULER,
 ) -> Linear:
-    """Linearise the body, its effects and its surroundings about the start of a step."""
-    elastic = _elastic(system, prepared, state, time_step)
+    """Linearise the body, its effects and its surroundings about a state, with the memory of the stage."""
+    elastic, length = _elastic(system, prepared, state, stage, time_step), stage.span * time_step
     stations = len(system.body.station)
     strained = multiply(elastic.tangent, state.velocity.reshape(stations, -1, 1)).reshape(-1, 3)
     dragged = prepared.rayleigh_mass * mass_times(system, prepared, state.velocity)
     load = prepared.weight + external_force
-    right = time_step * (elastic.force + load - elastic.lookahead * strained - dragged)
-    inertia, elasticity = 1.0 + time_step * prepared.rayleigh_mass, time_step * elastic.lookahead
+    right = length * (elastic.force + load - elastic.behind * strained - dragged)
+    inertia, elasticity = 1.0 + length * prepared.rayleigh_mass, length * elastic.lookahead
     mass = [jnp.kron(block, jnp.eye(3)) for block in prepared.mass]  # for the three components
     matrix = BlockTridiagonal(*(inertia * m + elasticity * k for m, k in zip(mass, elastic.tangent, strict=True)))
-    taut = _taut(system, prepared, state, elastic, time_step)
+    taut = _taut(system, prepared, state, elastic, length)
     matrix = BlockTridiagonal(*(m + k for m, k in zip(matrix, taut, strict=True)))
-    right = right - multiply(taut, state.velocity.reshape(stations, -1, 1)).reshape(-1, 3)
+    if not stage.predicted:
+        right = right - multiply(taut, state.velocity.reshape(stations, -1, 1)).reshape(-1, 3)
     centre, drift = section_means(system, state.position), section_means(system, state.velocity)
-    around = section_load(system.body, prepared.effects, centre, drift)
-    matrix, right = _surround(system, around, matrix, right, drift, time_step)
-    return Linear(matrix, right, elastic.memory)
+    around = section_load(system.body, prepared.effects, centre, drift, steep=stage.predicted)
+    matrix, right = _surround(system, around, matrix, right, drift, stage, time_step)
+    return Linear(matrix, right)
+
+
+class Carried(NamedTuple):
+    """What the stage before did, with a share of which the motion goes on; nothing before the first stage."""
+
+    velocity: Float[Array, "nodes 3"]  # change in it [m/s]
+    sudden: Float[Array, "nodes 3"]  # impacts in it [N s]: no share of them
+    twist: Float[Array, "6"] | None  # change of the cube's velocity and spin, without these
+    slip: Float[Array, "kinds cables cable_runs"] | None  # change of the friction mobilised
 
 
 def step(
@@ -360,31 +404,95 @@ def step(
     external_force: Float[Array, "nodes 3"] | float = 0.0,
     scene: PushScene | None = None,
     cube: Cube | None = None,
+    integrator: Integrator = "euler",
 ) -> tuple[State, StepInfo]:
-    """One implicit Euler step to the commanded cable displacements [m] (pull > 0) at its end.
+    """One time step to the commanded cable displacements [m] (pull > 0) at its end.
 
     ``external_force`` [N] acts on the nodes throughout the step. With a ``scene`` and a ``cube`` the body touches them;
     the state says where the cube is. A step that is not finite leaves everything where it was, at rest and without
-    tension, and says so: a batch goes on. Where there is a scene, or the material has effects with a memory, the state
-    comes from ``remembering``.
+    tension, and says so: a batch goes on. Where there is a scene, the material has effects with a memory, or a step has
+    several stages, the state comes from ``remembering``.
     """
-    matrix, right, memory = linearised(system, prepared, state, time_step, external_force)
+    take = partial(_take_stage, system, prepared, time_step=time_step, external=external_force, scene=scene, cube=cube)
+    return in_stages(take, state, displacement, STAGES[integrator])
+
+
+def in_stages(
+    take: Callable[[Any, Float[Array, " cables"], Stage, Carried | None], tuple[Any, StepInfo, Carried | None]],
+    state: AnyState,
+    displacement: Float[Array, " cables"],
+    stages: Sequence[Stage],
+) -> tuple[AnyState, StepInfo]:
+    """A step of any body, given how it takes a stage; commands within the step lie on the way to those at its end."""
+    here: Any = state
+    start = here.commanded
+    if start is None:
+        return take(here, displacement, stages[0], None)[:2]
+    elapsed, codes, carried = 0.0, StepInfo(jnp.array(False), jnp.array(True)), None
+    for stage in stages:
+        elapsed += stage.elapsed
+        here, info, carried = take(here, start + elapsed * (displacement - start), stage, carried)
+        codes = StepInfo(codes.diverged | info.diverged, codes.converged & info.converged)
+    return here._replace(commanded=displacement), codes
+
+
+def _take_stage(
+    system: System,
+    prepared: Prepared,
+    state: State,
+    displacement: Float[Array, " cables"],
+    stage: Stage,
+    carried: Carried | None,
+    *,
+    time_step: Scalar,
+    external: Float[Array, "nodes 3"] | float,
+    scene: PushScene | None,
+    cube: Cube | None,
+) -> tuple[State, StepInfo, Carried | None]:
+    """One stage of a step, see ``fem.integrators``."""
+    at = state._replace(memory=within(system, prepared, state, time_step, stage))
+    if stage.predicted:
+        at = at._replace(position=state.position + stage.elapsed * time_step * state.velocity)
     push = None
     if scene is not None and cube is not None and state.cube is not None and state.touch is not None:
-        surroundings = state.position, prepared.gravity, prepared.rayleigh_mass
-        push = meet(scene, cube, state.cube, state.touch, *surroundings, time_step)
+        around = prepared.gravity, prepared.rayleigh_mass
+        change = None if carried is None else carried.twist
+        place = at.position, at.velocity, around
+        push, stage = meet(scene, cube, state.cube, state.touch, *place, stage, time_step, change)
+    length = stage.span * time_step
+    matrix, right = linearised(system, prepared, at, time_step, external, stage)
+    if carried is not None:
+        going = mass_times(system, prepared, carried.velocity) - carried.sudden
+        right = right + stage.going * going
     slip = None
     mobilised, segment = state.memory.slip, state.memory.segment
     if mobilised is not None and segment is not None:
-        slip = slip_problem(system.cables, prepared.effects, mobilised, segment, prepared.guides, state.position)
-    pull = _pull(system, prepared, state, displacement, time_step)
-    found = constrained_step(free_solve(system, matrix), right, state.velocity, pull, time_step, slip, push)
-    velocity, tension = state.velocity + found.increment, found.impulses.cable / time_step
+        if carried is not None and carried.slip is not None:
+            mobilised = jnp.clip(mobilised + stage.carried * carried.slip, -1.0, 1.0)
+        slip = slip_problem(system.cables, prepared.effects, mobilised, segment, prepared.guides, at.position)
+    pull = _pull(system, prepared, at, displacement, length)
+    found = constrained_step(free_solve(system, matrix), right, at.velocity, pull, stage, time_step, slip, push)
+    velocity, tension = at.velocity + found.increment, found.impulses.cable / length
+    memory = at.memory
     if slip is not None:
         share, segment = slipped(system.cables, slip, found.impulses.share, tension)
         memory = memory._replace(slip=share, segment=segment)
-    moved = State(state.position + time_step * velocity, velocity, tension, memory, found.cube, found.touch)
-    return accept(system, prepared, state, moved, found.impulses.converged)
+    position = at.position + length * (found.increment if stage.predicted else velocity)
+    moved = State(position, velocity, tension, memory, found.cube, found.touch, state.commanded)
+    taken, info = accept(system, prepared, state, moved, found.impulses.converged)
+    return taken, info, carried_from(state, taken, found, info) if stage.predicted else None
+
+
+def carried_from(before: Any, after: Any, found: ConstrainedStep, info: StepInfo) -> Carried:
+    """What a stage of any body did that was taken; nothing where it was not."""
+    twist = slip = None
+    if before.cube is not None and after.cube is not None and found.sudden_twist is not None:
+        parts = after.cube.velocity - before.cube.velocity, after.cube.spin - before.cube.spin
+        twist = jnp.concatenate(parts) - found.sudden_twist
+    if before.memory.slip is not None and after.memory.slip is not None:
+        slip = after.memory.slip - before.memory.slip
+    changes = Carried(after.velocity - before.velocity, jnp.asarray(found.sudden), twist, slip)
+    return jax.tree.map(lambda change: jnp.where(info.diverged, 0.0, change), changes)
 
 
 def free_solve(system: System, matrix: BlockTridiagonal) -> Solve:
@@ -401,14 +509,14 @@ def free_solve(system: System, matrix: BlockTridiagonal) -> Solve:
 
 
 def _pull(
-    system: System, prepared: Prepared, state: State, displacement: Float[Array, " cables"], time_step: Scalar
+    system: System, prepared: Prepared, state: State, displacement: Float[Array, " cables"], length: Scalar
 ) -> Pull:
-    """The cables of a step to their commanded displacements."""
-    length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, state.position)
+    """The cables of a stage to their commanded displacements."""
+    reach, jacobian = lengths_and_jacobian(system.cables, prepared.guides, state.position)
     compliance = prepared.effects.cable_compliance
-    give = 0.0 if compliance is None else compliance / time_step**2
-    slack = (prepared.rest_length - displacement - length) / time_step
-    return Pull(jacobian, slack, state.tension * time_step, give)
+    give = 0.0 if compliance is None else compliance / length**2
+    slack = (prepared.rest_length - displacement - reach) / length
+    return Pull(jacobian, slack, state.tension * length, give)
 
 
 def accept(

@@ -69,7 +69,7 @@ def _forces(system: System, prepared: Prepared, iterate: _Iterate) -> _Forces:
     length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, iterate.position)
     cable = -jnp.einsum("cni,c->ni", jacobian, iterate.tension)
     stiffening = lateral_stiffening(system.body, frame, layer_tension(system.body, local_force, cable, frame))
-    packed = packed + strings(system, prepared, frame, iterate.position, iterate.tension)
+    packed = packed + corotational.pack(strings(system, prepared, frame, iterate.position, iterate.tension))
     tangent = jax.tree.map(jnp.add, corotational.tangent(packed, frame), stiffening)
     centre = section_means(system, iterate.position)
     around = section_load(system.body, prepared.effects, centre, jnp.zeros_like(centre))
@@ -103,7 +103,7 @@ def static_equilibrium(
         slack = prepared.rest_length - displacement - forces.length
         pull = Pull(forces.jacobian, slack, current.tension, give)
         still = jnp.zeros_like(current.position)
-        found = constrained_step(free_solve(system, forces.tangent), forces.body + load, still, pull, 1.0)
+        found = constrained_step(free_solve(system, forces.tangent), forces.body + load, still, pull)
         increment, tension, converged = found.increment, found.impulses.cable, found.impulses.converged
         now, before = lax.stop_gradient((increment, current.increment))
         along = jnp.sum(now * before)

@@ -65,6 +65,11 @@ def inverse_inertia(cube: Cube) -> Float[Array, "6"]:
     return jnp.concatenate([mass, mass / cube.gyration_radius**2])
 
 
+def twist_of(state: CubeState) -> Float[Array, "6"]:
+    """Velocity and spin."""
+    return jnp.concatenate([state.velocity, state.spin])
+
+
 def free_twist(
     state: CubeState, gravity: Float[Array, "3"], rayleigh_mass: Scalar, time_step: Scalar
 ) -> Float[Array, "6"]:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.fem.dynamics import Prepared, State, StepInfo, System, remembering, step
 from rfdropo_bayes.fem.effects import Scalar
+from rfdropo_bayes.fem.integrators import Integrator
 from rfdropo_bayes.fem.layered import PointMap, point_positions
 from rfdropo_bayes.fem.pushing import PushScene
 from rfdropo_bayes.fem.rigid_body import Cube
@@ -105,14 +106,16 @@ def simulate(
     scene: PushScene | None = None,
     cube: Cube | None = None,
     horizon: Int[Array, ""] | int | None = None,
+    integrator: Integrator = "euler",
 ) -> Rollout:
     """Rollout from ``state`` through the commanded cable displacements [m] of every step, recorded after every row.
 
     ``time_step`` [s] is that of one substep; ``external_force`` [N] is constant. With a ``scene`` and a ``cube`` the
-    body pushes it; ``state.cube`` is where it starts. ``horizon`` as for `roll`.
+    body pushes it; ``state.cube`` is where it starts. ``horizon`` as for `roll`. Where a step has several stages,
+    ``state.commanded`` are the displacements before the first step, zero where that is None.
     """
 
     def take(before: State, commanded: Float[Array, " cables"]) -> tuple[State, StepInfo]:
-        return step(system, prepared, before, commanded, time_step, external_force, scene, cube)
+        return step(system, prepared, before, commanded, time_step, external_force, scene, cube, integrator)
 
-    return roll(take, remembering(system, prepared, state, scene), displacement, points, horizon)
+    return roll(take, remembering(system, prepared, state, scene, integrator), displacement, points, horizon)

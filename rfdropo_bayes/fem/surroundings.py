@@ -58,24 +58,33 @@ def _wall_load(body: LayeredBody, wall: Wall, centre: Float[Array, "stations 3"]
     )
 
 
-def _drag_load(body: LayeredBody, drag: Scalar, velocity: Float[Array, "stations 3"]) -> SectionLoad:
-    """Drag -c A |v| v with the speed of the step's start and the velocity of its end: it never adds energy."""
+def _drag_load(body: LayeredBody, drag: Scalar, velocity: Float[Array, "stations 3"], steep: bool) -> SectionLoad:
+    """Drag -c A |v| v with the speed of a stage's start and the velocity of its end, which never adds energy; or with
+    its whole derivative, ``steep``, without which no scheme would be of second order."""
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=1) + STILL**2)
     factor = drag * jnp.asarray(drag_areas(body)) * speed
-    return SectionLoad(
-        force=-factor[:, None] * velocity,
-        stiffness=jnp.zeros((len(velocity), 3, 3)),
-        damping=factor[:, None, None] * jnp.eye(3),
-    )
+    damping = factor[:, None, None] * jnp.eye(3)
+    if steep:
+        along = velocity / speed[:, None]
+        damping = damping + factor[:, None, None] * along[:, :, None] * along[:, None, :]
+    return SectionLoad(force=-factor[:, None] * velocity, stiffness=jnp.zeros((len(velocity), 3, 3)), damping=damping)
 
 
 def section_load(
-    body: LayeredBody, effects: BodyEffects, centre: Float[Array, "stations 3"], velocity: Float[Array, "stations 3"]
+    body: LayeredBody,
+    effects: BodyEffects,
+    centre: Float[Array, "stations 3"],
+    velocity: Float[Array, "stations 3"],
+    *,
+    steep: bool = False,
 ) -> SectionLoad | None:
-    """Load on the sections whose nodes have this mean place [m] and velocity [m/s]; None if nothing surrounds them."""
+    """Load on the sections whose nodes have this mean place [m] and velocity [m/s]; None if nothing surrounds them.
+
+    ``steep``: drag with the derivative of its speed.
+    """
     loads = []
     if effects.wall is not None:
         loads.append(_wall_load(body, effects.wall, centre))
     if effects.drag is not None:
-        loads.append(_drag_load(body, effects.drag, velocity))
+        loads.append(_drag_load(body, effects.drag, velocity, steep))
     return SectionLoad(*(sum(parts) for parts in zip(*loads, strict=True))) if loads else None

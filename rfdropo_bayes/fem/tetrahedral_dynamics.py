@@ -1,6 +1,6 @@
-"""Implicit Euler for a corotational tetrahedral body pulled by unilateral cables: the reference engine, in JAX.
+"""Time steps of a corotational tetrahedral body pulled by unilateral cables: the reference engine, in JAX.
 
-The step is that of ``fem.dynamics``, with nodal masses and the drive limits of ``fem.drives``. With
+The step is that of ``fem.dynamics``, with nodal masses and the drive limits of ``fem.drives``. With implicit Euler,
 ``frames="edges"``, equal node masses and a start from rest it reproduces SOFA's EulerImplicitSolver,
 TetrahedronFEMForceField ("large"), UniformMass and CableConstraint under FreeMotionAnimationLoop to the digits that
 SOFA's recordings hold.
@@ -19,7 +19,9 @@ from rfdropo_bayes.fem import levels as level_systems
 from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian
 from rfdropo_bayes.fem.constrained_step import Pull, constrained_step, meet
 from rfdropo_bayes.fem.drives import DriveLimits
-from rfdropo_bayes.fem.dynamics import LOST, StepInfo, accept_within
+from rfdropo_bayes.fem.dynamics import LOST, Carried, StepInfo, accept_within, carried_from, in_stages
+from rfdropo_bayes.fem.effects import Memory
+from rfdropo_bayes.fem.integrators import EULER, STAGES, Integrator, Stage
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.levels import LevelMatrix, Levels, node_levels
 from rfdropo_bayes.fem.pushing import PushScene, untouched
@@ -58,14 +60,16 @@ class TetrahedralMaterial(NamedTuple):
 
 
 class TetrahedralState(NamedTuple):
-    """Mechanical state at one instant, and the cable displacements measured at the start of the step before."""
+    """Mechanical state at one instant, and the cable displacements measured where the stage before took its forces."""
 
     position: Float[Array, "nodes 3"]  # [m]
     velocity: Float[Array, "nodes 3"]  # [m/s]
     tension: Float[Array, " cables"]  # [N]
     measured: Float[Array, " cables"]  # [m]
     cube: CubeState | None = None  # that the body pushes
-    touch: Float[Array, "pairs 3"] | None = None  # impulses of the step before between the pairs that can touch [N s]
+    touch: Float[Array, "pairs 3"] | None = None  # impulses of the stage before between the pairs that can touch [N s]
+    commanded: Float[Array, " cables"] | None = None  # displacements [m]; where a step has several stages
+    memory: Memory = Memory()  # of effects: there are none
 
 
 def tetrahedral_system(body: TetrahedralBody, cables: CableLayout, limits: DriveLimits) -> TetrahedralSystem:
@@ -86,21 +90,26 @@ def state_at_rest(system: TetrahedralSystem) -> TetrahedralState:
 
 
 def linearised(
-    system: TetrahedralSystem, material: TetrahedralMaterial, state: TetrahedralState, time_step: float
+    system: TetrahedralSystem,
+    material: TetrahedralMaterial,
+    state: TetrahedralState,
+    time_step: float,
+    stage: Stage = EULER,
 ) -> tuple[LevelMatrix, Float[Array, "nodes 3"]]:
-    """Matrix A and right-hand side of a step's linear system without cables, A dv = r."""
-    body, levels = system.body, system.levels
+    """Matrix A and right-hand side of a stage's linear system without cables, A d = r, about a state."""
+    body, levels, length = system.body, system.levels, stage.span * time_step
     first, shear = lame_constants(material.young_modulus, material.poisson_ratio)
     lame = first * material.stiffness_scale, shear * material.stiffness_scale
     turn = element_rotations(body, state.position)
-    lookahead = time_step + material.rayleigh_stiffness
+    lookahead = length + material.rayleigh_stiffness
+    behind = material.rayleigh_stiffness if stage.predicted else lookahead
     force = nodal_force(body, turn, state.position, jnp.asarray(body.rest), lame)
-    force = force + lookahead * nodal_force(body, turn, state.velocity, 0.0, lame)
+    force = force + behind * nodal_force(body, turn, state.velocity, 0.0, lame)
     mass = material.node_mass[:, None]
-    right = time_step * (force + mass * (material.gravity - material.rayleigh_mass * state.velocity))
-    inertia = (1.0 + time_step * material.rayleigh_mass) * material.node_mass
+    right = length * (force + mass * (material.gravity - material.rayleigh_mass * state.velocity))
+    inertia = (1.0 + length * material.rayleigh_mass) * material.node_mass
     matrix = level_systems.assemble(
-        levels, body.element, time_step * lookahead * element_tangents(body, turn, lame), inertia
+        levels, body.element, length * lookahead * element_tangents(body, turn, lame), inertia
     )
     return matrix, right
 
@@ -113,32 +122,57 @@ def step(
     time_step: float,
     scene: PushScene | None = None,
     cube: Cube | None = None,
+    integrator: Integrator = "euler",
 ) -> tuple[TetrahedralState, StepInfo]:
-    """One implicit Euler step to the commanded cable displacements [m]; with ``scene`` and ``cube`` as in
-    ``fem.dynamics.step``."""
-    levels = system.levels
-    matrix, right = linearised(system, material, state, time_step)
-    length, jacobian = lengths_and_jacobian(system.cables, jnp.asarray(system.guides), state.position)
-    shortening = jnp.asarray(system.rest_length) - length
-    slack = (shortening - system.limits.apply(displacement, state.measured)) / time_step
+    """One time step to the commanded cable displacements [m] at its end; with ``scene``, ``cube`` and ``integrator`` as
+    in ``fem.dynamics.step``."""
+    take = partial(_take_stage, system, material, time_step=time_step, scene=scene, cube=cube)
+    return in_stages(take, state, displacement, STAGES[integrator])
+
+
+def _take_stage(
+    system: TetrahedralSystem,
+    material: TetrahedralMaterial,
+    state: TetrahedralState,
+    displacement: Float[Array, " cables"],
+    stage: Stage,
+    carried: Carried | None,
+    *,
+    time_step: float,
+    scene: PushScene | None,
+    cube: Cube | None,
+) -> tuple[TetrahedralState, StepInfo, Carried | None]:
+    """One stage of a step, see ``fem.integrators``."""
+    levels, at, push = system.levels, state, None
+    if stage.predicted:
+        at = at._replace(position=state.position + stage.elapsed * time_step * state.velocity)
+    if scene is not None and cube is not None and state.cube is not None and state.touch is not None:
+        around = material.gravity, material.rayleigh_mass
+        change = None if carried is None else carried.twist
+        place = at.position, at.velocity, around
+        push, stage = meet(scene, cube, state.cube, state.touch, *place, stage, time_step, change)
+    length = stage.span * time_step
+    matrix, right = linearised(system, material, at, time_step, stage)
+    if carried is not None:
+        right = right + stage.going * (material.node_mass[:, None] * carried.velocity - carried.sudden)
+    reach, jacobian = lengths_and_jacobian(system.cables, jnp.asarray(system.guides), at.position)
+    shortening = jnp.asarray(system.rest_length) - reach
+    slack = (shortening - system.limits.apply(displacement, state.measured)) / length
 
     def solved(fields: Float[Array, "columns nodes 3"]) -> Float[Array, "columns nodes 3"]:
         columns = fields[:, levels.order].reshape(len(fields), -1).T
         solution = level_systems.solve(matrix, columns).T.reshape(len(fields), -1, 3)
         return jnp.zeros_like(fields).at[:, levels.order].set(solution)
 
-    push = None
-    if scene is not None and cube is not None and state.cube is not None and state.touch is not None:
-        surroundings = state.position, material.gravity, material.rayleigh_mass
-        push = meet(scene, cube, state.cube, state.touch, *surroundings, time_step)
-    pull = Pull(jacobian, slack, state.tension * time_step)
-    found = constrained_step(solved, right, state.velocity, pull, time_step, push=push)
+    pull = Pull(jacobian, slack, state.tension * length)
+    found = constrained_step(solved, right, state.velocity, pull, stage, time_step, push=push)
     velocity = state.velocity + found.increment
-    tension = found.impulses.cable / time_step
-    position = state.position + time_step * velocity
-    moved = TetrahedralState(position, velocity, tension, shortening, found.cube, found.touch)
-    reach = LOST * float(np.ptp(system.body.rest, axis=0).max())
-    return accept_within(reach, moved.position - system.body.rest, state, moved, found.impulses.converged)
+    tension = found.impulses.cable / length
+    position = at.position + length * (found.increment if stage.predicted else velocity)
+    moved = TetrahedralState(position, velocity, tension, shortening, found.cube, found.touch, state.commanded)
+    far = LOST * float(np.ptp(system.body.rest, axis=0).max())
+    taken, info = accept_within(far, moved.position - system.body.rest, state, moved, found.impulses.converged)
+    return taken, info, carried_from(state, taken, found, info) if stage.predicted else None
 
 
 def simulate(
@@ -151,12 +185,15 @@ def simulate(
     scene: PushScene | None = None,
     cube: Cube | None = None,
     horizon: Int[Array, ""] | int | None = None,
+    integrator: Integrator = "euler",
 ) -> Rollout:
     """Rollout through the commanded cable displacements [m] of every step; as ``fem.simulate``."""
     if scene is not None and state.touch is None:
         state = state._replace(touch=untouched(scene))
+    if len(STAGES[integrator]) > 1 and state.commanded is None:
+        state = state._replace(commanded=jnp.zeros(len(system.rest_length)))
     return roll(
-        partial(step, system, material, time_step=time_step, scene=scene, cube=cube),
+        partial(step, system, material, time_step=time_step, scene=scene, cube=cube, integrator=integrator),
         state,
         displacement,
         points,

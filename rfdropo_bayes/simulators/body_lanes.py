@@ -108,8 +108,8 @@ class CompiledLanes:
     def reset(self, rows: Int[np.ndarray, " row"], given: LaneStart) -> Motion:
         """See `BodyLanes`."""
         cube = None if given.cube is None else cube_arrays(given.cube)
-        begin = given.start if self._from_equilibrium else None
-        return _last(self._session.reset(rows, given.material, start=begin, cube=cube))
+        begin = {"start" if self._from_equilibrium else "before": given.start}
+        return _last(self._session.reset(rows, given.material, **begin, cube=cube))
 
     def advance(self, displacement: Float[np.ndarray, "lane step cable"]) -> Motion:
         """See `BodyLanes`."""
@@ -185,7 +185,7 @@ class ReferenceLanes:
 
         def first(given: LaneStart) -> _Lane:
             prepared, state, imbalance = engine.initial(given.material, given.start)
-            state = remembering(self._system, prepared, state, engine.scene)
+            state = remembering(self._system, prepared, state, engine.scene, engine.integrator)
             solid, place = (None, None) if given.cube is None else given.cube
             return _Lane(prepared, state._replace(cube=place), jnp.array(False), imbalance, jnp.array(True), solid)
 
@@ -193,12 +193,12 @@ class ReferenceLanes:
 
     @cached_property
     def _moved(self) -> Callable[[_Lane | None, Array], _Lane]:
-        system, time_step = self._system, self._engine.time_step
+        system, time_step, integrator = self._system, self._engine.time_step, self._engine.integrator
 
         def moved(lane: _Lane, displacement: Float[Array, "step cable"]) -> _Lane:
             def one(before: _Lane, command: Float[Array, " cable"]) -> tuple[_Lane, None]:
                 around = 0.0, self._engine.scene, before.cube
-                state, info = step(system, before.prepared, before.state, command, time_step, *around)
+                state, info = step(system, before.prepared, before.state, command, time_step, *around, integrator)
                 codes = before.diverged | info.diverged, before.converged & info.converged
                 return before._replace(state=state, diverged=codes[0], converged=codes[1]), None
 

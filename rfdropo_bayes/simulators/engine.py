@@ -31,6 +31,7 @@ from rfdropo_bayes.fem import (
 )
 from rfdropo_bayes.fem import static_equilibrium as find_equilibrium
 from rfdropo_bayes.fem.dynamics import Prepared, State, System
+from rfdropo_bayes.fem.integrators import Integrator
 from rfdropo_bayes.fem.native.layered import NativeLayered
 from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
 from rfdropo_bayes.fem.pushing import PushScene
@@ -123,6 +124,7 @@ class Engine:
         backend: what computes.
         from_equilibrium: start in the static equilibrium of the initial displacements, else undeformed; of layers.
         scene: what the body pushes a cube on; None for a body that touches nothing.
+        integrator: how a time step is taken, see `fem.integrators`.
     """
 
     body: Body
@@ -130,10 +132,18 @@ class Engine:
     backend: Backend = field(default_factory=Backend)
     from_equilibrium: bool = False
     scene: PushScene | None = None
+    integrator: Integrator = "euler"
 
     def __post_init__(self) -> None:
         if self.from_equilibrium and not self.layered:
             raise InputError("a body of tetrahedra starts at rest", where="engine", remedy="use a layered body")
+        system = self.body.system
+        if self.integrator != "euler" and not isinstance(system, System) and np.isfinite(system.limits.rate):
+            raise InputError(
+                f"integrator {self.integrator!r} with drives that SOFA limits: their limit is one of SOFA's own steps",
+                where="[simulator] integrator",
+                remedy='use integrator = "euler", or drives = "robot" in [simulator.tetrahedra]',
+            )
 
     @property
     def layered(self) -> bool:
@@ -148,10 +158,11 @@ class Engine:
         return 512 if self.layered else 64
 
     def describe(self) -> dict[str, object]:
-        """Name, precision and device, for the record."""
+        """Name, precision, device and, where it is not implicit Euler, integrator, for the record."""
+        steps = {} if self.integrator == "euler" else {"integrator": self.integrator}
         if self.backend.name == "jax":
-            return {"engine": "jax", "precision": "float64", "device": jax.devices()[0].platform}
-        return {"engine": "numba", "precision": self.backend.precision, "device": "cpu"}
+            return {"engine": "jax", "precision": "float64", "device": jax.devices()[0].platform, **steps}
+        return {"engine": "numba", "precision": self.backend.precision, "device": "cpu", **steps}
 
     def recording(self, points: PointMap) -> Engine:
         """The same engine in double precision, recording these points of the body in place of the markers."""
@@ -184,11 +195,13 @@ class Engine:
     def initial(self, material: Material, start: Float[Array, " cable"]) -> tuple[Prepared, State, Float[Array, ""]]:
         """A layered body in the reference engine before its first step, and the relative force out of balance."""
         system: Any = self.body.system
-        prepared, state = prepare(system, material), state_at_rest(system)
-        if not self.from_equilibrium:
-            return prepared, state, jnp.zeros(())
-        state, found = find_equilibrium(system, prepared, start)
-        return prepared, state, found.residual
+        prepared, state, residual = prepare(system, material), state_at_rest(system), jnp.zeros(())
+        if self.from_equilibrium:
+            state, found = find_equilibrium(system, prepared, start)
+            residual = found.residual
+        if self.integrator != "euler":
+            state = state._replace(commanded=jnp.asarray(start))
+        return prepared, state, residual
 
     def _reference(self, inputs: Inputs, steps: Int[Array, ""] | None) -> Motion:
         markers, rows = self.body.markers, inputs.displacement[:, None, :]
@@ -204,7 +217,7 @@ class Engine:
             state = tetrahedral_dynamics.state_at_rest(system)  # type: ignore[assignment]
             run = partial(tetrahedral_dynamics.simulate, system, material)
         state = state._replace(cube=place)
-        rollout = run(state, rows, self.time_step, markers, horizon=steps, **around)
+        rollout = run(state, rows, self.time_step, markers, horizon=steps, integrator=self.integrator, **around)
         first = point_positions(markers, state.position)
         pose = None
         if cube is not None:
@@ -223,7 +236,7 @@ class Engine:
     def native(self) -> Any:
         """The compiled engine."""
         system, backend = self.body.system, self.backend
-        options: dict[str, Any] = {"threads": backend.threads, "scene": self.scene}
+        options: dict[str, Any] = {"threads": backend.threads, "scene": self.scene, "integrator": self.integrator}
         if isinstance(system, System):
             return NativeLayered(system, self.body.markers, self.time_step, precision=backend.precision, **options)
         kind = np.dtype(backend.precision).type
@@ -250,8 +263,8 @@ class Engine:
         """Rollouts of a batch with one axis."""
         cube = None if inputs.cube is None else cube_arrays(inputs.cube)
         if isinstance(self.body.system, System):
-            start = inputs.start if self.from_equilibrium else None
-            return self.native.rollout(inputs.material, inputs.displacement, start=start, steps=steps, cube=cube)
+            begin = {"start" if self.from_equilibrium else "before": inputs.start}
+            return self.native.rollout(inputs.material, inputs.displacement, **begin, steps=steps, cube=cube)
         commands = inputs.displacement[:, :steps]
         return self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
 

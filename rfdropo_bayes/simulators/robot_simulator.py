@@ -182,8 +182,15 @@ class RobotSimulator(ExtendedSimulator):
         `rollout`.
 
         Raises:
-            InputError: a name that is not a parameter of this simulator, or cables with friction.
+            InputError: a name that is not a parameter of this simulator, cables with friction, or another integrator
+                than implicit Euler, whose states alone tell the velocities.
         """
+        if self.engine.integrator != "euler":
+            raise InputError(
+                f"forces and energies are not available with integrator {self.engine.integrator!r}",
+                where="balance",
+                remedy='use integrator = "euler" under [simulator], with shorter steps',
+            )
         values = self.complete(parameters)
         inputs = self.inputs(values, commands)
         engine = self.engine.recording(every_node(self.assembly.system.body.nodes))

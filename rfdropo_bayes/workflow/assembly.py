@@ -98,12 +98,13 @@ def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
         options = table.tetrahedra
         mesh = read_tetrahedra(find_data_file(options.mesh, spec.folder), options.unit)
         bound = assemble_mesh(robot, mesh, options)
-        engine = Engine(bound, time_step, backend(table, False))
+        engine = Engine(bound, time_step, backend(table, False), integrator=table.integrator)
         trunk = MeshTrunkSimulator(robot, engine, bound, options, time_step, mechanisms)
     else:
         discretisation = Discretisation(time_step, table.nodes_across, table.refine)
         assembly = assemble(robot, discretisation)
-        engine = Engine(assembly, time_step, backend(table, True), robot.initial_state == "equilibrium")
+        settled = robot.initial_state == "equilibrium"
+        engine = Engine(assembly, time_step, backend(table, True), settled, integrator=table.integrator)
         trunk = TrunkSimulator(robot, engine, assembly, discretisation, mechanisms)
     return trunk.pushing() if table.push else trunk
 

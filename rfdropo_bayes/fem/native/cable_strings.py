@@ -38,8 +38,8 @@ def _way(tables, layer, c, field, token):
 
 
 @kernel
-def measure_strings(tables, layer, rate, work, token):
-    """Spring, over ``rate`` squared, and lever of every cable in a layer, whose frame is known."""
+def measure_strings(tables, layer, square, work, token):
+    """Spring, times the ``square`` of a stage's length, and lever of every cable in a layer, whose frame is known."""
     modes, cables, axes, a = tables.modes, tables.cables, work.axes, 9 * layer
     zero, one, half = fill(0.0, axes, token), fill(1.0, axes, token), fill(0.5, axes, token)
     base, first, stretch = 3 * layer * modes, 2 * modes * layer, zero
@@ -54,7 +54,7 @@ def measure_strings(tables, layer, rate, work, token):
             store(work.local, 3 * k + i, x)
             along = fma(load(axes, a + 3 * i + axis, token), x, along)
         stretch = fma(slope, along if kind == 0 else half * along, stretch)
-    shrink, slower = one / stretch, 1.0 / (rate * rate)
+    shrink = one / stretch
     for c in range(cables):
         tension, string = load(work.tension, c, token), 2 * (layer * cables + c)
         if tables.crossing[string * modes] == 0.0 or not any_greater(tension, zero):
@@ -63,7 +63,7 @@ def measure_strings(tables, layer, rate, work, token):
         x, y, z = _way(tables, layer, c, work.local, token)
         length = square_root(fma(x, x, fma(y, y, z * z)))
         length = where_greater(length, least, length, least)
-        store(work.string, string, slower * tension / length, length * shrink)
+        store(work.string, string, square * tension / length, length * shrink)
 
 
 @kernel

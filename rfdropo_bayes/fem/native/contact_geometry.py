@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 from rfdropo_bayes.fem.constraints import APART
+from rfdropo_bayes.fem.integrators import REBOUND
 from rfdropo_bayes.fem.native.contact_records import CORNERS
 from rfdropo_bayes.fem.native.fields import weighted
 from rfdropo_bayes.fem.native.simd import (
@@ -49,14 +50,16 @@ def turn_cube(touch, token):
 
 
 @kernel
-def free_cube(touch, gravity, drag, time_step, token):
-    """Twist of the cube at the end of a step without contacts; see ``fem.rigid_body.free_twist``."""
+def free_cube(touch, gravity, drag, time_step, wide, going, token):
+    """Twist of the cube at the end of a stage without contacts; see ``fem.rigid_body.free_twist``."""
     one = fill(1.0, touch.cube, token)
-    shrink = one / fma(load(drag, 0, token), time_step, one)
+    shrink = one / fma(load(drag, 0, token) * wide, time_step, one)
     for i in range(3):
-        velocity = fma(load(gravity, i, token), time_step, load(touch.cube, 7 + i, token))
+        velocity = fma(going, load(touch.carried, i, token), load(touch.cube, 7 + i, token))
+        velocity = fma(load(gravity, i, token) * wide, time_step, velocity)
+        spin = fma(going, load(touch.carried, 3 + i, token), load(touch.cube, 10 + i, token))
         store(touch.twist, i, velocity * shrink)
-        store(touch.twist, 3 + i, load(touch.cube, 10 + i, token) * shrink)
+        store(touch.twist, 3 + i, spin * shrink)
 
 
 @kernel
@@ -282,7 +285,7 @@ def trunk_velocity(scene, touch, slot, kind, field, token):
 
 
 @kernel
-def _cube_rate(touch, slot, kind, r, twist, first, token):
+def cube_rate(touch, slot, kind, r, twist, first, token):
     """What the cube's twist, at rows from ``first`` on, adds to a candidate's relative velocity along row r."""
     a, b, c, d, e, f = cube_row(touch, slot, r, kind, token)
     x, y, z = load3(twist, first, token)
@@ -293,17 +296,17 @@ def _cube_rate(touch, slot, kind, r, twist, first, token):
 @kernel
 def add_cube_velocity(touch, slot, kind, u, v, w, twist, first, token):
     """A candidate's relative velocity with what the cube's twist, at rows from ``first`` on, adds to it."""
-    u = u + _cube_rate(touch, slot, kind, 0, twist, first, token)
-    v = v + _cube_rate(touch, slot, kind, 1, twist, first, token)
-    return u, v, w + _cube_rate(touch, slot, kind, 2, twist, first, token)
+    u = u + cube_rate(touch, slot, kind, 0, twist, first, token)
+    v = v + cube_rate(touch, slot, kind, 1, twist, first, token)
+    return u, v, w + cube_rate(touch, slot, kind, 2, twist, first, token)
 
 
 @kernel
-def _closing(touch, slot, u, v, w, time_step, token):
+def _closing(touch, slot, u, v, w, time_step, narrow, token):
     """Velocity at which a candidate presses, given its relative velocity, friction included; see `fem.constraints`."""
     sliding = square_root(fma(v, v, w * w))
     pressed = fma(load(touch.values, 3, token), sliding, -u)
-    return pressed - load(touch.gap, slot, token) * (1.0 / time_step)
+    return pressed - load(touch.gap, slot, token) * (1.0 / time_step) * narrow
 
 
 @kernel
@@ -313,23 +316,56 @@ def _near(touch, slot, value, token):
 
 
 @kernel
-def find_candidates(scene, position, velocity, gravity, drag, touch, time_step, token):
-    """The candidates of a step, and which of them the velocities of its start would close."""
-    zero, one = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token)
+def impact(change, token):
+    """How much of an impact a change of the closing speed is, from 0 to 1."""
+    square = change * change
+    return square / (square + REBOUND * REBOUND)
+
+
+@kernel
+def _longer(touch, slot, u, stage, token):
+    """By how much a stage is longer for a candidate that closes with this relative velocity; see
+    ``fem.integrators``."""
+    zero, one, gap = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token), load(touch.gap, slot, token)
+    closes = where_greater(zero, gap, where_greater(zero, u, one, zero), zero)
+    past = where_greater(closes, zero, gap / where_greater(closes, zero, u, one), zero)
+    longest = fill(stage.elapsed, past, token)
+    longer = where_greater(past, longest, longest, past) - stage.length
+    return where_greater(longer, zero, longer, zero) * impact(u, token)
+
+
+@kernel
+def find_candidates(scene, position, velocity, touch, stage, token):
+    """The candidates of a stage; returns how much longer it is for their impacts, as a factor."""
     turn_cube(touch, token)
-    free_cube(touch, gravity, drag, time_step, token)
-    _place_spheres(scene, touch, position, velocity, time_step, token)
-    reach = _cube_reach(touch, time_step, token)
+    _place_spheres(scene, touch, position, velocity, stage.length, token)
+    reach = _cube_reach(touch, stage.length, token)
     corners = _list_corners(scene, touch, reach, token)
     pushing = _list_pushing(scene, touch, position, corners, reach, token)
     last = _list_lying(scene, touch, position, pushing, token)
     touch.count[0], touch.count[1], touch.count[2] = corners, pushing - corners, last - pushing
+    longest = fill(0.0, touch.cube, token)
     for slot in range(last):
         kind = kind_of(touch, slot)
         u, v, w = trunk_velocity(scene, touch, slot, kind, velocity, token)
         store(touch.rate, 3 * slot, u, v, w)
-        u, v, w = add_cube_velocity(touch, slot, kind, u, v, w, touch.cube, 7, token)
-        closing = where_greater(_closing(touch, slot, u, v, w, time_step, token), -EAGER * one, one, zero)
+        if stage.carried > 0.0:
+            longer = _longer(touch, slot, u + cube_rate(touch, slot, kind, 0, touch.cube, 7, token), stage, token)
+            longest = where_greater(longer, longest, longer, longest)
+    return fill(1.0, longest, token) + longest * (1.0 / stage.length)
+
+
+@kernel
+def choose_closing(touch, gravity, drag, stage, wide, narrow, going, token):
+    """The cube without contacts, and which candidates of a stage the velocities of its start would close."""
+    zero, one, time_step = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token), stage.length
+    free_cube(touch, gravity, drag, time_step, wide, going, token)
+    for slot in range(touch.count[0] + touch.count[1] + touch.count[2]):
+        u, v, w = load3(touch.rate, 3 * slot, token)
+        u, v, w = add_cube_velocity(touch, slot, kind_of(touch, slot), u, v, w, touch.cube, 7, token)
+        if stage.predicted:  # the velocity of the start has closed the gap already
+            store(touch.gap, slot, fnma(u * wide, time_step, load(touch.gap, slot, token)))
+        closing = where_greater(_closing(touch, slot, u, v, w, time_step, narrow, token), -EAGER * one, one, zero)
         # What touched before may hold on by its friction.
         x, y, z = load3(touch.memory, 3 * touch.pair[slot], token)
         closing = where_greater(_dot(x, y, z, x, y, z), zero, one, closing)
@@ -359,7 +395,7 @@ def list_contacts(touch, token):
 
 
 @kernel
-def add_missed(scene, touch, increment, time_step, missed, token):
+def add_missed(scene, touch, increment, time_step, narrow, missed, token):
     """Choose the candidates that a step's solution closes; returns whether there are any."""
     zero, one, found = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token), False
     for slot in range(touch.count[0] + touch.count[1] + touch.count[2]):
@@ -370,7 +406,7 @@ def add_missed(scene, touch, increment, time_step, missed, token):
         u, v, w = load3(touch.rate, 3 * slot, token)
         x, y, z = trunk_velocity(scene, touch, slot, kind, increment, token)
         u, v, w = add_cube_velocity(touch, slot, kind, u + x, v + y, w + z, touch.after, 0, token)
-        near = where_greater(_closing(touch, slot, u, v, w, time_step, token), missed * one, near, zero)
+        near = where_greater(_closing(touch, slot, u, v, w, time_step, narrow, token), missed * one, near, zero)
         if any_greater(near, zero):
             found = True
             store(touch.chosen, slot, chosen + near)

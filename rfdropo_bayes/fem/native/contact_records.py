@@ -62,8 +62,9 @@ class Touch(NamedTuple):
     values: Float[np.ndarray, "4 lanes"]
     memory: Float[np.ndarray, "pairs3 lanes"]  # impulses of the step before, in space [N s]
     turn: Float[np.ndarray, "9 lanes"]  # matrix of the cube's orientation, row-major
-    twist: Float[np.ndarray, "6 lanes"]  # at the end of the step without contacts
+    twist: Float[np.ndarray, "6 lanes"]  # at the end of the stage without contacts
     after: Float[np.ndarray, "6 lanes"]  # with them
+    carried: Float[np.ndarray, "6 lanes"]  # change of the twist with which the stage before goes on; then zero again
     middle: Float[np.ndarray, "spheres3 lanes"]  # the spheres' centres [m]
     reach: Float[np.ndarray, "spheres lanes"]  # gap within which a sphere may meet something in the step [m]
     rate: Float[np.ndarray, "pairs3 lanes"]  # of a candidate: relative velocity by the trunk's at the start of the step
@@ -87,7 +88,7 @@ def touch_storage(spheres: int, lanes: int, dtype: type) -> Touch:
     """Zeroed, aligned storage of one lane block."""
     pairs = pairs_of(spheres)
     sizes = {
-        "cube": CUBE_STATE, "values": CUBE_VALUES, "memory": 3 * pairs, "turn": 9, "twist": 6, "after": 6,
+        "cube": CUBE_STATE, "values": CUBE_VALUES, "memory": 3 * pairs, "turn": 9, "twist": 6, "after": 6, "carried": 6,
         "middle": 3 * spheres, "reach": spheres, "rate": 3 * pairs, "gap": pairs, "frame": 9 * pairs,
         "arm": 3 * pairs, "offset": 3 * pairs,
         "chosen": pairs, "on_cube": 18 * pairs,

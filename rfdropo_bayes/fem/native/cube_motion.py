@@ -1,14 +1,14 @@
-"""Cubes of a lane block: their part of a step's constraints, their motion, and the record."""
+"""Cubes of a lane block: their part of a stage's constraints, their motion, and the record."""
 
 from __future__ import annotations
 
 import math
 
 from rfdropo_bayes.fem.constraints import APART
-from rfdropo_bayes.fem.native.contact_geometry import cube_row, kind_of
+from rfdropo_bayes.fem.native.contact_geometry import cube_rate, cube_row, impact, kind_of
 from rfdropo_bayes.fem.native.contact_records import CORNERS, CUBE_STATE, CUBE_VALUES
 from rfdropo_bayes.fem.native.fields import fill_lanes
-from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, store, where_greater
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store, where_greater
 
 
 @kernel
@@ -21,7 +21,7 @@ def start_cubes(scene, cubes, count, touch, first, token):
 
 
 @kernel
-def add_cube(touch, p, lines, contacts, time_step, token):
+def add_cube(touch, p, lines, contacts, time_step, wide, narrow, token):
     """Add the cube to the problem of a step: W, the velocities without impulses, openings, and where to start."""
     zero, one, n = fill(0.0, touch.cube, token), fill(1.0, touch.cube, token), lines + 3 * contacts
     light = one / load(touch.values, 0, token)
@@ -31,7 +31,7 @@ def add_cube(touch, p, lines, contacts, time_step, token):
     for c in range(contacts):
         slot = touch.contact[c]
         kind, chosen = kind_of(touch, slot), load(touch.chosen, slot, token)
-        opening = load(touch.gap, slot, token) * (1.0 / time_step)
+        opening = load(touch.gap, slot, token) * (1.0 / time_step) * narrow
         store(p.opening, c, where_greater(chosen, zero, opening, one * APART))
         for r in range(3):
             i = lines + 3 * c + r
@@ -45,7 +45,7 @@ def add_cube(touch, p, lines, contacts, time_step, token):
             for k in range(3):
                 remembered = load(touch.memory, 3 * touch.pair[slot] + k, token)
                 before = fma(remembered, load(touch.frame, 9 * slot + 3 * r + k, token), before)
-            before = where_greater(chosen, zero, before, zero)
+            before = where_greater(chosen, zero, before * wide, zero)
             store(p.impulse, i, before)
             if r > 0:
                 store(p.held, 2 * c + r - 1, before)
@@ -76,7 +76,7 @@ def stop_cube(touch, p, lines, contacts, token):
 
 
 @kernel
-def remember_impulses(scene, touch, p, lines, contacts, accepted, token):
+def remember_impulses(scene, touch, p, lines, contacts, narrow, accepted, token):
     """Keep the impulses of a step that was taken, in space: the next one starts from them, and friction goes on."""
     zero, taken = fill(0.0, touch.cube, token), load(accepted, 0, token)
     for i in range(3 * (CORNERS + 2 * scene.spheres)):
@@ -88,16 +88,55 @@ def remember_impulses(scene, touch, p, lines, contacts, accepted, token):
             for r in range(3):
                 impulse = load(p.impulse, lines + 3 * c + r, token)
                 total = fma(impulse, load(touch.frame, 9 * slot + 3 * r + k, token), total)
-            store(touch.memory, 3 * touch.pair[slot] + k, where_greater(taken, zero, total, zero))
+            store(touch.memory, 3 * touch.pair[slot] + k, where_greater(taken, zero, total * narrow, zero))
 
 
 @kernel
-def _move_cube(touch, time_step, lane, lanes):
-    """Let the cube move on with ``after``; see ``fem.rigid_body.moved``. Returns False if that leads nowhere."""
+def find_impacts(touch, p, lines, contacts, token):
+    """Impulses of contacts into ``before``, as far as they are impacts: as they change the closing speed."""
+    for c in range(contacts):
+        slot, i = touch.contact[c], lines + 3 * c
+        start = load(touch.rate, 3 * slot, token)
+        start = start + cube_rate(touch, slot, kind_of(touch, slot), 0, touch.cube, 7, token)
+        share = impact(load(p.velocity, i, token) - start, token)
+        for r in range(3):
+            store(p.before, i + r, share * load(p.impulse, i + r, token))
+
+
+@kernel
+def carry_cube(touch, p, lines, contacts, later, accepted, token):
+    """The change of the cube's twist without impacts, where a later stage carries a share of it on."""
+    zero, taken = fill(0.0, touch.cube, token), load(accepted, 0, token)
+    light = fill(1.0, touch.cube, token) / load(touch.values, 0, token)
+    gyration = load(touch.values, 2, token)
+    for k in range(6):
+        total = zero
+        for i in range(3 * contacts if later > 0.0 else 0):
+            total = fma(load(touch.on_cube, 6 * i + k, token), load(p.before, lines + i, token), total)
+        share = light if k < 3 else light / (gyration * gyration)
+        change = load(touch.after, k, token) - load(touch.cube, 7 + k, token)
+        change = where_greater(taken, zero, fnma(share, total, change), zero)
+        store(touch.carried, k, change if later > 0.0 else zero)
+
+
+@kernel
+def predict_cubes(touch, time, token):
+    """Let the cubes move on at their velocity and spin."""
+    lanes = len(token)
+    for lane in range(lanes):
+        for i in range(6):
+            touch.after[i * lanes + lane] = touch.cube[(7 + i) * lanes + lane]
+        _move_cube(touch, time, 0.0, lane, lanes)
+
+
+@kernel
+def _move_cube(touch, time_step, moved, lane, lanes):
+    """Let the cube move on with ``after``, less the share of its velocity and spin with which it has ``moved`` already;
+    see ``fem.rigid_body.moved``. Returns False if that leads nowhere."""
     wx, wy, wz = (
-        0.5 * time_step * touch.after[3 * lanes + lane],
-        0.5 * time_step * touch.after[4 * lanes + lane],
-        0.5 * time_step * touch.after[5 * lanes + lane],
+        0.5 * time_step * (touch.after[3 * lanes + lane] - moved * touch.cube[10 * lanes + lane]),
+        0.5 * time_step * (touch.after[4 * lanes + lane] - moved * touch.cube[11 * lanes + lane]),
+        0.5 * time_step * (touch.after[5 * lanes + lane] - moved * touch.cube[12 * lanes + lane]),
     )
     square = wx * wx + wy * wy + wz * wz
     angle = math.sqrt(square)
@@ -110,9 +149,12 @@ def _move_cube(touch, time_step, lane, lanes):
     qz = scalar * z + w * wz + wx * y - wy * x
     qw = scalar * w - wx * x - wy * y - wz * z
     length = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
-    px = touch.cube[lane] + time_step * touch.after[lane]
-    py = touch.cube[lanes + lane] + time_step * touch.after[lanes + lane]
-    pz = touch.cube[2 * lanes + lane] + time_step * touch.after[2 * lanes + lane]
+    vx = touch.after[lane] - moved * touch.cube[7 * lanes + lane]
+    vy = touch.after[lanes + lane] - moved * touch.cube[8 * lanes + lane]
+    vz = touch.after[2 * lanes + lane] - moved * touch.cube[9 * lanes + lane]
+    px = touch.cube[lane] + time_step * vx
+    py = touch.cube[lanes + lane] + time_step * vy
+    pz = touch.cube[2 * lanes + lane] + time_step * vz
     if not math.isfinite(px + py + pz + length):
         return False
     touch.cube[lane], touch.cube[lanes + lane], touch.cube[2 * lanes + lane] = px, py, pz
@@ -124,13 +166,14 @@ def _move_cube(touch, time_step, lane, lanes):
 
 
 @kernel
-def take_cube_step(touch, accepted, lost, time_step, token):
-    """Move the cube on where the body's step was taken, else stop it; marks lanes where that leads nowhere."""
-    lanes = len(token)
+def take_cube_stage(touch, accepted, lost, length, wide, predicted, token):
+    """Move the cube on where the body's stage was taken, else stop it; marks lanes where that leads nowhere."""
+    lanes, moved = len(token), 1.0 if predicted else 0.0
     for lane in range(lanes):
-        if not (accepted[lane] > 0.0 and _move_cube(touch, time_step, lane, lanes)):
+        if not (accepted[lane] > 0.0 and _move_cube(touch, length * wide[lane], moved, lane, lanes)):
             for i in range(6):
                 touch.cube[(7 + i) * lanes + lane] = 0.0
+                touch.carried[i * lanes + lane] = 0.0
             lost[lane] = 1.0
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import ArrayLike, Float, Int
 
 from rfdropo_bayes.fem.bending_law import relative_curvature, section_areas
 from rfdropo_bayes.fem.effects import BodyEffects
+from rfdropo_bayes.fem.integrators import Stage
 from rfdropo_bayes.fem.layered import LayeredBody
 from rfdropo_bayes.fem.native import layered_effects as at
 
@@ -19,16 +21,24 @@ def _each(function: Callable[[float], float], values: ArrayLike, count: int) -> 
     return np.array([function(float(value)) for value in np.broadcast_to(values, count)])
 
 
-def effect_rows(effects: BodyEffects, count: int, time_step: float) -> Float[np.ndarray, "batch rows"]:
+def _decay(time: float, rate: float) -> float:
+    """What a time leaves of the moduli."""
+    return math.exp(-rate * time)
+
+
+def effect_rows(
+    effects: BodyEffects, count: int, stages: Sequence[Stage], time_step: float
+) -> Float[np.ndarray, "batch rows"]:
     """Numbers of the effects beside the bending law, null where there are none."""
-    rows = np.zeros((count, at.EFFECTS))
-    rows[:, at.DECAY] = 1.0
+    rows, length = np.zeros((count, at.EFFECTS)), stages[0].length * time_step
+    rows[:, at.DECAY : at.LATER_DECAY + 1] = 1.0
     if effects.viscoelasticity is not None:
         fraction, time = (np.asarray(value, float) for value in effects.viscoelasticity)
-        rows[:, at.SHARE] = time_step / (time + time_step)
+        rows[:, at.SHARE] = length / (time + length)
         rows[:, at.GAIN] = fraction * (1.0 - rows[:, at.SHARE])
     if effects.softening_rate is not None:
-        rows[:, at.DECAY] = _each(lambda rate: math.exp(-rate * time_step), effects.softening_rate, count)
+        for k, stage in enumerate(stages):
+            rows[:, at.DECAY + k] = _each(partial(_decay, stage.elapsed * time_step), effects.softening_rate, count)
     if effects.drag is not None:
         rows[:, at.DRAG] = effects.drag
     if effects.wall is not None:

@@ -20,6 +20,7 @@ from jaxtyping import Float
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
 from rfdropo_bayes.fem.equilibrium import ITERATIONS
+from rfdropo_bayes.fem.integrators import STAGES, Integrator, timed_stages
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
 from rfdropo_bayes.fem.native.contact_records import (
@@ -98,11 +99,12 @@ class NativeLayered:
     Args:
         system: body, cables, and how many stations are held.
         points: the points whose positions are recorded.
-        time_step: of one implicit Euler step [s].
+        time_step: of one step [s].
         precision: of all arithmetic; parameters, commands and results are float64 in any case.
         threads: lane blocks computed at the same time; None for all processors this process may use.
         lanes: samples side by side; None for as many as a vector register holds.
         scene: what the body pushes a cube on; None for a body that touches nothing.
+        integrator: how a step is taken.
 
     Raises:
         InputError: unknown precision, or a number of threads or lanes that makes no sense.
@@ -118,12 +120,13 @@ class NativeLayered:
         threads: int | None = None,
         lanes: int | None = None,
         scene: PushScene | None = None,
+        integrator: Integrator = "euler",
     ) -> None:
         if precision not in _NUMERICS:
             raise InputError(f"precision {precision!r}", remedy=f"use one of {', '.join(_NUMERICS)}")
         if threads is not None and threads < 1:
             raise InputError(f"{threads} threads", remedy="use at least one, or None for all processors")
-        self.system, self.time_step = system, float(time_step)
+        self.system, self.time_step, self.integrator = system, float(time_step), integrator
         self.precision, self.dtype = precision, np.dtype(precision)
         self.threads = threads or available_threads()
         self.lanes = lanes or native_lanes(self.dtype)
@@ -141,6 +144,7 @@ class NativeLayered:
         displacement: Float[np.ndarray, "*batch steps cables"],
         *,
         start: Float[np.ndarray, "*batch cables"] | None = None,
+        before: Float[np.ndarray, "*batch cables"] | None = None,
         steps: int | None = None,
         stride: int = 1,
         cube: tuple[Float[np.ndarray, "*batch 13"], Float[np.ndarray, "*batch 4"]] | None = None,
@@ -152,6 +156,8 @@ class NativeLayered:
             displacement: cable displacements [m] at the end of every step, one sequence for all or one per rollout.
             start: cable displacements [m] whose static equilibrium is the initial state, as in
                 ``fem.static_equilibrium``; None starts undeformed.
+            before: cable displacements [m] before the first step of a body that starts undeformed; zero by default.
+                Stages within the step take theirs from the way to its end.
             steps: compute only so many steps.
             stride: record every so many steps.
             cube: of an engine with a scene: centre [m], unit quaternion (x, y, z, w), velocity [m/s] and spin [rad/s]
@@ -160,7 +166,7 @@ class NativeLayered:
         Raises:
             InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
         """
-        run = self.run_of(material, displacement, start, steps, stride, cube)
+        run = self.run_of(material, displacement, start, before, steps, stride, cube)
         rubs = material.effects.rubs
         in_blocks(
             lambda first: self.run_block(run, self.records(rubs), first), run.batch.count, self.lanes, self.threads
@@ -195,6 +201,7 @@ class NativeLayered:
         material: Material,
         displacement: np.ndarray,
         start: np.ndarray | None,
+        before: np.ndarray | None,
         steps: int | None,
         stride: int,
         cube: tuple[np.ndarray, np.ndarray] | None,
@@ -204,7 +211,8 @@ class NativeLayered:
         cables = self.tables.cables
         if displacement.ndim not in (2, 3) or displacement.shape[-1] != cables:
             raise InputError(f"displacement has shape {displacement.shape} for {cables} cables", where="rollout")
-        begin = np.zeros(cables) if start is None else np.asarray(start, dtype=float)
+        given = before if start is None else start
+        begin = np.zeros(cables) if given is None else np.asarray(given, dtype=float)
         if begin.ndim not in (1, 2) or begin.shape[-1] != cables:
             raise InputError(f"start has shape {begin.shape} for {cables} cables", where="rollout")
         moves = displacement.reshape(-1, displacement.shape[-2] * cables)
@@ -214,7 +222,8 @@ class NativeLayered:
             raise InputError("a scene without a cube, or a cube without a scene", where="rollout")
         cubes = None if cube is None else cube_rows(*cube, batch.count, self.dtype)
         settling = 0 if start is None else ITERATIONS
-        schedule = Schedule(self.time_step, steps, int(stride), settling, *_NUMERICS[self.precision])
+        stages = timed_stages(self.integrator, self.time_step)
+        schedule = Schedule(self.time_step, steps, int(stride), settling, *_NUMERICS[self.precision], *stages)
         return self.with_output(Run(batch, cubes, schedule))
 
     def with_output(self, run: Run) -> Run:
@@ -261,7 +270,7 @@ class NativeLayered:
             "layer_scale": rows["stiffness_scale"],
             "point_mass": rows["point_mass"],
             "law": law_rows(effects, self.system.body, modulus, shear, rows["stiffness_scale"]),
-            "effects": effect_rows(effects, count, self.time_step),
+            "effects": effect_rows(effects, count, STAGES[self.integrator], self.time_step),
             **commands,
         }
         arrays = {name: np.ascontiguousarray(array, dtype=self.dtype) for name, array in arrays.items()}

@@ -91,21 +91,37 @@ def _local_field(rest, modes, layer, factors, work, token):
 
 
 @kernel
-def add_branch(tables, factors, layer, work, token):
-    """Let the dashpot of a layer's Prony branch follow, and add to ``local`` what the branch makes of its strain."""
-    modes, rest, frame = tables.modes, tables.rest, 9 * layer
-    share, gain = load(factors.share, 0, token), load(factors.branch, 0, token)
+def _strain(tables, layer, k, i, x, y, z, work, token):
+    """Component i of a mode's displacement in the layer's frame, relative to the lower section."""
+    row, base = 3 * layer * tables.modes + 3 * k + i, 3 * layer * tables.modes + i
+    constant = k == 0 or k == tables.modes
+    still = tables.rest[row] - tables.rest[base] if constant else tables.rest[row]
+    return _turned(work.axes, 9 * layer, x, y, z, i, token) - still
+
+
+@kernel
+def follow_branch(tables, factors, layer, work, token):
+    """Let the dashpot of a layer's Prony branch follow the strain."""
+    modes, share = tables.modes, load(factors.share, 0, token)
     base = 3 * layer * modes
     for k in range(2 * modes):
-        row = base + 3 * k
-        constant = k == 0 or k == modes
-        x, y, z = _relative(work.position, row, base, constant, token)
+        x, y, z = _relative(work.position, base + 3 * k, base, k == 0 or k == modes, token)
         for i in range(3):
-            still = rest[row + i] - rest[base + i] if constant else rest[row + i]
-            strain, t = _turned(work.axes, frame, x, y, z, i, token) - still, 2 * base + 3 * k + i
+            strain, t = _strain(tables, layer, k, i, x, y, z, work, token), 2 * base + 3 * k + i
             behind = load(work.branch, t, token)
-            behind = fma(share, strain - behind, behind)
-            store(work.branch, t, behind)
+            store(work.branch, t, fma(share, strain - behind, behind))
+
+
+@kernel
+def add_branch(tables, factors, layer, work, token):
+    """Add to ``local`` what the Prony branch of a layer makes of its strain."""
+    modes, gain = tables.modes, load(factors.branch, 0, token)
+    base = 3 * layer * modes
+    for k in range(2 * modes):
+        x, y, z = _relative(work.position, base + 3 * k, base, k == 0 or k == modes, token)
+        for i in range(3):
+            strain = _strain(tables, layer, k, i, x, y, z, work, token)
+            behind = load(work.branch, 2 * base + 3 * k + i, token)
             store(work.local, 3 * k + i, fma(gain, strain - behind, load(work.local, 3 * k + i, token)))
 
 
@@ -275,11 +291,12 @@ def subtract_tangent_product(tables, samples, factors, change, field, work, toke
 
 
 @kernel
-def assemble_layer(tables, samples, factors, layer, rate, work, whole, token):
-    """Frame and force of a layer, and its part of the matrix; see `_layer_tangent` for ``whole``."""
+def assemble_layer(tables, samples, factors, layer, square, strings, work, whole, token):
+    """Frame and force of a layer, and its part of the matrix, of a stage whose length has this ``square``; see
+    `add_layer_force` for ``strings`` and `_layer_tangent` for ``whole``."""
     layer_frame(tables, layer, work, token)
-    measure_strings(tables, layer, rate, work, token)
-    add_layer_force(tables, samples, factors, layer, work, True, token)
+    measure_strings(tables, layer, square, work, token)
+    add_layer_force(tables, samples, factors, layer, work, strings, token)
     first = layer * tables.entries
     _layer_tangent(tables.parity, tables.modes, samples.stiffness, first, layer, whole, factors, work, token)
     add_strings(tables, layer, work, whole, token)

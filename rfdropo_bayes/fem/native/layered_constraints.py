@@ -1,4 +1,4 @@
-"""A step of a layered body in SIMD lanes with everything that holds it: cables, slip at their guides, and contacts.
+"""A stage of a layered body in SIMD lanes with everything that holds it: cables, slip at their guides, and contacts.
 
 Slip and contacts are further border rows of the factor that the step has already. What is None is not there.
 """
@@ -12,20 +12,35 @@ from jaxtyping import Float
 
 from rfdropo_bayes.fem.native.chain_cholesky import condense_rows, extend_border
 from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
-from rfdropo_bayes.fem.native.contact_geometry import add_missed, find_candidates, list_contacts, sphere_of, weights
-from rfdropo_bayes.fem.native.cube_motion import add_cube, remember_impulses, stop_cube, take_cube_step
+from rfdropo_bayes.fem.native.contact_geometry import (
+    add_missed,
+    choose_closing,
+    find_candidates,
+    list_contacts,
+    sphere_of,
+    weights,
+)
+from rfdropo_bayes.fem.native.cube_motion import (
+    add_cube,
+    carry_cube,
+    find_impacts,
+    remember_impulses,
+    stop_cube,
+    take_cube_stage,
+)
 from rfdropo_bayes.fem.native.fields import clear
 from rfdropo_bayes.fem.native.layered_step import (
     condense_increment,
     refine_increment,
+    set_factors,
     start_problem,
     substitute_increment,
-    take_step,
+    take_stage,
     take_tensions,
     weigh_border,
     weigh_rows,
 )
-from rfdropo_bayes.fem.native.simd import aligned_zeros, fill, fma, kernel, load, store
+from rfdropo_bayes.fem.native.simd import aligned_zeros, fill, fma, kernel, load, store, where_greater
 from rfdropo_bayes.fem.native.slip_rows import add_friction, gather_slip, kinds_present, remember_slip, sum_losses
 
 
@@ -117,11 +132,13 @@ def _condense(tables, rows, work, p, n, panels, slips, corners, top, token):
 
 
 @kernel
-def _hold(tables, runs, scene, samples, factors, work, friction, touch, rows, p, slips, contacts, schedule, token):
-    """Impulses of all constraints, and the solution of the step with them."""
-    time_step, cables, size = schedule.time_step, tables.cables, 3 * tables.modes
+def _hold(
+    tables, runs, scene, samples, factors, work, friction, touch, rows, p, slips, contacts, length, schedule, token
+):  # fmt: skip
+    """Impulses of all constraints, and the solution of the stage with them."""
+    cables, size = tables.cables, 3 * tables.modes
     lines, slip_panels, corners, top = cables + slips, (slips + 2) // 3, 0, 0
-    n, rate = lines + 3 * contacts, 1.0 / time_step
+    n, rate = lines + 3 * contacts, 1.0 / length
     clear(p.matrix, 0, n * n, token)
     start_problem(tables, factors, work, p, n, rate, token)
     if scene is not None:
@@ -132,14 +149,15 @@ def _hold(tables, runs, scene, samples, factors, work, friction, touch, rows, p,
     if runs is not None or scene is not None:
         clear(rows.border, 0, 3 * (top + 1) * panels * size if panels > 0 else 0, token)
         if runs is not None:
-            gather_slip(tables, runs, samples, friction, rows.border, panels, p, work, time_step, token)
+            gather_slip(tables, runs, samples, factors, friction, rows.border, panels, p, work, length, token)
         if scene is not None:
             _gather_contacts(tables, scene, touch, rows, p, lines, contacts, slip_panels, panels, token)
         if panels > 0:
             _condense(tables, rows, work, p, n, panels, slips, corners, top, token)
         if scene is not None:
-            add_cube(touch, p, lines, contacts, time_step, token)
-    soften(p, cables, slips, contacts, time_step, schedule.softness, token)
+            wide, narrow = load(factors.wide, 0, token), load(factors.narrow, 0, token)
+            add_cube(touch, p, lines, contacts, length, wide, narrow, token)
+    soften(p, cables, slips, contacts, length, schedule.softness, token)
     solve_problem(p, cables, slips, contacts, schedule.settled, token)
     weigh_border(cables, work, p, token)
     weigh_rows(tables, work, token)
@@ -164,8 +182,8 @@ def _add_rows(tables, rows, work, p, panels, slips, corners, top, token):
 
 
 @kernel
-def _add_forces(scene, touch, p, lines, contacts, field, token):
-    """Add the contacts' impulses to a field."""
+def _add_forces(scene, touch, impulses, lines, contacts, accepted, field, token):
+    """Add the contacts' impulses to a field, in the lanes that are accepted."""
     for c in range(touch.count[3], contacts):
         slot, i = touch.contact[c], lines + 3 * c
         sphere = sphere_of(scene, touch.pair[slot])
@@ -174,43 +192,66 @@ def _add_forces(scene, touch, p, lines, contacts, field, token):
             for j in range(3):
                 push = fill(0.0, field, token)
                 for r in range(3):
-                    impulse = load(p.impulse, i + r, token) * (centre if r == 0 else around)
+                    impulse = load(impulses, i + r, token) * (centre if r == 0 else around)
                     push = fma(impulse, load(touch.frame, 9 * slot + 3 * r + j, token), push)
                 row = scene.place[k] + j
-                store(field, row, load(field, row, token) + push)
+                old = load(field, row, token)
+                store(field, row, where_greater(accepted, fill(0.0, field, token), old + push, old))
 
 
 @kernel
-def constrained_step(tables, runs, scene, samples, factors, work, friction, touch, rows, p, schedule, token):
-    """One implicit Euler step of a body, its cables' friction and its cube."""
-    time_step, slips, contacts = schedule.time_step, 0, 0
-    condense_increment(tables, samples, factors, work, 1.0 / time_step, token)
+def _carry_contacts(tables, scene, touch, work, p, lines, contacts, later, token):
+    """What the next stage goes on with of what contacts did: nothing of their impacts."""
+    find_impacts(touch, p, lines, contacts, token)
+    carry_cube(touch, p, lines, contacts, later, work.accepted, token)
+    if later > 0.0:
+        clear(work.sudden, 0, 3 * tables.modes * tables.stations, token)
+        accepted = load(work.accepted, 0, token)
+        _add_forces(scene, touch, p.before, lines, contacts, accepted, work.sudden, token)
+
+
+@kernel
+def constrained_stage(tables, runs, scene, samples, factors, work, friction, touch, rows, p, schedule, number, token):
+    """One stage of a body, its cables' friction and its cube."""
+    stage, slips, contacts, cables = schedule.stages[number], 0, 0, tables.cables
+    length, later = stage.length, schedule.stages[number + 1].carried if number + 1 < schedule.count else 0.0
+    if scene is not None:
+        wide = find_candidates(scene, work.position, work.velocity, touch, stage, token)
+        if stage.carried > 0.0:
+            set_factors(samples, factors, work, stage, wide, token)
+        going, narrow = load(factors.going, 0, token), load(factors.narrow, 0, token)
+        choose_closing(touch, samples.gravity, samples.damping, stage, wide, narrow, going, token)
+    condense_increment(tables, samples, factors, work, stage, token)
     if runs is not None:
         slips = kinds_present(samples)[0] * runs.count
-    if scene is not None:
-        find_candidates(scene, work.position, work.velocity, samples.gravity, samples.damping, touch, time_step, token)
     again = True
     while again:
         again = False
         if scene is not None:
             contacts = list_contacts(touch, token)
-        _hold(tables, runs, scene, samples, factors, work, friction, touch, rows, p, slips, contacts, schedule, token)
+        _hold(
+            tables, runs, scene, samples, factors, work, friction, touch, rows, p, slips, contacts, length, schedule,
+            token,
+        )  # fmt: skip
         if scene is not None:
-            stop_cube(touch, p, tables.cables + slips, contacts, token)
-            again = add_missed(scene, touch, work.solution, time_step, schedule.missed, token)
-    take_tensions(tables.cables, work, 1.0 / time_step, token)
+            stop_cube(touch, p, cables + slips, contacts, token)
+            again = add_missed(scene, touch, work.solution, length, narrow, schedule.missed, token)
+    take_tensions(cables, factors, work, 1.0 / length, token)
     if runs is not None:
         sum_losses(tables, runs, samples, friction, p, token)
     if schedule.refinements > 0:
         if runs is not None:
             add_friction(tables, friction, work.field, token)
         if scene is not None:
-            _add_forces(scene, touch, p, tables.cables + slips, contacts, work.field, token)
+            one = fill(1.0, work.field, token)
+            _add_forces(scene, touch, p.impulse, cables + slips, contacts, one, work.field, token)
     for _ in range(schedule.refinements):
         refine_increment(tables, samples, factors, work, token)
-    take_step(tables, work, time_step, token)
+    take_stage(tables, factors, work, stage, token)
     if runs is not None:
-        remember_slip(tables, friction, p, work, slips, time_step, token)
+        remember_slip(tables, factors, friction, p, work, slips, length, later, token)
     if scene is not None:
-        remember_impulses(scene, touch, p, tables.cables + slips, contacts, work.accepted, token)
-        take_cube_step(touch, work.accepted, work.lost, time_step, token)
+        if schedule.count > 1:
+            _carry_contacts(tables, scene, touch, work, p, cables + slips, contacts, later, token)
+        remember_impulses(scene, touch, p, cables + slips, contacts, narrow, work.accepted, token)
+        take_cube_stage(touch, work.accepted, work.lost, length, factors.wide, stage.predicted, token)

@@ -13,8 +13,8 @@ from rfdropo_bayes.fem.surroundings import STILL, WALL_SOFTNESS
 BENDING, BRANCH, SURROUNDED, FRICTION = range(4)
 """Flags in ``samples.present``; the last one is Coulomb's friction, that of the capstan follows it."""
 FLAGS = FRICTION + 2
-GAIN, SHARE, DECAY, DRAG, WALL, DISTANCE, NORMAL_X, NORMAL_Y, GIVE, COULOMB, CAPSTAN = range(11)
-"""Rows of ``samples.effects``; gain and share are those of a step, decay that of the moduli in a step."""
+GAIN, SHARE, DECAY, LATER_DECAY, DRAG, WALL, DISTANCE, NORMAL_X, NORMAL_Y, GIVE, COULOMB, CAPSTAN = range(12)
+"""Rows of ``samples.effects``; gain and share are those of a stage, decay that of the moduli in each stage."""
 EFFECTS = CAPSTAN + 1
 LAW = 9
 """Rows of ``samples.law`` for each layer: linear 00, 01, 02, 11, 12, 22, then EI / L about x and y, then cubic."""
@@ -155,8 +155,11 @@ def add_law_tangent(tables, factors, layer, work, whole, token):
 
 
 @kernel
-def add_surroundings(tables, samples, factors, station, work, token):
-    """Add the wall and the fluid of a station to ``field`` and to its pivot; keeps their part of the matrix."""
+def add_surroundings(tables, samples, factors, station, predicted, work, token):
+    """Add the wall and the fluid of a station to ``field`` and to its pivot; keeps their part of the matrix.
+
+    ``predicted``: the wall is met where the position is, and the fluid with the derivative of the speed.
+    """
     zero, row = fill(0.0, work.field, token), 3 * station * tables.modes
     x, y = load(work.position, row, token), load(work.position, row + 1, token)
     u, v, w = load3(work.velocity, row, token)
@@ -169,10 +172,12 @@ def add_surroundings(tables, samples, factors, station, work, token):
     stiffness = load(samples.effects, WALL, token) * tables.section_length[station]
     slope = into * (0.5 / WALL_SOFTNESS)
     wall = step * step * stiffness * slope
-    push = step * stiffness * fma(0.5 * slope, into, beyond) + wall * fma(nx, u, ny * v)
+    push = step * stiffness * fma(0.5 * slope, into, beyond)
+    if not predicted:
+        push = push + wall * fma(nx, u, ny * v)
     speed = square_root(fma(u, u, fma(v, v, w * w)) + STILL * STILL)
     drag = load(factors.fluid, 0, token) * load(samples.effects, DRAG, token) * tables.section_area[station] * speed
-    store(work.around, 2 * station, wall, drag)
+    store(work.around, 3 * station, wall, drag)
     store(work.field, row, fnma(push, nx, fnma(drag, u, load(work.field, row, token))))
     store(work.field, row + 1, fnma(push, ny, fnma(drag, v, load(work.field, row + 1, token))))
     store(work.field, row + 2, fnma(drag, w, load(work.field, row + 2, token)))
@@ -182,6 +187,16 @@ def add_surroundings(tables, samples, factors, station, work, token):
     store(work.pivot, t + 3, fma(wall * nx, ny, load(work.pivot, t + 3, token)))
     store(work.pivot, t + 4, fma(wall * ny, ny, load(work.pivot, t + 4, token)) + drag)
     store(work.pivot, t + 8, load(work.pivot, t + 8, token) + drag)
+    if predicted:
+        steep = drag / (speed * speed)
+        store(work.around, 3 * station + 2, steep)
+        for c in range(3):
+            along = steep * load(work.velocity, row + c, token)
+            for r in range(3):
+                k = t + 3 * c + r
+                store(work.pivot, k, fma(along, load(work.velocity, row + r, token), load(work.pivot, k, token)))
+    else:
+        store(work.around, 3 * station + 2, zero)
 
 
 @kernel
@@ -190,9 +205,12 @@ def subtract_surroundings_product(tables, samples, change, field, work, token):
     nx, ny = load(samples.effects, NORMAL_X, token), load(samples.effects, NORMAL_Y, token)
     for station in range(tables.stations):
         row = 3 * station * tables.modes
-        wall, drag = load(work.around, 2 * station, token), load(work.around, 2 * station + 1, token)
-        x, y = load(change, row, token), load(change, row + 1, token)
+        wall, drag, steep = load3(work.around, 3 * station, token)
+        x, y, z = load3(change, row, token)
         push = wall * fma(nx, x, ny * y)
-        store(field, row, fnma(push, nx, fnma(drag, x, load(field, row, token))))
-        store(field, row + 1, fnma(push, ny, fnma(drag, y, load(field, row + 1, token))))
-        store(field, row + 2, fnma(drag, load(change, row + 2, token), load(field, row + 2, token)))
+        u, v, w = load3(work.velocity, row, token)
+        along = steep * fma(u, x, fma(v, y, w * z))
+        a, b, c = load3(field, row, token)
+        store(field, row, fnma(along, u, fnma(push, nx, fnma(drag, x, a))))
+        store(field, row + 1, fnma(along, v, fnma(push, ny, fnma(drag, y, b))))
+        store(field, row + 2, fnma(along, w, fnma(drag, z, c)))

@@ -46,6 +46,9 @@ class Factors(NamedTuple):
     branch: Float[np.ndarray, "1 lanes"]  # of the elastic force of the Prony branch
     share: Float[np.ndarray, "1 lanes"]  # of its strain that its dashpot follows
     give: Float[np.ndarray, "1 lanes"]  # of a cable's length per impulse, over the time step
+    wide: Float[np.ndarray, "1 lanes"]  # length of the stage for its impacts, in that of the others
+    narrow: Float[np.ndarray, "1 lanes"]  # its inverse
+    going: Float[np.ndarray, "1 lanes"]  # share of the change of velocity in the stage before that is carried on
 
 
 class Work(NamedTuple):
@@ -74,7 +77,8 @@ class Work(NamedTuple):
     lost: Float[np.ndarray, "1 lanes"]  # 1 once a step was not taken
     failed: Float[np.ndarray, "1 lanes"]  # 1 once impulses were not found
     points: Float[np.ndarray, "point_values lanes"]
-    before: Float[np.ndarray, "values lanes"]  # static iteration: the increment before
+    before: Float[np.ndarray, "values lanes"]  # the increment of the stage or static iteration before
+    sudden: Float[np.ndarray, "values lanes"]  # impulses of contacts that began in the stage before
     relaxation: Float[np.ndarray, "1 lanes"]
     beyond: Float[np.ndarray, "layers3 lanes"]  # force of the cables on the stations beyond each layer
     imbalance: Float[np.ndarray, "1 lanes"]
@@ -88,7 +92,7 @@ class Work(NamedTuple):
     softness: Float[np.ndarray, "1 lanes"]  # what time has left of the moduli
     branch: Float[np.ndarray, "layer_values lanes"]  # strain of the dashpots, as displacements
     slope: Float[np.ndarray, "layers6 lanes"]  # derivatives of the bending law's moments
-    around: Float[np.ndarray, "stations2 lanes"]  # wall and fluid in the matrix
+    around: Float[np.ndarray, "stations3 lanes"]  # wall and fluid in the matrix
 
 
 class Runs(NamedTuple):

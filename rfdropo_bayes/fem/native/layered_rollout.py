@@ -8,15 +8,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from rfdropo_bayes.fem.native.cube_motion import record_cubes, start_cubes
+from rfdropo_bayes.fem.integrators import EULER, Stage
+from rfdropo_bayes.fem.native.cube_motion import predict_cubes, record_cubes, start_cubes
 from rfdropo_bayes.fem.native.fields import clear, fill_lanes, point
 from rfdropo_bayes.fem.native.kernel_cache import named_by
-from rfdropo_bayes.fem.native.layered_assembly import add_branch, layer_frame
-from rfdropo_bayes.fem.native.layered_constraints import constrained_step
-from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, GAIN, GIVE, LAW, SHARE
+from rfdropo_bayes.fem.native.layered_assembly import follow_branch, layer_frame
+from rfdropo_bayes.fem.native.layered_constraints import constrained_stage
+from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, LAW
 from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
-from rfdropo_bayes.fem.native.layered_step import solve_increment
+from rfdropo_bayes.fem.native.layered_step import set_factors, solve_statics
 from rfdropo_bayes.fem.native.section_modes import LayeredTables, border_panels
 from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store, whole
 from rfdropo_bayes.fem.native.slip_rows import start_slip
@@ -35,7 +36,7 @@ class Batch(NamedTuple):
     law: Float[np.ndarray, "batch layer_rows"]
     effects: Float[np.ndarray, "batch rows"]
     present: Int[np.ndarray, " flags"]
-    start: Float[np.ndarray, "rows cables"]  # displacements of the initial equilibrium
+    start: Float[np.ndarray, "rows cables"]  # displacements before the first step, those of the initial equilibrium
     displacement: Float[np.ndarray, "rows steps cables"]
     count: int
     start_pitch: int  # from one row to the next, 0 where one serves all
@@ -63,7 +64,9 @@ class Schedule(NamedTuple):
     settled: float  # relative change of the velocities that ends the iterations of a step
     softness: float  # of the cables, relative to W
     missed: float  # [m/s] velocity at which surfaces may meet that were not taken to
-    refinements: int  # of every step's linear solution
+    refinements: int  # of every stage's linear solution
+    count: int = 1  # stages of a step
+    stages: tuple[Stage, Stage] = (EULER, EULER)  # in seconds; the first ``count`` of them
     resumed: int = 0  # 1 goes on from the state in ``Work`` instead of starting anew
 
 
@@ -86,10 +89,10 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> tuple[Samples, Fa
         position=values, velocity=values, pivot=values * size, coupling=values * size, border=3 * panels * values,
         condensed=9 * panels * panels, solution=values, field=values, correction=values, weight=3 * panels,
         axes=9 * layers, dyads=54, local=section, reaction=section, pull=3 * (len(tables.guide_first) - 1),
-        slack=cables, tension=cables, commanded=cables, points=3 * tables.points, before=values, beyond=3 * layers,
-        held=layers, string=2 * layers * cables, ways=3 * web * cables,
+        slack=cables, tension=cables, commanded=cables, points=3 * tables.points, before=values, sudden=values,
+        beyond=3 * layers, held=layers, string=2 * layers * cables, ways=3 * web * cables,
         pulled=3 * web * cables, web=9 * web**2, branch=layers * section, slope=6 * layers,
-        around=2 * stations, unsolved=1, accepted=1, lost=1, failed=1, relaxation=1, imbalance=1, softness=1,
+        around=3 * stations, unsolved=1, accepted=1, lost=1, failed=1, relaxation=1, imbalance=1, softness=1,
     )  # fmt: skip
     factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))
     return Samples(**samples, present=np.zeros(FLAGS, dtype=np.int64)), factors, Work(**work)
@@ -150,30 +153,46 @@ def _relax_branches(tables, samples, factors, work, token):
     """Let the dashpots of the Prony branches follow all the strain of the initial shape."""
     if samples.present[BRANCH]:
         store(factors.share, 0, fill(1.0, factors.share, token))
-        store(factors.branch, 0, fill(0.0, factors.branch, token))
-        for layer in range(tables.stations - 1):
-            layer_frame(tables, layer, work, token)
-            add_branch(tables, factors, layer, work, token)
+        _follow_branches(tables, factors, work, token)
 
 
 @kernel
-def step_factors(samples, factors, work, length, token):
-    """Factors of an implicit Euler step."""
-    time_step, drag = fill(length, samples.damping, token), load(samples.damping, 0, token)
-    one, gain = fill(1.0, drag, token), load(samples.effects, GAIN, token)
-    softness = load(work.softness, 0, token) * load(samples.effects, DECAY, token)
-    store(work.softness, 0, softness)
-    lookahead = time_step * (one + gain) + load(samples.damping, 1, token)
-    store(factors.elasticity, 0, time_step * lookahead * softness)
-    store(factors.inertia, 0, fma(time_step, drag, one))
-    store(factors.force, 0, time_step)
-    store(factors.strain, 0, time_step * softness)
-    store(factors.strain_rate, 0, time_step * lookahead * softness)
-    store(factors.drag, 0, time_step * drag)
-    store(factors.fluid, 0, time_step)
-    store(factors.branch, 0, time_step * softness * gain)
-    store(factors.share, 0, load(samples.effects, SHARE, token))
-    store(factors.give, 0, load(samples.effects, GIVE, token) / (time_step * time_step))
+def _follow_branches(tables, factors, work, token):
+    """Let the dashpots of all layers follow the strain."""
+    for layer in range(tables.stations - 1):
+        layer_frame(tables, layer, work, token)
+        follow_branch(tables, factors, layer, work, token)
+
+
+@kernel
+def _take_commands(tables, batch, work, step, share, first, token):
+    """Commands at the end of a stage: a share of the way from those before to those of the step."""
+    pitch, offset, cables = batch.displacement_pitch, step * tables.cables, tables.cables
+    if share < 1.0:
+        fill_lanes(batch.displacement, pitch, offset, cables, first, batch.count, work.slack, token)
+        for c in range(cables):
+            before = load(work.commanded, c, token)
+            store(work.commanded, c, fma(load(work.slack, c, token) - before, share, before))
+    else:
+        fill_lanes(batch.displacement, pitch, offset, cables, first, batch.count, work.commanded, token)
+
+
+@kernel
+def begin_stage(tables, batch, samples, factors, work, touch, schedule, step, number, first, token):
+    """Factors and commands of a stage, and the place where its forces are taken."""
+    stage = schedule.stages[number]
+    store(work.softness, 0, load(work.softness, 0, token) * load(samples.effects, DECAY + number, token))
+    set_factors(samples, factors, work, stage, fill(1.0, work.softness, token), token)
+    share = 1.0 if number + 1 == schedule.count else stage.elapsed / schedule.time_step
+    _take_commands(tables, batch, work, step, share, first, token)
+    if samples.present[BRANCH]:
+        _follow_branches(tables, factors, work, token)
+    if stage.predicted:
+        for row in range(3 * tables.modes * tables.stations):
+            ahead = fma(load(work.velocity, row, token), stage.elapsed, load(work.position, row, token))
+            store(work.position, row, ahead)
+        if touch is not None:
+            predict_cubes(touch, stage.elapsed, token)
 
 
 @kernel
@@ -206,29 +225,24 @@ def settle(tables, batch, samples, factors, work, p, schedule, first, token):
     if schedule.resumed:
         return
     start_rollouts(tables, batch, samples, work, first, token)
+    fill_lanes(batch.start, batch.start_pitch, 0, tables.cables, first, batch.count, work.commanded, token)
     if schedule.static_iterations > 0:
         start_settling(tables, samples, factors, work, token)
-        fill_lanes(batch.start, batch.start_pitch, 0, tables.cables, first, batch.count, work.commanded, token)
         for _ in range(schedule.static_iterations):
-            solve_increment(tables, samples, factors, work, p, 1.0, schedule, token)
+            solve_statics(tables, samples, factors, work, p, schedule, token)
             take_increment(tables, work, token)
         finish_settling(tables, samples, factors, work, token)
     _relax_branches(tables, samples, factors, work, token)
 
 
 @kernel
-def begin_step(tables, batch, samples, factors, work, touch, schedule, output, poses, step, first, token):
-    """Record the state that a step starts from, and take the step's commands; returns False after the last step."""
+def begin_step(tables, batch, work, touch, schedule, output, poses, step, first, token):
+    """Record the state that a step starts from; returns False after the last step."""
     if step % schedule.stride == 0:
         record_body(tables, work, output, step // schedule.stride, first, batch.count, token)
         if touch is not None:
             record_cubes(touch, poses, output.records, step // schedule.stride, first, batch.count, token)
-    if step == schedule.steps:
-        return False
-    step_factors(samples, factors, work, schedule.time_step, token)
-    pitch, offset = batch.displacement_pitch, step * tables.cables
-    fill_lanes(batch.displacement, pitch, offset, tables.cables, first, batch.count, work.commanded, token)
-    return True
+    return step < schedule.steps
 
 
 def compile_rollout(sources: str) -> Callable:
@@ -258,8 +272,12 @@ def compile_rollout(sources: str) -> Callable:
             start_cubes(around, addresses(cubes), given.count, meeting, first, token)
         shown = None if scene is None else addresses(poses)
         step = 0
-        while begin_step(body, given, material, factor, state, meeting, schedule, record, shown, step, first, token):
-            constrained_step(body, rubbing, around, material, factor, state, slips, meeting, extra, p, schedule, token)
+        while begin_step(body, given, state, meeting, schedule, record, shown, step, first, token):
+            for number in range(schedule.count):
+                begin_stage(body, given, material, factor, state, meeting, schedule, step, number, first, token)
+                constrained_stage(
+                    body, rubbing, around, material, factor, state, slips, meeting, extra, p, schedule, number, token
+                )
             step += 1
         finish_rollouts(state, record, first, given.count, token)
 

@@ -25,7 +25,7 @@ from rfdropo_bayes.fem.rollouts import Motion
 
 KEPT = {
     "samples": tuple(name for name in Samples._fields if name != "present"),
-    "work": ("position", "velocity", "tension", "branch", "softness", "lost", "failed", "imbalance"),
+    "work": ("position", "velocity", "tension", "commanded", "branch", "softness", "lost", "failed", "imbalance"),
     "friction": ("mobilised", "segment"),
     "touch": ("cube", "values", "memory"),
 }
@@ -86,6 +86,7 @@ class LayeredSession:
         material: Material,
         *,
         start: Float[np.ndarray, "row cables"] | None = None,
+        before: Float[np.ndarray, "row cables"] | None = None,
         cube: tuple[Float[np.ndarray, "row 13"], Float[np.ndarray, "row 4"]] | None = None,
     ) -> Motion:
         """Start some lanes anew; the others do not notice.
@@ -95,6 +96,7 @@ class LayeredSession:
             material: fields with one entry per row.
             start: cable displacements [m] whose static equilibrium is the initial state; None starts undeformed. An
                 equilibrium that was found before is not computed again.
+            before: as in `NativeLayered.rollout`.
             cube: of an engine with a scene, as in `NativeLayered.rollout`.
 
         Returns:
@@ -105,7 +107,7 @@ class LayeredSession:
         """
         rows = np.asarray(rows, dtype=np.intp)
         still = np.zeros((len(rows), 1, self.engine.tables.cables))
-        run = self.engine.run_of(material, still, start, 0, 1, cube)
+        run = self.engine.run_of(material, still, start, before, 0, 1, cube)
         self._admit(run, material.effects.rubs)
         settles = run.schedule.static_iterations > 0
         keys = [b"".join(_row(getattr(run.batch, n), row).tobytes() for n in GIVEN) for row in range(len(rows))]

@@ -87,7 +87,7 @@ def _imbalance(tables, samples, factors, work, token):
     modes, zero = tables.modes, fill(0.0, work.position, token)
     panels = (tables.cables + 3) // 3
     clear(work.border, 0, 9 * tables.stations * panels * modes, token)
-    gather_cables(tables, work, 1.0, token)
+    gather_cables(tables, work, fill(1.0, zero, token), False, token)
     start_loads(tables, samples, factors, work, token)
     loads, largest = zero, zero
     for station in range(tables.stations):
@@ -98,7 +98,7 @@ def _imbalance(tables, samples, factors, work, token):
         loads = loads + load(work.tension, c, token)
     if samples.present[SURROUNDED]:
         for station in range(tables.stations):
-            add_surroundings(tables, samples, factors, station, work, token)
+            add_surroundings(tables, samples, factors, station, False, work, token)
     for layer in range(tables.stations - 1):
         layer_frame(tables, layer, work, token)
         add_layer_force(tables, samples, factors, layer, work, False, token)
@@ -125,6 +125,8 @@ def start_settling(tables, samples, factors, work, token):
     store(factors.fluid, 0, zero)
     store(factors.branch, 0, zero)
     store(factors.share, 0, zero)
+    store(factors.wide, 0, one)
+    store(factors.narrow, 0, one)
     store(factors.give, 0, load(samples.effects, GIVE, token))
     clear(work.before, 0, 3 * tables.modes * tables.stations, token)
     store(work.relaxation, 0, one)
@@ -136,7 +138,7 @@ def finish_settling(tables, samples, factors, work, token):
     values, zero = 3 * tables.modes * tables.stations, fill(0.0, work.position, token)
     imbalance = _imbalance(tables, samples, factors, work, token)
     clear(work.solution, 0, values, token)
-    accepted = near(tables, work, zero, token)
+    accepted = near(tables, work, zero, False, token)
     accepted = where_greater(UNBOUNDED + zero, imbalance, accepted, zero)
     for row in range(values):
         rest = fill(tables.rest[row], zero, token)

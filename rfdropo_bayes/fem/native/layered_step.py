@@ -1,22 +1,50 @@
-"""One linear solve for a layered body in SIMD lanes, and the step it makes: time step or static iteration."""
+"""One linear solve for a layered body in SIMD lanes, and the step it makes: a stage or a static iteration.
+
+``stage`` is that of ``fem.integrators``, in seconds.
+"""
 
 from __future__ import annotations
 
+from rfdropo_bayes.fem.integrators import EULER
 from rfdropo_bayes.fem.native.chain_cholesky import combine_border, eliminate, substitute_back, substitute_forward
 from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
 from rfdropo_bayes.fem.native.fields import clear, point
 from rfdropo_bayes.fem.native.layered_assembly import (
     add_mass,
+    add_momentum,
     assemble_layer,
     start_loads,
     subtract_tangent_product,
 )
-from rfdropo_bayes.fem.native.layered_effects import SURROUNDED, add_surroundings
-from rfdropo_bayes.fem.native.simd import fill, fma, kernel, load, load3, square_root, store, where_greater
+from rfdropo_bayes.fem.native.layered_effects import GAIN, GIVE, SHARE, SURROUNDED, add_surroundings
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, square_root, store, where_greater
 from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral, stiffen, sum_cable_forces
 
 LARGEST = 1e30
 """Tensions beyond this [N] are not finite."""
+
+
+@kernel
+def set_factors(samples, factors, work, stage, wide, token):
+    """Factors of a stage, which impacts make so much longer."""
+    length, drag = fill(stage.length, samples.damping, token) * wide, load(samples.damping, 0, token)
+    one, gain = fill(1.0, drag, token), load(samples.effects, GAIN, token)
+    softness, damping = load(work.softness, 0, token), load(samples.damping, 1, token)
+    lookahead = length * (one + gain) + damping
+    behind = damping if stage.predicted else lookahead
+    store(factors.elasticity, 0, length * lookahead * softness)
+    store(factors.inertia, 0, fma(length, drag, one))
+    store(factors.force, 0, length)
+    store(factors.strain, 0, length * softness)
+    store(factors.strain_rate, 0, length * behind * softness)
+    store(factors.drag, 0, length * drag)
+    store(factors.fluid, 0, length)
+    store(factors.branch, 0, length * softness * gain)
+    store(factors.share, 0, load(samples.effects, SHARE, token) * (1.0 + stage.carried))
+    store(factors.wide, 0, wide)
+    store(factors.narrow, 0, one / wide)
+    store(factors.going, 0, (one - wide) + stage.carried)
+    store(factors.give, 0, load(samples.effects, GIVE, token) / (length * length))
 
 
 @kernel
@@ -68,11 +96,15 @@ def _gather_cable(tables, c, work, token):
 
 
 @kernel
-def gather_cables(tables, work, rate, token):
-    """Border rows dl/dx of all cables; ``slack`` = rate * (commanded length - length) - dl/dt."""
+def gather_cables(tables, work, rate, predicted, token):
+    """Border rows dl/dx of all cables; ``slack`` = rate * (commanded length - length) - dl/dt, the last one where it
+    is not ``predicted`` already."""
     for c in range(tables.cables):
         shorter, growth = _gather_cable(tables, c, work, token)
-        store(work.slack, c, (shorter - load(work.commanded, c, token)) * rate - growth)
+        slack = (shorter - load(work.commanded, c, token)) * rate
+        if not predicted:
+            slack = slack - growth
+        store(work.slack, c, slack)
 
 
 @kernel
@@ -85,9 +117,9 @@ def _condensed_entry(condensed, i, j, panels, token):
 def start_problem(tables, factors, work, p, n, rate, token):
     """The cables' part of a problem of ``n`` rows: their tensions before, W, and the velocities without impulses."""
     cables, panels = tables.cables, (tables.cables + 3) // 3
-    give = load(factors.give, 0, token)
+    give, wide = load(factors.give, 0, token), load(factors.wide, 0, token)
     for c in range(cables):
-        store(p.impulse, c, load(work.tension, c, token) * (1.0 / rate))
+        store(p.impulse, c, load(work.tension, c, token) * (1.0 / rate) * wide)
         store(p.free, c, load(work.slack, c, token) - _condensed_entry(work.condensed, c + 1, 0, panels, token))
         for d in range(c + 1):
             value = _condensed_entry(work.condensed, c + 1, d + 1, panels, token)
@@ -108,15 +140,27 @@ def weigh_border(cables, work, p, token):
 
 
 @kernel
-def take_tensions(cables, work, rate, token):
+def take_tensions(cables, factors, work, rate, token):
     """Tensions [N] from the impulses in ``weight``."""
     for c in range(cables):
-        store(work.tension, c, -rate * load(work.weight, c + 1, token))
+        store(work.tension, c, -rate * load(work.weight, c + 1, token) * load(factors.narrow, 0, token))
 
 
 @kernel
-def condense_increment(tables, samples, factors, work, rate, token):
+def _go_on(tables, samples, factors, work, token):
+    """Add to ``field`` a share of what the stage before did, without the impacts in it."""
+    zero, share = fill(0.0, work.field, token), load(factors.going, 0, token)
+    add_momentum(tables, samples, zero, -share, work.before, work.field, token)
+    for row in range(3 * tables.modes * tables.stations):
+        store(work.field, row, fnma(load(work.sudden, row, token), share, load(work.field, row, token)))
+
+
+@kernel
+def condense_increment(tables, samples, factors, work, stage, token):
     """Assemble and eliminate the matrix station by station."""
+    rate, predicted = 1.0 / stage.length, stage.predicted
+    wide, narrow = load(factors.wide, 0, token), load(factors.narrow, 0, token)
+    square = fill(1.0 / (rate * rate), wide, token) * (wide * wide)
     tiles, stations, cables, held = tables.modes, tables.stations, tables.cables, tables.held
     size, panels = 3 * tiles, (cables + 3) // 3
     frame, block = 3 * panels * size, 3 * tiles * size
@@ -124,22 +168,25 @@ def condense_increment(tables, samples, factors, work, rate, token):
     clear(work.border, 0, stations * frame, token)
     clear(work.condensed, 0, 9 * panels * panels, token)
     clear(work.pivot, (stations - 1) * block, stations * block, token)
-    gather_cables(tables, work, rate, token)
+    gather_cables(tables, work, fill(rate, wide, token) * narrow, predicted, token)
     start_loads(tables, samples, factors, work, token)
+    if stage.carried > 0.0:
+        _go_on(tables, samples, factors, work, token)
     sum_cable_forces(tables, work, token)
     for station in range(stations - 1, held - 1, -1):
         last = station == held
         if station > 0:
-            assemble_layer(tables, samples, factors, station - 1, rate, work, not last, token)
-            stiffen(tables, station - 1, rate, work, not last, token)
-            resist_lateral(tables, station - 1, work.velocity, work.field, work, token)
+            assemble_layer(tables, samples, factors, station - 1, square, not predicted, work, not last, token)
+            stiffen(tables, factors, station - 1, rate, work, not last, token)
+            if not predicted:
+                resist_lateral(tables, station - 1, work.velocity, work.field, work, token)
         entry, t = station * tables.pairs, station * block
         add_mass(tables.parity, tiles, work.pivot, t, samples.station_mass, entry, inertia, True, token)
         if not last:
             entry = (station - 1) * tables.coupled
             add_mass(tables.parity, tiles, work.coupling, t, samples.layer_mass, entry, inertia, False, token)
         if samples.present[SURROUNDED]:
-            add_surroundings(tables, samples, factors, station, work, token)
+            add_surroundings(tables, samples, factors, station, predicted, work, token)
         for k in range(size):
             t = station * frame + 3 * k
             store(work.border, t, load(work.border, t, token) + load(work.field, station * size + k, token))
@@ -160,14 +207,14 @@ def substitute_increment(tables, work, token):
 
 
 @kernel
-def solve_increment(tables, samples, factors, work, p, rate, schedule, token):
-    """``solution`` = A^-1 (r - J' T) and the tensions, of a body that nothing but cables holds."""
-    condense_increment(tables, samples, factors, work, rate, token)
-    start_problem(tables, factors, work, p, tables.cables, rate, token)
+def solve_statics(tables, samples, factors, work, p, schedule, token):
+    """``solution`` = A^-1 (r - J' T) and the tensions, of a body at rest that nothing but cables holds."""
+    condense_increment(tables, samples, factors, work, EULER, token)
+    start_problem(tables, factors, work, p, tables.cables, 1.0, token)
     soften(p, tables.cables, 0, 0, 1.0, schedule.softness, token)
     solve_problem(p, tables.cables, 0, 0, schedule.settled, token)
     weigh_border(tables.cables, work, p, token)
-    take_tensions(tables.cables, work, rate, token)
+    take_tensions(tables.cables, factors, work, 1.0, token)
     weigh_rows(tables, work, token)
     substitute_increment(tables, work, token)
 
@@ -205,8 +252,26 @@ def refine_increment(tables, samples, factors, work, token):
 
 
 @kernel
-def near(tables, work, time_step, token):
-    """One in the lanes whose step is finite and leaves every node near its place at rest, zero elsewhere."""
+def _move(work, row, length, predicted, token):
+    """Position after a stage; the step length may be zero."""
+    x, d = load(work.position, row, token), load(work.solution, row, token)
+    if predicted:
+        return fma(length, d, x)
+    return fma(length, load(work.velocity, row, token) + d, x)
+
+
+@kernel
+def _away(tables, work, row, length, predicted, token):
+    """How far a stage leads from the place at rest."""
+    away, d = load(work.position, row, token) - tables.rest[row], load(work.solution, row, token)
+    if predicted:
+        return fma(length, d, away)
+    return fma(length, load(work.velocity, row, token) + d, away)
+
+
+@kernel
+def near(tables, work, length, predicted, token):
+    """One in the lanes whose stage is finite and leaves every node near its place at rest, zero elsewhere."""
     modes, one, zero = tables.modes, fill(1.0, work.position, token), fill(0.0, work.position, token)
     accepted, reach = one, fill(tables.reach, work.position, token)
     for station in range(tables.stations):
@@ -216,8 +281,7 @@ def near(tables, work, time_step, token):
                 away = zero
                 for m in range(modes):
                     row = base + 3 * m + i
-                    speed = load(work.velocity, row, token) + load(work.solution, row, token)
-                    moved = fma(time_step, speed, load(work.position, row, token) - tables.rest[row])
+                    moved = _away(tables, work, row, length, predicted, token)
                     away = fma(moved, fill(tables.shape[node * modes + m], one, token), away)
                 away = where_greater(away, zero, away, -away)
                 accepted = where_greater(reach, away, accepted, zero)
@@ -227,16 +291,21 @@ def near(tables, work, time_step, token):
 
 
 @kernel
-def take_step(tables, work, length, token):
-    """Take the step x += length * (v + solution); where it is lost, stay in place at rest without tension."""
-    zero, time_step = fill(0.0, work.position, token), fill(length, work.position, token)
-    accepted = near(tables, work, time_step, token)
+def take_stage(tables, factors, work, stage, token):
+    """Take the stage: velocity + solution, and where that leads; where it is lost, stay in place at rest without
+    tension. ``before`` is the change of velocity."""
+    zero = fill(0.0, work.position, token)
+    length = fill(stage.length, work.position, token) * load(factors.wide, 0, token)
+    accepted = near(tables, work, length, stage.predicted, token)
     store(work.accepted, 0, accepted)
     for row in range(3 * tables.modes * tables.stations):
-        x = load(work.position, row, token)
-        v = load(work.velocity, row, token) + load(work.solution, row, token)
-        store(work.velocity, row, where_greater(accepted, zero, v, zero))
-        store(work.position, row, where_greater(accepted, zero, fma(time_step, v, x), x))
+        x, moved = load(work.position, row, token), _move(work, row, length, stage.predicted, token)
+        old, change = load(work.velocity, row, token), load(work.solution, row, token)
+        if stage.predicted:
+            x = fnma(old, stage.elapsed, x)
+            store(work.before, row, where_greater(accepted, zero, change, zero))
+        store(work.velocity, row, where_greater(accepted, zero, old + change, zero))
+        store(work.position, row, where_greater(accepted, zero, moved, x))
     for c in range(tables.cables):
         store(work.tension, c, where_greater(accepted, zero, load(work.tension, c, token), zero))
     store(work.lost, 0, where_greater(accepted, zero, load(work.lost, 0, token), fill(1.0, zero, token)))

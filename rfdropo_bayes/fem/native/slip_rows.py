@@ -81,13 +81,14 @@ def _gather_run(tables, runs, friction, r, kind, border, panels, work, token):
 
 
 @kernel
-def gather_slip(tables, runs, samples, friction, border, panels, p, work, time_step, token):
+def gather_slip(tables, runs, samples, factors, friction, border, panels, p, work, time_step, token):
     """Border rows of all runs, and their part of a step's problem."""
     kinds, kind = kinds_present(samples)
     _find_directions(tables, work, friction, token)
     _weigh_guides(runs, friction, kinds, kind, token)
     for k in range(kinds):
         coefficient = time_step * load(samples.effects, COULOMB if kind + k == 0 else CAPSTAN, token)
+        coefficient = coefficient * load(factors.wide, 0, token)
         for r in range(runs.count):
             row = k * runs.count + r
             line = tables.cables + row
@@ -148,18 +149,26 @@ def add_friction(tables, friction, field, token):
 
 
 @kernel
-def remember_slip(tables, friction, p, work, rows, time_step, token):
-    """Friction mobilised and tensions along the cables after a step that was taken."""
+def remember_slip(tables, factors, friction, p, work, rows, time_step, going, token):
+    """Friction mobilised and tensions along the cables after a stage that was taken.
+
+    ``going`` is the share of its change with which mobilised friction goes on into the next stage.
+    """
     zero, one, accepted = fill(0.0, work.tension, token), fill(1.0, work.tension, token), load(work.accepted, 0, token)
     for i in range(rows):
         line, before = tables.cables + i, load(friction.mobilised, i, token)
         share = fnma(load(p.velocity, line, token), time_step / PRESLIDING, before)
         share = where_greater(share, one, one, share)
         share = where_greater(-one, share, -one, share)
+        if going > 0.0:
+            share = fma(share - before, going, share)
+            share = where_greater(share, one, one, share)
+            share = where_greater(-one, share, -one, share)
         store(friction.mobilised, i, where_greater(accepted, zero, share, before))
     for c in range(tables.cables):
         left = load(work.tension, c, token)
         for g in range(tables.cable_first[c], tables.cable_first[c + 1]):
             tension = where_greater(left, zero, left, zero)
             store(friction.segment, g, where_greater(accepted, zero, tension, load(friction.segment, g, token)))
-            left = load(work.tension, c, token) - load(friction.lost, g, token) * (1.0 / time_step)
+            lost = load(friction.lost, g, token) * (1.0 / time_step) * load(factors.narrow, 0, token)
+            left = load(work.tension, c, token) - lost

@@ -22,7 +22,7 @@ def sum_cable_forces(tables, work, token):
 
 
 @kernel
-def stiffen(tables, layer, rate, work, whole, token):
+def stiffen(tables, factors, layer, rate, work, whole, token):
     """Add N / L against lateral motion of the mean of one face relative to the other, N > 0 of body and cables
     together, over ``rate`` squared.
 
@@ -30,10 +30,11 @@ def stiffen(tables, layer, rate, work, whole, token):
     """
     modes, axes, zero = tables.modes, work.axes, fill(0.0, work.axes, token)
     length = tables.rest[3 * (layer + 1) * modes + 2] - tables.rest[3 * layer * modes + 2]
-    tension = load(work.held, layer, token) * fill(rate, axes, token)
+    wide = load(factors.wide, 0, token)
+    tension = load(work.held, layer, token) * fill(rate, axes, token) * load(factors.narrow, 0, token)
     for i in range(3):
         tension = fnma(load(work.beyond, 3 * layer + i, token), load(axes, 9 * layer + 3 * i + 2, token), tension)
-    spring = where_greater(tension, zero, tension, zero) / fill(length * rate * rate, axes, token)
+    spring = where_greater(tension, zero, tension, zero) / fill(length * rate * rate, axes, token) * (wide * wide)
     store(work.held, layer, spring)
     block = 9 * modes * modes
     upper = (layer + 1) * block

@@ -1,4 +1,4 @@
-"""Kernels of a body of corotational tetrahedra in SIMD lanes: frames, forces, and the matrix of an implicit step.
+"""Kernels of a body of corotational tetrahedra in SIMD lanes: frames, forces, and the matrix of a stage.
 
 The physics is that of ``fem.tetrahedra`` and ``fem.tetrahedral_dynamics``, with samples in lanes. Nodes are numbered
 in elimination order, held nodes after the free ones. Block storage beyond that of the factor is a dump for blocks of
@@ -57,6 +57,10 @@ class Work(NamedTuple):
 
     position: Float[np.ndarray, "nodes3 lanes"]
     velocity: Float[np.ndarray, "nodes3 lanes"]
+    begun: Float[np.ndarray, "nodes3 lanes"]  # velocity at the start of the stage
+    moving: Float[np.ndarray, "nodes3 lanes"]  # velocity that carries the forces to the end of the stage
+    before: Float[np.ndarray, "nodes3 lanes"]  # change of velocity in the stage before
+    sudden: Float[np.ndarray, "nodes3 lanes"]  # impulses of contacts that began in it
     force: Float[np.ndarray, "nodes3 lanes"]
     pivot: Float[np.ndarray, "nodes6 lanes"]
     lower: Float[np.ndarray, "blocks9 lanes"]
@@ -67,10 +71,14 @@ class Work(NamedTuple):
     tension: Float[np.ndarray, "cables lanes"]
     measured: Float[np.ndarray, "cables lanes"]
     load: Float[np.ndarray, "border9 lanes"]
+    commanded: Float[np.ndarray, "cables lanes"]
     target: Float[np.ndarray, "cables lanes"]
     accepted: Float[np.ndarray, "1 lanes"]
     lost: Float[np.ndarray, "1 lanes"]
     unsolved: Float[np.ndarray, "1 lanes"]
+    wide: Float[np.ndarray, "1 lanes"]  # length of the stage for its impacts, in that of the others
+    narrow: Float[np.ndarray, "1 lanes"]  # its inverse
+    going: Float[np.ndarray, "1 lanes"]  # share of the change of velocity in the stage before that is carried on
     axes: Float[np.ndarray, "9 lanes"]
     turned: Float[np.ndarray, "12 lanes"]
 
@@ -141,10 +149,10 @@ def _rotate_back(axes, x, y, z, token):
 
 
 @mesh_inlined
-def _element_force(mesh, e, work, lame, shear, lookahead, token):
+def _element_force(mesh, e, work, v, lame, shear, lookahead, token):
     """Add an element's force at the positions x + lookahead v, in the frame of x, to ``work.force``; fill
     ``work.turned``."""
-    x, v, axes = work.position, work.velocity, work.axes
+    x, axes = work.position, work.axes
     zero = fill(0.0, x, token)
     h00, h01, h02, h10, h11, h12, h20, h21, h22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
     o = 3 * mesh.node[e, 0]
@@ -232,7 +240,7 @@ def clear(array, token):
 
 
 @mesh_inlined
-def _element(mesh, e, samples, work, lookahead, token):
+def _element(mesh, e, samples, work, velocity, lookahead, token):
     """Frame and force of an element; returns its Lame constants times its volume."""
     if mesh.polar:
         _polar_frame(mesh, e, work.position, work.axes, token)
@@ -240,37 +248,54 @@ def _element(mesh, e, samples, work, lookahead, token):
         _edge_frame(mesh, e, work.position, work.axes, token)
     scale = load(samples.element_scale, e, token) * mesh.volume[e]
     lame, shear = scale * load(samples.first_lame, 0, token), scale * load(samples.shear_modulus, 0, token)
-    _element_force(mesh, e, work, lame, shear, lookahead, token)
+    _element_force(mesh, e, work, velocity, lame, shear, lookahead, token)
     return lame, shear
 
 
 @mesh_part
-def elastic_forces(mesh, samples, work, time_step, token):
-    """``work.force`` at the positions x + (h + b) v, in the frames of x."""
+def elastic_forces(mesh, samples, work, stage, token):
+    """``work.force`` at the positions of the end of the stage, and for its velocity, in the frames of x."""
     clear(work.force, token)
-    lookahead = load(samples.rayleigh_stiffness, 0, token) + time_step
+    damping = load(samples.rayleigh_stiffness, 0, token)
+    length = stage.length * load(work.wide, 0, token)
+    lookahead = damping + length
+    moved = length / lookahead if stage.predicted else fill(0.0, work.force, token)
+    for i in range(work.moving.shape[0]):
+        store(work.moving, i, fnma(moved, load(work.begun, i, token), load(work.velocity, i, token)))
     for e in range(mesh.node.shape[0]):
-        _element(mesh, e, samples, work, lookahead, token)
+        _element(mesh, e, samples, work, work.moving, lookahead, token)
 
 
 @mesh_part
-def assemble(pattern, mesh, samples, work, time_step, token):
-    """Matrix (1 + h a) M + h (h + b) K and, as border row 0, the right-hand side h (f + M g - (h + b) K v - a M v)."""
+def gone_on(samples, work, node, i, token):
+    """Component i of the impulse with which a node goes on from the stage before."""
+    going = load(samples.mass, node, token) * load(work.before, 3 * node + i, token)
+    return (going - load(work.sudden, 3 * node + i, token)) * load(work.going, 0, token)
+
+
+@mesh_part
+def assemble(pattern, mesh, samples, work, stage, token):
+    """Matrix (1 + q a) M + q (q + b) K and, as border row 0, the right-hand side q (f + M g - (r + b) K v - a M v); see
+    ``fem.dynamics``."""
     clear(work.pivot, token)
     clear(work.lower, token)
     clear(work.force, token)
-    lookahead = load(samples.rayleigh_stiffness, 0, token) + time_step
-    scale = time_step * lookahead
+    length, damping = stage.length * load(work.wide, 0, token), load(samples.rayleigh_stiffness, 0, token)
+    lookahead = damping + length
+    scale = length * lookahead
+    behind = damping if stage.predicted else lookahead
     for e in range(mesh.node.shape[0]):
-        lame, shear = _element(mesh, e, samples, work, lookahead, token)
+        lame, shear = _element(mesh, e, samples, work, work.velocity, behind, token)
         _element_tangent(mesh, e, work, lame * scale, shear * scale, token)
     drag = load(samples.rayleigh_mass, 0, token)
-    inertia = 1.0 + time_step * drag
+    inertia = 1.0 + length * drag
     for node in range(mesh.free):
         mass = load(samples.mass, node, token)
         for i in range(3):
             p = 6 * node + (i * (i + 3)) // 2
             store(work.pivot, p, load(work.pivot, p, token) + inertia * mass)
             acceleration = load(samples.gravity, i, token) - drag * load(work.velocity, 3 * node + i, token)
-            right = time_step * (load(work.force, 3 * node + i, token) + mass * acceleration)
+            right = length * (load(work.force, 3 * node + i, token) + mass * acceleration)
+            if stage.carried > 0.0:
+                right = right + gone_on(samples, work, node, i, token)
             store(work.lower, 9 * (pattern.first[node + 1] - pattern.border) + i, right)

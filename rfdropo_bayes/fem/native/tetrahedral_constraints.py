@@ -11,6 +11,7 @@ from rfdropo_bayes.fem.native.constraint_problem import soften, solve_problem
 from rfdropo_bayes.fem.native.contact_geometry import (
     add_cube_velocity,
     choose_all,
+    choose_closing,
     find_candidates,
     kind_of,
     list_contacts,
@@ -20,7 +21,7 @@ from rfdropo_bayes.fem.native.contact_geometry import (
 )
 from rfdropo_bayes.fem.native.cube_motion import add_cube, stop_cube
 from rfdropo_bayes.fem.native.fields import clear
-from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store
+from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store, where_greater
 
 
 @kernel
@@ -95,7 +96,7 @@ def _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free
         store(work.weight, i, fill(0.0, work.weight, token))
     for c in range(cables):
         store(work.weight, c + 1, load(p.impulse, c, token) - load(p.before, c, token))
-        store(work.tension, c, load(p.impulse, c, token) * (1.0 / time_step))
+        store(work.tension, c, load(p.impulse, c, token) * (1.0 / time_step) * load(work.narrow, 0, token))
     if scene is not None:
         first = cables + 3 * touch.count[3]
         panels = contacts - touch.count[3]
@@ -113,15 +114,27 @@ def _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free
 
 
 @kernel
-def hold(pattern, scene, samples, touch, work, rows, p, reached, cables, free, schedule, token):
-    """Impulses of all constraints of a step, and the weights of its substitution; returns how many contacts it has.
+def meet(scene, samples, touch, work, stage, token):
+    """The candidates of a stage, how much longer it is for their impacts, and the cube without contacts."""
+    one = fill(1.0, work.wide, token)
+    wide = find_candidates(scene, work.position, work.velocity, touch, stage, token)
+    if stage.carried > 0.0:
+        store(work.wide, 0, wide)
+        store(work.narrow, 0, one / wide)
+        store(work.going, 0, (one - wide) + stage.carried)
+    narrow, going = load(work.narrow, 0, token), load(work.going, 0, token)
+    choose_closing(touch, samples.gravity, samples.rayleigh_mass, stage, wide, narrow, going, token)
+
+
+@kernel
+def hold(pattern, scene, samples, touch, work, rows, p, reached, cables, free, stage, schedule, token):
+    """Impulses of all constraints of a stage, and the weights of its substitution; returns how many contacts it has.
 
     ``work.slack`` holds the velocities of the cables' rows without impulses, ``work.condensed`` their products.
     """
-    time_step, contacts, border = schedule.time_step, 0, 3 * pattern.border
+    time_step, contacts, border = stage.length, 0, 3 * pattern.border
+    wide, narrow = load(work.wide, 0, token), load(work.narrow, 0, token)
     if scene is not None:
-        drag = samples.rayleigh_mass
-        find_candidates(scene, work.position, work.velocity, samples.gravity, drag, touch, time_step, token)
         choose_all(touch, token)
         contacts = list_contacts(touch, token)
     n = cables + 3 * contacts
@@ -129,14 +142,14 @@ def hold(pattern, scene, samples, touch, work, rows, p, reached, cables, free, s
     clear(p.before, 0, n, token)
     for i in range(cables):
         store(p.free, i, load(work.slack, i, token))
-        store(p.impulse, i, load(work.tension, i, token) * time_step)
+        store(p.impulse, i, load(work.tension, i, token) * time_step * wide)
         for j in range(cables):
             store(p.matrix, i * n + j, load(work.condensed, (i + 1) * border + j + 1, token))
     if scene is not None:
         _gather_contacts(scene, touch, work, rows, p, reached, cables, contacts, free, token)
         if contacts > touch.count[3]:
             _condense(pattern, touch, work, rows, p, n, reached, cables, contacts, free, token)
-        add_cube(touch, p, cables, contacts, time_step, token)
+        add_cube(touch, p, cables, contacts, time_step, wide, narrow, token)
     soften(p, cables, 0, contacts, time_step, schedule.softness, token)
     solve_problem(p, cables, 0, contacts, schedule.settled, token)
     _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, time_step, token)
@@ -166,7 +179,27 @@ def add_forces(pattern, scene, touch, work, p, cables, contacts, free, token):
 
 
 @kernel
-def hold_again(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, schedule, token):
+def add_sudden(scene, touch, work, p, cables, contacts, free, token):
+    """Add the impulses in ``before`` to ``work.sudden``, in the lanes whose stage was taken."""
+    zero, taken = fill(0.0, work.sudden, token), load(work.accepted, 0, token)
+    for c in range(touch.count[3], contacts):
+        slot = touch.contact[c]
+        sphere = sphere_of(scene, touch.pair[slot])
+        for k in range(scene.first[sphere], scene.first[sphere + 1]):
+            row = scene.place[k]
+            if row >= 3 * free:
+                continue
+            centre, around = weights(scene, touch, slot, k, token)
+            for j in range(3):
+                value = load(work.sudden, row + j, token)
+                for r in range(3):
+                    impulse = load(p.before, cables + 3 * c + r, token) * (centre if r == 0 else around)
+                    value = fma(impulse, load(touch.frame, 9 * slot + 3 * r + j, token), value)
+                store(work.sudden, row + j, where_greater(taken, zero, value, zero))
+
+
+@kernel
+def hold_again(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, stage, schedule, token):
     """As `hold`, for what a step's solution has left: the change of the impulses since it was found."""
     n = cables + 3 * contacts
     for i in range(cables):
@@ -187,6 +220,6 @@ def hold_again(pattern, scene, touch, work, rows, p, reached, cables, contacts, 
         store(p.free, i, value)
         store(p.before, i, load(p.impulse, i, token))
     solve_problem(p, cables, 0, contacts, schedule.settled, token)
-    _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, schedule.time_step, token)
+    _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, stage.length, token)
     if scene is not None:
         stop_cube(touch, p, cables, contacts, token)

@@ -13,6 +13,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.cables import CableLayout, routes
 from rfdropo_bayes.fem.drives import DriveLimits
 from rfdropo_bayes.fem.dynamics import LOST, POISSON_LIMIT
+from rfdropo_bayes.fem.integrators import Integrator, timed_stages
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
@@ -35,6 +36,7 @@ class TetrahedralEngine:
         dtype: ``numpy.float64`` or ``numpy.float32``.
         threads: lane blocks at a time; results do not depend on it.
         scene: what the body pushes a cube on; None for a body that touches nothing.
+        integrator: how a step is taken; SOFA's drive limits, which are those of a step, go with "euler" only.
     """
 
     def __init__(
@@ -47,7 +49,9 @@ class TetrahedralEngine:
         dtype: type = np.float64,
         threads: int | None = None,
         scene: PushScene | None = None,
+        integrator: Integrator = "euler",
     ) -> None:
+        self.integrator: Integrator = integrator
         self.body, self.dtype, self.points = body, np.dtype(dtype), points
         self._kernel = _kernel()  # here, so that threads do not make one each
         self.lanes = native_lanes(dtype)
@@ -109,7 +113,8 @@ class TetrahedralEngine:
             output = kernels.Output(self._nodes, self._weights, *(aligned_zeros(size, self.dtype) for size in sizes))
             single = self.dtype.itemsize == 4
             numbers = SETTLED[self.dtype.name], SOFTNESS[self.dtype.name]
-            schedule = kernels.Schedule(float(time_step), stride, *numbers, self._reach, single)
+            stages = timed_stages(self.integrator, time_step)
+            schedule = kernels.Schedule(float(time_step), stride, *numbers, self._reach, single, *stages)
             self._kernel(
                 self._pattern, self._mesh, self._cables, self._scene, self._rest, displacement, cubes, inputs, work,
                 *self._constraints(), schedule, output, poses, first, samples, lane_token(self.lanes),
@@ -161,12 +166,13 @@ class TetrahedralEngine:
         nodes, free, rows = len(self.body.rest), self._mesh.free, 3 * self._pattern.border
         cables = len(self._cables.limit)
         sizes = {
-            "position": 3 * nodes, "velocity": 3 * nodes, "force": 3 * nodes, "pivot": 6 * nodes,
+            "position": 3 * nodes, "velocity": 3 * nodes, "begun": 3 * nodes, "moving": 3 * nodes,
+            "before": 3 * nodes, "sudden": 3 * nodes, "force": 3 * nodes, "pivot": 6 * nodes,
             "lower": 9 * len(self._pattern.row) + 9, "solution": 3 * free, "condensed": rows * rows, "weight": rows,
             "slack": cables, "tension": cables, "measured": cables,
             "load": 9 * self._pattern.border * free,
-            "target": cables, "accepted": 1, "lost": 1,
-            "unsolved": 1, "axes": 9, "turned": 12,
+            "commanded": cables, "target": cables, "accepted": 1, "lost": 1,
+            "unsolved": 1, "wide": 1, "narrow": 1, "going": 1, "axes": 9, "turned": 12,
         }  # fmt: skip
         work = Work(**{name: aligned_zeros((size, self.lanes), self.dtype) for name, size in sizes.items()})
         work.position[...] = self._rest[:, None]

@@ -1,6 +1,6 @@
-"""Rollouts of a tetrahedral body in SIMD lanes: cables, the implicit Euler step, and one lane block through all steps.
+"""Rollouts of a tetrahedral body in SIMD lanes: cables, the stages of a step, and one lane block through all steps.
 
-In single precision the elimination loses digits that the motion of a long soft body needs: there the step is refined
+In single precision the elimination loses digits that the motion of a long soft body needs: there the stage is refined
 once. Its residual costs one pass over the elements, without tangents, and the factor is used again.
 """
 
@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from rfdropo_bayes.fem.integrators import Stage
 from rfdropo_bayes.fem.native.block_cholesky import (
     back_substitute,
     condense,
@@ -19,7 +20,15 @@ from rfdropo_bayes.fem.native.block_cholesky import (
     factor,
     forward_substitute,
 )
-from rfdropo_bayes.fem.native.cube_motion import record_cubes, remember_impulses, start_cubes, take_cube_step
+from rfdropo_bayes.fem.native.cube_motion import (
+    carry_cube,
+    find_impacts,
+    predict_cubes,
+    record_cubes,
+    remember_impulses,
+    start_cubes,
+    take_cube_stage,
+)
 from rfdropo_bayes.fem.native.kernel_cache import named_by
 from rfdropo_bayes.fem.native.simd import (
     addresses,
@@ -32,8 +41,8 @@ from rfdropo_bayes.fem.native.simd import (
     where_greater,
     whole,
 )
-from rfdropo_bayes.fem.native.tetrahedral import assemble, elastic_forces
-from rfdropo_bayes.fem.native.tetrahedral_constraints import add_forces, hold, hold_again
+from rfdropo_bayes.fem.native.tetrahedral import assemble, clear, elastic_forces, gone_on
+from rfdropo_bayes.fem.native.tetrahedral_constraints import add_forces, add_sudden, hold, hold_again, meet
 
 LARGEST = 1e12
 """[N] A tension beyond means that the rollout has diverged."""
@@ -59,7 +68,9 @@ class Schedule(NamedTuple):
     settled: float  # relative change of the velocities that ends the iterations of a step
     softness: float  # of the cables, relative to W
     reach: float  # largest distance of a node from its place at rest [m]
-    refined: bool  # solve every step twice
+    refined: bool  # solve every stage twice
+    count: int  # stages of a step
+    stages: tuple[Stage, Stage]  # in seconds; the first ``count`` of them
 
 
 class Output(NamedTuple):
@@ -102,14 +113,17 @@ def _pull(pattern, mesh, cables, p, row, work, x, y, z, token):
 
 
 @mesh_part
-def set_targets(cables, commanded, work, token):
-    """Displacement that the step imposes on every cable.
+def set_targets(cables, commanded, share, work, token):
+    """Displacement that a stage imposes on every cable, a share of the way to the commanded one.
 
     The commanded one may differ from that measured a step before by no more than ``rate``, and never exceeds the limit.
     """
     one = fill(1.0, work.position, token)
     for c in range(len(cables.limit)):
-        target, before = load(commanded, c, token), load(work.measured, c, token)
+        target, before, past = load(commanded, c, token), load(work.measured, c, token), load(work.commanded, c, token)
+        if share < 1.0:
+            target = fma(target - past, share, past)
+        store(work.commanded, c, target)
         target = where_greater(target, before + cables.rate, before + cables.rate, target)
         target = where_greater(before - cables.rate, target, before - cables.rate, target)
         limit = one * cables.limit[c]
@@ -117,8 +131,8 @@ def set_targets(cables, commanded, work, token):
 
 
 @mesh_part
-def gather_cables(pattern, mesh, cables, work, time_step, token):
-    """Border rows -dl/dx of all cables, and their slack [m] at the end of the step if nothing changed the velocity."""
+def gather_cables(pattern, mesh, cables, work, stage, token):
+    """Border rows -dl/dx of all cables, and their slack [m] at the end of the stage if nothing changed the velocity."""
     one = fill(1.0, work.position, token)
     for c in range(len(cables.limit)):
         row = c + 1
@@ -140,7 +154,10 @@ def gather_cables(pattern, mesh, cables, work, time_step, token):
                 _pull(pattern, mesh, cables, p - 1, row, work, dx, dy, dz, token)
             x, y, z, vx, vy, vz = px, py, pz, wx, wy, wz
         store(work.measured, c, shortening)
-        store(work.slack, c, shortening - time_step * growth - load(work.target, c, token))
+        slack = shortening
+        if not stage.predicted:
+            slack = slack - stage.length * growth
+        store(work.slack, c, slack - load(work.target, c, token))
 
 
 @mesh_part
@@ -162,9 +179,10 @@ def _keep_border(pattern, work, token):
 
 
 @mesh_part
-def unbalance(pattern, mesh, samples, work, count, time_step, token):
-    """Write what the step leaves unbalanced to border row 0, and the slack that it leaves the cables."""
-    elastic_forces(mesh, samples, work, time_step, token)
+def unbalance(pattern, mesh, samples, work, count, stage, token):
+    """Write what the stage leaves unbalanced to border row 0, and the slack that it leaves the cables."""
+    elastic_forces(mesh, samples, work, stage, token)
+    time_step = stage.length * load(work.wide, 0, token)
     drag, size = load(samples.rayleigh_mass, 0, token), 9 * pattern.border
     for c in range(count):
         store(work.slack, c, load(work.measured, c, token) - load(work.target, c, token))
@@ -176,25 +194,42 @@ def unbalance(pattern, mesh, samples, work, count, time_step, token):
             for c in range(count):
                 row = load(work.load, size * node + 3 * (c + 1) + i, token)
                 force = fma(row, load(work.tension, c, token), force)
-                store(work.slack, c, fma(row, time_step * velocity, load(work.slack, c, token)))
+                moving = velocity
+                if stage.predicted:
+                    moving = moving - load(work.begun, 3 * node + i, token)
+                store(work.slack, c, fma(row, time_step * moving, load(work.slack, c, token)))
             right = time_step * force - mass * load(work.solution, 3 * node + i, token)
+            if stage.carried > 0.0:
+                right = right + gone_on(samples, work, node, i, token)
             store(work.lower, 9 * (pattern.first[node + 1] - pattern.border) + i, right)
 
 
 @mesh_part
-def accept(rest, count, work, schedule, token):
-    """Take the step x += h v; in the lanes where it is lost, stay in place at rest without tension."""
+def _moved(work, i, stage, token):
+    """How far a stage moves a coordinate."""
+    length = stage.length * load(work.wide, 0, token)
+    if stage.predicted:
+        return length * (load(work.velocity, i, token) - load(work.begun, i, token))
+    return length * load(work.velocity, i, token)
+
+
+@mesh_part
+def accept(rest, count, work, schedule, stage, token):
+    """Take the stage; in the lanes where it is lost, stay in place at rest without tension."""
     one, zero = fill(1.0, work.position, token), fill(0.0, work.position, token)
     accepted, reach = one, fill(schedule.reach, work.position, token)
     for i in range(work.solution.shape[0]):
-        away = load(work.position, i, token) + schedule.time_step * load(work.velocity, i, token) - rest[i]
+        away = load(work.position, i, token) + _moved(work, i, stage, token) - rest[i]
         accepted = where_greater(reach, where_greater(away, zero, away, -away), accepted, zero)
     for c in range(count):
         accepted = where_greater(zero + LARGEST, load(work.tension, c, token), accepted, zero)
     for i in range(work.solution.shape[0]):
-        x, v = load(work.position, i, token), load(work.velocity, i, token)
+        x, v, moved = load(work.position, i, token), load(work.velocity, i, token), _moved(work, i, stage, token)
+        begun = load(work.begun, i, token)
+        store(work.before, i, where_greater(accepted, zero, v - begun, zero))
         store(work.velocity, i, where_greater(accepted, zero, v, zero))
-        store(work.position, i, where_greater(accepted, zero, x + schedule.time_step * v, x))
+        stayed = x - stage.elapsed * begun if stage.predicted else x
+        store(work.position, i, where_greater(accepted, zero, x + moved, stayed))
     for c in range(count):
         store(work.tension, c, where_greater(accepted, zero, load(work.tension, c, token), zero))
     store(work.accepted, 0, accepted)
@@ -202,18 +237,31 @@ def accept(rest, count, work, schedule, token):
 
 
 @mesh_part
-def condense_step(pattern, mesh, cables, commanded, samples, work, schedule, token):
-    """Assemble and factorise the matrix of a step, and set up the problem of its tensions."""
-    count, rows, time_step = len(cables.limit), 3 * pattern.border, schedule.time_step
-    assemble(pattern, mesh, samples, work, time_step, token)
-    set_targets(cables, commanded, work, token)
-    gather_cables(pattern, mesh, cables, work, time_step, token)
+def begin_stage(work, stage, token):
+    """Where a stage takes its forces."""
+    one = fill(1.0, work.wide, token)
+    store(work.wide, 0, one)
+    store(work.narrow, 0, one)
+    store(work.going, 0, stage.carried * one)
+    for i in range(work.begun.shape[0]):
+        velocity = load(work.velocity, i, token)
+        store(work.begun, i, velocity)
+        if stage.predicted:
+            store(work.position, i, load(work.position, i, token) + stage.elapsed * velocity)
+
+
+@mesh_part
+def condense_stage(pattern, mesh, cables, samples, work, schedule, stage, token):
+    """Assemble and factorise the matrix of a stage, and set up the problem of its tensions."""
+    count, rows = len(cables.limit), 3 * pattern.border
+    assemble(pattern, mesh, samples, work, stage, token)
+    gather_cables(pattern, mesh, cables, work, stage, token)
     if schedule.refined:
         _keep_border(pattern, work, token)
     factor(pattern, work.pivot, work.lower, token)
     condense(pattern, work.lower, work.condensed, token)
     for i in range(count):
-        free = load(work.slack, i, token) * (1.0 / time_step)
+        free = load(work.slack, i, token) * (1.0 / stage.length) * load(work.narrow, 0, token)
         store(work.slack, i, free + load(work.condensed, (i + 1) * rows, token))
 
 
@@ -251,27 +299,67 @@ def compile_rollout(sources: str) -> Callable:
             start_cubes(around, addresses(cubes), count, meeting, first, token)
             record_cubes(meeting, addresses(poses), records, 0, first, count, token)
         for step in range(commands.shape[0]):
-            condense_step(pattern, mesh, cables, commands[step], samples, work, schedule, token)
-            contacts = hold(
-                bare_pattern, around, bare_samples, meeting, bare, extra, p, reached, drives, mesh.free, schedule, token
-            )
-            substitute(pattern, mesh, work, token)
-            if schedule.refined:
-                unbalance(pattern, mesh, samples, work, drives, schedule.time_step, token)
+            for number in range(schedule.count):
+                stage, last = schedule.stages[number], number + 1 == schedule.count
+                going = 0.0 if last else schedule.stages[number + 1].carried
+                share = 1.0 if last else stage.elapsed / schedule.time_step
+                begin_stage(work, stage, token)
                 if scene is not None:
-                    add_forces(bare_pattern, around, meeting, bare, p, drives, contacts, mesh.free, token)
-                forward_substitute(pattern, work.pivot, work.lower, token)
-                for i in range(drives):
-                    free = load(work.slack, i, token) * (1.0 / schedule.time_step)
-                    store(work.slack, i, free + condensed_entry(pattern, work.lower, i + 1, 0, token))
-                hold_again(
-                    bare_pattern, around, meeting, bare, extra, p, reached, drives, contacts, mesh.free, schedule, token
+                    if stage.predicted:
+                        predict_cubes(meeting, stage.elapsed, token)
+                    meet(around, bare_samples, meeting, bare, stage, token)
+                set_targets(cables, commands[step], share, work, token)
+                condense_stage(pattern, mesh, cables, samples, work, schedule, stage, token)
+                contacts = hold(
+                    bare_pattern,
+                    around,
+                    bare_samples,
+                    meeting,
+                    bare,
+                    extra,
+                    p,
+                    reached,
+                    drives,
+                    mesh.free,
+                    stage,
+                    schedule,
+                    token,
                 )
                 substitute(pattern, mesh, work, token)
-            accept(rest, drives, work, schedule, token)
-            if scene is not None:
-                remember_impulses(around, meeting, p, drives, contacts, bare.accepted, token)
-                take_cube_step(meeting, bare.accepted, bare.lost, schedule.time_step, token)
+                if schedule.refined:
+                    unbalance(pattern, mesh, samples, work, drives, stage, token)
+                    if scene is not None:
+                        add_forces(bare_pattern, around, meeting, bare, p, drives, contacts, mesh.free, token)
+                    forward_substitute(pattern, work.pivot, work.lower, token)
+                    for i in range(drives):
+                        free = load(work.slack, i, token) * (1.0 / stage.length) * load(work.narrow, 0, token)
+                        store(work.slack, i, free + condensed_entry(pattern, work.lower, i + 1, 0, token))
+                    hold_again(
+                        bare_pattern,
+                        around,
+                        meeting,
+                        bare,
+                        extra,
+                        p,
+                        reached,
+                        drives,
+                        contacts,
+                        mesh.free,
+                        stage,
+                        schedule,
+                        token,
+                    )
+                    substitute(pattern, mesh, work, token)
+                accept(rest, drives, work, schedule, stage, token)
+                if scene is not None:
+                    if schedule.count > 1:
+                        find_impacts(meeting, p, drives, contacts, token)
+                        carry_cube(meeting, p, drives, contacts, going, bare.accepted, token)
+                        clear(work.sudden, token)
+                        add_sudden(around, meeting, bare, p, drives, contacts, mesh.free, token)
+                    narrow = load(bare.narrow, 0, token)
+                    remember_impulses(around, meeting, p, drives, contacts, narrow, bare.accepted, token)
+                    take_cube_stage(meeting, bare.accepted, bare.lost, stage.length, bare.wide, stage.predicted, token)
             if (step + 1) % schedule.stride == 0:
                 row = (step + 1) // schedule.stride
                 record_body(work, output, row - 1, token)

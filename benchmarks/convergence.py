@@ -1,0 +1,171 @@
+"""How near the motion comes to the converged one, for implicit Euler and SDIRK2, and what a millimetre costs.
+
+    python benchmarks/convergence.py [--robots NAME [NAME ...]] [--motions N] [--seconds S] [--json FILE]
+
+Every robot is pulled about at random: one command moves its cable by 5 mm every 50 ms, within its range. The error is
+the root mean square over motions and time of the tip's distance from the converged motion, that of SDIRK2 with the
+shortest step. Usual damping is the robot's nominal one, small damping a stiffness damping of 2 ms. Processor time is
+that of one rollout on one thread; between two steps, and beyond the shortest, it follows the line through the last two
+points of error against time, in logarithms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import time
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.simulators import Commands
+from rfdropo_bayes.simulators.trunk import TrunkSimulator
+from rfdropo_bayes.workflow.assembly import build_simulator
+from rfdropo_bayes.workflow.experiment import SimulatorTable
+from rfdropo_bayes.workflow.model_spec import ModelSpec
+
+ROBOTS = ("trunk_sofa", "trunk_physical", "smooth_arm", "asl_trunk", "motor_trunk")
+PERIOD, MOVE, FARTHEST, OBSERVED = 0.05, 0.005, 0.03, 0.02
+"""[s] and [m] between commands; [m] largest pull; [s] between observations."""
+STEPS_MS = (20.0, 10.0, 5.0, 2.5)
+FURTHER_MS = (1.25, 0.625)
+"""Where Euler is still more than a millimetre away."""
+CONVERGED_MS = 0.3125
+SMALL_DAMPING = 0.002  # [s]
+ALLOWED = 1.0  # [mm]
+REPEATS = 3
+
+
+class Row(NamedTuple):
+    """One integrator on one robot."""
+
+    robot: str
+    damping_s: float
+    integrator: str
+    error_mm: dict[str, float]  # by step [ms]
+    cpu_s: dict[str, float]  # of one rollout
+    cpu_s_for_1_mm: float
+
+
+def simulator(robot: Robot, integrator: str, step_ms: float) -> TrunkSimulator:
+    """A robot on one thread of the compiled engine."""
+    options = {"engine": "numba", "threads": 1, "time_step": 1e-3 * step_ms, "integrator": integrator}
+    built = build_simulator(ModelSpec(robot, simulator=SimulatorTable.model_validate(options)))
+    assert isinstance(built, TrunkSimulator)
+    return built
+
+
+def walk(robot: Robot, motions: int, seconds: float) -> Float[np.ndarray, "motion command channel"]:
+    """Random commands [m or rad], cumulative."""
+    random = np.random.default_rng(0)
+    gain = np.abs(robot.channel_matrix({})).max(axis=0)
+    low, high = robot.displacement_limits().T
+    matrix, count = np.asarray(robot.channel_matrix({})), round(seconds / PERIOD)
+    two_sided = np.any(matrix < 0.0, axis=0)  # a motor that pulls one cable lets another one go
+    reach = min(FARTHEST, float(np.min(high)), float(np.min(-low)))
+    moves = np.zeros((motions, count, len(gain)))
+    chosen, sign = random.integers(len(gain), size=(motions, count)), random.choice([-MOVE, MOVE], (motions, count))
+    np.put_along_axis(moves, chosen[..., None], sign[..., None], axis=2)
+    there = np.zeros((motions, len(gain)))
+    for k in range(count):
+        there = np.clip(there + moves[:, k], np.where(two_sided, -0.5 * reach, 0.0), reach)
+        moves[:, k] = there
+    return moves / gain
+
+
+@cache
+def inputs(robot: str, step_ms: float, motions: int, seconds: float) -> Any:
+    """What the engine moves the body by, at nominal parameters; the same for every integrator."""
+    model = simulator(load_robot(robot), "euler", step_ms)
+    clock, values = PERIOD * np.arange(round(seconds / PERIOD) + 1), model.complete({})
+    grid = [
+        model.commands(clock[:-1], rows, np.zeros(rows.shape[1]), clock) for rows in walk(model.robot, motions, seconds)
+    ]
+    stacked = Commands(*(np.stack(parts) for parts in zip(*grid, strict=True)))
+    material, start, displacement = jax.jit(jax.vmap(lambda c: model.inputs(values, c)))(stacked)
+    return jax.tree.map(np.asarray, (material, start, displacement))
+
+
+def tip(
+    robot: str, integrator: str, step_ms: float, damping: float | None, motions: int, seconds: float
+) -> tuple[Float[np.ndarray, "motion time 3"], float]:
+    """Path of the tip [m], and processor time of one rollout [s]."""
+    model = simulator(load_robot(robot), integrator, step_ms)
+    material, start, displacement = inputs(robot, step_ms, motions, seconds)
+    if damping is not None:
+        material = material._replace(rayleigh_stiffness=np.full(motions, damping))
+    begin = {"start" if model.engine.from_equilibrium else "before": start}
+    engine, cost = model.engine.native, np.inf
+    for _ in range(REPEATS):
+        began = time.process_time()
+        found = engine.rollout(material, displacement, **begin, stride=round(1e3 * OBSERVED / step_ms))
+        cost = min(cost, (time.process_time() - began) / motions)
+    if found.diverged.any():
+        raise SystemExit(f"{robot}: {integrator} at {step_ms} ms diverged")
+    return found.position[:, :, -1], cost
+
+
+def error(path: np.ndarray, converged: np.ndarray) -> float:
+    """Root mean square of the distance [mm]."""
+    return float(1e3 * np.sqrt(np.mean(np.sum((path - converged) ** 2, axis=-1))))
+
+
+def cost_of(allowed: float, errors: dict[str, float], costs: dict[str, float]) -> float:
+    """Processor time [s] at which the error is the allowed one, by the line between its neighbours."""
+    pairs = list(itertools.pairwise(errors))
+    first, second = next((pair for pair in pairs if errors[pair[1]] <= allowed), pairs[-1])
+    at = np.log([errors[first], errors[second]])
+    slope = (np.log(costs[second]) - np.log(costs[first])) / (at[1] - at[0])
+    return float(np.exp(np.log(costs[first]) + slope * (np.log(allowed) - at[0])))
+
+
+def rows_of(robot: str, damping: float | None, motions: int, seconds: float) -> list[Row]:
+    """Both integrators on one robot."""
+    converged, _ = tip(robot, "sdirk2", CONVERGED_MS, damping, motions, seconds)
+    nominal = float(inputs(robot, STEPS_MS[0], motions, seconds)[0].rayleigh_stiffness[0])
+    rows = []
+    for integrator in ("euler", "sdirk2"):
+        errors: dict[str, float] = {}
+        costs: dict[str, float] = {}
+        for step in (*STEPS_MS, *FURTHER_MS):
+            if step in FURTHER_MS and errors and min(errors.values()) <= ALLOWED:
+                break
+            path, cost = tip(robot, integrator, step, damping, motions, seconds)
+            errors[f"{step:g}"], costs[f"{step:g}"] = error(path, converged), cost
+        cheap = cost_of(ALLOWED, errors, costs)
+        rows.append(Row(robot, nominal if damping is None else damping, integrator, errors, costs, cheap))
+    return rows
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--robots", nargs="+", default=list(ROBOTS))
+    parser.add_argument("--motions", type=int, default=4)
+    parser.add_argument("--seconds", type=float, default=3.0, help="of every motion")
+    parser.add_argument("--json", type=Path, help="also write the rows here")
+    chosen = parser.parse_args()
+    names = [f"{step:g}" for step in (*STEPS_MS, *FURTHER_MS)]
+    steps = " | ".join(f"{name} ms" for name in names)
+    print(f"| robot | damping [s] | integrator | {steps} | CPU ms for 1 mm |")
+    print("|" + "---|" * (4 + len(STEPS_MS) + len(FURTHER_MS)))
+    rows = []
+    for robot in chosen.robots:
+        for damping in (None, SMALL_DAMPING):
+            for row in rows_of(robot, damping, chosen.motions, chosen.seconds):
+                rows.append(row)
+                shown = [f"{row.error_mm[k]:.2f}" if k in row.error_mm else "" for k in names]
+                cells = [row.robot, f"{row.damping_s:g}", row.integrator, *shown, f"{1e3 * row.cpu_s_for_1_mm:.1f}"]
+                print("| " + " | ".join(cells) + " |", flush=True)
+    if chosen.json:
+        chosen.json.write_text(json.dumps([row._asdict() for row in rows], indent=1))
+
+
+if __name__ == "__main__":
+    main()
