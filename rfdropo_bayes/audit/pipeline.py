@@ -383,27 +383,13 @@ def base_model(
     """
     target = first_target(problem, journal or Journal(), deadline)
     try:
-        return _fitted(target, problem.start, seed, report, [])
+        return _base_fit(target, problem.start, seed, report, [])
     except OutOfTime:
         raise InputError(
             "the time was up before the base model was fitted",
             where=(deadline or Deadline()).where,
             remedy="raise it, fit fewer or shorter recordings, or start from a calibration (--base)",
         ) from None
-
-
-def _fitted(
-    target: Target,
-    start: dict[str, float] | None,
-    seed: int,
-    report: Callable[[str], None],
-    reached: list[tuple[Target, Float[np.ndarray, " d"]]],
-) -> tuple[Target, Fit]:
-    """The base model's noise and fit; ``reached`` gets the points that the search has come to."""
-    _announce(target, start, report)
-    known = target.noise.source != RESIDUALS
-    target, fit = _base_fit(target, start, seed, report, reached)
-    return (target, fit) if known else _under_residual_noise(target, fit)
 
 
 def _fitted_or_not(
@@ -415,7 +401,7 @@ def _fitted_or_not(
     coordinates = target.forward.coordinates
     reached = [(target, coordinates.null if problem.start is None else coordinates.encode(problem.start))]
     try:
-        return _fitted(target, problem.start, problem.seed, report, reached)
+        return _base_fit(target, problem.start, problem.seed, report, reached)
     except OutOfTime:
         report("the time was up before the base model was fitted")
         deadline.lift()
@@ -479,9 +465,10 @@ def _base_fit(
     report: Callable[[str], None],
     reached: list[tuple[Target, Float[np.ndarray, " d"]]],
 ) -> tuple[Target, Fit]:
-    """Posterior mode of the base model, from a given start or from where `calibrate`'s search leads; climbed on while
-    rollouts beside it are better."""
-    coordinates = target.forward.coordinates
+    """The base model's noise and posterior mode, from a given start or from where `calibrate`'s search leads; climbed
+    on while rollouts beside it are better. ``reached`` gets the points that the search has come to."""
+    _announce(target, start, report)
+    coordinates, known = target.forward.coordinates, target.noise.source != RESIDUALS
     free = np.arange(coordinates.base)
     first = base_optimum(target, jax.random.key(seed)) if start is None else coordinates.encode(start)
     reached.append((target, first))
@@ -493,10 +480,13 @@ def _base_fit(
         reached.append((target, fit.x))
         better = better_nearby(target, fit)
         if better is None:  # of a motion that bends, as where cables go slack, slopes promise what is not there
-            return target, replace(fit, promise=0.0) if fit.promise < WITHIN else fit
+            fit = replace(fit, promise=0.0) if fit.promise < WITHIN else fit
+            break
         report(f"base model: sum of squares {fit.residual @ fit.residual:.0f}, and better beside it")
         fit = climb(target, better, free)
-    return target, fit if better_nearby(target, fit) is None else replace(fit, promise=np.inf)
+    else:
+        fit = fit if better_nearby(target, fit) is None else replace(fit, promise=np.inf)
+    return (target, fit) if known else _under_residual_noise(target, fit)
 
 
 def _under_residual_noise(target: Target, fit: Fit) -> tuple[Target, Fit]:

@@ -46,7 +46,7 @@ class ConstrainedStep(NamedTuple):
     impulses: Impulses
     cube: CubeState | None
     touch: Float[Array, "pairs 3"] | None  # impulses of all pairs that can touch, in space [N s]
-    sudden: Float[Array, "nodes 3"] | float = 0.0  # impacts on the body [N s]
+    sudden: Float[Array, "nodes 3"]  # impacts on the body [N s]
     sudden_twist: Float[Array, "6"] | None = None  # and what that changes the cube's velocity and spin by
 
 

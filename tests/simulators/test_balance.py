@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.engine import Backend, Engine
@@ -95,3 +96,10 @@ def test_both_engines_balance_alike():
         scale = max(1e-3, float(np.abs(theirs).max()))
         np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-6 * scale, err_msg=name)
     assert np.abs(one.base_force).max() > 0.1
+
+
+def test_only_the_states_of_implicit_euler_tell_the_velocities(trunk):
+    """Another integrator is refused rather than taken for it."""
+    other = replace(trunk, engine=replace(trunk.engine, integrator="sdirk2"))
+    with pytest.raises(InputError, match="integrator 'sdirk2'"):
+        other.balance({}, every_step(trunk, 5))

@@ -207,3 +207,13 @@ def test_every_mechanism_says_whether_it_runs_on_a_mesh(sofa, name):
         assert obstacle(mechanism, "tetrahedra", "numba") is not None
         with pytest.raises(InputError, match="layered bodies only"):
             jax.eval_shape(lambda commands: simulator.rollout({}, commands), pulls(sofa))
+
+
+def test_drives_that_sofa_limits_go_with_its_own_steps_only(mesh):
+    """Their limit is one of a step of implicit Euler; the robot's own drives take any integrator, which is recorded."""
+    assembly = assemble_mesh(ROBOT, mesh, table(**SOFA))
+    with pytest.raises(InputError, match="drives that SOFA limits"):
+        Engine(assembly, TIME_STEP, integrator="sdirk2")
+    free = Engine(assemble_mesh(ROBOT, mesh, table()), TIME_STEP, integrator="sdirk2")
+    assert free.describe()["integrator"] == "sdirk2"
+    assert "integrator" not in replace(free, integrator="euler").describe()

@@ -11,7 +11,7 @@ import pytest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.robots import DriveTravel, load_robot
-from rfdropo_bayes.simulators.engine import Backend, Engine
+from rfdropo_bayes.simulators.engine import Backend, Engine, Integrator
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.session import Session
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
@@ -29,7 +29,13 @@ VALUES = {
 
 
 @functools.cache
-def simulator(engine: str, precision: str = "float64", mechanisms: tuple[str, ...] = (), state: str = "rest"):
+def simulator(
+    engine: str,
+    precision: str = "float64",
+    mechanisms: tuple[str, ...] = (),
+    state: str = "rest",
+    integrator: Integrator = "euler",
+):
     """The paper's trunk; its drives ramp every command over two periods, and here answer late, as far as they reach."""
     robot = load_robot("trunk_sofa")
     names, kinds = robot.channel_names, ("lost", "clipped", "kept")
@@ -39,7 +45,7 @@ def simulator(engine: str, precision: str = "float64", mechanisms: tuple[str, ..
     discretisation = Discretisation(robot.time_step_s)
     assembly = assemble(robot, discretisation)
     backend = Backend(engine, precision)
-    computed = Engine(assembly, robot.time_step_s, backend, state == "equilibrium")
+    computed = Engine(assembly, robot.time_step_s, backend, state == "equilibrium", integrator=integrator)
     return TrunkSimulator(robot, computed, assembly, discretisation, mechanisms_named(mechanisms, robot))
 
 
@@ -86,10 +92,11 @@ def run(model, parameters, commands, late=(1, 3)):
         yield session, seen
 
 
+@pytest.mark.parametrize("integrator", ["euler", "sdirk2"])
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("state", ["rest", "equilibrium"])
-def test_a_session_is_a_rollout_bit_for_bit(precision, state):
-    model = simulator("numba", precision, (), state)
+def test_a_session_is_a_rollout_bit_for_bit(precision, state, integrator):
+    model = simulator("numba", precision, (), state, integrator)
     parameters, commands = drawn({})
     whole = rollouts(model, parameters, commands)
     compared = 0

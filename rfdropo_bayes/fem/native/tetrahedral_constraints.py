@@ -19,7 +19,14 @@ from rfdropo_bayes.fem.native.contact_geometry import (
     trunk_velocity,
     weights,
 )
-from rfdropo_bayes.fem.native.cube_motion import add_cube, stop_cube
+from rfdropo_bayes.fem.native.cube_motion import (
+    add_cube,
+    carry_cube,
+    find_impacts,
+    remember_impulses,
+    stop_cube,
+    take_cube_stage,
+)
 from rfdropo_bayes.fem.native.fields import clear
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, store, where_greater
 
@@ -179,7 +186,7 @@ def add_forces(pattern, scene, touch, work, p, cables, contacts, free, token):
 
 
 @kernel
-def add_sudden(scene, touch, work, p, cables, contacts, free, token):
+def _add_impacts(scene, touch, work, p, cables, contacts, free, token):
     """Add the impulses in ``before`` to ``work.sudden``, in the lanes whose stage was taken."""
     zero, taken = fill(0.0, work.sudden, token), load(work.accepted, 0, token)
     for c in range(touch.count[3], contacts):
@@ -196,6 +203,19 @@ def add_sudden(scene, touch, work, p, cables, contacts, free, token):
                     impulse = load(p.before, cables + 3 * c + r, token) * (centre if r == 0 else around)
                     value = fma(impulse, load(touch.frame, 9 * slot + 3 * r + j, token), value)
                 store(work.sudden, row + j, where_greater(taken, zero, value, zero))
+
+
+@kernel
+def end_stage(scene, touch, work, p, cables, contacts, free, schedule, stage, later, token):
+    """Move the cube, and keep what contacts did: for a later stage of the step, which carries a share of it on, and as
+    impulses to start from."""
+    if schedule.count > 1:
+        find_impacts(touch, p, cables, contacts, token)
+        carry_cube(touch, p, cables, contacts, later, work.accepted, token)
+        clear(work.sudden, 0, 3 * free, token)
+        _add_impacts(scene, touch, work, p, cables, contacts, free, token)
+    remember_impulses(scene, touch, p, cables, contacts, load(work.narrow, 0, token), work.accepted, token)
+    take_cube_stage(touch, work.accepted, work.lost, stage.length, work.wide, stage.predicted, token)
 
 
 @kernel

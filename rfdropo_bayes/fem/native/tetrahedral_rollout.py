@@ -20,15 +20,7 @@ from rfdropo_bayes.fem.native.block_cholesky import (
     factor,
     forward_substitute,
 )
-from rfdropo_bayes.fem.native.cube_motion import (
-    carry_cube,
-    find_impacts,
-    predict_cubes,
-    record_cubes,
-    remember_impulses,
-    start_cubes,
-    take_cube_stage,
-)
+from rfdropo_bayes.fem.native.cube_motion import predict_cubes, record_cubes, start_cubes
 from rfdropo_bayes.fem.native.kernel_cache import named_by
 from rfdropo_bayes.fem.native.simd import (
     addresses,
@@ -41,8 +33,8 @@ from rfdropo_bayes.fem.native.simd import (
     where_greater,
     whole,
 )
-from rfdropo_bayes.fem.native.tetrahedral import assemble, clear, elastic_forces, gone_on
-from rfdropo_bayes.fem.native.tetrahedral_constraints import add_forces, add_sudden, hold, hold_again, meet
+from rfdropo_bayes.fem.native.tetrahedral import assemble, elastic_forces, gone_on
+from rfdropo_bayes.fem.native.tetrahedral_constraints import add_forces, end_stage, hold, hold_again, meet
 
 LARGEST = 1e12
 """[N] A tension beyond means that the rollout has diverged."""
@@ -301,7 +293,6 @@ def compile_rollout(sources: str) -> Callable:
         for step in range(commands.shape[0]):
             for number in range(schedule.count):
                 stage, last = schedule.stages[number], number + 1 == schedule.count
-                going = 0.0 if last else schedule.stages[number + 1].carried
                 share = 1.0 if last else stage.elapsed / schedule.time_step
                 begin_stage(work, stage, token)
                 if scene is not None:
@@ -311,20 +302,9 @@ def compile_rollout(sources: str) -> Callable:
                 set_targets(cables, commands[step], share, work, token)
                 condense_stage(pattern, mesh, cables, samples, work, schedule, stage, token)
                 contacts = hold(
-                    bare_pattern,
-                    around,
-                    bare_samples,
-                    meeting,
-                    bare,
-                    extra,
-                    p,
-                    reached,
-                    drives,
-                    mesh.free,
-                    stage,
-                    schedule,
-                    token,
-                )
+                    bare_pattern, around, bare_samples, meeting, bare, extra, p, reached, drives, mesh.free, stage,
+                    schedule, token,
+                )  # fmt: skip
                 substitute(pattern, mesh, work, token)
                 if schedule.refined:
                     unbalance(pattern, mesh, samples, work, drives, stage, token)
@@ -335,31 +315,14 @@ def compile_rollout(sources: str) -> Callable:
                         free = load(work.slack, i, token) * (1.0 / stage.length) * load(work.narrow, 0, token)
                         store(work.slack, i, free + condensed_entry(pattern, work.lower, i + 1, 0, token))
                     hold_again(
-                        bare_pattern,
-                        around,
-                        meeting,
-                        bare,
-                        extra,
-                        p,
-                        reached,
-                        drives,
-                        contacts,
-                        mesh.free,
-                        stage,
-                        schedule,
-                        token,
-                    )
+                        bare_pattern, around, meeting, bare, extra, p, reached, drives, contacts, mesh.free, stage,
+                        schedule, token,
+                    )  # fmt: skip
                     substitute(pattern, mesh, work, token)
                 accept(rest, drives, work, schedule, stage, token)
                 if scene is not None:
-                    if schedule.count > 1:
-                        find_impacts(meeting, p, drives, contacts, token)
-                        carry_cube(meeting, p, drives, contacts, going, bare.accepted, token)
-                        clear(work.sudden, token)
-                        add_sudden(around, meeting, bare, p, drives, contacts, mesh.free, token)
-                    narrow = load(bare.narrow, 0, token)
-                    remember_impulses(around, meeting, p, drives, contacts, narrow, bare.accepted, token)
-                    take_cube_stage(meeting, bare.accepted, bare.lost, stage.length, bare.wide, stage.predicted, token)
+                    later = 0.0 if last else schedule.stages[number + 1].carried
+                    end_stage(around, meeting, bare, p, drives, contacts, mesh.free, schedule, stage, later, token)
             if (step + 1) % schedule.stride == 0:
                 row = (step + 1) // schedule.stride
                 record_body(work, output, row - 1, token)
