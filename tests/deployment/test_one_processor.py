@@ -43,6 +43,7 @@ from rfdropo_bayes.deployment.drives import Drive
 from rfdropo_bayes.deployment.simulation import SimulationTable, simulated_drives
 from rfdropo_bayes.robots import load_robot
 
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # here: a fork before it would copy what JAX holds
 plant, own_process = sys.argv[1], sys.argv[2] == "own"
 hub = BusTable(interface="hub", channel="127.0.0.1:0")
 with simulated_drives(SimulationTable("motor_arm", hub, plant, own_process=own_process)) as found:
@@ -71,12 +72,8 @@ def serve_on_one_processor(folder: Path, plant: str, where: str) -> str:
     """What a master says that starts drives, asks one, and ends them, all on one processor."""
     (folder / "plants_for_test.py").write_text(PLANTS)
     path = os.pathsep.join([str(folder), *filter(None, sys.path)])
-    one = min(os.sched_getaffinity(0))
-    process = subprocess.Popen(
-        [sys.executable, "-c", SERVE, f"plants_for_test:{plant}", where],
-        stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path},
-        preexec_fn=lambda: os.sched_setaffinity(0, {one}),
-    )  # fmt: skip
+    command = [sys.executable, "-c", SERVE, f"plants_for_test:{plant}", where]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path})
     try:
         return process.communicate(timeout=PATIENCE)[0]
     except subprocess.TimeoutExpired:
