@@ -190,9 +190,9 @@ def evened(time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
     return time if not len(short) else time[0] + _between(time, short) * np.arange(len(time))
 
 
-def sample_time(time: Float[np.ndarray, " rows"]) -> float:
-    """Median time from row to row [s], on evenly spaced rows where stamps are those of deliveries."""
-    return float(np.median(np.diff(evened(time))))
+def sample_time(*times: Float[np.ndarray, " rows"]) -> float:
+    """Median time from row to row [s] of one or more recordings, evenly spaced where stamps are those of deliveries."""
+    return float(np.median(np.concatenate([np.diff(evened(time)) for time in times])))
 
 
 def _between(time: np.ndarray, short: np.ndarray) -> float:

@@ -13,6 +13,7 @@ from rfdropo_bayes.data.csv_table import MOTIVE, CsvTable
 from rfdropo_bayes.data.plain_csv import CsvColumns, command_table, coordinates, read_tables
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.tables import changed
 
 MAPPED = (plain_csv.FORMAT, motive_csv.FORMAT, rosbag.FORMAT, lerobot.FORMAT)
 FOLDERS = (rosbag.FORMAT, lerobot.FORMAT)
@@ -78,7 +79,7 @@ def observed_table(format: str, path: Path, columns: CsvColumns, episode: int | 
         file = motive_csv.read_motive(path)
         file.table.require(places)
         unit = file.length_unit or columns.position_unit
-        return Observed(file.table, columns.model_copy(update={"position_unit": unit}))
+        return Observed(file.table, changed(columns, where=str(path), position_unit=unit))
     return Observed(CsvTable(path, places, machine_written=False), columns)
 
 
@@ -108,7 +109,8 @@ def read_mapped(
     source = command_table(commands, columns)
     name = path.name.removesuffix(".gz")
     if format == rosbag.FORMAT and source is None:
-        source, columns = rosbag.read_commands(path, columns), columns.model_copy(update={"command_time": columns.time})
+        source = rosbag.read_commands(path, columns)
+        columns = changed(columns, where=str(path), command_time=columns.time)
     if format == motive_csv.FORMAT and source is None:
         raise InputError(
             "has no commands: Motive records none",

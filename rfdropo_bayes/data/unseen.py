@@ -20,6 +20,7 @@ from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, lo
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import find_files
+from rfdropo_bayes.tables import changed
 
 
 def load_unseen(
@@ -73,7 +74,7 @@ def load_unseen(
     changes: dict[str, Any] = {"fit": [entry], "test": [], "resample": None, "missing": "mask"}
     if spec.initial_command is None and spec.format in UNTOLD:
         changes["initial_command"] = "first"  # not recognised: later rows would have a say
-    recordings = load_recordings(spec.model_copy(update=changes), base)
+    recordings = load_recordings(changed(spec, where="[data]", **changes), base)
     if len(recordings) > 1:
         raise InputError(f"names {len(recordings)} files", where=commands, remedy="predict one at a time")
     return first_row_only(spec.piece(_begun(recordings[0], spec, begun), rows))

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, estimate_noise
+from rfdropo_bayes.data.clock import sample_time
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 
 MODEL_ERROR = "model_error"  # among the attributes of a posterior
@@ -70,7 +71,7 @@ def model_error(
     noise = estimate_noise(error, valid, 1.0, source=RESIDUALS, order=1, pooled=False, shared=None)
     across = noise.correlation
     share = 1.0 if across is None else len(across) / float(np.sum(across**2))
-    step = float(np.median(np.concatenate([np.diff(p.time) for p in fitted])))
+    step = sample_time(*(p.time for p in fitted))
     memory = float(np.clip(noise.autocorrelation[1], 1e-3, 0.999))
     return ModelError(tuple(markers), tuple((widened * noise.scale).tolist()), float(-step / np.log(memory)), share)
 

@@ -17,6 +17,7 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.clock import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.posteriors import RecordingPrediction
@@ -116,7 +117,7 @@ def predict_new(
     recordings = gather_recordings(model.simulator, trajectories)
     markers = model.markers.like(recordings)
     if left and markers.known is None and markers.independent and set(recordings.markers) <= set(left.markers):
-        step = float(np.median(np.concatenate([np.diff(t.time) for t in trajectories])))
+        step = sample_time(*(t.time for t in trajectories))
         markers = replace(markers, known=noise_of_markers(left.every(step), left.markers, recordings))
     fresh = replace(model, space=space, recordings=recordings, channels=(markers,))
     problem = CalibrationProblem(fresh, chunk=chunk)

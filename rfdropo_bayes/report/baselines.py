@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory, group_repeats
+from rfdropo_bayes.data.clock import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.fir import FirRegression, fit_fir
 from rfdropo_bayes.report.scores import ErrorFigures, measured_paths, score
@@ -84,7 +85,7 @@ def copied_mean(fit: Sequence[Trajectory]) -> Predictor:
 
 def _tolerance(recording: Trajectory) -> float:
     """Repeats end a little apart, with the jitter of their clocks."""
-    return 2.0 * float(np.median(np.diff(recording.time)))
+    return 2.0 * sample_time(recording.time)
 
 
 def baseline_errors(

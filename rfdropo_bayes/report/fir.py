@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.clock import sample_time
 
 SPANS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)  # history that is looked at [s]
 LAGS = 11  # at most, evenly spaced over the span
@@ -66,7 +67,7 @@ def fit_fir(fit: Sequence[Trajectory], groups: Sequence[Sequence[int]], *, degre
         fold = np.concatenate([np.full(n, group_of[i]) for i, n in enumerate(rows)])
     else:
         fold = np.concatenate([np.arange(n) * BLOCKS // n for n in rows])
-    step = float(np.median(np.concatenate([np.diff(t.time) for t in fit])))
+    step = sample_time(*(t.time for t in fit))
     trained = [_train(fit, fold, _lags(span, step), degree) for span in _distinct_spans(step)]
     return min(trained, key=lambda regression: regression.error)
 

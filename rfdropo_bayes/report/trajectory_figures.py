@@ -7,6 +7,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rfdropo_bayes.data.clock import sample_time
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.report import style
 from rfdropo_bayes.report.coverage import predictive_bands
@@ -157,7 +158,7 @@ def _legend_above(axes: Axes, *, columns: int) -> None:
 
 def _memory(axes: Axes, time: np.ndarray, residual: Float[np.ndarray, "time 3"]) -> None:
     lags = min(len(time) - 1, max(10, len(time) // 3))
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    step = sample_time(time) if len(time) > 1 else 1.0
     size = 2 ** int(np.ceil(np.log2(2 * len(time))))
     power = np.abs(np.fft.rfft(residual, size, axis=0)) ** 2
     correlation = np.fft.irfft(power, axis=0)[: lags + 1]

@@ -173,7 +173,9 @@ class Robot(Table):
         Raises:
             InputError: values that do not fit together.
         """
-        return changed(self, where=f"robot {self.name}", **values).grouped(self._groups)
+        found = changed(self, where=f"robot {self.name}", **values)
+        found._groups = self._groups
+        return found
 
     def travel(self, recording: str, initial: Float[np.ndarray, " channel"]) -> Travel | None:
         """What is stated of the drives in a recording that begins at this command [m or rad]; see `travel_in`."""
@@ -187,7 +189,7 @@ class Robot(Table):
 
     def grouped(self, groups: Patterns) -> Robot:
         """The same robot, whose drives may be stated by groups of recordings."""
-        found = self.model_copy()
+        found = self.with_changes()
         found._groups = groups
         return found
 

@@ -22,6 +22,7 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace, deviations, spread_of
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import DataSpec, Trajectory, load_recordings
+from rfdropo_bayes.data.clock import sample_time
 from rfdropo_bayes.data.spec import RecordingEntry
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import group_of, in_group
@@ -143,7 +144,7 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
     simulator, key = model.simulator, jax.random.key(seed)
     fixed, _ = fitted_parts(fit)
     recordings = gather_recordings(simulator, [head])
-    noise = noise_of_markers(left.every(float(np.median(np.diff(head.time)))), left.markers, recordings)
+    noise = noise_of_markers(left.every(sample_time(head.time)), left.markers, recordings)
     spread_key, fit_key, fitted_key, rest_key = jax.random.split(key, 4)
     posterior = fit.record.posterior
     body = thin({p.name: posterior[p.name] for p in space.parameters if p.name in posterior}, draws)

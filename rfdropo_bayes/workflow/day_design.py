@@ -16,6 +16,7 @@ from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory, actions
+from rfdropo_bayes.data.clock import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, group_of, whole
 from rfdropo_bayes.posteriors import PosteriorRecord
@@ -161,7 +162,7 @@ def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationP
     model, left = model_of(fit), model_error_of(fit.record)
     fixed, space = fitted_parts(fit)
     recordings = gather_recordings(model.simulator, runs)
-    noise = noise_of_markers(left.every(float(np.median(np.diff(runs[0].time)))), left.markers, recordings)
+    noise = noise_of_markers(left.every(sample_time(runs[0].time)), left.markers, recordings)
     space = day_space(space, model, recordings.names, DAY, fit.record.attrs[FITTED])
     drawn = fit.record.posterior
     body = {name: value for name, value in space.typical_scales.items() if name not in drawn}
@@ -216,7 +217,7 @@ def _of_group(runs: Sequence[Trajectory], groups: Patterns, group: str | None) -
 
 def _begun_like(run: Trajectory, seconds: float) -> Trajectory:
     """A recording of so many seconds that begins as another one, is observed as often, by all of its markers."""
-    step = float(np.median(np.diff(run.time)))
+    step = sample_time(run.time)
     time = step * np.arange(max(2, int(seconds / step + 1e-6) + 1))
     return _as_recording(run, whole(run.name), np.zeros(1), run.initial_command[None], time)
 

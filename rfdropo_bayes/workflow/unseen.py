@@ -23,6 +23,7 @@ from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory, commands_alone, first_row_only, load_unseen, start_is_known
+from rfdropo_bayes.data.clock import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_json
 from rfdropo_bayes.groups import group_of, in_group
@@ -137,7 +138,7 @@ def predict(
     simulator = with_groups(model.simulator, groups)
     fixed, space = fitted_parts(fit)
     recordings = gather_recordings(simulator, [unseen])
-    stated, step = spec.stated, float(np.median(np.diff(unseen.time)))
+    stated, step = spec.stated, sample_time(unseen.time)
     lasts = stated.correlation_time if stated is not None and spec.noise == STATED else None
     memory = None if lasts is None else np.array([1.0, np.exp(-step / lasts)])
     channels = (_markers(recordings, spec.noise, record.attrs.get(KNOWN_NOISE), memory),)

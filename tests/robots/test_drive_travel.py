@@ -139,7 +139,7 @@ def test_a_model_drives_a_recording_as_its_group_does():
     """Groups of the experiment, wildcards of the robot; a session's drives are those of the recording it names."""
     robot = load_robot("smooth_arm")
     first = robot.channel_names[0]
-    robot = robot.model_copy(update={"drives": (table(recordings="tuesday_*", beyond="clipped"),)})
+    robot = robot.with_changes(drives=(table(recordings="tuesday_*", beyond="clipped"),))
     stated = [{"cables": [first], "recordings": "mondays", "high": 0.012, "beyond": "lost"}]
     model = Model(robot, drives=stated, groups={"mondays": ["monday_*"]})
     runs = [recording(name, robot) for name in ("monday_1", "tuesday_1", "friday")]
