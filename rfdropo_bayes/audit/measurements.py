@@ -11,10 +11,18 @@ from jaxtyping import Bool, Float
 from rfdropo_bayes.bayes.channels import Channel, Series, WeighedParts
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, RESIDUALS, estimate_noise
-from rfdropo_bayes.bayes.noise.repeat_shifts import repeat_shift
 from rfdropo_bayes.bayes.noise.stacked import Stacked, side_by_side
 from rfdropo_bayes.bayes.recordings import RecordingSet
-from rfdropo_bayes.bayes.repeats import Groups, deviations, group_recordings, mean_error, mean_of, repeats_apart, spread
+from rfdropo_bayes.bayes.repeats import (
+    Groups,
+    deviations,
+    group_recordings,
+    mean_error,
+    mean_of,
+    repeat_shift,
+    repeats_apart,
+    spread,
+)
 from rfdropo_bayes.data import Trajectory
 
 

@@ -17,8 +17,7 @@ from rfdropo_bayes.audit.screen import Row, Screen
 from rfdropo_bayes.audit.sentence import sentence
 from rfdropo_bayes.audit.verdict import NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS
-from rfdropo_bayes.bayes.space import SEPARATOR
-from rfdropo_bayes.bayes.units import force_power
+from rfdropo_bayes.bayes.space import SEPARATOR, force_power
 
 SCHEMA_VERSION = 1
 MILLIMETRES = 1e3

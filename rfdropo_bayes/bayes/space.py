@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,6 +23,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
 SEPARATOR = "@"
 HALF_NORMAL_MEDIAN = 0.6745
 INTERIOR = 15.0  # in unconstrained space: within 3e-7 of the width of a bound
+FORCES = frozenset({"N", "kg", "Pa", "J", "W"})  # units that hold one force each
 
 
 @dataclass(frozen=True)
@@ -256,3 +258,14 @@ def deviations(spec: ParameterSpec, pooled: Pooled) -> list[Parameter]:
         Parameter(own, prior, group, dict(own.prior), tuple(members), spec.name, scale)
         for group, members in pooled.groups.items()
     ]
+
+
+def force_power(unit: str) -> int:
+    """Power of the unit of force in a unit such as "kg", "N/m", "Pa s" or "1/Pa"; exponents of its parts do not count.
+
+    1 for masses, forces and stiffnesses, -1 for compliances. Of equations of motion in which every such parameter is
+    multiplied by one factor to that power, no motion changes: where only positions are measured and lengths commanded,
+    data say nothing of that factor (Buckingham's theorem).
+    """
+    above, *below = [sum(part in FORCES for part in re.findall(r"[A-Za-z]+", side)) for side in unit.split("/")]
+    return above - sum(below)

@@ -1,14 +1,19 @@
-"""Mechanisms of the body itself: masses, direction of gravity, and a material beyond linear elasticity."""
+"""Mechanisms of the body: masses, gravity's direction, a material beyond linear elasticity, cables, a fluid, a wall.
+
+A cable whose length is imposed finds its own tension, so friction at its drive would move nothing. Friction and
+elasticity of cables act between the guides, or in series with the drive; see ``fem.cable_friction``.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from rfdropo_bayes.fem import BendingLaw, LayeredBody, Material, Viscoelasticity
+from rfdropo_bayes.fem import BendingLaw, LayeredBody, Material, Viscoelasticity, Wall
 from rfdropo_bayes.mechanisms.priors import half_normal, log_normal, normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Values
@@ -229,3 +234,137 @@ class Softening:
     def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
         """Let every modulus drift."""
         return material._replace(effects=material.effects._replace(softening_rate=values["softening_rate"]))
+
+
+class CoulombFriction:
+    """Each guide holds its cable back with a constant force, by stick and slip; zero is the base simulator."""
+
+    name = "coulomb_friction"
+    stage = "body"
+    bodies = ("layered",)
+    cause = "cables that rub in their guides, sheaths or seals with a force that does not depend on tension"
+    remedy = "pull a slack cable through the body with a spring scale; lubricate or line the guides"
+    parameters = (
+        ParameterSpec(
+            "coulomb_friction", "N", 0.0, 50.0, 0.0, half_normal(0.5), "friction force of every guide along the cable"
+        ),
+    )
+
+    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+        """Give every guide the friction force."""
+        return material._replace(effects=material.effects._replace(coulomb_friction=values["coulomb_friction"]))
+
+
+class CapstanFriction:
+    """Tension decays along a bent cable by exp(-mu angle) where it slides; zero is the base simulator."""
+
+    name = "capstan_friction"
+    stage = "body"
+    bodies = ("layered",)
+    cause = "friction of cables pressed against their guides where the body bends"
+    remedy = "measure the tension at both ends of a cable over a known bend; lubricate or line the guides"
+    parameters = (
+        ParameterSpec(
+            "capstan_friction",
+            "-",
+            0.0,
+            2.0,
+            0.0,
+            half_normal(0.3),
+            "coefficient of friction between cables and guides",
+        ),
+    )
+
+    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+        """Give every guide the coefficient of friction."""
+        return material._replace(effects=material.effects._replace(capstan_friction=values["capstan_friction"]))
+
+
+class CableCompliance:
+    """Cables and transmission stretch in proportion to tension; zero is the base simulator."""
+
+    name = "cable_compliance"
+    stage = "body"
+    bodies = ("layered",)
+    cause = "stretch of the cables, of their anchorage and of the transmission under load"
+    remedy = "hang a known weight on each cable and measure its stretch; use stiffer cable"
+    parameters = (
+        ParameterSpec(
+            "cable_compliance", "m/N", 0.0, 0.1, 0.0, half_normal(5e-4), "stretch of every cable per tension"
+        ),
+    )
+
+    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+        """Put the compliance in series with every cable."""
+        return material._replace(effects=material.effects._replace(cable_compliance=values["cable_compliance"]))
+
+
+class QuadraticDrag:
+    """Drag with the square of the speed; zero is the base simulator."""
+
+    name = "quadratic_drag"
+    stage = "body"
+    bodies = ("layered",)
+    cause = "resistance of the surrounding air or water"
+    remedy = "compare slow and fast sweeps of the same path"
+    parameters = (
+        ParameterSpec(
+            "drag_density",
+            "kg/m3",
+            0.0,
+            1e5,
+            0.0,
+            half_normal(300.0),
+            "half the fluid's density times the drag coefficient",
+        ),
+    )
+
+    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+        """Let every section be dragged."""
+        return material._replace(effects=material.effects._replace(drag=values["drag_density"]))
+
+
+class WallContact:
+    """A surface beside the body pushes back where the body's axis passes it; zero stiffness is the base simulator."""
+
+    name = "wall_contact"
+    stage = "body"
+    bodies = ("layered",)
+    cause = "the body touches its mount, a table, a cable bundle or itself"
+    remedy = "look where the trajectory ends on one side; clear the workspace or measure where the surface is"
+    parameters = (
+        ParameterSpec(
+            "wall_stiffness",
+            "N/m2",
+            0.0,
+            1e7,
+            0.0,
+            half_normal(1e3),
+            "force of the surface per depth and length of the body",
+        ),
+        ParameterSpec(
+            "wall_distance",
+            "m",
+            -1.0,
+            1.0,
+            0.03,
+            normal(0.03, loc=0.03),
+            "distance at which the surface stops the axis, from the axis at rest",
+            grid=(0.005, 0.01, 0.02, 0.04, 0.08),
+        ),
+        ParameterSpec(
+            "wall_azimuth",
+            "rad",
+            -2 * math.pi,
+            2 * math.pi,
+            0.0,
+            {"distribution": "Uniform", "low": -math.pi, "high": math.pi},
+            "direction in which the surface lies, from x towards y",
+            grid=tuple(math.pi / 4 * k for k in range(-3, 5)),
+        ),
+    )
+
+    def embody(self, values: Values, material: Material, body: LayeredBody) -> Material:
+        """Put the wall there."""
+        wall = Wall(values["wall_stiffness"], values["wall_distance"], values["wall_azimuth"])
+        return material._replace(effects=material.effects._replace(wall=wall))

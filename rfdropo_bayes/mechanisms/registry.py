@@ -34,13 +34,17 @@ from rfdropo_bayes.mechanisms.body import (
     BaseTilt,
     BendingStiffening,
     BendTwistCoupling,
+    CableCompliance,
+    CapstanFriction,
+    CoulombFriction,
     Payload,
     PlaneAnisotropy,
+    QuadraticDrag,
     Softening,
     StiffnessGradient,
     ViscoelasticBranch,
+    WallContact,
 )
-from rfdropo_bayes.mechanisms.friction import CableCompliance, CapstanFriction, CoulombFriction
 from rfdropo_bayes.mechanisms.sensing import (
     CameraDrift,
     CameraOffset,
@@ -50,7 +54,6 @@ from rfdropo_bayes.mechanisms.sensing import (
     MarkerOffset,
     SensorLag,
 )
-from rfdropo_bayes.mechanisms.surroundings import QuadraticDrag, WallContact
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.mechanisms import Mechanism

@@ -2,8 +2,13 @@
 
 from rfdropo_bayes.posteriors.bounds import contradiction, contradicts, piled_at
 from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
-from rfdropo_bayes.posteriors.inference_data import load_posterior, save_posterior, summarise, to_inference_data
-from rfdropo_bayes.posteriors.intervals import central_interval
+from rfdropo_bayes.posteriors.inference_data import (
+    central_interval,
+    load_posterior,
+    save_posterior,
+    summarise,
+    to_inference_data,
+)
 from rfdropo_bayes.posteriors.record import SPREAD, InferenceData, ParameterInfo, PosteriorRecord, RecordingPrediction
 
 __all__ = [

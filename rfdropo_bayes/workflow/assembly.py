@@ -43,8 +43,7 @@ from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
 from rfdropo_bayes.simulators.engine import Engine
 from rfdropo_bayes.simulators.mechanisms import Mechanism
-from rfdropo_bayes.simulators.mesh_body import assemble_mesh
-from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
+from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, assemble_mesh
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble

@@ -23,7 +23,7 @@ from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.inference.methods import make_config
-from rfdropo_bayes.report.recording_figures import save_recording
+from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.workflow.assembly import build_model, build_simulator, with_drives

@@ -12,7 +12,7 @@ import pandas as pd
 from rfdropo_bayes.bayes.calibration import CalibrationProblem
 from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise.autoregression import STATED
-from rfdropo_bayes.bayes.numpyro_priors import table_of
+from rfdropo_bayes.bayes.priors import table_of
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.prediction.predictive import Batch
 from rfdropo_bayes.robots import Robot

@@ -12,8 +12,7 @@ from jaxtyping import Float
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.trajectory import open_netcdf
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.report.motion import Motion, cube_corners, smooth_line, upright
-from rfdropo_bayes.report.motion_export import save_frames, save_vtk
+from rfdropo_bayes.report.motion import Motion, cube_corners, save_frames, save_vtk, smooth_line, upright
 from rfdropo_bayes.report.motion_figures import save_animation, save_still
 from rfdropo_bayes.robots import Robot, known_robots, load_robot
 from rfdropo_bayes.workflow.assembly import robot_of

@@ -7,10 +7,9 @@ from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.omnibus import statistics
 from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.audit.screen import null_residuals, tail
-from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED, Autoregression
-from rfdropo_bayes.bayes.noise.repeat_shifts import repeat_shift
-from rfdropo_bayes.bayes.noise.shared import mixed, shrunk_correlation
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED, Autoregression, mixed, shrunk_correlation
 from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.bayes.repeats import repeat_shift
 
 from .toys import measurements
 

@@ -9,8 +9,7 @@ import pytest
 from numpyro.distributions.transforms import AffineTransform, ExpTransform, SigmoidTransform
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.bayes.numpyro_priors import table_of
-from rfdropo_bayes.bayes.priors import log_density, prior_from_table
+from rfdropo_bayes.bayes.priors import log_density, prior_from_table, table_of
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec

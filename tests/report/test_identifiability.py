@@ -8,7 +8,7 @@ import pytest
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.report.identifiability import identify, product_in_words, spread_in_words
-from rfdropo_bayes.report.tables import bound_reached, posterior_table
+from rfdropo_bayes.report.summary import bound_reached, posterior_table
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 LOG = {"distribution": "LogNormal"}

@@ -11,8 +11,7 @@ import pytest
 from rfdropo_bayes.inference.result import stage_cautions
 from rfdropo_bayes.posteriors import ParameterInfo
 from rfdropo_bayes.report.randomisation import judge
-from rfdropo_bayes.report.summary import build_summary
-from rfdropo_bayes.report.tables import bound_reached
+from rfdropo_bayes.report.summary import bound_reached, build_summary
 
 CORRELATED = {"all": {"correlated": True, "narrowing": 2.4}}
 

@@ -17,8 +17,7 @@ from rfdropo_bayes.simulators import Result, Simulator
 from rfdropo_bayes.simulators.commands import animated_on_grid
 from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.mechanisms import bodies_of, obstacle
-from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
-from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
+from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, TetrahedraTable, assemble_mesh
 
 TIME_STEP = 0.01
 SOFA = {"frames": "edges", "masses": "equal", "drives": "sofa", "drive_rate": 1e-3}

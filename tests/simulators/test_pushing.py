@@ -19,8 +19,7 @@ from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators import Result, Simulator
 from rfdropo_bayes.simulators.cube import push_table
 from rfdropo_bayes.simulators.engine import Backend, Engine
-from rfdropo_bayes.simulators.mesh_body import TetrahedraTable, assemble_mesh
-from rfdropo_bayes.simulators.mesh_trunk import MeshTrunkSimulator
+from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, TetrahedraTable, assemble_mesh
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 from rfdropo_bayes.workflow.engines import backend

@@ -15,7 +15,7 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.data import Trajectory, first_row_only
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
-from rfdropo_bayes.prediction.cube_start import with_measured_starts
+from rfdropo_bayes.prediction.predictive import with_measured_starts
 from rfdropo_bayes.simulators.cube import push_table
 from rfdropo_bayes.workflow.model import Model
 from rfdropo_bayes.workflow.unseen import run_prediction

@@ -29,7 +29,6 @@ from rfdropo_bayes.bayes.problem import Hierarchy, Problem, ResidualProblem, Tra
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
-from rfdropo_bayes.inference.modes.blocks import BlockProblem
 from rfdropo_bayes.inference.modes.climb import (
     Climbable,
     Laplace,
@@ -52,7 +51,7 @@ from rfdropo_bayes.inference.modes.targets import (
 from rfdropo_bayes.inference.progress import UNRECORDED, UNSAVED, Checkpoint, Logbook, run_digest
 from rfdropo_bayes.inference.result import Draws, InferenceResult, chains, exclusion_cautions, prior_cautions
 from rfdropo_bayes.inference.smc import sampler
-from rfdropo_bayes.inference.smc.moves import StraightProblem, squared_distance
+from rfdropo_bayes.inference.smc.moves import BlockProblem, StraightProblem, squared_distance
 from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES
 
 JACOBIANS = ("auto", "forward", "central")

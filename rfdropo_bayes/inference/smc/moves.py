@@ -3,6 +3,7 @@
 - `propose`: preconditioned Crank-Nicolson steps, shaped by the covariance of the particles.
 - `Flow`: trajectories along the gradient of the posterior, for many parameters.
 - `StraightProblem`: logarithms of positive parameters, in which ridges are straight.
+- `BlockProblem`: whole blocks of rows as rows, which a survey of modes tempers one after the other.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy.linalg import solve_triangular
 
 from rfdropo_bayes.bayes.batches import padded
-from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, Values
+from rfdropo_bayes.bayes.problem import Problem, ProblemDefaults, ResidualProblem, Values
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.modes.climb import Laplace
 
@@ -322,3 +323,21 @@ class StraightProblem:
             return value, jnp.abs(slope)
 
         return jax.jit(both)
+
+
+class BlockProblem(ProblemDefaults):
+    """Blocks of a problem's rows as its rows, which a sampler brings in by shares: it tempers a whole block at once."""
+
+    def __init__(self, problem: StraightProblem, horizons: tuple[int, ...]) -> None:
+        self.problem, self.horizons = problem, horizons
+        self.names, self.units, self.bounds = problem.names, problem.units, problem.bounds
+        self.status_names = problem.status_names
+        self.fingerprint = f"{problem.fingerprint} {horizons}"
+        self.n_rows = len(horizons)
+        self.sample_prior, self.log_prior = problem.sample_prior, problem.log_prior
+        self.to_unconstrained, self.from_unconstrained = problem.to_unconstrained, problem.from_unconstrained
+
+    def row_log_likelihood(self, values: Values, horizon: int) -> tuple[Float[Any, "n horizon"], Int[Any, " n"]]:
+        """Log density of the rows of each block together."""
+        rows, status = self.problem.row_log_likelihood(values, self.horizons[horizon - 1])
+        return np.add.reduceat(np.asarray(rows), [0, *self.horizons[: horizon - 1]], axis=1), status
