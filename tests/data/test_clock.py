@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from rfdropo_bayes.data import CsvColumns, Trajectory, find_faults, read_plain_csv
-from rfdropo_bayes.data.clock import check_times, clock_notes, read_stamps
+from rfdropo_bayes.data.clock import check_times, clock_notes, read_stamps, sample_time
 from rfdropo_bayes.data.held_readings import hold_time
 from rfdropo_bayes.errors import InputError
 
@@ -190,6 +190,14 @@ def test_stamps_of_arrival_are_noted_and_mask_nothing(sizes):
     assert hold_time(time, angle) == pytest.approx(4 * STEP, rel=0.05)
     place[200, 0, 1] += 0.03  # a jump is still found, on an even clock
     assert np.flatnonzero(~find_faults(time, place).mask[:, 0]).tolist() == [200]
+
+
+def test_the_sample_time_of_recordings_is_that_of_their_rows_whatever_their_stamps():
+    """Half of these stamps follow the one before at once: the median interval is none."""
+    late = delivered(np.full(70, 6))
+    assert np.median(np.diff(late)) < 0.1 * STEP
+    assert sample_time(late) == pytest.approx(STEP, rel=0.05)
+    assert sample_time(TIME, late) == pytest.approx(STEP, rel=0.05)
 
 
 def test_jitter_two_rates_and_a_gap_are_no_stamps_of_arrival():
