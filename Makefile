@@ -29,7 +29,7 @@ demo: $(CORE) ## calibrate the bundled example and write its report (minutes)
 test: $(DEV) ## the tests that are not slow
 	$(PYTEST) -n $(WORKERS) -m "not slow and not notebook"
 
-# The rooms that compute. `make test-portable ROOMS="training audit"` runs some of them: those that learn, sample and
+# The rooms that compute. `make test-portable ROOMS="policies audit"` runs some of them: those that learn, sample and
 # search are where a test that rests on one processor shows, because a last bit becomes another curve there.
 test-portable: $(DEV) ## the numerical tests with other instruction sets: what rests on one processor fails
 	$(BIN)/python tools/portable.py $(ROOMS) -- -n $(WORKERS)
@@ -38,7 +38,7 @@ test-all: $(ALL) ## every test, the slow ones, the notebooks and those of option
 	$(PYTEST) -n $(WORKERS)
 
 matrix: $(DEV) ## every method and every command, on the demo, an own robot and a mesh body (minutes)
-	$(PYTEST) -n $(WORKERS) --dist loadgroup tests/workflow/test_matrix.py tests/workflow/test_commands_matrix.py
+	$(PYTEST) -n $(WORKERS) --dist loadgroup tests/verbs/test_matrix.py tests/verbs/test_commands_matrix.py
 
 test-compiler: $(DEV) ## the layered engine, its kernels compiled by Numba's own compilers (docs/native.md)
 	RFDROPO_COMPILER=numba $(PYTEST) -n $(WORKERS) tests/fem/test_native_layered.py tests/fem/test_native_session.py tests/fem/test_compilers.py

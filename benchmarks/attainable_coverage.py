@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rfdropo_bayes.studies.tasks import TASKS, Task, draw_truth
+from rfdropo_bayes.studies.virtual_tasks import TASKS, InferenceTask, draw_truth
 
 TRUTHS = 100_000
 INSIDE = 0.05, 0.95
@@ -54,12 +54,12 @@ def _row(task: str, ridge: tuple[str, ...], truths: str, inside: Bool[np.ndarray
     print(f"| {task} | {', '.join(ridge)} | {truths} | {inside.mean():.1%} |")
 
 
-def _off_centre(task: Task, ridge: tuple[str, ...], rng: np.random.Generator) -> Values:
+def _off_centre(task: InferenceTask, ridge: tuple[str, ...], rng: np.random.Generator) -> Values:
     drawn = [draw_truth(task, "off-centre", ridge, rng) for _ in range(TRUTHS)]
     return {key: np.array([truth[key] for truth in drawn]) for key in ridge}
 
 
-def held(task: Task, truths: Values) -> Bool[np.ndarray, " truth"]:
+def held(task: InferenceTask, truths: Values) -> Bool[np.ndarray, " truth"]:
     """Whether the scale of each truth lies inside the central interval of the prior along its ridge."""
     down = np.max([task.ranges[name][0] / values for name, values in truths.items()], axis=0)
     up = np.min([task.ranges[name][1] / values for name, values in truths.items()], axis=0)
@@ -68,7 +68,7 @@ def held(task: Task, truths: Values) -> Bool[np.ndarray, " truth"]:
     return (share > INSIDE[0]) & (share < INSIDE[1])
 
 
-def _corners(task: Task, truths: Values) -> list[tuple[str, Bool[np.ndarray, " truth"]]]:
+def _corners(task: InferenceTask, truths: Values) -> list[tuple[str, Bool[np.ndarray, " truth"]]]:
     """Mass and stiffness low or high."""
     upper = {name: truths[name] > np.mean(task.ranges[name]) for name in ("trunk_mass", "young_modulus")}
     words = ("low", "high")

@@ -23,12 +23,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from rfdropo_bayes.model.assembly import build_simulator
+from rfdropo_bayes.model.experiment import SimulatorTable
+from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot, load_robot
 from rfdropo_bayes.simulators import Commands
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
-from rfdropo_bayes.workflow.assembly import build_simulator
-from rfdropo_bayes.workflow.experiment import SimulatorTable
-from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 ROBOTS = ("trunk_sofa", "trunk_physical", "smooth_arm", "asl_trunk", "motor_trunk")
 PERIOD, MOVE, FARTHEST, OBSERVED = 0.05, 0.005, 0.03, 0.02

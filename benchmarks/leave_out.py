@@ -21,11 +21,11 @@ import rfdropo_bayes as rb
 from rfdropo_bayes.data import RecordingEntry
 from rfdropo_bayes.groups import whole
 from rfdropo_bayes.inference.methods import make_config
+from rfdropo_bayes.model.assembly import load_data
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.report.coverage import predictive_bands
 from rfdropo_bayes.tables import changed
-from rfdropo_bayes.workflow.assembly import load_data
-from rfdropo_bayes.workflow.calibration import calibrate, inference_options
+from rfdropo_bayes.verbs.calibrate import calibrate, inference_options
 
 HEAD = ("left out", "recording", "start held [mm]", "error [mm]", "coordinates in", "of the tip", "tips in")
 

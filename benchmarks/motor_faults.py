@@ -30,16 +30,16 @@ import can
 import numpy as np
 
 from rfdropo_bayes.deployment import objects
+from rfdropo_bayes.deployment.bench.hub import HubBus
+from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
+from rfdropo_bayes.deployment.bench.simulated_drive import SimulatedFault
 from rfdropo_bayes.deployment.bus import BusTable
-from rfdropo_bayes.deployment.cia402 import State, state_of
-from rfdropo_bayes.deployment.hub import HubBus
+from rfdropo_bayes.deployment.cia402 import DriveState, state_of
 from rfdropo_bayes.deployment.objects import Object
 from rfdropo_bayes.deployment.policy import METADATA
 from rfdropo_bayes.deployment.sensors import Sighting, SimulatedMarkers
 from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, SafetyTable
-from rfdropo_bayes.deployment.simulated_drive import SimulatedFault
-from rfdropo_bayes.deployment.simulation import SimulationTable, simulated_drives
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.robots.policy_layout import ObservationPart, PolicyLayout
@@ -49,7 +49,7 @@ ALLOWED = 0.1  # [s]
 ONSET = 0.5  # [s] of motion before the fault
 STILL = 5e-5  # [m]: nearer to where it comes to rest than this, a cable rests
 VICTIM = 2  # node of the drive that fails
-SAFE = {State.QUICK_STOP_ACTIVE, State.FAULT, State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON}
+SAFE = {DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT, DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON}
 
 
 class Case(NamedTuple):
@@ -110,7 +110,7 @@ class Observer:
         self.robot = load_robot(ROBOT)
         self._bus = HubBus(channel)
         self._done = threading.Event()
-        self.seen: list[tuple[float, int, State | None, float]] = []  # time, node, state, length
+        self.seen: list[tuple[float, int, DriveState | None, float]] = []  # time, node, state, length
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def begin(self) -> None:
@@ -163,7 +163,7 @@ class Observer:
             unsafe = [
                 number
                 for number, (_, _, state, length) in enumerate(mine)
-                if abs(length - rest) > STILL or not (state in SAFE or (ramp and state is State.OPERATION_ENABLED))
+                if abs(length - rest) > STILL or not (state in SAFE or (ramp and state is DriveState.OPERATION_ENABLED))
             ]
             times.append(mine[unsafe[-1] + 1][0] - start if unsafe else 0.0)
         return max(times)

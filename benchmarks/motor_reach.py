@@ -21,21 +21,21 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
+from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.bus import BusTable, open_bus
 from rfdropo_bayes.deployment.log import read_journal
 from rfdropo_bayes.deployment.loop import Phase
 from rfdropo_bayes.deployment.sensors import SimulatedMarkers
 from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import Deployment, load_deployment
-from rfdropo_bayes.deployment.simulation import SimulationTable, simulated_drives
-from rfdropo_bayes.envs.episodes import Episodes, Settings
-from rfdropo_bayes.envs.randomisation import Point
-from rfdropo_bayes.envs.tasks import observed_of, task_named
-from rfdropo_bayes.envs.vec_env import TrunkVecEnv
+from rfdropo_bayes.policies.episodes import Episodes, Settings
+from rfdropo_bayes.policies.evaluation import Case, play
+from rfdropo_bayes.policies.onnx_export import ExportedPolicy
+from rfdropo_bayes.policies.randomisation import Point
+from rfdropo_bayes.policies.tasks import observed_of, task_named
+from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.robots import load_robot
-from rfdropo_bayes.training.evaluation import Case, play
-from rfdropo_bayes.training.export import ExportedPolicy
-from rfdropo_bayes.workflow.plant import true_simulator
+from rfdropo_bayes.verbs.simulated_plant import true_simulator
 
 THRESHOLDS = (0.005, 0.01, 0.01525)  # [m]
 

@@ -22,13 +22,13 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from rfdropo_bayes.envs.building import make_episodes
-from rfdropo_bayes.envs.randomisation import Uniform
-from rfdropo_bayes.envs.spaces import spaces_of
-from rfdropo_bayes.envs.tasks import EPISODE, task_named
-from rfdropo_bayes.envs.vec_env import TrunkVecEnv
+from rfdropo_bayes.policies.algorithms import algorithm_options
+from rfdropo_bayes.policies.building import make_episodes
+from rfdropo_bayes.policies.randomisation import Uniform
+from rfdropo_bayes.policies.spaces import spaces_of
+from rfdropo_bayes.policies.tasks import EPISODE, task_named
+from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
-from rfdropo_bayes.training.algorithms import algorithm_options
 
 REACH, PUSH, EMPTY = "TrunkReach-v0", "TrunkPush-v0", "empty"
 RANGES = {"young_modulus": (4.0e6, 5.0e6), "trunk_mass": (0.38, 0.46)}

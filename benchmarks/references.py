@@ -28,8 +28,8 @@ from rfdropo_bayes.fem.rigid_body import (
     rotation_matrix,
     solid_gyration_radius,
 )
-from rfdropo_bayes.workflow.model import Model
-from rfdropo_bayes.workflow.simulation import simulate_all
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.verbs.simulate import simulate_all
 
 EXPERIMENTS = Path(__file__).resolve().parents[1] / "experiments"
 BEFORE_CONTACT = "{observations='sofa_trunk/push_1.csv', rows=[0, 10]}"

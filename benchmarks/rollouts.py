@@ -36,14 +36,14 @@ import numpy as np
 import peers
 
 from rfdropo_bayes import fem
+from rfdropo_bayes.model.assembly import build_robot_simulator
+from rfdropo_bayes.model.engines import backend
+from rfdropo_bayes.model.experiment import SimulatorTable
+from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.engine import Engine
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.trunk import Assembly
-from rfdropo_bayes.workflow.assembly import build_robot_simulator
-from rfdropo_bayes.workflow.engines import backend
-from rfdropo_bayes.workflow.experiment import SimulatorTable
-from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 SOLVES = 100
 TIME_STEP = 0.01  # [s]

@@ -21,13 +21,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from rfdropo_bayes.fem.native.layered import available_threads
+from rfdropo_bayes.fem.native.layered_engine import available_threads
+from rfdropo_bayes.model.assembly import build_simulator
+from rfdropo_bayes.model.experiment import SimulatorTable
+from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators import Commands
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
-from rfdropo_bayes.workflow.assembly import build_simulator
-from rfdropo_bayes.workflow.experiment import SimulatorTable
-from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 ROBOT, PERIOD, SOLVES, ACTIONS = "trunk_sofa", 0.05, 5, 20
 

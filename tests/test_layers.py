@@ -27,11 +27,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     "audit": {"data", "posteriors", "simulators", "mechanisms", "bayes", "inference"},
     "prediction": {"data", "posteriors", "simulators", "bayes", "inference"},
     "report": {"data", "posteriors", "bayes", "inference", "audit"},
-    "envs": {"posteriors", "robots", "simulators", "mechanisms", "report"},
-    "training": {"posteriors", "robots", "inference", "report", "envs"},
+    "policies": {"posteriors", "robots", "simulators", "mechanisms", "inference", "report"},
     "deployment": {"data", "robots"},
 }
-MAY_IMPORT["workflow"] = set(MAY_IMPORT)
+MAY_IMPORT["model"] = set(MAY_IMPORT)
+MAY_IMPORT["results"] = set(MAY_IMPORT)
+MAY_IMPORT["verbs"] = set(MAY_IMPORT)
 MAY_IMPORT["studies"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}

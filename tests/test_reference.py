@@ -12,9 +12,9 @@ from pydantic import BaseModel
 from rfdropo_bayes.deployment.settings import Deployment
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.mechanisms.registry import REGISTRY
+from rfdropo_bayes.model.experiment import Experiment
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.sections import SHAPES, SectionedBody
-from rfdropo_bayes.workflow.experiment import Experiment
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SPEC = importlib.util.spec_from_file_location("reference", REPOSITORY / "tools" / "reference.py")

@@ -16,8 +16,8 @@ from packaging.utils import canonicalize_name
 
 import rfdropo_bayes
 from rfdropo_bayes.cli.main import app
+from rfdropo_bayes.model.experiment import load_experiment
 from rfdropo_bayes.robots import load_robot
-from rfdropo_bayes.workflow.experiment import load_experiment
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]

@@ -17,7 +17,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-ROOMS = ("training", "envs", "prediction", "audit", "inference", "bayes", "simulators", "fem")
+ROOMS = ("policies", "prediction", "audit", "inference", "bayes", "simulators", "fem")
 """The rooms that compute; others read, write and print."""
 
 # Without a list of features Numba would take the name, and this processor's features with it.
@@ -39,7 +39,7 @@ SETTINGS: dict[str, dict[str, str]] = {
         **NUMBA,
     },
 }
-RUN_IN = {"avx2": ROOMS, "default": ("training",)}
+RUN_IN = {"avx2": ROOMS, "default": ("policies",)}
 """Rooms of a setting: only PyTorch is as slow as "default" on machines that are in use, where a wheel has no better."""
 
 NUMPY_OFF = {"avx2": ("AVX512", "X86_V4"), "default": ("AVX", "FMA", "F16C", "X86_V3", "X86_V4")}

@@ -28,15 +28,15 @@ from rfdropo_bayes.deployment.objects import SIMULATED_EDS
 from rfdropo_bayes.deployment.settings import Deployment
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.mechanisms.registry import REGISTRY
+from rfdropo_bayes.model.assembly import measurement_specs
+from rfdropo_bayes.model.experiment import Experiment, NoiseModel
+from rfdropo_bayes.model.mechanism_listings import EXAMPLE_ROBOT, first_paragraph, mechanism_facts, prior_text
+from rfdropo_bayes.model.model_spec import DataChannels
+from rfdropo_bayes.model.robot_listings import format_rows, robot_rows
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.sections import SHAPES, SectionedBody
 from rfdropo_bayes.simulators.mechanisms import STAGES
 from rfdropo_bayes.simulators.parameters import ParameterSpec
-from rfdropo_bayes.workflow.assembly import measurement_specs
-from rfdropo_bayes.workflow.experiment import Experiment, NoiseModel
-from rfdropo_bayes.workflow.listings import format_rows, robot_rows
-from rfdropo_bayes.workflow.model_listings import EXAMPLE_ROBOT, first_paragraph, mechanism_facts, prior_text
-from rfdropo_bayes.workflow.model_spec import DataChannels
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "reference"
 NOTE = "<!-- Written by tools/reference.py from the code: change the code, then run it. -->"

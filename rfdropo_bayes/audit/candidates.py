@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.fit import Fit, Target
+from rfdropo_bayes.audit.fit import Fit, FitTarget
 from rfdropo_bayes.audit.score import Signature, project_out, signature, span
 from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.simulators.mechanisms import Mechanism
@@ -92,7 +92,7 @@ class Candidate:
         return self.name.partition(SEPARATOR)[0]
 
 
-def probe_all(target: Target, fit: Fit, candidates: Sequence[Candidate]) -> list[Probe]:
+def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> list[Probe]:
     """Probes of every candidate at a fit of the present model, all in a few batches of rollouts.
 
     A parameter without effect at null is a shape (a time constant, a threshold). Its prior is tried on a grid. Where
@@ -117,7 +117,7 @@ def probe_all(target: Target, fit: Fit, candidates: Sequence[Candidate]) -> list
     return probes + _probe_grid(target, fit, base, jobs)
 
 
-def screening_rollouts(target: Target, candidates: Sequence[Candidate]) -> int:
+def screening_rollouts(target: FitTarget, candidates: Sequence[Candidate]) -> int:
     """Rollouts that `probe_all` takes: a slope for each parameter, and the grids of those that are shapes."""
     forward, parameters = target.forward, target.forward.coordinates.space.parameters
     found = 0
@@ -129,7 +129,7 @@ def screening_rollouts(target: Target, candidates: Sequence[Candidate]) -> int:
     return found
 
 
-def _shapes(target: Target, candidate: Candidate, size: dict[int, float]) -> list[int]:
+def _shapes(target: FitTarget, candidate: Candidate, size: dict[int, float]) -> list[int]:
     """Parameters without effect at null that may have one elsewhere."""
     coordinates = target.forward.coordinates
     seen = [i for i in candidate.indices if size[i] >= UNSEEN]
@@ -138,7 +138,7 @@ def _shapes(target: Target, candidate: Candidate, size: dict[int, float]) -> lis
     return [i for i in unseen if not seen or not coordinates.affine[i] or coordinates.space.parameters[i].spec.grid]
 
 
-def _grid(target: Target, candidate: Candidate, shapes: Sequence[int]) -> list[dict[int, float]]:
+def _grid(target: FitTarget, candidate: Candidate, shapes: Sequence[int]) -> list[dict[int, float]]:
     coordinates = target.forward.coordinates
     levels = LEVELS if len(shapes) < 2 else LEVELS_OF_TWO
     values = []
@@ -149,7 +149,7 @@ def _grid(target: Target, candidate: Candidate, shapes: Sequence[int]) -> list[d
 
 
 def _probe_grid(
-    target: Target, fit: Fit, base: np.ndarray, jobs: Sequence[tuple[Candidate, dict[int, float]]]
+    target: FitTarget, fit: Fit, base: np.ndarray, jobs: Sequence[tuple[Candidate, dict[int, float]]]
 ) -> list[Probe]:
     if not jobs:
         return []
@@ -175,12 +175,12 @@ def _probe_grid(
     return probes
 
 
-def _slopes(target: Target, points: np.ndarray, directions: np.ndarray) -> dict[str, np.ndarray]:
+def _slopes(target: FitTarget, points: np.ndarray, directions: np.ndarray) -> dict[str, np.ndarray]:
     return {"slopes": target.slopes(points, directions)[0]}
 
 
 def _probe(
-    target: Target,
+    target: FitTarget,
     base: np.ndarray,
     candidate: Candidate,
     point: dict[int, float],
@@ -192,7 +192,7 @@ def _probe(
     return Probe(candidate.name, point, columns, amplitudes, mark)
 
 
-def lead(target: Target, fit: Fit, probe: Probe, lm: float) -> tuple[float, Float[np.ndarray, " d"]]:
+def lead(target: FitTarget, fit: Fit, probe: Probe, lm: float) -> tuple[float, Float[np.ndarray, " d"]]:
     """What a candidate may take from the sum of squares, and the point from which a refit should start.
 
     The score statistic is the drop that an amplitude brings, if its effect is in proportion to it. One large enough to
@@ -214,7 +214,7 @@ def lead(target: Target, fit: Fit, probe: Probe, lm: float) -> tuple[float, Floa
     return _best_of(target, fit, np.clip(points, *coordinates.bounds))
 
 
-def _sizes(target: Target, fit: Fit, probe: Probe) -> Float[np.ndarray, "way d"]:
+def _sizes(target: FitTarget, fit: Fit, probe: Probe) -> Float[np.ndarray, "way d"]:
     """A fit with several sizes of a probe's one amplitude, of both signs where it has two."""
     coordinates, (index,) = target.forward.coordinates, probe.amplitudes
     null, sd, sign = coordinates.null[index], coordinates.prior_sd[index], coordinates.one_sided[index]
@@ -225,7 +225,7 @@ def _sizes(target: Target, fit: Fit, probe: Probe) -> Float[np.ndarray, "way d"]
     return np.clip(points, *coordinates.bounds)
 
 
-def _best_of(target: Target, fit: Fit, points: Float[np.ndarray, "way d"]) -> tuple[float, Float[np.ndarray, " d"]]:
+def _best_of(target: FitTarget, fit: Fit, points: Float[np.ndarray, "way d"]) -> tuple[float, Float[np.ndarray, " d"]]:
     """The point that takes most from the sum of squares, base parameters moved with it, and how much it takes."""
     base = span(fit.jacobian)
     found = target.recall("way", [points], lambda: {"residual": target.residual(points)})["residual"]

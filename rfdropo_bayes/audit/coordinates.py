@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.bayes.batches import padded
 from rfdropo_bayes.bayes.priors import log_density
-from rfdropo_bayes.bayes.space import Parameter, ParameterSpace
+from rfdropo_bayes.bayes.space import InferredParameter, ParameterSpace
 
 MEASURED_FROM_NULL = ("Normal", "TruncatedNormal", "HalfNormal")
 PRIOR_DRAWS = 4000
@@ -227,6 +227,6 @@ class Coordinates:
         return theta
 
 
-def _spread(parameter: Parameter, draws: np.ndarray) -> float:
+def _spread(parameter: InferredParameter, draws: np.ndarray) -> float:
     """Scale of the prior: its own where it names one, so that a half-normal at null is a standard normal's half."""
     return float((parameter.table or {}).get("scale", 0.0)) or float(np.std(draws)) or 1.0

@@ -18,7 +18,7 @@ from rfdropo_bayes.audit.coordinates import MEASURED_FROM_NULL, PRIOR_DRAWS
 from rfdropo_bayes.audit.fixed_quantities import OwnParameter, families, stem
 from rfdropo_bayes.bayes.pooling import deviation_spec
 from rfdropo_bayes.bayes.priors import prior_from_table
-from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
+from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter, ParameterSpace
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 WHERE = "--between"
@@ -47,9 +47,9 @@ class Groups:
 class _Space:
     """Parameters that are found one after the other, and where each of them is."""
 
-    parameters: list[Parameter]
+    parameters: list[InferredParameter]
 
-    def add(self, parameter: Parameter) -> int:
+    def add(self, parameter: InferredParameter) -> int:
         self.parameters.append(parameter)
         return len(self.parameters) - 1
 
@@ -96,19 +96,19 @@ def with_differences(
     return ParameterSpace(tuple(found.parameters)), candidates
 
 
-def _deviation_of(spec: ParameterSpec, shared: Mapping[str, Parameter]) -> float:
+def _deviation_of(spec: ParameterSpec, shared: Mapping[str, InferredParameter]) -> float:
     """Standard deviation of a parameter's prior: what the model allows the parameter, it allows the difference."""
     known = shared.get(spec.name)
     prior = known.prior if known else prior_from_table(spec, dict(spec.prior), where=f"{WHERE} {spec.name}")
     return float(np.std(np.asarray(prior.sample(jax.random.key(0), (PRIOR_DRAWS,)))))
 
 
-def _difference(spec: ParameterSpec, spread: float, group: str, groups: Groups) -> Parameter:
+def _difference(spec: ParameterSpec, spread: float, group: str, groups: Groups) -> InferredParameter:
     """What one group's value is off that of the other, Normal(0, ``spread``)."""
     width = spec.high - spec.low
     own = deviation_spec(spec, spread)._replace(low=-width, high=width)
     prior = prior_from_table(own, dict(own.prior), where=f"{WHERE} {spec.name}")
-    return Parameter(own, prior, group, dict(own.prior), tuple(groups.members[group]), spec.name)
+    return InferredParameter(own, prior, group, dict(own.prior), tuple(groups.members[group]), spec.name)
 
 
 def _changed(specs: Sequence[ParameterSpec], places: Sequence[int], group: str, groups: Groups) -> Candidate:
@@ -136,7 +136,7 @@ def _in_one_group(candidate: Candidate, group: str, groups: Groups, found: _Spac
     return replace(candidate, name=f"{candidate.name}{SEPARATOR}{group}", indices=tuple(indices), group=group)
 
 
-def _of_one_group(parameter: Parameter, group: str, groups: Groups) -> Parameter:
+def _of_one_group(parameter: InferredParameter, group: str, groups: Groups) -> InferredParameter:
     """The size of a mechanism in one group, measured from its null value and added to what both share."""
     spec, table = parameter.spec, dict(parameter.table or parameter.spec.prior)
     for key in ("loc", "low", "high"):
@@ -145,4 +145,4 @@ def _of_one_group(parameter: Parameter, group: str, groups: Groups) -> Parameter
     low, high, grid = spec.low - spec.nominal, spec.high - spec.nominal, tuple(g - spec.nominal for g in spec.grid)
     own = spec._replace(low=low, high=high, nominal=0.0, prior=table, grid=grid)
     prior = prior_from_table(own, table, where=f"{WHERE} {spec.name}")
-    return Parameter(own, prior, group, table, tuple(groups.members[group]), spec.name)
+    return InferredParameter(own, prior, group, table, tuple(groups.members[group]), spec.name)

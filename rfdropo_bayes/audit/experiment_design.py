@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import norm
 
-from rfdropo_bayes.audit.fit import Fit, Target
+from rfdropo_bayes.audit.fit import Fit, FitTarget
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 
@@ -29,7 +29,7 @@ class Hypothesis:
 
 
 @dataclass(frozen=True)
-class Outlook:
+class DesignOutlook:
     """What a command sequence would decide.
 
     Attributes:
@@ -46,8 +46,8 @@ class Outlook:
 
 
 def outlooks(
-    target: Target, base: Fit, hypotheses: Sequence[Hypothesis], sequences: Sequence[Commands]
-) -> list[Outlook]:
+    target: FitTarget, base: Fit, hypotheses: Sequence[Hypothesis], sequences: Sequence[Commands]
+) -> list[DesignOutlook]:
     """Outlook of each command sequence, recorded once with the noise and at the times of the first recording at hand.
 
     Args:
@@ -93,7 +93,9 @@ def outlooks(
                 ]
                 pairs[(one.name, other.name)] = min(both)
         least = min(pairs.values(), default=0.0)
-        found.append(Outlook(least, pairs, float(norm.cdf(0.5 * np.sqrt(least))), _information(base, jacobians[0])))
+        found.append(
+            DesignOutlook(least, pairs, float(norm.cdf(0.5 * np.sqrt(least))), _information(base, jacobians[0]))
+        )
     return found
 
 
@@ -117,12 +119,12 @@ def _information(base: Fit, jacobian: Float[np.ndarray, "m free"]) -> float:
     return 0.5 * float(np.linalg.slogdet(precision + jacobian.T @ jacobian)[1] - np.linalg.slogdet(precision)[1])
 
 
-def best(outlook: Sequence[Outlook], separating: bool) -> int:
+def best(outlook: Sequence[DesignOutlook], separating: bool) -> int:
     """The sequence that separates most, or that informs most where there is nothing to separate."""
     return int(np.argmax([o.separation if separating else o.information for o in outlook]))
 
 
-def at_hand(target: Target, hypotheses: Sequence[Hypothesis]) -> dict[tuple[str, str], float]:
+def at_hand(target: FitTarget, hypotheses: Sequence[Hypothesis]) -> dict[tuple[str, str], float]:
     """Lambda of each pair on the recordings at hand alone."""
     none = np.zeros((0, 1))
     found = {}

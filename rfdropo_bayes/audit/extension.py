@@ -20,13 +20,13 @@ from rfdropo_bayes.audit.candidates import (
     start_together,
 )
 from rfdropo_bayes.audit.deadline import OutOfTime, about
-from rfdropo_bayes.audit.fit import FIRST, Fit, Target, best_between, climb, climb_rollouts, heights
+from rfdropo_bayes.audit.fit import FIRST, Fit, FitTarget, best_between, climb, climb_rollouts, heights
 from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.gain import noise_distance
 from rfdropo_bayes.audit.inadequacy import as_measured, far_off, fit_with_noise
 from rfdropo_bayes.audit.omnibus import Omnibus
 from rfdropo_bayes.audit.score import joint_statistic, likeness, project_out, span
-from rfdropo_bayes.audit.screen import Row, Screen, p_in_words, screen
+from rfdropo_bayes.audit.screen import Screen, ScreenRow, p_in_words, screen
 
 DISCRETISATION = "discretisation"
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])
@@ -69,7 +69,7 @@ class Rules:
 
 
 @dataclass(frozen=True)
-class Step:
+class Added:
     """One mechanism that joined the model.
 
     Attributes:
@@ -89,7 +89,7 @@ class Step:
     fit: Fit
     log_bayes_factor: float
     refits: dict[str, float]
-    judge: Target
+    judge: FitTarget
 
 
 @dataclass
@@ -106,7 +106,7 @@ class ExtensionSearch:
         report: called with a line of words as the search goes on.
     """
 
-    target: Target
+    target: FitTarget
     candidates: Sequence[Candidate]
     rules: Rules
     seed: int
@@ -176,20 +176,20 @@ class ExtensionSearch:
         measured = as_measured(self.target, fit)
         return screen(known, measured, [], [], [self.seed, number], self.rules.bootstraps).omnibus
 
-    def name_causes(self, base: Fit) -> tuple[Fit, list[Step], Screen]:
+    def name_causes(self, base: Fit) -> tuple[Fit, list[Added], Screen]:
         """Forward-stepwise extension: the base model, the steps taken, and the screen of the final model.
 
         The base model is another one where a candidate has led to a better optimum of it. When the time is up: the
         steps so far, and a joint test without candidates.
         """
-        bases, steps = [base], list[Step]()
+        bases, steps = [base], list[Added]()
         try:
             found = self._name_causes(bases, steps)
         except OutOfTime:
             found = self.tested(steps[-1].fit if steps else bases[-1], len(steps))
         return bases[-1], steps, found
 
-    def _name_causes(self, bases: list[Fit], steps: list[Step]) -> Screen:
+    def _name_causes(self, bases: list[Fit], steps: list[Added]) -> Screen:
         """Append steps until no more are called for, and better base models; the screen of the final model."""
         fit = bases[-1]
         renewed: set[int] = set()  # numbers of steps at which the model was climbed again: once at each
@@ -207,7 +207,7 @@ class ExtensionSearch:
                 return found
             with self.target.forward.deadline.stage("refits"):
                 step = self._extend(found, named)
-                pair = list[Step]()
+                pair = list[Added]()
                 with suppress(OutOfTime):
                     pair = self._pair(found, named, step) if self._room(steps) > 1 else []
             if pair:
@@ -239,12 +239,12 @@ class ExtensionSearch:
                     steps[:] = self._without_needless(bases[-1], self._reconsider(bases[-1], steps))
                 fit = steps[-1].fit
 
-    def _room(self, steps: Sequence[Step]) -> int:
+    def _room(self, steps: Sequence[Added]) -> int:
         """How many mechanisms may still be added: a model that is far off lacks more than a few, and rows that count
         as few keep out what only imitates them."""
         return len(self.candidates) if self.target.known is not None else self.rules.effects - len(steps)
 
-    def _extend(self, found: Screen, named: Sequence[str]) -> Step | None:
+    def _extend(self, found: Screen, named: Sequence[str]) -> Added | None:
         """Refit the leading classes and add the best of them, if it is worth it."""
         significant = [row for row in found.rows if row.adjusted_p <= self.rules.family and row.probe is not None]
         if any(row.name == DISCRETISATION for row in significant) and self._below_the_noise(found.fit):
@@ -277,9 +277,9 @@ class ExtensionSearch:
         able = [row for row in able if refits.get(row.name, np.inf) > refits[best] - TOLD_APART]
         members = self._class_of(found.row(best), able)
         judge = self.target.on(self.finer) if best == DISCRETISATION and self.finer else self.target
-        return Step(best, members, found, fits[best], refits[best], refits, judge)
+        return Added(best, members, found, fits[best], refits[best], refits, judge)
 
-    def _pair(self, found: Screen, named: Sequence[str], single: Step | None) -> list[Step]:
+    def _pair(self, found: Screen, named: Sequence[str], single: Added | None) -> list[Added]:
         """Two mechanisms at once, where the best one leaves most of a large misfit; none where they do not pay.
 
         Of compliance and pretension of cables neither does much without the other. Pairs are ranked by what the linear
@@ -316,11 +316,11 @@ class ExtensionSearch:
         between, _ = self.screened(alone[first], [*named, first])
         gains = [alone[first].log_evidence - fit.log_evidence, fits[best].log_evidence - alone[first].log_evidence]
         return [
-            Step(first, (first,), found, alone[first], gains[0], single.refits if single else {}, self.target),
-            Step(second, (second,), between, fits[best], gains[1], {}, self.target),
+            Added(first, (first,), found, alone[first], gains[0], single.refits if single else {}, self.target),
+            Added(second, (second,), between, fits[best], gains[1], {}, self.target),
         ]
 
-    def _refit_pair(self, fit: Fit, rows: Sequence[Row]) -> Fit:
+    def _refit_pair(self, fit: Fit, rows: Sequence[ScreenRow]) -> Fit:
         """The model of a fit with two candidates in it."""
         probes = [row.probe for row in rows if row.probe is not None]
         chosen = [c.indices for c in self.candidates if c.name in [row.name for row in rows]]
@@ -328,7 +328,7 @@ class ExtensionSearch:
         start = best_between(self.target, fit.x, start_together(fit, probes), held, SHARES)
         return climb(self.target, start, np.array([*fit.free, *np.setdiff1d(np.concatenate(chosen), fit.free)]))
 
-    def _climbed_again(self, step: Step) -> Fit | None:
+    def _climbed_again(self, step: Added) -> Fit | None:
         """The model before a step, climbed from where the step led: a candidate must not be named for having moved a
         climb on that had stopped early. None where that is no better."""
         before = step.before.fit
@@ -346,20 +346,20 @@ class ExtensionSearch:
         again = climb(self.target, starts[int(np.argmax(heights(self.target, starts, "without")))], before.free)
         return again if again.log_evidence > before.log_evidence + 1.0 else None
 
-    def _lead(self, fit: Fit, row: Row) -> tuple[float, np.ndarray]:
+    def _lead(self, fit: Fit, row: ScreenRow) -> tuple[float, np.ndarray]:
         """See `lead`; a finer mesh has no parameter, and its effect only one size."""
         assert row.probe is not None
         if row.name == DISCRETISATION:
             return fixed_drop(fit, row.probe), fit.x
         return lead(self.target, fit, row.probe, row.lm)
 
-    def _leading(self, significant: Sequence[Row], drops: Mapping[str, float], fit: Fit) -> list[Row]:
+    def _leading(self, significant: Sequence[ScreenRow], drops: Mapping[str, float], fit: Fit) -> list[ScreenRow]:
         """The best candidates of the leading classes, and further members of these while there is room; those that
         cannot bring what a mechanism must are left out."""
         able = [row for row in significant if drops[row.name] > 2.0 * self.rules.evidence]
         able.sort(key=lambda row: row.rank * np.log(fit.counted) - drops[row.name])
-        heads: list[Row] = []
-        rest: list[Row] = []
+        heads: list[ScreenRow] = []
+        rest: list[ScreenRow] = []
         for row in able:
             assert row.probe is not None
             alike = any(likeness(row.probe.mark, h.probe.mark) > self.rules.class_cosine for h in heads if h.probe)
@@ -371,7 +371,7 @@ class ExtensionSearch:
         # A refit on a finer mesh costs as much as all others: only where it could win.
         return [row for row in chosen if row.name != DISCRETISATION or drops[row.name] > 0.5 * drops[chosen[0].name]]
 
-    def _class_of(self, best: Row, able: Sequence[Row]) -> tuple[str, ...]:
+    def _class_of(self, best: ScreenRow, able: Sequence[ScreenRow]) -> tuple[str, ...]:
         """The best, and of those that explain as much of these data the ones that look the same."""
         assert best.probe is not None
         alike = [
@@ -383,11 +383,11 @@ class ExtensionSearch:
         ]
         return (best.name, *alike)
 
-    def refit(self, fit: Fit, row: Row) -> Fit:
+    def refit(self, fit: Fit, row: ScreenRow) -> Fit:
         """The model of a fit with a candidate in it."""
         return self._refit(fit, row, self._lead(fit, row)[1])
 
-    def _refit(self, fit: Fit, row: Row, start: np.ndarray) -> Fit:
+    def _refit(self, fit: Fit, row: ScreenRow, start: np.ndarray) -> Fit:
         if row.name == DISCRETISATION:
             assert self.finer is not None
             return climb(self.target.on(self.finer), start, fit.free)
@@ -427,7 +427,7 @@ class ExtensionSearch:
         further = max(len(new.free) - len(old.free), 0)
         return new.log_evidence > old.log_evidence + worth + WIDER * further
 
-    def without(self, steps: Sequence[Step], index: int, base: Fit) -> list[Step]:
+    def without(self, steps: Sequence[Added], index: int, base: Fit) -> list[Added]:
         """Steps less one of them that has parameters, the later ones refitted without it."""
         candidate = next(c for c in self.candidates if c.name == steps[index].name)
         gone = np.setdiff1d(candidate.indices, steps[index - 1].fit.free if index else base.free)
@@ -441,7 +441,7 @@ class ExtensionSearch:
             found.append(replace(step, fit=fit, log_bayes_factor=fit.log_evidence - under.log_evidence))
         return found
 
-    def _without_needless(self, base: Fit, steps: list[Step]) -> list[Step]:
+    def _without_needless(self, base: Fit, steps: list[Added]) -> list[Added]:
         """Steps less those that later ones have made needless: without its parameters the last model has as much
         evidence. Of a lag found first, and a delay and another lag found later, the first may come down to nothing."""
         last = steps[-1]
@@ -459,7 +459,7 @@ class ExtensionSearch:
                 return self._without_needless(base, self.without(steps, index, base))
         return steps
 
-    def _reconsider(self, base: Fit, steps: list[Step]) -> list[Step]:
+    def _reconsider(self, base: Fit, steps: list[Added]) -> list[Added]:
         """With the last mechanism in the model, was the first one named rightly? Take it out and ask again."""
         first, last = steps[0], steps[-1]
         if DISCRETISATION in (first.name, last.name) or len(steps) > 2:
@@ -485,7 +485,7 @@ class ExtensionSearch:
         return [renewed, again]
 
 
-def numerical_shift(target: Target, finer: Forward, fit: Fit) -> float | None:
+def numerical_shift(target: FitTarget, finer: Forward, fit: Fit) -> float | None:
     """Root mean square distance [m] by which a finer mesh and time step move the markers where they are measured; None
     where the finer rollouts do not end well."""
     seen, fine = finer.observe(fit.x[None])

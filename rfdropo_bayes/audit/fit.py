@@ -26,10 +26,10 @@ from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.bayes.channels import Seen
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.problem import ProblemDefaults
-from rfdropo_bayes.bayes.space import Parameter, ParameterSpace
+from rfdropo_bayes.bayes.space import InferredParameter, ParameterSpace
 from rfdropo_bayes.inference import LaplaceConfig, climb_cost, find_modes, maximise, normal_at
 from rfdropo_bayes.inference import Target as Climbed
-from rfdropo_bayes.simulators.differences import usable_difference
+from rfdropo_bayes.simulators.finite_differences import usable_difference
 from rfdropo_bayes.simulators.protocol import Observation
 
 FIRST, ALL = 8, 40  # steps of a short climb, and most of one to its end
@@ -88,7 +88,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Target:
+class FitTarget:
     """What is fitted: measurements under a noise, by a simulator; ``journal`` keeps what was computed.
 
     Where the noise is that of a model that is far off (see `inadequacy`), ``known`` is the same under the noise of the
@@ -99,14 +99,14 @@ class Target:
     measurements: Measurements
     noise: Stacked
     journal: Journal = field(default_factory=Journal)
-    known: Target | None = None
+    known: FitTarget | None = None
 
     @property
-    def measured(self) -> Target:
+    def measured(self) -> FitTarget:
         """The same under the noise of the measurement."""
         return self if self.known is None else self.known
 
-    def on(self, forward: Forward) -> Target:
+    def on(self, forward: Forward) -> FitTarget:
         """The same with another simulator."""
         known = None if self.known is None else replace(self.known, forward=forward)
         return replace(self, forward=forward, known=known)
@@ -250,7 +250,7 @@ class Posterior(ProblemDefaults):
         free: those that are not held.
     """
 
-    target: Target
+    target: FitTarget
     start: Float[np.ndarray, " d"]
     free: Int[np.ndarray, " free"]
     jacobian: str = "central"
@@ -260,7 +260,7 @@ class Posterior(ProblemDefaults):
         return self.target.forward.coordinates
 
     @cached_property
-    def _parameters(self) -> tuple[Parameter, ...]:
+    def _parameters(self) -> tuple[InferredParameter, ...]:
         return tuple(self._coordinates.space.parameters[i] for i in self.free)
 
     @cached_property
@@ -375,7 +375,7 @@ class Posterior(ProblemDefaults):
 
 
 def climb(
-    target: Target, start: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"], *, evaluations: int = ALL
+    target: FitTarget, start: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"], *, evaluations: int = ALL
 ) -> Fit:
     """Posterior mode over the free coordinates from one start, the others held."""
 
@@ -388,7 +388,7 @@ def climb(
     return Fit(**{**found, **numbers})  # type: ignore[arg-type]
 
 
-def _climb(target: Target, start: np.ndarray, free: np.ndarray, evaluations: int) -> Fit:
+def _climb(target: FitTarget, start: np.ndarray, free: np.ndarray, evaluations: int) -> Fit:
     """A climb, and the normal approximation around where it ends."""
     posterior = Posterior(target, start, free)
     climbed = posterior.whole()
@@ -406,14 +406,14 @@ def _climb(target: Target, start: np.ndarray, free: np.ndarray, evaluations: int
     return Fit(posterior.place(u[None])[0], free, residual, -jacobian, found.covariance, evidence, promise)
 
 
-def climb_rollouts(target: Target, parameters: int) -> int:
+def climb_rollouts(target: FitTarget, parameters: int) -> int:
     """Rollouts that a climb of so many parameters may take."""
     forward = target.forward
     return forward.count * USUAL * (1 + forward.lanes.slope_rollouts * parameters)
 
 
 def best_between(
-    target: Target,
+    target: FitTarget,
     here: Float[np.ndarray, " d"],
     there: Float[np.ndarray, " d"],
     held: Sequence[int],
@@ -428,7 +428,7 @@ def best_between(
     return points[int(np.argmax(heights(target, points, "shares")))]
 
 
-def heights(target: Target, points: Float[np.ndarray, "n d"], what: str) -> Float[np.ndarray, " n"]:
+def heights(target: FitTarget, points: Float[np.ndarray, "n d"], what: str) -> Float[np.ndarray, " n"]:
     """Log posteriors of points, up to the noise's normaliser; kept in the journal by the name of ``what``."""
 
     found = target.recall(what, [points], lambda: {"height": target.log_likelihood(points)})
@@ -458,7 +458,7 @@ def widening(fit: Fit, coordinates: Coordinates) -> Float[np.ndarray, " d"]:
     return np.where(free, np.maximum(np.abs(fit.x / coordinates.prior_sd), 1.0), 1.0)
 
 
-def base_optimum(target: Target, key: PRNGKeyArray) -> Float[np.ndarray, " d"]:
+def base_optimum(target: FitTarget, key: PRNGKeyArray) -> Float[np.ndarray, " d"]:
     """Where the best of `calibrate`'s climbs ends.
 
     Raises:
@@ -475,7 +475,7 @@ def base_optimum(target: Target, key: PRNGKeyArray) -> Float[np.ndarray, " d"]:
     return target.recall("search", [np.asarray(jax.random.key_data(key))], compute)["x"]
 
 
-def optimum_rollouts(target: Target) -> int:
+def optimum_rollouts(target: FitTarget) -> int:
     """Rollouts that `base_optimum` usually takes: draws that are screened, at each horizon, and climbs, of which the
     better half goes on to the next."""
     config, own = LaplaceConfig(), target.forward.coordinates
@@ -484,12 +484,12 @@ def optimum_rollouts(target: Target) -> int:
     return target.forward.count * int(config.blocks * config.screen + climbs * (beginning + SEARCHED * step))
 
 
-def poll_rollouts(target: Target) -> int:
+def poll_rollouts(target: FitTarget) -> int:
     """Rollouts that `better_nearby` takes."""
     return target.forward.count * (1 + 2 * (len(POLLED) + len(ALONG)) * target.forward.coordinates.base)
 
 
-def with_usable_differences(target: Target, x: Float[np.ndarray, " d"]) -> Target:
+def with_usable_differences(target: FitTarget, x: Float[np.ndarray, " d"]) -> FitTarget:
     """The target with derivatives over steps on whose scale its motion is smooth around a point.
 
     Slopes over the steps of a ladder, in prior deviations, are compared, of all base parameters at once; rollouts say
@@ -510,7 +510,7 @@ def with_usable_differences(target: Target, x: Float[np.ndarray, " d"]) -> Targe
     return target if step <= usual else replace(target, forward=target.forward.with_difference(step))
 
 
-def better_nearby(target: Target, fit: Fit) -> Float[np.ndarray, " d"] | None:
+def better_nearby(target: FitTarget, fit: Fit) -> Float[np.ndarray, " d"] | None:
     """A point beside a fit that is clearly better; None where rollouts confirm that it is a summit.
 
     Derivatives cannot tell: of a motion that is rough on the scale of their steps they are noise, and promise nothing.

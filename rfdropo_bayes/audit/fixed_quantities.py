@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.bayes.priors import prior_from_table
-from rfdropo_bayes.bayes.space import Parameter, ParameterSpace
+from rfdropo_bayes.bayes.space import InferredParameter, ParameterSpace
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 ZEROS = "initial_displacement"  # of cables, see `Robot`
@@ -50,7 +50,7 @@ def with_fixed_quantities(
         first = len(parameters)
         for spec in family:
             prior = prior_from_table(spec, dict(spec.prior), where=spec.name)
-            parameters.append(Parameter(spec, prior, "", dict(spec.prior)))
+            parameters.append(InferredParameter(spec, prior, "", dict(spec.prior)))
         cause = f"{family[0].description}: not the nominal one"
         own = OwnParameter(stem(family), tuple(family), cause, _remedy(family))
         candidates.append(Candidate(own.name, tuple(range(first, len(parameters))), own, own.name))

@@ -22,7 +22,7 @@ from rfdropo_bayes.bayes.channels.object_pose import OFFSETS, Placing
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.callbacks import distinct
 from rfdropo_bayes.simulators.commands import Commands
-from rfdropo_bayes.simulators.differences import DIFFERENCE, FORWARD
+from rfdropo_bayes.simulators.finite_differences import DIFFERENCE, FORWARD
 from rfdropo_bayes.simulators.protocol import Result, Simulator
 
 # Lanes of one call: a compilation costs more than the padding of a call, so that there is one size. A compiled engine

@@ -28,7 +28,7 @@ SURE = 3.0  # standard errors by which a discrepancy must exceed the noise to be
 LEVELS = (0.5, 0.9)
 
 
-class Prediction(NamedTuple):
+class UnseenErrors(NamedTuple):
     """What draws of one model leave of unseen trajectories: measured less simulated, in the unit of the noise."""
 
     errors: Float[np.ndarray, "draw trajectory time column"]
@@ -57,7 +57,7 @@ class Unseen(NamedTuple):
         """Number of columns that are coordinates of markers."""
         return self.position.shape[-1]
 
-    def predicted(self, prediction: Prediction) -> Float[np.ndarray, "trajectory time coordinate"]:
+    def predicted(self, prediction: UnseenErrors) -> Float[np.ndarray, "trajectory time coordinate"]:
         """Where a model has the markers, in the mean over its draws [m]."""
         return self.position - prediction.mean[..., : self.markers]
 
@@ -135,8 +135,8 @@ class Gain:
 
 def measure_gain(
     unseen: Unseen,
-    base: Prediction,
-    extended: Prediction,
+    base: UnseenErrors,
+    extended: UnseenErrors,
     noise: Stacked,
     pattern: Float[np.ndarray, "group time column"],
     rng: np.random.Generator,
@@ -207,14 +207,14 @@ def noise_distance(noise: Autoregression) -> float:
     return float(np.sqrt(3.0 * np.mean(noise.scale**2)))
 
 
-def _elpd(unseen: Unseen, prediction: Prediction, noise: Stacked) -> Float[np.ndarray, " trajectory"]:
+def _elpd(unseen: Unseen, prediction: UnseenErrors, noise: Stacked) -> Float[np.ndarray, " trajectory"]:
     """Log predictive density of each trajectory, up to the noise's normaliser."""
     residual = np.where(unseen.valid, prediction.errors, 0.0)
     white = noise.whiten(residual, unseen.valid)
     return logsumexp(-0.5 * np.sum(white**2, axis=(-2, -1)), axis=0) - np.log(len(residual))
 
 
-def _coverage(unseen: Unseen, prediction: Prediction, spread: Float[np.ndarray, " column"]) -> dict[float, float]:
+def _coverage(unseen: Unseen, prediction: UnseenErrors, spread: Float[np.ndarray, " column"]) -> dict[float, float]:
     whole = np.sqrt(prediction.errors.var(axis=0) + spread**2)
     z = (np.abs(prediction.mean) / whole)[unseen.valid]
     return {level: float(np.mean(z < norm.ppf(0.5 + level / 2))) for level in LEVELS}

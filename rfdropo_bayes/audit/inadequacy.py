@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from rfdropo_bayes.audit.fit import Fit, Target, climb
+from rfdropo_bayes.audit.fit import Fit, FitTarget, climb
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import MISFIT, RESIDUALS
 from rfdropo_bayes.bayes.noise.stacked import Stacked
@@ -25,7 +25,7 @@ ROUNDS = 6  # of noise and fit in turn
 SETTLED = 0.1  # relative change of the noise between rounds
 
 
-def far_off(target: Target, x: Float[np.ndarray, " d"]) -> bool:
+def far_off(target: FitTarget, x: Float[np.ndarray, " d"]) -> bool:
     """Whether a model leaves more than `POOR` times the variance of the measurement's noise."""
     known = target.measured
     if known.noise.source == RESIDUALS:  # of the model itself
@@ -34,7 +34,9 @@ def far_off(target: Target, x: Float[np.ndarray, " d"]) -> bool:
     return bool(residual @ residual > POOR * np.count_nonzero(residual))
 
 
-def fit_with_noise(known: Target, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]) -> tuple[Target, Fit]:
+def fit_with_noise(
+    known: FitTarget, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]
+) -> tuple[FitTarget, Fit]:
     """The target under which a model is judged, and its fit, climbed from a point."""
     if not far_off(known, x):
         return known, climb(known, x, free)
@@ -50,7 +52,7 @@ def fit_with_noise(known: Target, x: Float[np.ndarray, " d"], free: Int[np.ndarr
     return judge, climb(judge, x, free)
 
 
-def as_measured(judge: Target, fit: Fit) -> Fit:
+def as_measured(judge: FitTarget, fit: Fit) -> Fit:
     """A fit with residuals and slopes in deviations of the measurement's noise; its covariance stays."""
     if judge.known is None:
         return fit
@@ -64,17 +66,17 @@ def as_measured(judge: Target, fit: Fit) -> Fit:
     return replace(fit, residual=whitened(fit.residual), jacobian=whitened(fit.jacobian.T).T, promise=promise)
 
 
-def spread(judge: Target, fit: Fit) -> Float[np.ndarray, " column"]:
+def spread(judge: FitTarget, fit: Fit) -> Float[np.ndarray, " column"]:
     """Deviation of what a fit leaves of each column: that of the measurement's noise, unless the model is far off."""
     return judge.noise.scale if judge.known is None else _sizes(judge, _errors(judge, fit.residual))
 
 
-def _errors(judge: Target, white: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch group time column"]:
+def _errors(judge: FitTarget, white: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch group time column"]:
     """Errors of which the white noise of a judge makes these residuals."""
     return judge.measurements.series(white) * judge.noise.scale
 
 
-def _sizes(target: Target, errors: Float[np.ndarray, "group time column"]) -> Float[np.ndarray, " column"]:
+def _sizes(target: FitTarget, errors: Float[np.ndarray, "group time column"]) -> Float[np.ndarray, " column"]:
     """Root mean square of errors, one for all columns of a channel."""
     valid, sizes = target.measurements.valid, np.empty(errors.shape[-1])
     for own in target.measurements.columns:
@@ -82,7 +84,7 @@ def _sizes(target: Target, errors: Float[np.ndarray, "group time column"]) -> Fl
     return sizes
 
 
-def _shares(judge: Target, fit: Fit) -> list[float]:
+def _shares(judge: FitTarget, fit: Fit) -> list[float]:
     """What a row of each channel counts, see `lasting_series`."""
     measured = judge.measurements
     errors = _errors(judge, fit.residual)
@@ -94,8 +96,8 @@ def _shares(judge: Target, fit: Fit) -> list[float]:
 
 
 def _under(
-    known: Target, errors: Float[np.ndarray, "group time column"], shares: Sequence[float] | None = None
-) -> Target:
+    known: FitTarget, errors: Float[np.ndarray, "group time column"], shares: Sequence[float] | None = None
+) -> FitTarget:
     """The target under white noise of the size of errors, over the root of what a row counts."""
     measured, parts, sizes = known.measurements, [], _sizes(known, errors)
     for own, share in zip(measured.columns, shares or [1.0] * len(measured.columns), strict=True):

@@ -13,7 +13,7 @@ from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, RESIDUALS, estimate_noise
 from rfdropo_bayes.bayes.noise.stacked import Stacked, side_by_side
 from rfdropo_bayes.bayes.recordings import RecordingSet
-from rfdropo_bayes.bayes.repeats import (
+from rfdropo_bayes.bayes.repeat_noise import (
     Groups,
     deviations,
     group_recordings,

@@ -15,11 +15,11 @@ from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.deadline import Deadline, OutOfTime, about
 from rfdropo_bayes.audit.differences import Groups
-from rfdropo_bayes.audit.extension import DISCRETISATION, ExtensionSearch, Rules, Step, numerical_shift
+from rfdropo_bayes.audit.extension import DISCRETISATION, Added, ExtensionSearch, Rules, numerical_shift
 from rfdropo_bayes.audit.fit import (
     WITHIN,
     Fit,
-    Target,
+    FitTarget,
     base_optimum,
     better_nearby,
     climb,
@@ -30,7 +30,7 @@ from rfdropo_bayes.audit.fit import (
     with_usable_differences,
 )
 from rfdropo_bayes.audit.forward import Forward, Lanes
-from rfdropo_bayes.audit.gain import Gain, Prediction, Unseen, measure_gain
+from rfdropo_bayes.audit.gain import Gain, Unseen, UnseenErrors, measure_gain
 from rfdropo_bayes.audit.inadequacy import as_measured, fit_with_noise, spread
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
@@ -38,10 +38,10 @@ from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Screen, p_in_words, screen
 from rfdropo_bayes.audit.verdict import NO_VERDICT, PARTLY, UNEXPLAINED, decide
 from rfdropo_bayes.bayes.channels import ObjectPose, Series
-from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED
 from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
@@ -99,7 +99,7 @@ class Causes:
         screens: of the base model, and after each step.
     """
 
-    steps: list[Step]
+    steps: list[Added]
     unsupported: list[str]
     screens: list[Screen]
 
@@ -119,7 +119,7 @@ class Validation:
     gain: Gain | None = None
     stages: list[float] = field(default_factory=list)
     recordings: str = ""
-    predictions: tuple[Prediction, Prediction] | None = None
+    predictions: tuple[UnseenErrors, UnseenErrors] | None = None
     unseen: Unseen | None = None
 
 
@@ -176,7 +176,7 @@ class Answer:
 
     verdict: str
     problem: AuditProblem
-    target: Target
+    target: FitTarget
     base: Fit
     causes: Causes
     validation: Validation
@@ -197,7 +197,7 @@ class Answer:
         return self.causes.steps[-1].fit if self.causes.steps else self.base
 
     @property
-    def adopted(self) -> list[Step]:
+    def adopted(self) -> list[Added]:
         """Steps that join the model for good: those that unseen recordings clearly support, in a model that explains
         more than next to nothing."""
         gain = self.validation.gain
@@ -277,8 +277,8 @@ def _validation(held_out: HeldOut | None, steps: int) -> Validation:
 
 
 def _supported(
-    problem: AuditProblem, judge: Target, search: ExtensionSearch, base: Fit, steps: list[Step], last: Screen
-) -> tuple[list[Step], Screen, HeldOut | None]:
+    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: list[Added], last: Screen
+) -> tuple[list[Added], Screen, HeldOut | None]:
     """The steps that recordings which no fit has seen support, all of them where these support none; the screen
     of the model with them; and the predictions of these recordings."""
     held_out = _held_out(problem, judge, search, base, steps)
@@ -289,7 +289,7 @@ def _supported(
     return steps, last if len(steps) == kept else search.tested(steps[-1].fit, len(steps)), held_out
 
 
-def _far_off(target: Target, fit: Fit) -> str:
+def _far_off(target: FitTarget, fit: Fit) -> str:
     """What a line of words says of a model that is far off."""
     if target.known is None:
         return ""
@@ -302,7 +302,7 @@ def _far_off(target: Target, fit: Fit) -> str:
 def _verdict(
     search: ExtensionSearch,
     base: Fit,
-    steps: Sequence[Step],
+    steps: Sequence[Added],
     screens: Sequence[Screen],
     gain: Gain | None,
     deadline: Deadline,
@@ -320,7 +320,7 @@ def _verdict(
     return verdict, suspected
 
 
-def _searched(search: ExtensionSearch, base: Fit) -> tuple[ExtensionSearch, Fit, list[Step], Screen]:
+def _searched(search: ExtensionSearch, base: Fit) -> tuple[ExtensionSearch, Fit, list[Added], Screen]:
     """Named causes, and the screen of the model with them; asked once more where the noise is that of residuals.
 
     Returns:
@@ -339,7 +339,7 @@ def _searched(search: ExtensionSearch, base: Fit) -> tuple[ExtensionSearch, Fit,
     return search, base, steps, last
 
 
-def _with_differences_of(problem: AuditProblem, target: Target) -> AuditProblem:
+def _with_differences_of(problem: AuditProblem, target: FitTarget) -> AuditProblem:
     """The problem with derivatives over the steps that the base fit has found usable."""
     step = target.forward.lanes.difference
     if step is None or step == problem.lanes.difference:
@@ -375,7 +375,7 @@ def base_model(
     journal: Journal | None = None,
     report: Callable[[str], None] = lambda line: None,
     deadline: Deadline | None = None,
-) -> tuple[Target, Fit]:
+) -> tuple[FitTarget, Fit]:
     """Noise and base fit; where the noise is estimated from residuals, the two in turn.
 
     Raises:
@@ -394,7 +394,7 @@ def base_model(
 
 def _fitted_or_not(
     problem: AuditProblem, journal: Journal | None, report: Callable[[str], None], deadline: Deadline
-) -> tuple[Target, Fit]:
+) -> tuple[FitTarget, Fit]:
     """The base model's noise and fit; where the time is up before, the last point that the search has come to, which
     counts as not converged. The deadline is lifted then: what is left is a rollout of each recording."""
     target = first_target(problem, journal or Journal(), deadline)
@@ -411,7 +411,7 @@ def _fitted_or_not(
     return target, fit
 
 
-def _unfitted(target: Target, x: Float[np.ndarray, " d"]) -> tuple[Target, Fit]:
+def _unfitted(target: FitTarget, x: Float[np.ndarray, " d"]) -> tuple[FitTarget, Fit]:
     """A point that no fit has ended at: of the base parameters no more is known than their prior."""
     free = np.arange(target.forward.coordinates.base)
     residual = target.residual(x[None])[0]
@@ -419,7 +419,7 @@ def _unfitted(target: Target, x: Float[np.ndarray, " d"]) -> tuple[Target, Fit]:
     return target, Fit(x, free, residual, np.zeros((len(residual), len(free))), covariance, -np.inf, np.inf)
 
 
-def _announce(target: Target, start: dict[str, float] | None, report: Callable[[str], None]) -> None:
+def _announce(target: FitTarget, start: dict[str, float] | None, report: Callable[[str], None]) -> None:
     """Say what is fitted first, and how long it may take: rollouts at the pace of different ones that fill a call, and
     derivatives, which take as long to compile as rollouts did."""
     forward, own = target.forward, target.forward.coordinates
@@ -437,7 +437,7 @@ def _announce(target: Target, start: dict[str, float] | None, report: Callable[[
     report(f"fitting the base model: {own.base} parameters, {counted}; about {rollouts} rollouts, {words}")
 
 
-def first_target(problem: AuditProblem, journal: Journal, deadline: Deadline | None = None) -> Target:
+def first_target(problem: AuditProblem, journal: Journal, deadline: Deadline | None = None) -> FitTarget:
     """The fitted recordings under the noise of repeats or of the experiment file, or a first guess."""
     measurements = measurements_of(problem, range(len(problem.trajectories)), problem.trajectories)
     noise = problem.stated_noise
@@ -446,7 +446,7 @@ def first_target(problem: AuditProblem, journal: Journal, deadline: Deadline | N
     if noise is None:
         scales = [np.full(c.valid.shape[-1], GUESSES[c.name]) for c in measurements.channels]
         noise = Stacked(tuple(Autoregression(scale, np.ones(1), RESIDUALS, np.inf) for scale in scales))
-    return Target(_forward(problem, False, measurements, deadline), measurements, noise, journal)
+    return FitTarget(_forward(problem, False, measurements, deadline), measurements, noise, journal)
 
 
 def measurements_of(problem: AuditProblem, chosen: Sequence[int], repeats: Sequence[Trajectory] = ()) -> Measurements:
@@ -459,12 +459,12 @@ def measurements_of(problem: AuditProblem, chosen: Sequence[int], repeats: Seque
 
 
 def _base_fit(
-    target: Target,
+    target: FitTarget,
     start: dict[str, float] | None,
     seed: int,
     report: Callable[[str], None],
-    reached: list[tuple[Target, Float[np.ndarray, " d"]]],
-) -> tuple[Target, Fit]:
+    reached: list[tuple[FitTarget, Float[np.ndarray, " d"]]],
+) -> tuple[FitTarget, Fit]:
     """The base model's noise and posterior mode, from a given start or from where `calibrate`'s search leads; climbed
     on while rollouts beside it are better. ``reached`` gets the points that the search has come to."""
     _announce(target, start, report)
@@ -489,7 +489,7 @@ def _base_fit(
     return (target, fit) if known else _under_residual_noise(target, fit)
 
 
-def _under_residual_noise(target: Target, fit: Fit) -> tuple[Target, Fit]:
+def _under_residual_noise(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
     """Noise and fit in turn."""
     converged = fit.converged
     for _ in range(2):
@@ -498,7 +498,7 @@ def _under_residual_noise(target: Target, fit: Fit) -> tuple[Target, Fit]:
     return target, fit if converged else replace(fit, promise=np.inf)
 
 
-def residual_noise(target: Target, fit: Fit) -> Stacked:
+def residual_noise(target: FitTarget, fit: Fit) -> Stacked:
     """Autoregressions fitted to what a model leaves of every recording."""
     measured = target.measurements
     left = np.array(measured.spread)
@@ -515,7 +515,7 @@ def _asked_again(search: ExtensionSearch, own: Forward, base: Fit, extended: Fit
     return replace(search, target=target), climb(target, base.x, base.free)
 
 
-def _final_screen(search: ExtensionSearch, extended: Fit, steps: Sequence[Step]) -> Screen:
+def _final_screen(search: ExtensionSearch, extended: Fit, steps: Sequence[Added]) -> Screen:
     """The screen of the extended model under the noise that it leaves itself."""
     renewed = replace(search.target, noise=residual_noise(search.target, extended))
     fit = climb(renewed, extended.x, extended.free)
@@ -536,7 +536,7 @@ def _suspected(search: ExtensionSearch, base: Fit) -> Stacked | None:
     return target.noise if passes else None
 
 
-def _predict(target: Target, fit: Fit, seed: Sequence[int]) -> Prediction:
+def _predict(target: FitTarget, fit: Fit, seed: Sequence[int]) -> UnseenErrors:
     """Predictions under the normal approximation, linear around the mode: along a ridge that the data leave free, such
     as the common scale of stiffness and mass, a draw would lie far from where the approximation holds."""
     centre = target.errors(fit.x)
@@ -544,7 +544,7 @@ def _predict(target: Target, fit: Fit, seed: Sequence[int]) -> Prediction:
     slopes, _ = target.error_slopes(points, np.eye(len(fit.x))[fit.free])
     z = np.random.default_rng(seed).multivariate_normal(np.zeros(len(fit.free)), fit.covariance, DRAWS, method="eigh")
     z -= z.mean(axis=0)
-    return Prediction(centre + np.tensordot(z, slopes, axes=1))
+    return UnseenErrors(centre + np.tensordot(z, slopes, axes=1))
 
 
 @dataclass(frozen=True)
@@ -564,7 +564,7 @@ class HeldOut:
 
     which: str
     unseen: Unseen
-    predictions: list[Prediction]
+    predictions: list[UnseenErrors]
     patterns: list[np.ndarray]
     noise: Stacked
     judges: list[Stacked]
@@ -596,8 +596,8 @@ class HeldOut:
 
 
 def _without_carried(
-    problem: AuditProblem, judge: Target, search: ExtensionSearch, base: Fit, steps: list[Step], held_out: HeldOut
-) -> tuple[list[Step], HeldOut]:
+    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: list[Added], held_out: HeldOut
+) -> tuple[list[Added], HeldOut]:
     """Steps less those that were supported beside a later one only, and without which that one does as well.
 
     Two mechanisms may pay only together. Whether they do is seen by taking the first one out: the model with it, as if
@@ -621,7 +621,7 @@ def _without_carried(
 
 
 def _held_out(
-    problem: AuditProblem, judge: Target, search: ExtensionSearch, base: Fit, steps: Sequence[Step]
+    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: Sequence[Added]
 ) -> HeldOut | None:
     """The test recordings, or fitted ones that are left out in turn; None where the model was not extended, or the time
     was up."""
@@ -634,7 +634,7 @@ def _held_out(
 
 
 def _predicted(
-    problem: AuditProblem, judge: Target, search: ExtensionSearch, base: Fit, steps: Sequence[Step]
+    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: Sequence[Added]
 ) -> HeldOut:
     """Predictions of the base model, fitted under ``judge``, and of the model after each step."""
     target, judges = search.target.measured, [judge, *(step.judge for step in steps)]
@@ -664,8 +664,8 @@ def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) 
 
 
 def _left_out(
-    problem: AuditProblem, judges: Sequence[Target], search: ExtensionSearch, fits: Sequence[Fit]
-) -> tuple[str, Unseen, list[Prediction]]:
+    problem: AuditProblem, judges: Sequence[FitTarget], search: ExtensionSearch, fits: Sequence[Fit]
+) -> tuple[str, Unseen, list[UnseenErrors]]:
     """Predict each group of repeats from the others; where one has parameters that no other tells (a single one has),
     the later rows of all from the earlier ones."""
     target = search.target.measured
@@ -693,6 +693,6 @@ def _left_out(
         joined = np.zeros((draws, *measured.count.shape))
         for mask, part in zip(masks, row, strict=True):
             joined = np.where(mask, part[:draws], joined)
-        predictions.append(Prediction(joined))
+        predictions.append(UnseenErrors(joined))
     valid = measured.valid & np.any(np.broadcast_arrays(*masks, measured.valid)[:-1], axis=0)
     return held_out, _unseen(measured, valid, problem.model.recordings.names), predictions

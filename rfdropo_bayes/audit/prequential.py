@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2
 
-from rfdropo_bayes.audit.fit import Fit, Target
+from rfdropo_bayes.audit.fit import Fit, FitTarget
 from rfdropo_bayes.audit.omnibus import BLOCK
 
 BEGINNING = (
@@ -41,7 +41,7 @@ class Prequential:
     misfit: Float[np.ndarray, " column"]
 
 
-def prequential(target: Target, fit: Fit) -> Prequential:
+def prequential(target: FitTarget, fit: Fit) -> Prequential:
     """Score the blocks of a fitted model."""
     measured = target.measurements
     shape, valid = measured.count.shape, measured.valid

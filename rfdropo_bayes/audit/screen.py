@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.candidates import Probe
-from rfdropo_bayes.audit.fit import Fit, Target
+from rfdropo_bayes.audit.fit import Fit, FitTarget
 from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.omnibus import Omnibus, block_means, joint_test, statistics
 from rfdropo_bayes.audit.score import project_out, span, statistic
@@ -27,7 +27,7 @@ DIRECTED = "candidates"
 
 
 @dataclass(frozen=True)
-class Row:
+class ScreenRow:
     """What the screen says of one candidate.
 
     Attributes:
@@ -58,7 +58,7 @@ class Screen:
 
     fit: Fit
     omnibus: Omnibus
-    rows: tuple[Row, ...]
+    rows: tuple[ScreenRow, ...]
     finer: Omnibus | None = None
 
     @property
@@ -66,13 +66,13 @@ class Screen:
         """Whether it is on the finer mesh and time step that the model was tested."""
         return self.omnibus is self.finer
 
-    def row(self, name: str) -> Row:
+    def row(self, name: str) -> ScreenRow:
         """That of one candidate."""
         return next(row for row in self.rows if row.name == name)
 
 
 def screen(
-    target: Target,
+    target: FitTarget,
     fit: Fit,
     probes: Sequence[Probe],
     names: Sequence[str],
@@ -112,15 +112,15 @@ def screen(
     return Screen(fit, tests[0], tuple(sorted(rows, key=lambda row: -row.score)), tests[1] if len(tests) > 1 else None)
 
 
-def _row(name: str, seen: Sequence[Probe], surprises: np.ndarray, most: np.ndarray, fit: Fit) -> Row:
+def _row(name: str, seen: Sequence[Probe], surprises: np.ndarray, most: np.ndarray, fit: Fit) -> ScreenRow:
     own = [i for i, probe in enumerate(seen) if probe.candidate == name]
     if not own:
-        return Row(name, None, 0.0, 0, 1.0, 1.0, -np.inf)
+        return ScreenRow(name, None, 0.0, 0, 1.0, 1.0, -np.inf)
     best = max(own, key=lambda i: surprises[i])
     probe = seen[best]
     lm = float(statistic(probe.mark, fit.residual)[0])
     score = lm - probe.mark.rank * np.log(fit.counted)
-    return Row(name, probe, lm, probe.mark.rank, _p_value(surprises[best]), tail(surprises[best], most), score)
+    return ScreenRow(name, probe, lm, probe.mark.rank, _p_value(surprises[best]), tail(surprises[best], most), score)
 
 
 def _p_value(surprise: float) -> float:
@@ -129,7 +129,7 @@ def _p_value(surprise: float) -> float:
 
 
 def _statistics(
-    target: Target, residuals: Float[np.ndarray, "count n"], probes: Sequence[Probe]
+    target: FitTarget, residuals: Float[np.ndarray, "count n"], probes: Sequence[Probe]
 ) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "count probe"]]:
     found = statistics(target.measurements.series(residuals))
     surprises = [statistic(probe.mark, residuals)[1] for probe in probes]
@@ -137,7 +137,7 @@ def _statistics(
 
 
 def _simulated(
-    target: Target, fit: Fit, probes: Sequence[Probe], rng: np.random.Generator, count: int
+    target: FitTarget, fit: Fit, probes: Sequence[Probe], rng: np.random.Generator, count: int
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     base = span(fit.jacobian)
     chunk = max(1, min(count, int(CHUNK_NUMBERS / base.shape[0])))

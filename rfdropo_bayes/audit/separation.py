@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.audit.candidates import Candidate, lead, probe_all
 from rfdropo_bayes.audit.extension import SHARES, TOLD_APART
-from rfdropo_bayes.audit.fit import Fit, Target, best_between, climb
+from rfdropo_bayes.audit.fit import Fit, FitTarget, best_between, climb
 from rfdropo_bayes.audit.pipeline import residual_noise
 from rfdropo_bayes.audit.score import Signature, likeness, project_out, signature, span, statistic
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS
@@ -55,7 +55,7 @@ class Separation:
         rollouts: that it took.
     """
 
-    target: Target
+    target: FitTarget
     groups: Mapping[str, tuple[str, ...]]
     none: Variant
     whole: Variant
@@ -83,7 +83,7 @@ class Separation:
 
 
 def separate(
-    target: Target,
+    target: FitTarget,
     candidates: Sequence[Candidate],
     groups: Mapping[str, Sequence[str]],
     start: Float[np.ndarray, " d"],
@@ -149,7 +149,7 @@ def separate(
     return Separation(target, members, none, whole, alone, without, marks, own, target.forward.rollouts)
 
 
-def distance(target: Target, fit: Fit) -> float:
+def distance(target: FitTarget, fit: Fit) -> float:
     """Root mean square distance of the markers from where the model has them [m]."""
     own = slice(0, target.measurements.markers)
     return float(np.sqrt(3.0 * np.mean(target.errors(fit.x)[..., own][target.measurements.valid[..., own]] ** 2)))
@@ -181,7 +181,7 @@ def _places(fit: Fit, indices: Mapping[str, tuple[int, ...]], members: Sequence[
     return np.flatnonzero(np.isin(fit.free, [i for name in members for i in indices[name]]))
 
 
-def _joined(target: Target, fit: Fit, candidate: Candidate) -> Fit:
+def _joined(target: FitTarget, fit: Fit, candidate: Candidate) -> Fit:
     """The model of a fit with a mechanism in it."""
     seen = [probe for probe in probe_all(target, fit, [candidate]) if probe.mark.rank > 0]
     start = fit.x.copy()
@@ -203,7 +203,7 @@ def _joined(target: Target, fit: Fit, candidate: Candidate) -> Fit:
     return found
 
 
-def _reduced(target: Target, fit: Fit, free: Int[np.ndarray, " free"]) -> Float[np.ndarray, " d"]:
+def _reduced(target: FitTarget, fit: Fit, free: Int[np.ndarray, " free"]) -> Float[np.ndarray, " d"]:
     """Where a fit with fewer free coordinates starts: the others at null, and these where the linear model has them."""
     coordinates = target.forward.coordinates
     gone = np.setdiff1d(fit.free, free)
@@ -220,5 +220,5 @@ def _reduced(target: Target, fit: Fit, free: Int[np.ndarray, " free"]) -> Float[
     return best_between(target, emptied, moved, [], WITH_NONE)
 
 
-def _words(target: Target, fit: Fit) -> str:
+def _words(target: FitTarget, fit: Fit) -> str:
     return f"{1e3 * distance(target, fit):.2f} mm"

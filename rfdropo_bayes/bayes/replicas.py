@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from rfdropo_bayes.bayes.calibration import CalibrationProblem
-from rfdropo_bayes.bayes.model import Measured
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
+from rfdropo_bayes.bayes.trajectory_model import Measured
 
 
 def simulated_data(problem: CalibrationProblem, truth: Mapping[str, float], key: PRNGKeyArray) -> Measured | None:

@@ -27,7 +27,7 @@ FORCES = frozenset({"N", "kg", "Pa", "J", "W"})  # units that hold one force eac
 
 
 @dataclass(frozen=True)
-class Parameter:
+class InferredParameter:
     """One inferred parameter.
 
     Attributes:
@@ -77,7 +77,7 @@ class Parameter:
         low, high = getattr(support, "lower_bound", -np.inf), getattr(support, "upper_bound", np.inf)
         return max(self.spec.low, float(low)), min(self.spec.high, float(high))
 
-    def scaled(self, spread: float) -> Parameter:
+    def scaled(self, spread: float) -> InferredParameter:
         """The same parameter where its standard deviation is known."""
         table = {**(self.table or {}), "scale": float(spread)}
         return replace(self, prior=dist.Normal(0.0, float(spread)), table=table, scaled_by="")
@@ -93,14 +93,14 @@ class Parameter:
 class ParameterSpace:
     """The inferred parameters, and how a set of their values becomes the parameters of one recording's rollout."""
 
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[InferredParameter, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names, in sampling order."""
         return tuple(parameter.name for parameter in self.parameters)
 
-    def __getitem__(self, name: str) -> Parameter:
+    def __getitem__(self, name: str) -> InferredParameter:
         return self.parameters[self.names.index(name)]
 
     def for_recording(self, values: Mapping[str, Float[Array | np.ndarray, "..."]], recording: str) -> dict[str, Any]:
@@ -135,7 +135,7 @@ class ParameterSpace:
         drawn = {p.name: p.prior.sample(k, (n,)) for p, k in zip(self.parameters, keys, strict=True)}
         return {p.name: drawn[p.name] * self._ratio(p, drawn) for p in self.parameters}
 
-    def _ratio(self, parameter: Parameter, values: Mapping[str, Any]) -> Any:
+    def _ratio(self, parameter: InferredParameter, values: Mapping[str, Any]) -> Any:
         """Standard deviation of a parameter over that of its prior; one where it is that of its prior."""
         return values[parameter.scaled_by] / parameter.prior.scale if parameter.scaled_by else 1.0
 
@@ -219,7 +219,7 @@ def build_space(
                 where="[model.per_group]",
                 remedy="give it a prior, and take it out of [model.per_recording]",
             )
-    parameters: list[Parameter] = []
+    parameters: list[InferredParameter] = []
     for name, table in priors.items():
         spec = by_name[name]
         chosen = dict(table) if table else dict(spec.prior)
@@ -231,7 +231,7 @@ def build_space(
                     where="[model.per_recording]",
                     remedy=f"recordings: {', '.join(recordings)}",
                 )
-            parameters.append(Parameter(confined(spec, chosen), prior, recording, chosen))
+            parameters.append(InferredParameter(confined(spec, chosen), prior, recording, chosen))
         if name in pooled:
             spread = spread_of(spec, pooled[name])
             known = [parameter.name for parameter in parameters]
@@ -241,21 +241,23 @@ def build_space(
     return ParameterSpace(tuple(parameters))
 
 
-def spread_of(spec: ParameterSpec, pooled: Pooled) -> list[Parameter]:
+def spread_of(spec: ParameterSpec, pooled: Pooled) -> list[InferredParameter]:
     """The standard deviation between groups, where it is inferred."""
     if not pooled.family:
         return []
     own = spread_spec(spec, pooled)
-    return [Parameter(own, prior_from_table(own, dict(own.prior), where="[model.per_group]"), "", dict(own.prior))]
+    return [
+        InferredParameter(own, prior_from_table(own, dict(own.prior), where="[model.per_group]"), "", dict(own.prior))
+    ]
 
 
-def deviations(spec: ParameterSpec, pooled: Pooled) -> list[Parameter]:
+def deviations(spec: ParameterSpec, pooled: Pooled) -> list[InferredParameter]:
     """What each group's value of a parameter is off the shared one."""
     own = deviation_spec(spec, pooled.spread)
     prior = prior_from_table(own, dict(own.prior), where=f"[model.per_group] {spec.name}")
     scale = spread_spec(spec, pooled).name if pooled.family else ""
     return [
-        Parameter(own, prior, group, dict(own.prior), tuple(members), spec.name, scale)
+        InferredParameter(own, prior, group, dict(own.prior), tuple(members), spec.name, scale)
         for group, members in pooled.groups.items()
     ]
 

@@ -10,7 +10,17 @@ from typing import Annotated
 import typer
 
 from rfdropo_bayes import __version__
-from rfdropo_bayes.cli import audit, check, inference, init, listings, motors, pictures, prediction, training
+from rfdropo_bayes.cli import (
+    audit_commands,
+    check_command,
+    init_command,
+    listing_commands,
+    motor_commands,
+    picture_commands,
+    policy_commands,
+    posterior_commands,
+    prediction_commands,
+)
 from rfdropo_bayes.cli.options import (
     AsJson,
     ExperimentFile,
@@ -22,7 +32,7 @@ from rfdropo_bayes.cli.options import (
     folder_for,
     see_calibration,
 )
-from rfdropo_bayes.cli.results import show_calibration, show_simulation
+from rfdropo_bayes.cli.terminal_summary import show_calibration, show_simulation
 from rfdropo_bayes.errors import InputError, Interrupted
 from rfdropo_bayes.interrupts import EXIT_STATUS, NOTHING_LOST, watch_interrupts
 from rfdropo_bayes.runtime import keep_compilations
@@ -76,9 +86,9 @@ def calibrate(
     command = "calibrate" if check is None else "check"
     folder = folder_for(command, experiment, out, overrides, resume=resume, overwrite=overwrite)
     if check is not None:
-        inference.check(experiment, folder, check, datasets, overrides or [], resume, overwrite)
+        posterior_commands.check(experiment, folder, check, datasets, overrides or [], resume, overwrite)
         return
-    from rfdropo_bayes.workflow.calibration import run_calibration
+    from rfdropo_bayes.verbs.calibrate import run_calibration
 
     found = run_calibration(
         experiment,
@@ -104,7 +114,7 @@ def simulate(
 ) -> None:
     """Simulate the experiment's commands: writes NetCDF and CSV, prints the error against the recordings."""
     folder = folder_for("simulate", experiment, out, overrides, overwrite=overwrite)
-    from rfdropo_bayes.workflow.simulation import run_simulation
+    from rfdropo_bayes.verbs.simulate import run_simulation
 
     found = run_simulation(experiment, folder, overrides=overrides or [], balance=balance, overwrite=overwrite)
     show_simulation(found, quiet=quiet, as_json=as_json)
@@ -119,26 +129,26 @@ def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a ca
     typer.echo(f"report: {rebuild_report(folder)}")
 
 
-app.command("init")(init.init)
-app.command("check")(check.check)
-app.command()(audit.audit)
-app.command()(audit.design)
-app.command()(inference.export)
-app.command()(pictures.view)
-app.command()(prediction.predict)
-app.command()(prediction.adapt)
-app.command()(training.train)
-app.command()(training.evaluate)
-app.command()(listings.robots)
-app.command()(listings.mechanisms)
-app.command()(listings.formats)
-app.command()(listings.methods)
-motors.register(app)
+app.command("init")(init_command.init)
+app.command("check")(check_command.check)
+app.command()(audit_commands.audit)
+app.command()(audit_commands.design)
+app.command()(posterior_commands.export)
+app.command()(picture_commands.view)
+app.command()(prediction_commands.predict)
+app.command()(prediction_commands.adapt)
+app.command()(policy_commands.train)
+app.command()(policy_commands.evaluate)
+app.command()(listing_commands.robots)
+app.command()(listing_commands.mechanisms)
+app.command()(listing_commands.formats)
+app.command()(listing_commands.methods)
+motor_commands.register(app)
 
 benchmark = typer.Typer(help="Comparisons that take hours; each can be interrupted and resumed.", no_args_is_help=True)
-benchmark.command()(inference.table1)
-benchmark.command()(training.table2)
-benchmark.command("audit")(audit.benchmark_audit)
+benchmark.command()(posterior_commands.table1)
+benchmark.command()(policy_commands.table2)
+benchmark.command("audit")(audit_commands.benchmark_audit)
 app.add_typer(benchmark, name="benchmark")
 
 

@@ -11,8 +11,8 @@ import typer
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.interrupts import check_interrupt
-from rfdropo_bayes.workflow.experiment_file import look_through
-from rfdropo_bayes.workflow.files import check_folder
+from rfdropo_bayes.model.experiment_file import look_through
+from rfdropo_bayes.model.run_folder import check_folder
 
 ExperimentFile = Annotated[Path, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file")]
 OutFolder = Annotated[

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import xarray as xr
 
-from rfdropo_bayes.data.clock import check_times
+from rfdropo_bayes.data.sample_times import check_times
 from rfdropo_bayes.errors import InputError
 
 DIMS: dict[str, tuple[str, ...]] = {

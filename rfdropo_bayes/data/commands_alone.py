@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.data.clock import sample_time
+from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 

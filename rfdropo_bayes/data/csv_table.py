@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from rfdropo_bayes.data.clock import Stamps, dated, numbers_of, read_stamps
+from rfdropo_bayes.data.sample_times import Stamps, dated, numbers_of, read_stamps
 from rfdropo_bayes.errors import InputError
 
 MOTIVE = "Format Version"

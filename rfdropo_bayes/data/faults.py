@@ -26,8 +26,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rfdropo_bayes.data.clock import check_times, clock_notes, evened
 from rfdropo_bayes.data.identities import Change, changed_names
+from rfdropo_bayes.data.sample_times import check_times, clock_notes, evened
 from rfdropo_bayes.errors import InputError
 
 NOTES = "notes"  # among the settings of a recording: what is allowed of it, and perhaps not meant

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from rfdropo_bayes.data.clock import evened, sample_time
+from rfdropo_bayes.data.sample_times import evened, sample_time
 
 HELD = 1.5  # samples: readings that last longer are held
 

@@ -10,10 +10,10 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
-from rfdropo_bayes.data.clock import PER_SECOND, check_times, read_stamps
 from rfdropo_bayes.data.faults import fill_missing, find_faults
 from rfdropo_bayes.data.first_command import MEMORY, Rule, begun_from
 from rfdropo_bayes.data.plain_csv import COMMAND_UNITS, METRES, CsvColumns, read_frame
+from rfdropo_bayes.data.sample_times import PER_SECOND, check_times, read_stamps
 from rfdropo_bayes.data.trajectory import AXES, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.tables import nearest, parse_table

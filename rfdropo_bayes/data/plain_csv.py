@@ -17,11 +17,11 @@ from jaxtyping import Float
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from rfdropo_bayes.data.clock import PER_SECOND, TimeUnit
 from rfdropo_bayes.data.commands_alone import commands_alone
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import fill_missing, find_faults
 from rfdropo_bayes.data.held_readings import hold_time
+from rfdropo_bayes.data.sample_times import PER_SECOND, TimeUnit
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 

@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.data import checks
-from rfdropo_bayes.data.clock import sample_time
 from rfdropo_bayes.data.faults import NOTES
 from rfdropo_bayes.data.held_readings import new_readings, present_readings
+from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole
 

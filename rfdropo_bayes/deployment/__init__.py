@@ -10,9 +10,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rfdropo_bayes.deployment.bench.plant import Plant, PlantState
     from rfdropo_bayes.deployment.causes import Cause, Stop
     from rfdropo_bayes.deployment.log import session_trajectory
-    from rfdropo_bayes.deployment.plant import Plant, PlantState
     from rfdropo_bayes.deployment.session import Mode, Outcome, deploy
     from rfdropo_bayes.deployment.settings import Deployment, load_deployment
 
@@ -33,8 +33,8 @@ _HOMES = {
     "Cause": "causes",
     "Stop": "causes",
     "session_trajectory": "log",
-    "Plant": "plant",
-    "PlantState": "plant",
+    "Plant": "bench.plant",
+    "PlantState": "bench.plant",
     "Mode": "session",
     "Outcome": "session",
     "deploy": "session",

@@ -13,7 +13,7 @@ import can
 import canopen
 from pydantic import BaseModel, ConfigDict, Field
 
-from rfdropo_bayes.deployment.hub import HubBus
+from rfdropo_bayes.deployment.bench.hub import HubBus
 from rfdropo_bayes.errors import InputError
 
 

@@ -10,7 +10,7 @@ from enum import Enum, IntEnum
 from typing import NamedTuple
 
 
-class State(Enum):
+class DriveState(Enum):
     """States of a drive; the value is the (mask, pattern) of the statusword that shows it."""
 
     NOT_READY = (0x4F, 0x00)
@@ -30,10 +30,10 @@ class State(Enum):
     @property
     def powered(self) -> bool:
         """Whether the motor may push or hold in this state."""
-        return self in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION)
+        return self in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION)
 
 
-class Command(IntEnum):
+class Controlword(IntEnum):
     """Controlwords that a master sends (object 0x6040)."""
 
     DISABLE_VOLTAGE = 0x00
@@ -63,74 +63,74 @@ class Transition(NamedTuple):
     """One row of the table: its number in the standard, where from, where to."""
 
     number: int
-    start: State
-    end: State
+    start: DriveState
+    end: DriveState
 
 
 TRANSITIONS = {
     row.number: row
     for row in (
-        Transition(1, State.NOT_READY, State.SWITCH_ON_DISABLED),
-        Transition(2, State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON),
-        Transition(3, State.READY_TO_SWITCH_ON, State.SWITCHED_ON),
-        Transition(4, State.SWITCHED_ON, State.OPERATION_ENABLED),
-        Transition(5, State.OPERATION_ENABLED, State.SWITCHED_ON),
-        Transition(6, State.SWITCHED_ON, State.READY_TO_SWITCH_ON),
-        Transition(7, State.READY_TO_SWITCH_ON, State.SWITCH_ON_DISABLED),
-        Transition(8, State.OPERATION_ENABLED, State.READY_TO_SWITCH_ON),
-        Transition(9, State.OPERATION_ENABLED, State.SWITCH_ON_DISABLED),
-        Transition(10, State.SWITCHED_ON, State.SWITCH_ON_DISABLED),
-        Transition(11, State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE),
-        Transition(12, State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED),
-        Transition(14, State.FAULT_REACTION, State.FAULT),
-        Transition(15, State.FAULT, State.SWITCH_ON_DISABLED),
-        Transition(16, State.QUICK_STOP_ACTIVE, State.OPERATION_ENABLED),
+        Transition(1, DriveState.NOT_READY, DriveState.SWITCH_ON_DISABLED),
+        Transition(2, DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON),
+        Transition(3, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON),
+        Transition(4, DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED),
+        Transition(5, DriveState.OPERATION_ENABLED, DriveState.SWITCHED_ON),
+        Transition(6, DriveState.SWITCHED_ON, DriveState.READY_TO_SWITCH_ON),
+        Transition(7, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCH_ON_DISABLED),
+        Transition(8, DriveState.OPERATION_ENABLED, DriveState.READY_TO_SWITCH_ON),
+        Transition(9, DriveState.OPERATION_ENABLED, DriveState.SWITCH_ON_DISABLED),
+        Transition(10, DriveState.SWITCHED_ON, DriveState.SWITCH_ON_DISABLED),
+        Transition(11, DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE),
+        Transition(12, DriveState.QUICK_STOP_ACTIVE, DriveState.SWITCH_ON_DISABLED),
+        Transition(14, DriveState.FAULT_REACTION, DriveState.FAULT),
+        Transition(15, DriveState.FAULT, DriveState.SWITCH_ON_DISABLED),
+        Transition(16, DriveState.QUICK_STOP_ACTIVE, DriveState.OPERATION_ENABLED),
     )
 }
 """All transitions but 0 (power on) and 13 (a fault, from every state)."""
 
-_COMMANDED: dict[State, dict[Command, int]] = {
-    State.SWITCH_ON_DISABLED: {Command.SHUTDOWN: 2},
-    State.READY_TO_SWITCH_ON: {
-        Command.SWITCH_ON: 3,
-        Command.QUICK_STOP: 7,
-        Command.DISABLE_VOLTAGE: 7,
+_COMMANDED: dict[DriveState, dict[Controlword, int]] = {
+    DriveState.SWITCH_ON_DISABLED: {Controlword.SHUTDOWN: 2},
+    DriveState.READY_TO_SWITCH_ON: {
+        Controlword.SWITCH_ON: 3,
+        Controlword.QUICK_STOP: 7,
+        Controlword.DISABLE_VOLTAGE: 7,
     },
-    State.SWITCHED_ON: {
-        Command.ENABLE_OPERATION: 4,
-        Command.SHUTDOWN: 6,
-        Command.QUICK_STOP: 10,
-        Command.DISABLE_VOLTAGE: 10,
+    DriveState.SWITCHED_ON: {
+        Controlword.ENABLE_OPERATION: 4,
+        Controlword.SHUTDOWN: 6,
+        Controlword.QUICK_STOP: 10,
+        Controlword.DISABLE_VOLTAGE: 10,
     },
-    State.OPERATION_ENABLED: {
-        Command.SWITCH_ON: 5,
-        Command.SHUTDOWN: 8,
-        Command.DISABLE_VOLTAGE: 9,
-        Command.QUICK_STOP: 11,
+    DriveState.OPERATION_ENABLED: {
+        Controlword.SWITCH_ON: 5,
+        Controlword.SHUTDOWN: 8,
+        Controlword.DISABLE_VOLTAGE: 9,
+        Controlword.QUICK_STOP: 11,
     },
-    State.QUICK_STOP_ACTIVE: {Command.ENABLE_OPERATION: 16, Command.DISABLE_VOLTAGE: 12},
+    DriveState.QUICK_STOP_ACTIVE: {Controlword.ENABLE_OPERATION: 16, Controlword.DISABLE_VOLTAGE: 12},
 }
 
 _PATTERNS = (
-    (0x82, 0x00, Command.DISABLE_VOLTAGE),
-    (0x86, 0x02, Command.QUICK_STOP),
-    (0x87, 0x06, Command.SHUTDOWN),
-    (0x8F, 0x07, Command.SWITCH_ON),
-    (0x8F, 0x0F, Command.ENABLE_OPERATION),
+    (0x82, 0x00, Controlword.DISABLE_VOLTAGE),
+    (0x86, 0x02, Controlword.QUICK_STOP),
+    (0x87, 0x06, Controlword.SHUTDOWN),
+    (0x8F, 0x07, Controlword.SWITCH_ON),
+    (0x8F, 0x0F, Controlword.ENABLE_OPERATION),
 )
 """Mask, pattern and meaning of controlwords without the fault reset bit."""
 
 
-def state_of(statusword: int) -> State | None:
+def state_of(statusword: int) -> DriveState | None:
     """State that a statusword shows; None for a pattern that the standard does not know."""
-    for state in State:
+    for state in DriveState:
         mask, pattern = state.value
         if statusword & mask == pattern:
             return state
     return None
 
 
-def command_of(controlword: int) -> Command | None:
+def command_of(controlword: int) -> Controlword | None:
     """Command that a controlword carries; the fault reset is an edge, hence no command of its own."""
     for mask, pattern, command in _PATTERNS:
         if controlword & mask == pattern:
@@ -138,14 +138,14 @@ def command_of(controlword: int) -> Command | None:
     return None
 
 
-def obey(state: State, controlword: int, previous: int) -> int | None:
+def obey(state: DriveState, controlword: int, previous: int) -> int | None:
     """Number of the transition that a controlword causes in a drive; None where it changes nothing.
 
     Args:
         state: of the drive.
         controlword, previous: the word now and the one before: a fault is reset by the rising edge of bit 7 alone.
     """
-    if state is State.FAULT:
+    if state is DriveState.FAULT:
         rising = controlword & FAULT_RESET_BIT and not previous & FAULT_RESET_BIT
         return 15 if rising else None
     command = command_of(controlword)
@@ -153,22 +153,22 @@ def obey(state: State, controlword: int, previous: int) -> int | None:
 
 
 _UPWARDS = {
-    State.SWITCH_ON_DISABLED: Command.SHUTDOWN,
-    State.READY_TO_SWITCH_ON: Command.SWITCH_ON,
-    State.SWITCHED_ON: Command.ENABLE_OPERATION,
-    State.OPERATION_ENABLED: Command.ENABLE_OPERATION,
+    DriveState.SWITCH_ON_DISABLED: Controlword.SHUTDOWN,
+    DriveState.READY_TO_SWITCH_ON: Controlword.SWITCH_ON,
+    DriveState.SWITCHED_ON: Controlword.ENABLE_OPERATION,
+    DriveState.OPERATION_ENABLED: Controlword.ENABLE_OPERATION,
 }
 _RANK = {state: rank for rank, state in enumerate(_UPWARDS)}
 _KEEP = {
-    State.SWITCH_ON_DISABLED: Command.DISABLE_VOLTAGE,
-    State.READY_TO_SWITCH_ON: Command.SHUTDOWN,
-    State.SWITCHED_ON: Command.SWITCH_ON,
-    State.OPERATION_ENABLED: Command.ENABLE_OPERATION,
-    State.QUICK_STOP_ACTIVE: Command.QUICK_STOP,
+    DriveState.SWITCH_ON_DISABLED: Controlword.DISABLE_VOLTAGE,
+    DriveState.READY_TO_SWITCH_ON: Controlword.SHUTDOWN,
+    DriveState.SWITCHED_ON: Controlword.SWITCH_ON,
+    DriveState.OPERATION_ENABLED: Controlword.ENABLE_OPERATION,
+    DriveState.QUICK_STOP_ACTIVE: Controlword.QUICK_STOP,
 }
 
 
-def controlword_towards(state: State, target: State, previous: int) -> int:
+def controlword_towards(state: DriveState, target: DriveState, previous: int) -> int:
     """Controlword that brings a drive one step nearer to a state, or keeps it there.
 
     A drive in quick stop is brought to another state through SWITCH ON DISABLED: to go on moving from a stop is a
@@ -186,14 +186,16 @@ def controlword_towards(state: State, target: State, previous: int) -> int:
         raise ValueError(f"no command leads to {target.words}")
     if state is target:
         return int(_KEEP[target])
-    if state is State.FAULT:
-        return int(Command.DISABLE_VOLTAGE if previous & FAULT_RESET_BIT else Command.FAULT_RESET)
-    if state in (State.NOT_READY, State.FAULT_REACTION):
-        return int(Command.DISABLE_VOLTAGE)  # the drive leaves them by itself
-    if target is State.QUICK_STOP_ACTIVE:
-        return int(Command.QUICK_STOP)  # from lower states it leads to SWITCH ON DISABLED, where nothing moves either
-    if state is State.QUICK_STOP_ACTIVE or target is State.SWITCH_ON_DISABLED:
-        return int(Command.DISABLE_VOLTAGE)
+    if state is DriveState.FAULT:
+        return int(Controlword.DISABLE_VOLTAGE if previous & FAULT_RESET_BIT else Controlword.FAULT_RESET)
+    if state in (DriveState.NOT_READY, DriveState.FAULT_REACTION):
+        return int(Controlword.DISABLE_VOLTAGE)  # the drive leaves them by itself
+    if target is DriveState.QUICK_STOP_ACTIVE:
+        return int(
+            Controlword.QUICK_STOP
+        )  # from lower states it leads to SWITCH ON DISABLED, where nothing moves either
+    if state is DriveState.QUICK_STOP_ACTIVE or target is DriveState.SWITCH_ON_DISABLED:
+        return int(Controlword.DISABLE_VOLTAGE)
     if _RANK[state] < _RANK[target]:
         return int(_UPWARDS[state])
     return int(_KEEP[target])

@@ -19,7 +19,13 @@ from canopen.sdo.exceptions import SdoError
 
 from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bus import LoggedNetwork
-from rfdropo_bayes.deployment.cia402 import CYCLIC_SYNCHRONOUS_POSITION, Command, State, controlword_towards, state_of
+from rfdropo_bayes.deployment.cia402 import (
+    CYCLIC_SYNCHRONOUS_POSITION,
+    Controlword,
+    DriveState,
+    controlword_towards,
+    state_of,
+)
 from rfdropo_bayes.deployment.objects import Nmt, NmtState, Object
 from rfdropo_bayes.deployment.vendors import (
     LEFT_OUT,
@@ -94,7 +100,7 @@ class Drive:
         self.node.sdo.RESPONSE_TIMEOUT = answer
         network.add_node(self.node)
         self._sdo = threading.Lock()
-        self.controlword, self.target = int(Command.DISABLE_VOLTAGE), 0
+        self.controlword, self.target = int(Controlword.DISABLE_VOLTAGE), 0
         self.reading: Reading | None = None
         self.short_frames = 0
         self.unanswered = 0  # cycles since the last status
@@ -108,7 +114,7 @@ class Drive:
         return f"drive {self.motor.channel!r} (node {self.motor.node})"
 
     @property
-    def state(self) -> State | None:
+    def state(self) -> DriveState | None:
         """State that the last TPDO shows."""
         return None if self.reading is None else state_of(self.reading.statusword)
 
@@ -283,10 +289,10 @@ class Drive:
         end = time.monotonic() + 1.0
         found, previous = False, 0
         while (state := state_of(self.read(Object.STATUSWORD))) is not None:
-            if not state.powered and state is not State.SWITCHED_ON:
+            if not state.powered and state is not DriveState.SWITCHED_ON:
                 return found
             found = True
-            previous = controlword_towards(state, State.SWITCH_ON_DISABLED, previous)
+            previous = controlword_towards(state, DriveState.SWITCH_ON_DISABLED, previous)
             self.write(Object.CONTROLWORD, previous, read_back=False)
             if time.monotonic() > end:
                 break
@@ -335,7 +341,7 @@ class Drive:
                         self.write(index + number - 1, cob | objects.PDO_INVALID, 1)
         self.network.subscribe(objects.TPDO1 + node, self._on_status)
         self.target = self.read(Object.POSITION)
-        self.controlword = int(Command.DISABLE_VOLTAGE)
+        self.controlword = int(Controlword.DISABLE_VOLTAGE)
 
     def _within(self, index: int, subindex: int, value: int, say: Callable[[str], None]) -> int:
         """The value, or the drive's largest where that is less and stricter."""
@@ -505,7 +511,7 @@ class Drives:
             stopped = self._stopped.is_set()
             for drive in self.all:
                 if stopped:
-                    drive.controlword = int(Command.QUICK_STOP)
+                    drive.controlword = int(Controlword.QUICK_STOP)
                 data = objects.SETPOINT.pack(drive.controlword, drive.target)
                 self.network.send_message(objects.RPDO1 + drive.motor.node, data)
             self._awaited = {drive.motor.node for drive in self.all}
@@ -541,10 +547,10 @@ class Drives:
         failures = []
         try:
             for drive in self.all:
-                drive.controlword = int(Command.QUICK_STOP)
+                drive.controlword = int(Controlword.QUICK_STOP)
                 try:
                     self.network.send_message(
-                        objects.RPDO2 + drive.motor.node, objects.COMMAND.pack(Command.QUICK_STOP)
+                        objects.RPDO2 + drive.motor.node, objects.COMMAND.pack(Controlword.QUICK_STOP)
                     )
                 except can.CanError as error:
                     failures.append(f"{drive.name}: {error}")

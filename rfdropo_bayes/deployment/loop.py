@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.deployment.causes import Cause, Reaction, Stop
-from rfdropo_bayes.deployment.cia402 import State, controlword_towards
+from rfdropo_bayes.deployment.cia402 import DriveState, controlword_towards
 from rfdropo_bayes.deployment.clock import CycleClock, Tick
 from rfdropo_bayes.deployment.drives import Drive, Drives
 from rfdropo_bayes.deployment.log import SessionLog
 from rfdropo_bayes.deployment.objects import Nmt
-from rfdropo_bayes.deployment.policy import CommandSource, Scene
+from rfdropo_bayes.deployment.policy import CommandSource, PolicyScene
 from rfdropo_bayes.deployment.sensors import MarkerView
 from rfdropo_bayes.deployment.setpoints import SetPoints
 from rfdropo_bayes.deployment.settings import SafetyTable
@@ -91,8 +91,8 @@ class ControlLoop:
         self._raw, self._asked = np.zeros(channels), np.zeros(channels)
         self.watch = Watch(drives, safety.patience())
         self._clock: CycleClock
-        self._wanted = State.SWITCH_ON_DISABLED
-        self._expected: State | None = None
+        self._wanted = DriveState.SWITCH_ON_DISABLED
+        self._expected: DriveState | None = None
         self.pulse: float | None = None
         self.demanded: Stop | None = None  # by another thread
         self.lateness: list[float] = []
@@ -122,7 +122,7 @@ class ControlLoop:
             state = drive.state
             if state is not None:
                 drive.controlword = controlword_towards(state, self._wanted, drive.controlword)
-            if state is State.OPERATION_ENABLED:
+            if state is DriveState.OPERATION_ENABLED:
                 drive.target = drive.motor.counts(length, drive.offset)
             elif drive.reading is not None:
                 drive.target = drive.reading.position  # a drive must find itself where it is when it is enabled
@@ -214,16 +214,16 @@ class ControlLoop:
                     Cause.NOT_ENABLED,
                     f"{drive.name} stands at {1e3 * drive.length:.1f} mm, outside its limits: home it",
                 )
-        self._wanted = State.OPERATION_ENABLED
+        self._wanted = DriveState.OPERATION_ENABLED
         end = time.monotonic() + self.safety.enable_s
-        while waiting := [drive for drive in self.drives.all if drive.state is not State.OPERATION_ENABLED]:
+        while waiting := [drive for drive in self.drives.all if drive.state is not DriveState.OPERATION_ENABLED]:
             if time.monotonic() > end:
                 state = waiting[0].state
                 raise Stop(
                     Cause.NOT_ENABLED, f"{waiting[0].name} stays in {state.words if state else 'no known state'}"
                 )
             self.cycle(Phase.ENABLING)
-        self._expected = State.OPERATION_ENABLED
+        self._expected = DriveState.OPERATION_ENABLED
 
     def go_to(self, length: Float[np.ndarray, " channel"], phase: Phase, settle: float) -> None:
         """Move slowly to these lengths [m], and rest there."""
@@ -276,7 +276,7 @@ class ControlLoop:
     def _act(self, source: CommandSource, period: float) -> bool:
         self.markers.act()
         unit = self.command / self.scale
-        scene = Scene(self.markers.position, self.markers.moved, unit, self.lengths(), self.tensions())
+        scene = PolicyScene(self.markers.position, self.markers.moved, unit, self.lengths(), self.tensions())
         began = time.monotonic()
         act = source.act(scene)
         self.act_times.append(time.monotonic() - began)
@@ -326,16 +326,16 @@ class ControlLoop:
 
     def _release(self) -> None:
         """Switch the drives off, one state down at a time."""
-        self._wanted, self._expected = State.SWITCH_ON_DISABLED, None
+        self._wanted, self._expected = DriveState.SWITCH_ON_DISABLED, None
         end = time.monotonic() + self.safety.enable_s
-        while any(drive.state is not State.SWITCH_ON_DISABLED for drive in self.drives.all):
+        while any(drive.state is not DriveState.SWITCH_ON_DISABLED for drive in self.drives.all):
             self.cycle(Phase.HOLDING)
             if time.monotonic() > end:
                 raise Stop(Cause.DRIVE_STATE, "a drive does not switch off")
 
     def _brake(self, began: float) -> None:
         """Quick stop, and look on until the drives have shown that they stand."""
-        self._wanted = State.QUICK_STOP_ACTIVE
+        self._wanted = DriveState.QUICK_STOP_ACTIVE
         for failure in self.drives.quick_stop():
             self._say(f"quick stop not sent: {failure}")
         end = time.monotonic() + self.safety.hold_s
@@ -361,4 +361,9 @@ class ControlLoop:
 
 
 def _stands(drive: Drive) -> bool:
-    return drive.state in (State.QUICK_STOP_ACTIVE, State.SWITCH_ON_DISABLED, State.FAULT, State.READY_TO_SWITCH_ON)
+    return drive.state in (
+        DriveState.QUICK_STOP_ACTIVE,
+        DriveState.SWITCH_ON_DISABLED,
+        DriveState.FAULT,
+        DriveState.READY_TO_SWITCH_ON,
+    )

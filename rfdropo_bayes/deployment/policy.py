@@ -25,7 +25,7 @@ METADATA = "rfdropo_layout"
 """Key of the layout in the metadata of the ONNX file."""
 
 
-class Scene(NamedTuple):
+class PolicyScene(NamedTuple):
     """What a policy may see.
 
     Attributes:
@@ -58,7 +58,7 @@ class CommandSource(Protocol):
     sees_markers: bool
     """Whether lost markers make its commands worthless."""
 
-    def act(self, scene: Scene) -> Act | None:
+    def act(self, scene: PolicyScene) -> Act | None:
         """The next command [command unit]; None where there is no more.
 
         Raises:
@@ -119,13 +119,13 @@ class OnnxPolicy:
         self._check_shapes(where)
         self._network = _bound(self._session, self.layout.size, len(self._reach))
         nowhere, still = np.zeros((len(robot.marker_names), 3)), np.zeros(len(robot.channel_names))
-        self._last = Scene(nowhere, nowhere, still, still, still)
+        self._last = PolicyScene(nowhere, nowhere, still, still, still)
 
     def rehearse(self) -> None:
         """Look at the last scene again; see `CommandSource.rehearse`."""
         self._answer(self._last)
 
-    def act(self, scene: Scene) -> Act:
+    def act(self, scene: PolicyScene) -> Act:
         """Run the network: what it gives is the change of the command, which the layout's limits end.
 
         Raises:
@@ -141,7 +141,7 @@ class OnnxPolicy:
             raise Stop(Cause.ACTION_OUTSIDE, f"the policy's output {raw.tolist()} is outside what its layout states")
         return Act(raw, np.clip(scene.command + raw, self._low, self._high))
 
-    def _observe(self, scene: Scene) -> Float[np.ndarray, " feature"]:
+    def _observe(self, scene: PolicyScene) -> Float[np.ndarray, " feature"]:
         parts = {
             "markers": scene.position[self._markers].ravel(),
             "moved": scene.moved[self._markers].ravel(),
@@ -155,7 +155,7 @@ class OnnxPolicy:
     def _run(self, observation: Float[np.ndarray, " feature"]) -> Float[np.ndarray, " channel"]:
         return self._network(observation)
 
-    def _answer(self, scene: Scene) -> tuple[Float[np.ndarray, " feature"], Float[np.ndarray, " channel"]]:
+    def _answer(self, scene: PolicyScene) -> tuple[Float[np.ndarray, " feature"], Float[np.ndarray, " channel"]]:
         """Observation, and what the network makes of it."""
         observation = self._observe(scene)
         try:
@@ -302,7 +302,7 @@ class RecordedCommands:
     def rehearse(self) -> None:
         """Nothing to prepare."""
 
-    def act(self, scene: Scene) -> Act | None:
+    def act(self, scene: PolicyScene) -> Act | None:
         """The command in force at the next instant of the recording."""
         if self._next >= len(self._commands):
             return None

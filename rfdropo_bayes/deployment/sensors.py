@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.deployment.simulation import DATAGRAM, MAGIC
+from rfdropo_bayes.deployment.bench.simulated_bus import DATAGRAM, MAGIC
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 

@@ -19,6 +19,7 @@ from rich.live import Live
 
 from rfdropo_bayes import __version__
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork, open_bus
 from rfdropo_bayes.deployment.causes import Cause, Stop
 from rfdropo_bayes.deployment.clock import real_time, steady_interpreter
@@ -31,7 +32,6 @@ from rfdropo_bayes.deployment.loop import ControlLoop, Phase
 from rfdropo_bayes.deployment.policy import CommandSource, OnnxPolicy, RecordedCommands
 from rfdropo_bayes.deployment.sensors import MarkerSensor, MarkerView, SimulatedMarkers, open_sensor
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, load_deployment
-from rfdropo_bayes.deployment.simulation import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.vendors import LEFT_OUT
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Motor, Robot, load_robot

@@ -7,7 +7,7 @@ from collections import deque
 from typing import NamedTuple
 
 from rfdropo_bayes.deployment.causes import Cause, Stop
-from rfdropo_bayes.deployment.cia402 import State, Status
+from rfdropo_bayes.deployment.cia402 import DriveState, Status
 from rfdropo_bayes.deployment.clock import Tick
 from rfdropo_bayes.deployment.drives import Drive, Drives
 from rfdropo_bayes.deployment.objects import NmtState
@@ -53,7 +53,7 @@ class Watch:
         self._started = time.monotonic()
         self._lagging: dict[int, float] = {}  # node -> since when
 
-    def check(self, tick: Tick, expected: State | None, tension: bool = True) -> None:
+    def check(self, tick: Tick, expected: DriveState | None, tension: bool = True) -> None:
         """Look at a cycle after its exchange.
 
         Args:
@@ -71,7 +71,7 @@ class Watch:
                 raise Stop(Cause.SHORT_FRAME, f"{drive.name} sent a status frame of the wrong length")
             self._check_life(drive, now)
             self._check_state(drive, expected)
-            if expected is State.OPERATION_ENABLED:
+            if expected is DriveState.OPERATION_ENABLED:
                 self._check_lag(drive, now)
             if tension and drive.tension > drive.motor.tension_limit_n[1]:
                 limit = drive.motor.tension_limit_n[1]
@@ -96,16 +96,16 @@ class Watch:
         if drive.unanswered > self._patience.stale_cycles:
             raise Stop(Cause.STALE_STATUS, f"{drive.name}: no status for {drive.unanswered} cycles")
 
-    def _check_state(self, drive: Drive, expected: State | None) -> None:
+    def _check_state(self, drive: Drive, expected: DriveState | None) -> None:
         if drive.reading is None:
             return
         state = drive.state
-        if state in (State.FAULT, State.FAULT_REACTION) and expected is not None:
+        if state in (DriveState.FAULT, DriveState.FAULT_REACTION) and expected is not None:
             raise Stop(Cause.DRIVE_STATE, f"{drive.name} is in {state.words}")
         if expected is not None and state is not expected:
             words = "an unknown state" if state is None else state.words
             raise Stop(Cause.DRIVE_STATE, f"{drive.name} is in {words}, not in {expected.words}")
-        if expected is State.OPERATION_ENABLED and drive.reading.statusword & Status.FOLLOWING_ERROR:
+        if expected is DriveState.OPERATION_ENABLED and drive.reading.statusword & Status.FOLLOWING_ERROR:
             raise Stop(Cause.FOLLOWING_ERROR, f"{drive.name} lags behind its set-point")
 
     def _check_lag(self, drive: Drive, now: float) -> None:

@@ -12,7 +12,7 @@ from rfdropo_bayes.fem.cable_friction import Slip
 from rfdropo_bayes.fem.constraints import Contacts, Impulses, Slips, solve_constraints
 from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.integrators import EULER, REBOUND, Stage
-from rfdropo_bayes.fem.pushing import PushScene, Touch, find_contacts, trunk_rows
+from rfdropo_bayes.fem.pushing import PushGeometry, Touch, find_contacts, trunk_rows
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState, free_twist, inverse_inertia, moved, twist_of
 
 Solve = Callable[[Float[Array, "columns nodes 3"]], Float[Array, "columns nodes 3"]]
@@ -51,7 +51,7 @@ class ConstrainedStep(NamedTuple):
 
 
 def meet(
-    scene: PushScene,
+    scene: PushGeometry,
     cube: Cube,
     state: CubeState,
     before: Float[Array, "pairs 3"],

@@ -32,7 +32,7 @@ from rfdropo_bayes.fem.constrained_step import ConstrainedStep, Pull, Solve, con
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
 from rfdropo_bayes.fem.integrators import EULER, STAGES, Integrator, Stage
 from rfdropo_bayes.fem.layered import LayeredBody
-from rfdropo_bayes.fem.pushing import PushScene, unchanged, untouched
+from rfdropo_bayes.fem.pushing import PushGeometry, unchanged, untouched
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.surroundings import SectionLoad, section_load
 from rfdropo_bayes.fem.tension_stiffening import lateral_stiffening, layer_tension
@@ -228,7 +228,7 @@ def remembering(
     system: System,
     prepared: Prepared,
     state: State,
-    scene: PushScene | None = None,
+    scene: PushGeometry | None = None,
     integrator: Integrator = "euler",
 ) -> State:
     """The state with the memory that effects and contacts start from: clock at zero, branches relaxed, no friction.
@@ -402,7 +402,7 @@ def step(
     displacement: Float[Array, " cables"],
     time_step: Scalar,
     external_force: Float[Array, "nodes 3"] | float = 0.0,
-    scene: PushScene | None = None,
+    scene: PushGeometry | None = None,
     cube: Cube | None = None,
     integrator: Integrator = "euler",
 ) -> tuple[State, StepInfo]:
@@ -446,7 +446,7 @@ def _take_stage(
     *,
     time_step: Scalar,
     external: Float[Array, "nodes 3"] | float,
-    scene: PushScene | None,
+    scene: PushGeometry | None,
     cube: Cube | None,
 ) -> tuple[State, StepInfo, Carried | None]:
     """One stage of a step, see ``fem.integrators``."""

@@ -37,7 +37,7 @@ class Spheres(NamedTuple):
     radius: Float[np.ndarray, " spheres"]  # [m]
 
 
-class PushScene(NamedTuple):
+class PushGeometry(NamedTuple):
     """What does not change between rollouts; static, never traced."""
 
     spheres: Spheres
@@ -59,10 +59,10 @@ class Touch(NamedTuple):
 
 def push_scene(
     spheres: Spheres, *, plate_normal: Float[np.ndarray, "3"], plate_height: float, contact_distance: float
-) -> PushScene:
+) -> PushGeometry:
     """Scene of a body with these spheres before a plate of any normal."""
     normal = np.asarray(plate_normal, float)
-    return PushScene(spheres, normal / np.linalg.norm(normal), float(plate_height), float(contact_distance))
+    return PushGeometry(spheres, normal / np.linalg.norm(normal), float(plate_height), float(contact_distance))
 
 
 def sphere_heights(start: float, tip: float, tip_radius: float) -> Float[np.ndarray, " spheres"]:
@@ -143,7 +143,9 @@ def distance_to_box(
     return jnp.where(far, length, jnp.max(beyond, axis=1)), direction @ turn.T
 
 
-def smallest_gap(scene: PushScene, cube: Cube, state: CubeState, centre: Float[Array, "spheres 3"]) -> Float[Array, ""]:
+def smallest_gap(
+    scene: PushGeometry, cube: Cube, state: CubeState, centre: Float[Array, "spheres 3"]
+) -> Float[Array, ""]:
     """Distance of the trunk, given by the spheres' centres [m], from the nearer of cube and plate, less the contact
     distance."""
     beside = distance_to_box(centre, state.position, rotation_matrix(state.orientation), cube.side)[0]
@@ -168,7 +170,7 @@ def _trunk_weights(
     return node, jnp.stack([centre, rubbing, rubbing], axis=1)
 
 
-def find_contacts(scene: PushScene, cube: Cube, state: CubeState, position: Float[Array, "nodes 3"]) -> Touch:
+def find_contacts(scene: PushGeometry, cube: Cube, state: CubeState, position: Float[Array, "nodes 3"]) -> Touch:
     """Contacts at the start of a step, from the positions of the body's nodes [m]."""
     spheres, up = scene.spheres, jnp.asarray(scene.plate_normal)
     turn, radius = rotation_matrix(state.orientation), jnp.asarray(spheres.radius)
@@ -195,7 +197,7 @@ def find_contacts(scene: PushScene, cube: Cube, state: CubeState, position: Floa
     )
 
 
-def untouched(scene: PushScene) -> Float[Array, "pairs 3"]:
+def untouched(scene: PushGeometry) -> Float[Array, "pairs 3"]:
     """Impulses of all pairs that can touch, before the first step."""
     return jnp.zeros((len(CORNERS) + 2 * len(scene.spheres.radius), 3))
 

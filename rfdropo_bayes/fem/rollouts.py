@@ -14,7 +14,7 @@ from rfdropo_bayes.fem.dynamics import Prepared, State, StepInfo, System, rememb
 from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.integrators import Integrator
 from rfdropo_bayes.fem.layered import PointMap, point_positions
-from rfdropo_bayes.fem.pushing import PushScene
+from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube
 
 
@@ -103,7 +103,7 @@ def simulate(
     time_step: Scalar,
     points: PointMap,
     external_force: Float[Array, "nodes 3"] | float = 0.0,
-    scene: PushScene | None = None,
+    scene: PushGeometry | None = None,
     cube: Cube | None = None,
     horizon: Int[Array, ""] | int | None = None,
     integrator: Integrator = "euler",

@@ -16,15 +16,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.fem import levels as level_systems
+from rfdropo_bayes.fem.cable_drive import DriveLimits
 from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian
 from rfdropo_bayes.fem.constrained_step import Pull, constrained_step, meet
-from rfdropo_bayes.fem.drives import DriveLimits
 from rfdropo_bayes.fem.dynamics import LOST, Carried, StepInfo, accept_within, carried_from, in_stages
 from rfdropo_bayes.fem.effects import Memory
 from rfdropo_bayes.fem.integrators import EULER, STAGES, Integrator, Stage
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.levels import LevelMatrix, Levels, node_levels
-from rfdropo_bayes.fem.pushing import PushScene, untouched
+from rfdropo_bayes.fem.pushing import PushGeometry, untouched
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.rollouts import Rollout, roll
 from rfdropo_bayes.fem.tetrahedra import (
@@ -120,7 +120,7 @@ def step(
     state: TetrahedralState,
     displacement: Float[Array, " cables"],
     time_step: float,
-    scene: PushScene | None = None,
+    scene: PushGeometry | None = None,
     cube: Cube | None = None,
     integrator: Integrator = "euler",
 ) -> tuple[TetrahedralState, StepInfo]:
@@ -139,7 +139,7 @@ def _take_stage(
     carried: Carried | None,
     *,
     time_step: float,
-    scene: PushScene | None,
+    scene: PushGeometry | None,
     cube: Cube | None,
 ) -> tuple[TetrahedralState, StepInfo, Carried | None]:
     """One stage of a step, see ``fem.integrators``."""
@@ -182,7 +182,7 @@ def simulate(
     displacement: Float[Array, "rows substeps cables"],
     time_step: float,
     points: PointMap,
-    scene: PushScene | None = None,
+    scene: PushGeometry | None = None,
     cube: Cube | None = None,
     horizon: Int[Array, ""] | int | None = None,
     integrator: Integrator = "euler",

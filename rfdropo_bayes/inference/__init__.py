@@ -6,9 +6,9 @@ Other rooms import from here, and the modules `methods` and `sbc`; a name's modu
 |---|---|
 | the methods by name | `methods` |
 | where SMC starts, how it goes on, how its particles move | `smc.start`, `smc.sampler`, `smc.moves` |
-| where modes are searched | `modes.search` |
-| RF-DROPO | `rfdropo.search` |
-| plain numpyro models | `plain.problem` |
+| where modes are searched | `modes.mode_search` |
+| RF-DROPO | `rfdropo.phi_search` |
+| plain numpyro models | `plain.plain_problem` |
 """
 
 from importlib import import_module
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     from rfdropo_bayes.inference.modes.climb import maximise as maximise
     from rfdropo_bayes.inference.modes.climb import normal_at as normal_at
     from rfdropo_bayes.inference.modes.lasting import lasting_series as lasting_series
-    from rfdropo_bayes.inference.modes.search import LaplaceConfig as LaplaceConfig
-    from rfdropo_bayes.inference.modes.search import find_modes as find_modes
+    from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig as LaplaceConfig
+    from rfdropo_bayes.inference.modes.mode_search import find_modes as find_modes
     from rfdropo_bayes.inference.modes.targets import Target as Target
     from rfdropo_bayes.inference.nested import NestedConfig as NestedConfig
     from rfdropo_bayes.inference.nuts import NutsConfig as NutsConfig
-    from rfdropo_bayes.inference.plain.problem import problem_from_numpyro as problem_from_numpyro
+    from rfdropo_bayes.inference.plain.plain_problem import problem_from_numpyro as problem_from_numpyro
     from rfdropo_bayes.inference.progress import Checkpoint as Checkpoint
     from rfdropo_bayes.inference.progress import Progress as Progress
     from rfdropo_bayes.inference.result import InferenceResult as InferenceResult
-    from rfdropo_bayes.inference.rfdropo.search import RfdropoConfig as RfdropoConfig
+    from rfdropo_bayes.inference.rfdropo.phi_search import RfdropoConfig as RfdropoConfig
     from rfdropo_bayes.inference.rivals import BayesSimConfig as BayesSimConfig
     from rfdropo_bayes.inference.rivals import NpdrConfig as NpdrConfig
     from rfdropo_bayes.inference.rivals import UdrConfig as UdrConfig
@@ -53,15 +53,15 @@ PUBLIC = {
     "maximise": "modes.climb",
     "normal_at": "modes.climb",
     "lasting_series": "modes.lasting",
-    "LaplaceConfig": "modes.search",
-    "find_modes": "modes.search",
+    "LaplaceConfig": "modes.mode_search",
+    "find_modes": "modes.mode_search",
     "Target": "modes.targets",
     "NestedConfig": "nested",
     "NutsConfig": "nuts",
-    "problem_from_numpyro": "plain.problem",
+    "problem_from_numpyro": "plain.plain_problem",
     "Progress": "progress",
     "InferenceResult": "result",
-    "RfdropoConfig": "rfdropo.search",
+    "RfdropoConfig": "rfdropo.phi_search",
     "BayesSimConfig": "rivals",
     "NpdrConfig": "rivals",
     "UdrConfig": "rivals",

@@ -14,10 +14,10 @@ from jaxtyping import PRNGKeyArray
 from rfdropo_bayes.bayes.problem import Problem, check_problem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import nested, nuts, rivals
-from rfdropo_bayes.inference.modes import search as laplace
+from rfdropo_bayes.inference.modes import mode_search as laplace
 from rfdropo_bayes.inference.progress import Logbook, Progress
 from rfdropo_bayes.inference.result import InferenceResult
-from rfdropo_bayes.inference.rfdropo import search as rfdropo
+from rfdropo_bayes.inference.rfdropo import phi_search as rfdropo
 from rfdropo_bayes.inference.smc import bridge, sampler
 from rfdropo_bayes.inference.smc import start as starts
 from rfdropo_bayes.tables import nearest

@@ -37,7 +37,7 @@ Simulate = Callable[[PRNGKeyArray], tuple[dict[str, float], Problem, int]]
 
 
 @dataclass(frozen=True)
-class Check:
+class SbcRanks:
     """Ranks of one quantity over all data sets.
 
     Attributes:
@@ -55,7 +55,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class SbcResult:
     """Result of the check.
 
     Attributes:
@@ -67,7 +67,7 @@ class Calibration:
         sentence: the same in words.
     """
 
-    checks: dict[str, Check]
+    checks: dict[str, SbcRanks]
     datasets: int
     failed_truths: int
     coverage: float
@@ -104,7 +104,7 @@ def calibrate(
     log: Path | None = None,
     resume: bool = False,
     progress: Progress | None = None,
-) -> Calibration:
+) -> SbcResult:
     """Check a method.
 
     Args:
@@ -178,7 +178,7 @@ def _one(
     }
 
 
-def _judge(names: tuple[str, ...], rows: list[dict[str, Any]]) -> Calibration:
+def _judge(names: tuple[str, ...], rows: list[dict[str, Any]]) -> SbcResult:
     quantities = (*names, LOG_LIKELIHOOD)
     ranks = {name: np.array([row["ranks"][name] for row in rows]) for name in quantities}
     raw = {name: uniformity(values) for name, values in ranks.items()}
@@ -186,7 +186,8 @@ def _judge(names: tuple[str, ...], rows: list[dict[str, Any]]) -> Calibration:
     inside = {name: float(np.mean([row["inside"][name] for row in rows])) for name in names}
     spread = {name: float(np.mean([row["contraction"][name] for row in rows])) for name in names}
     checks = {
-        name: Check(ranks[name], raw[name], adjusted[name], inside.get(name), spread.get(name)) for name in quantities
+        name: SbcRanks(ranks[name], raw[name], adjusted[name], inside.get(name), spread.get(name))
+        for name in quantities
     }
     coverage = float(np.mean(list(inside.values())))
     # Intervals of one data set go together: the scatter is that of `datasets` draws, not of each parameter's.
@@ -207,7 +208,7 @@ def _judge(names: tuple[str, ...], rows: list[dict[str, Any]]) -> Calibration:
         else f"NOT calibrated on {len(rows)} data sets: {'; '.join(problems)}."
     )
     totals = {name: sum(row[name] for row in rows) for name in ("rollouts", "seconds", "failed")}
-    return Calibration(
+    return SbcResult(
         checks, len(rows), int(totals["failed"]), coverage, passed, sentence, totals["rollouts"], totals["seconds"]
     )
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.mechanisms.priors import half_normal, log_normal, normal
+from rfdropo_bayes.mechanisms.default_priors import half_normal, log_normal, normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec

@@ -30,7 +30,7 @@ from rfdropo_bayes.mechanisms.actuation import (
     SpoolGrowth,
     TravelStop,
 )
-from rfdropo_bayes.mechanisms.body import (
+from rfdropo_bayes.mechanisms.body_mechanisms import (
     BaseTilt,
     BendingStiffening,
     BendTwistCoupling,

@@ -20,8 +20,8 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.special import softmax
 from scipy.stats import chi2
 
-from rfdropo_bayes.bayes.calibration import CalibrationProblem
-from rfdropo_bayes.bayes.space import Parameter
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
+from rfdropo_bayes.bayes.space import InferredParameter
 from rfdropo_bayes.inference import next_step
 from rfdropo_bayes.prediction.first_row import LEAST_SHARE, SURE, spread_of_draws
 from rfdropo_bayes.prediction.own_fit import OwnFit, fit_own
@@ -54,7 +54,7 @@ class DayFit(NamedTuple):
 def fit_day(
     problem: CalibrationProblem,
     body: Batch,
-    own: Sequence[Parameter],
+    own: Sequence[InferredParameter],
     key: PRNGKeyArray,
     report: Callable[[int, float], None] = lambda step, share: None,
 ) -> DayFit:
@@ -99,7 +99,7 @@ def fit_day(
 
 
 def physical_of_normal(
-    parameter: Parameter, normal: Float[np.ndarray, " b"], given: Mapping[str, np.ndarray]
+    parameter: InferredParameter, normal: Float[np.ndarray, " b"], given: Mapping[str, np.ndarray]
 ) -> np.ndarray:
     """Values of a parameter at standard normal coordinates of its prior."""
     if parameter.added_to:

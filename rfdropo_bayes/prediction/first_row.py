@@ -16,10 +16,10 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.special import softmax
 from scipy.stats import chi2
 
-from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels.object_pose import OFFSETS
 from rfdropo_bayes.bayes.recordings import RecordingSet
-from rfdropo_bayes.bayes.space import SEPARATOR, Parameter
+from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import next_step
 from rfdropo_bayes.posteriors import RecordingPrediction
@@ -37,7 +37,7 @@ def match_first_row(
     problem: CalibrationProblem,
     values: Batch,
     names: Sequence[str],
-    deviations: Sequence[Parameter],
+    deviations: Sequence[InferredParameter],
     left: ModelError | None,
     key: PRNGKeyArray,
 ) -> tuple[Batch, int]:
@@ -160,7 +160,7 @@ def _with_deviations(
     problem: CalibrationProblem,
     values: Batch,
     recording: str,
-    own: Sequence[Parameter],
+    own: Sequence[InferredParameter],
     left: ModelError | None,
     key: PRNGKeyArray,
     *,
@@ -190,7 +190,9 @@ def _with_deviations(
     return {**values, **dict(matched)}, int((~found.converged).sum())
 
 
-def spread_of_draws(deviation: Parameter, values: Mapping[str, np.ndarray], count: int) -> Float[np.ndarray, " n"]:
+def spread_of_draws(
+    deviation: InferredParameter, values: Mapping[str, np.ndarray], count: int
+) -> Float[np.ndarray, " n"]:
     """Standard deviation between groups of what a deviation is added to, for each of ``count`` draws."""
     if deviation.scaled_by:
         return np.asarray(values[deviation.scaled_by])

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.channels.object_pose import (
     OBJECT_CORRELATION_TIME,
@@ -23,13 +23,13 @@ from rfdropo_bayes.bayes.channels.object_pose import (
     OFFSETS,
     draw_object_error,
 )
-from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.space import SEPARATOR, Parameter, ParameterSpace
+from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter, ParameterSpace
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.clock import sample_time
+from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.posteriors import RecordingPrediction
@@ -159,7 +159,7 @@ def _for_new_recordings(
     """The space with its per-recording parameters renamed to the new recordings, and values for them."""
     own = {whole(recording) for recording in fitted}
     shared = [p for p in space.parameters if not p.recording]
-    families: dict[str, list[Parameter]] = {}
+    families: dict[str, list[InferredParameter]] = {}
     for parameter in space.parameters:
         if parameter.recording and not parameter.added_to:
             families.setdefault(parameter.spec.name, []).append(parameter)
@@ -190,7 +190,7 @@ def _for_new_recordings(
     return ParameterSpace(tuple(parameters)), extended
 
 
-def _deviations(fitted: Sequence[Parameter], groups: Mapping[str, tuple[str, ...]]) -> list[Parameter]:
+def _deviations(fitted: Sequence[InferredParameter], groups: Mapping[str, tuple[str, ...]]) -> list[InferredParameter]:
     """The deviations of the groups that new recordings belong to, whether any of a group was fitted or not."""
     kinds = {p.spec.name: p for p in fitted}
     return [replace(p, recording=group, members=members) for group, members in groups.items() for p in kinds.values()]
@@ -277,7 +277,7 @@ def with_measured_starts(
         for name in PLACE:
             if name in known:
                 prior = prior_from_table(specs[name], dict(specs[name].prior), where=name)
-                parameters.append(Parameter(specs[name], prior, trajectory.name))
+                parameters.append(InferredParameter(specs[name], prior, trajectory.name))
                 placed[f"{name}{SEPARATOR}{trajectory.name}"] = np.asarray(known[name])
     return replace(model, space=ParameterSpace(tuple(parameters))), placed
 

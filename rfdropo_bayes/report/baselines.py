@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory, group_repeats
-from rfdropo_bayes.data.clock import sample_time
+from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.fir import FirRegression, fit_fir
 from rfdropo_bayes.report.scores import ErrorFigures, measured_paths, score

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.clock import sample_time
+from rfdropo_bayes.data.sample_times import sample_time
 
 SPANS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)  # history that is looked at [s]
 LAGS = 11  # at most, evenly spaced over the span

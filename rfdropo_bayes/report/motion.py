@@ -25,7 +25,7 @@ CUBE_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for
 CUBE_FACES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 
 
-class Motion(NamedTuple):
+class DrawnMotion(NamedTuple):
     """What is drawn, in metres, in a frame whose third axis points upwards."""
 
     title: str
@@ -100,7 +100,7 @@ def silhouette(
     return np.concatenate([centre + normal, (centre - normal)[::-1]])
 
 
-def save_vtk(motion: Motion, folder: Path) -> list[Path]:
+def save_vtk(motion: DrawnMotion, folder: Path) -> list[Path]:
     """Write trunk and cube at every instant as VTK files, and a .pvd that lists them with their times."""
     folder.mkdir(parents=True, exist_ok=True)
     written, entries = [], []
@@ -120,14 +120,14 @@ def save_vtk(motion: Motion, folder: Path) -> list[Path]:
     return [index, *written]
 
 
-def _surfaces(motion: Motion, row: int) -> list[tuple[str, Float[np.ndarray, "points 3"], np.ndarray]]:
+def _surfaces(motion: DrawnMotion, row: int) -> list[tuple[str, Float[np.ndarray, "points 3"], np.ndarray]]:
     found = [("trunk", tube(motion.centre[row], motion.radius).reshape(-1, 3), tube_faces(len(motion.radius)))]
     if motion.cube is not None:
         found.append(("cube", motion.cube[row], CUBE_FACES))
     return found
 
 
-def save_frames(motion: Motion, folder: Path, frames_per_second: int) -> list[Path]:
+def save_frames(motion: DrawnMotion, folder: Path, frames_per_second: int) -> list[Path]:
     """Render frames in real time off-screen, one PNG each.
 
     Raises:
@@ -152,7 +152,7 @@ def save_frames(motion: Motion, folder: Path, frames_per_second: int) -> list[Pa
     return written
 
 
-def _populate(plotter: Any, pyvista: Any, motion: Motion, row: int) -> None:
+def _populate(plotter: Any, pyvista: Any, motion: DrawnMotion, row: int) -> None:
     """Put the surfaces of one instant before a camera that stays where it is."""
     for name, points, faces in _surfaces(motion, row):
         mesh = pyvista.PolyData(points, np.insert(faces, 0, 4, axis=1).ravel())

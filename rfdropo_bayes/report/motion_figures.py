@@ -20,7 +20,7 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from scipy.spatial import ConvexHull
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.report.motion import CUBE_FACES, Motion, silhouette, tube
+from rfdropo_bayes.report.motion import CUBE_FACES, DrawnMotion, silhouette, tube
 from rfdropo_bayes.report.style import ACCENT, MEASURED, WIDTH, styled
 
 PLANES = {"from the side": (0, 2), "from above": (0, 1)}
@@ -33,7 +33,7 @@ GROUND = "#D9D9D9"
 MILLIMETRES = 1e3
 
 
-def _frame(motion: Motion) -> tuple[Figure, Axes, dict[str, Axes]]:
+def _frame(motion: DrawnMotion) -> tuple[Figure, Axes, dict[str, Axes]]:
     """Figure with a view in space and two projections, of equal scale."""
     figure = Figure(figsize=(WIDTH, 4.6))
     FigureCanvasAgg(figure)
@@ -71,7 +71,7 @@ def _hull(points: Float[np.ndarray, "corner 2"]) -> Float[np.ndarray, "outline 2
     return points[ConvexHull(points).vertices]
 
 
-def _draw(motion: Motion, row: int, space: Any, flat: dict[str, Axes], colour: Any, alpha: float) -> list[Any]:
+def _draw(motion: DrawnMotion, row: int, space: Any, flat: dict[str, Axes], colour: Any, alpha: float) -> list[Any]:
     """Trunk, cube and measured markers at one instant; returns what was drawn."""
     centre, radius = MILLIMETRES * motion.centre[row], MILLIMETRES * motion.radius
     rings = tube(centre, radius)
@@ -94,7 +94,7 @@ def _draw(motion: Motion, row: int, space: Any, flat: dict[str, Axes], colour: A
 
 
 @styled
-def still(motion: Motion, instants: Sequence[int] | None = None) -> Figure:
+def still(motion: DrawnMotion, instants: Sequence[int] | None = None) -> Figure:
     """Several instants in one picture, from light to dark; dots are measured markers."""
     rows = np.unique(np.linspace(0, len(motion.time) - 1, INSTANTS).astype(int)) if instants is None else instants
     figure, space, flat = _frame(motion)
@@ -106,12 +106,12 @@ def still(motion: Motion, instants: Sequence[int] | None = None) -> Figure:
     return figure
 
 
-def save_still(motion: Motion, path: Path) -> None:
+def save_still(motion: DrawnMotion, path: Path) -> None:
     """Write a still as PNG, SVG or PDF, as the name says."""
     still(motion).savefig(path)
 
 
-def save_animation(motion: Motion, path: Path, frames_per_second: int) -> None:
+def save_animation(motion: DrawnMotion, path: Path, frames_per_second: int) -> None:
     """Write an animation in real time as GIF, or as MP4 where ffmpeg is installed.
 
     Raises:
@@ -124,7 +124,7 @@ def save_animation(motion: Motion, path: Path, frames_per_second: int) -> None:
 
 
 @styled
-def _animation(motion: Motion, frames_per_second: int, writer: Any, path: Path) -> Figure:
+def _animation(motion: DrawnMotion, frames_per_second: int, writer: Any, path: Path) -> Figure:
     figure, space, flat = _frame(motion)
     count = max(2, round(float(motion.time[-1] - motion.time[0]) * frames_per_second))
     rows = np.searchsorted(motion.time, np.linspace(motion.time[0], motion.time[-1], count))

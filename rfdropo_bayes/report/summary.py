@@ -21,7 +21,7 @@ from rfdropo_bayes.report.coverage import Coverage, coverage
 from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.headline import headline
 from rfdropo_bayes.report.identifiability import identify
-from rfdropo_bayes.report.randomisation import judge
+from rfdropo_bayes.report.randomisation_safety import judge
 from rfdropo_bayes.report.residuals import error_correlations
 from rfdropo_bayes.report.scores import MILLIMETRES, ErrorFigures, MeasuredPath, score
 from rfdropo_bayes.tables import parse_table

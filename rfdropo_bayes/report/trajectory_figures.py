@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.clock import sample_time
+from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.report import style
 from rfdropo_bayes.report.coverage import predictive_bands

@@ -6,7 +6,7 @@ from rfdropo_bayes.robots.catalogue import find_robot_file, known_robots, load_r
 from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in
 from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.parameter import Parameter
-from rfdropo_bayes.robots.robot import OBJECT, Command, Marker, PushScene, Robot
+from rfdropo_bayes.robots.robot import OBJECT, CommandTiming, Marker, PushScene, Robot
 from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, section_profile
 from rfdropo_bayes.robots.shape import robot_shape
 
@@ -15,7 +15,7 @@ __all__ = [
     "Body",
     "Cable",
     "Channels",
-    "Command",
+    "CommandTiming",
     "Cone",
     "Cylinder",
     "Disks",

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, model_validator
 
-from rfdropo_bayes.robots.table import Name, Pair, Positive, Table
+from rfdropo_bayes.robots.table import Name, Pair, Positive, RobotTable
 
 
 def poisson_terms(poisson_ratio: Any, reference: float) -> tuple[Any, Any, Any]:
@@ -20,14 +20,14 @@ def poisson_terms(poisson_ratio: Any, reference: float) -> tuple[Any, Any, Any]:
     return here**-0.25 - there**-0.25, here**-0.5 - there**-0.5, here - there
 
 
-class PointMass(Table):
+class PointMass(RobotTable):
     """A rigid part fixed to the body: its mass [kg] is the parameter of that name; it sits at a station."""
 
     parameter: Name = Field(description="parameter that holds its mass [kg]")
     z_m: float = Field(description="station at which it sits")
 
 
-class Body(Table):
+class Body(RobotTable):
     """A body layered along z, from the clamp (first station) to the tip.
 
     A layer's section is effective: the profile is what makes the layer's ends move as those of the real body do under

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, model_validator
 
-from rfdropo_bayes.robots.table import Name, Pair, Positive, Table
+from rfdropo_bayes.robots.table import Name, Pair, Positive, RobotTable
 
 
-class Cable(Table):
+class Cable(RobotTable):
     """A cable that runs at one azimuth, parallel to the axis or tapering towards it.
 
     It starts at the anchor, a point fixed to the base, and passes the guides on to the last one, where it ends.
@@ -56,7 +56,7 @@ def _points(azimuth: float, radius: float | tuple[float, ...], z: float | tuple[
     return np.stack([distance * np.cos(angle), distance * np.sin(angle), np.atleast_1d(z)], axis=1)
 
 
-class Channels(Table):
+class Channels(RobotTable):
     """How commands become cable displacements: ``displacement = radius * gain @ command``."""
 
     names: tuple[Name, ...] = Field(

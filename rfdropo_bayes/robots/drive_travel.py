@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import whole
-from rfdropo_bayes.robots.table import Table
+from rfdropo_bayes.robots.table import RobotTable
 from rfdropo_bayes.tables import nearest
 
 ROUNDING = 1e-9
@@ -23,7 +23,7 @@ ROUNDING = 1e-9
 Values = float | tuple[float, ...]
 
 
-class DriveTravel(Table):
+class DriveTravel(RobotTable):
     """What is known of how some drives answer commands, in some recordings.
 
     Numbers are those of the drive's counter, one for all of the table's cables or one for each.

@@ -6,12 +6,12 @@ import math
 
 from pydantic import Field, model_validator
 
-from rfdropo_bayes.robots.table import Name, Pair, Positive, Table
+from rfdropo_bayes.robots.table import Name, Pair, Positive, RobotTable
 
 _LEAST_LIMIT = 10.0  # [per mille]: drives tell and limit torque in whole per mille, a tenth of such a limit
 
 
-class Motor(Table):
+class Motor(RobotTable):
     """The drive of one command channel: a motor with encoder, gear and drum, and its limits.
 
     Lengths are cable wound up by the drum [m], pull > 0, from where homing put zero. Counts rise with the length where

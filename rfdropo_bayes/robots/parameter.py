@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from rfdropo_bayes.robots.table import Table
+from rfdropo_bayes.robots.table import RobotTable
 from rfdropo_bayes.tables import nearest
 
 ARGUMENTS = {
@@ -20,7 +20,7 @@ ARGUMENTS = {
 """Prior distributions (names of numpyro) and their arguments; LogNormal's ``sigma`` is that of the logarithm."""
 
 
-class Parameter(Table):
+class Parameter(RobotTable):
     """A physical parameter."""
 
     unit: str = Field(description='SI unit, "-" if it has none')

@@ -17,7 +17,7 @@ from rfdropo_bayes.robots.cable import Cable, Channels
 from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in, unstated_travel
 from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.parameter import Parameter
-from rfdropo_bayes.robots.table import Name, Positive, Table, Vector
+from rfdropo_bayes.robots.table import Name, Positive, RobotTable, Vector
 from rfdropo_bayes.tables import changed, nearest
 
 REQUIRED = (
@@ -34,7 +34,7 @@ REQUIRED = (
 """Parameters every robot has."""
 
 
-class Command(Table):
+class CommandTiming(RobotTable):
     """Timing of commands."""
 
     unit: Literal["m", "rad"] = Field(description='of the recorded commands: "m" of cable, or "rad" of a motor')
@@ -42,7 +42,7 @@ class Command(Table):
     dead_time_s: float = Field(ge=0.0, description="a command starts to act so much later than it was given")
 
 
-class Marker(Table):
+class Marker(RobotTable):
     """A measured point of the body, given where it lies in the undeformed body."""
 
     name: Name = Field(description="name, as in the recordings")
@@ -53,7 +53,7 @@ OBJECT = ("cube_mass", "friction", "cube_side", "cube_x", "cube_y", "cube_z", "c
 """Parameters of a cube on a plate."""
 
 
-class PushScene(Table):
+class PushScene(RobotTable):
     """A cube on a plate across gravity, for pushing."""
 
     plate_height_m: float = Field(description="coordinate of the plate's top against gravity")
@@ -75,7 +75,7 @@ class PushScene(Table):
         return self
 
 
-class Robot(Table):
+class Robot(RobotTable):
     """A soft robot, in the frame of its base: z along the body, away from the clamp; SI units."""
 
     name: Name = Field(description="name of the robot")
@@ -85,7 +85,7 @@ class Robot(Table):
     initial_state: Literal["rest", "equilibrium"] = Field(
         description='"rest" starts undeformed, "equilibrium" in the static equilibrium of the first command',
     )
-    command: Command = Field(description="unit and timing of commands")
+    command: CommandTiming = Field(description="unit and timing of commands")
     channels: Channels = Field(description="from commands to cable displacements")
     cables: tuple[Cable, ...] = Field(min_length=1, description="the cables")
     body: Body = Field(description="geometry: a section profile, or shapes that make one up")
@@ -165,7 +165,7 @@ class Robot(Table):
 
     def without_command_timing(self) -> Robot:
         """The same robot, carrying every command out at once: no ramp, no dead time."""
-        return self.with_changes(command=Command(unit=self.command.unit, ramp_s=0.0, dead_time_s=0.0))
+        return self.with_changes(command=CommandTiming(unit=self.command.unit, ramp_s=0.0, dead_time_s=0.0))
 
     def with_changes(self, **values: Any) -> Robot:
         """The same robot with other values of some fields, validated anew.

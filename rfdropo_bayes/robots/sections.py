@@ -15,7 +15,7 @@ from jaxtyping import Float
 from pydantic import Field, model_validator
 
 from rfdropo_bayes.robots.body import Body, PointMass
-from rfdropo_bayes.robots.table import Positive, Table
+from rfdropo_bayes.robots.table import Positive, RobotTable
 from rfdropo_bayes.tables import parse_table
 
 QUADRATURE_POINTS = 24
@@ -60,7 +60,7 @@ def tapered(length: float, layers: int, outer: tuple[float, float], inner: tuple
     )
 
 
-class Cylinder(Table):
+class Cylinder(RobotTable):
     """A solid round rod."""
 
     shape: Literal["cylinder"] = Field(default="cylinder", description="what this section is")
@@ -73,7 +73,7 @@ class Cylinder(Table):
         return tapered(self.length_m, self.layers, (self.radius_m, self.radius_m))
 
 
-class Cone(Table):
+class Cone(RobotTable):
     """A solid round rod that tapers."""
 
     shape: Literal["cone"] = Field(default="cone", description="what this section is")
@@ -86,7 +86,7 @@ class Cone(Table):
         return tapered(self.length_m, self.layers, self.radius_m)
 
 
-class Tube(Table):
+class Tube(RobotTable):
     """A hollow round rod, straight or tapering."""
 
     shape: Literal["tube"] = Field(default="tube", description="what this section is")
@@ -106,7 +106,7 @@ class Tube(Table):
         return tapered(self.length_m, self.layers, _both(self.radius_m), _both(self.inner_radius_m))
 
 
-class Disks(Table):
+class Disks(RobotTable):
     """Disks stacked on a backbone, the last one at the end towards the tip; each layer is a disk or bare backbone."""
 
     shape: Literal["disks"] = Field(default="disks", description="what this section is")
@@ -146,7 +146,7 @@ Section = Annotated[Cylinder | Cone | Tube | Disks, Field(discriminator="shape")
 SHAPES: tuple[type[Cylinder | Cone | Tube | Disks], ...] = (Cylinder, Cone, Tube, Disks)
 
 
-class SectionedBody(Table):
+class SectionedBody(RobotTable):
     """A body given by shapes, ``[[body.section]]``, in the place of a section profile."""
 
     section: tuple[Section, ...] = Field(min_length=1, description="shapes from the clamp to the tip")

@@ -12,7 +12,7 @@ Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 Positive = Annotated[float, Field(gt=0.0)]
 
 
-class Table(BaseModel):
+class RobotTable(BaseModel):
     """A table of a robot file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

@@ -20,8 +20,8 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.simulators.callbacks import one_callback
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
-from rfdropo_bayes.simulators.differences import LENGTH, with_differences
 from rfdropo_bayes.simulators.extended import ExtendedSimulator
+from rfdropo_bayes.simulators.finite_differences import LENGTH, with_differences
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, Mechanism, Values, check_mechanisms, code_of, obstacle
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.protocol import Observation, Result

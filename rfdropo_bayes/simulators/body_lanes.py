@@ -17,7 +17,7 @@ from rfdropo_bayes.fem import Material, point_positions
 from rfdropo_bayes.fem.dynamics import Prepared, State, remembering, step
 from rfdropo_bayes.fem.layered import PointMap, joined
 from rfdropo_bayes.fem.native.layered_session import LayeredSession
-from rfdropo_bayes.fem.pushing import PushScene, smallest_gap
+from rfdropo_bayes.fem.pushing import PushGeometry, smallest_gap
 from rfdropo_bayes.fem.rigid_body import Cube
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.simulators.engine import CubeInputs, Engine, cube_arrays
@@ -69,7 +69,9 @@ class LanesBeforeCube:
     the unbalanced force of the start counts as infinite.
     """
 
-    def __init__(self, kind: Callable[[Engine, int], BodyLanes], engine: Engine, scene: PushScene, count: int) -> None:
+    def __init__(
+        self, kind: Callable[[Engine, int], BodyLanes], engine: Engine, scene: PushGeometry, count: int
+    ) -> None:
         markers, spheres = engine.body.markers, scene.spheres
         self._shown, self._count = len(markers.node), count
         body: Any = engine.body._replace(markers=joined([markers, PointMap(spheres.node, spheres.centre)]))

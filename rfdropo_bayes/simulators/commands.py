@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.drives import animated_commands
+from rfdropo_bayes.fem.cable_drive import animated_commands
 
 FEW_STEPS = 60_000  # ten minutes in steps of 10 ms: simulated however few the rows are, with a gigabyte or two
 MOST_STEPS_PER_ROW = 200.0  # beyond these: two seconds a row in steps of 10 ms, where cameras see ten rows a second

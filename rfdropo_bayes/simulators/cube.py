@@ -11,15 +11,14 @@ from jaxtyping import Array, Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.layered import LayeredBody
-from rfdropo_bayes.fem.pushing import PushScene, layered_spheres, mesh_spheres, push_scene
+from rfdropo_bayes.fem.pushing import PushGeometry, layered_spheres, mesh_spheres, push_scene
 from rfdropo_bayes.fem.rigid_body import Cube, cube_at, solid_gyration_radius
 from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
-from rfdropo_bayes.robots import PushScene as PushTable
-from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots import PushScene, Robot
 from rfdropo_bayes.simulators.engine import CubeInputs
 
 
-def push_table(robot: Robot) -> PushTable:
+def push_table(robot: Robot) -> PushScene:
     """The robot's cube and plate.
 
     Raises:
@@ -37,7 +36,7 @@ def plate_normal(robot: Robot) -> Float[np.ndarray, "3"]:
     return -robot.gravity / np.linalg.norm(robot.gravity)
 
 
-def scene_of(robot: Robot, body: LayeredBody | TetrahedralBody) -> PushScene:
+def scene_of(robot: Robot, body: LayeredBody | TetrahedralBody) -> PushGeometry:
     """Cube and plate of a robot, before its body; its section profile without notches is the body's outline.
 
     Raises:

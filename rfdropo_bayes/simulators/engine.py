@@ -32,14 +32,14 @@ from rfdropo_bayes.fem import (
 from rfdropo_bayes.fem import static_equilibrium as find_equilibrium
 from rfdropo_bayes.fem.dynamics import Prepared, State, System
 from rfdropo_bayes.fem.integrators import Integrator
-from rfdropo_bayes.fem.native.layered import NativeLayered
+from rfdropo_bayes.fem.native.layered_engine import NativeLayered
 from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
-from rfdropo_bayes.fem.pushing import PushScene
+from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem
 from rfdropo_bayes.simulators.callbacks import one_callback
-from rfdropo_bayes.simulators.differences import (
+from rfdropo_bayes.simulators.finite_differences import (
     ACCELERATION,
     LENGTH,
     MASS,
@@ -66,7 +66,7 @@ FRICTION = 0.1
 """Size of a coefficient of friction."""
 
 
-class Body(Protocol):
+class EngineBody(Protocol):
     """A body with its cables, and the points of it that are recorded: a named tuple that may hold more."""
 
     @property
@@ -127,11 +127,11 @@ class Engine:
         integrator: how a time step is taken, see `fem.integrators`.
     """
 
-    body: Body
+    body: EngineBody
     time_step: float
     backend: Backend = field(default_factory=Backend)
     from_equilibrium: bool = False
-    scene: PushScene | None = None
+    scene: PushGeometry | None = None
     integrator: Integrator = "euler"
 
     def __post_init__(self) -> None:

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import LayeredBody
 from rfdropo_bayes.fem.balance import Balance, tetrahedral_balance
-from rfdropo_bayes.fem.drives import DriveLimits
+from rfdropo_bayes.fem.cable_drive import DriveLimits
 from rfdropo_bayes.fem.layered import PointMap, joined
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.tetrahedra import (

@@ -14,19 +14,19 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
+from rfdropo_bayes.audit.audit_record import STIFFNESS
 from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.pipeline import Answer, measurements_of, simulated
-from rfdropo_bayes.audit.record import STIFFNESS
 from rfdropo_bayes.audit.verdict import EQUIVALENT, EXPLAINED, NO_DISCREPANCY, PARTLY, UNEXPLAINED
 from rfdropo_bayes.errors import InputError, Interrupted
 from rfdropo_bayes.files import output_folder, read_lines, write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.interrupts import running
 from rfdropo_bayes.mechanisms import REGISTRY
+from rfdropo_bayes.model.experiment import CommandsTable
 from rfdropo_bayes.studies.fits import Job, run_fits
 from rfdropo_bayes.studies.hidden_effects import Hidden, Setting, hide
-from rfdropo_bayes.workflow.audit import JOURNAL, Workshop, run_audit
-from rfdropo_bayes.workflow.experiment import CommandsTable
+from rfdropo_bayes.verbs.audit import JOURNAL, Workshop, run_audit
 
 RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
 NEAR = 1.3  # times the error of the model that knows what is hidden

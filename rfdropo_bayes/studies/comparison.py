@@ -10,12 +10,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.posteriors import central_interval
-from rfdropo_bayes.studies.tasks import TASKS, Task, draw_truth, excited, task_problem
+from rfdropo_bayes.studies.virtual_tasks import TASKS, InferenceTask, draw_truth, excited, task_problem
 
 WIDTH = 4.0  # the paper's error is measured with every search range scaled to [0, 4]
 PREDICTED = 64  # draws behind a prediction
@@ -94,7 +94,7 @@ def infer(
 
 
 def scores(
-    task: Task, draws: Mapping[str, Float[np.ndarray, " n"]], truth: Mapping[str, float], told: Sequence[str]
+    task: InferenceTask, draws: Mapping[str, Float[np.ndarray, " n"]], truth: Mapping[str, float], told: Sequence[str]
 ) -> dict[str, Any]:
     """Errors of a posterior that need no simulation, those of the parameters ``told`` of apart; see reports/table1."""
     scale = {name: WIDTH / (high - low) for name, (low, high) in task.ranges.items()}
@@ -127,7 +127,7 @@ def _log_score(offsets: Float[np.ndarray, "d n"]) -> float | None:
     return float(-0.5 * white @ white - 0.5 * np.linalg.slogdet(2.0 * np.pi * covariance)[1])
 
 
-def misleads(task: Task, result: Mapping[str, Any]) -> bool:
+def misleads(task: InferenceTask, result: Mapping[str, Any]) -> bool:
     """Whether the posterior of a fit says less of its truth than the uniform prior did, by its log score against the
     prior's density; where draws do not vary, whether they miss it."""
     if result["log_score"] is None:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.fit import Target, climb
+from rfdropo_bayes.audit.fit import FitTarget, climb
 from rfdropo_bayes.audit.pipeline import measurements_of, simulated
 from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.bayes.channels.tension import reading_size
@@ -28,13 +28,13 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.files import output_folder
+from rfdropo_bayes.model.assembly import build_simulator
+from rfdropo_bayes.model.experiment import AuditTable, CommandsTable, Experiment, SimulatorTable
+from rfdropo_bayes.model.experiment_file import describe
+from rfdropo_bayes.model.model_spec import find_robot, spec_of
 from rfdropo_bayes.simulators.protocol import Observation
-from rfdropo_bayes.workflow.assembly import build_simulator
-from rfdropo_bayes.workflow.audit import Workshop, build_problem
-from rfdropo_bayes.workflow.commands import random_walk
-from rfdropo_bayes.workflow.experiment import AuditTable, CommandsTable, Experiment, SimulatorTable
-from rfdropo_bayes.workflow.experiment_file import describe
-from rfdropo_bayes.workflow.model_spec import find_robot, spec_of
+from rfdropo_bayes.verbs.audit import Workshop, build_problem
+from rfdropo_bayes.verbs.random_commands import random_walk
 
 NOISE, MEMORY = 5e-4, 0.6  # standard deviation [m] and correlation from row to row
 TENSION_NOISE = 0.02  # of a tension reading
@@ -142,7 +142,7 @@ def hide(
     read = [shown["position"], shown["tension"]]
     channels = tuple(replace(c, readings=part) for c, part in zip(measurements.channels, read, strict=False))
     plain = replace(measurements, channels=channels, count=measurements.valid.astype(float))
-    target = Target(forward, plain, white)
+    target = FitTarget(forward, plain, white)
     sizes = {}
     for name in mechanisms:
         index = next(c.indices for c in problem.candidates if c.name == name)
@@ -209,7 +209,7 @@ def _blank_recordings(setting: Setting, rng: np.random.Generator) -> list[Trajec
 
 
 def _sized(
-    target: Target, truth: np.ndarray, indices: Sequence[int], rho: float, rng: np.random.Generator
+    target: FitTarget, truth: np.ndarray, indices: Sequence[int], rho: float, rng: np.random.Generator
 ) -> np.ndarray | None:
     """The truth with a mechanism of size ``rho`` in it, its signs and shapes at random.
 
@@ -255,7 +255,7 @@ def _made(
     return observed
 
 
-def _discretisation(target: Target, truth: np.ndarray, made: Observation, members: Sequence[Sequence[int]]) -> float:
+def _discretisation(target: FitTarget, truth: np.ndarray, made: Observation, members: Sequence[Sequence[int]]) -> float:
     """RMS of what a refit with the true mechanisms in the model cannot absorb, in noise deviations."""
     firsts = [group[0] for group in members]
     shown = [np.asarray(part)[firsts] for part in (made.position, made.tension)]

@@ -10,16 +10,16 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json
 from rfdropo_bayes.inference import sbc
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.inference.progress import Progress
-from rfdropo_bayes.workflow.calibration import inference_options
-from rfdropo_bayes.workflow.files import LOG, hashes, run_folder
-from rfdropo_bayes.workflow.model import Model
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.run_folder import LOG, hashes, run_folder
+from rfdropo_bayes.verbs.calibrate import inference_options
 
 CHECKS = ("sbc",)
 MOST_FAILURES = 100

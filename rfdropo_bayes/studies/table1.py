@@ -17,11 +17,11 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.rivals import import_sbi
+from rfdropo_bayes.model.run_folder import LOG, run_folder
 from rfdropo_bayes.report.facts import software_versions
 from rfdropo_bayes.studies.comparison import RIVALS, ROWS, fit, misleads
 from rfdropo_bayes.studies.fits import finished, run_fits
-from rfdropo_bayes.studies.tasks import TASKS
-from rfdropo_bayes.workflow.files import LOG, run_folder
+from rfdropo_bayes.studies.virtual_tasks import TASKS
 
 PAPER = {  # mean squared error and its deviation, Table I
     "TrunkReach": {"BayesSim": (16.60, 0.30), "NPDR": (8.38, 3.22), "RF-DROPO": (1.70, 1.93)},
@@ -52,7 +52,7 @@ COLOURS = {"paper": "#4c72b0", "off-centre": "#dd8452"}
 
 
 @dataclass(frozen=True)
-class Size:
+class Table1Size:
     """How large the benchmark is.
 
     Attributes:
@@ -79,7 +79,7 @@ class Size:
 
 def run_table1(
     out: Path,
-    size: Size,
+    size: Table1Size,
     *,
     rows: Sequence[str] = tuple(ROWS),
     tasks: Sequence[str] = tuple(TASKS),
@@ -134,7 +134,7 @@ def run_table1(
     return content
 
 
-def list_jobs(size: Size, rows: Sequence[str], tasks: Sequence[str] = tuple(TASKS)) -> list[dict[str, Any]]:
+def list_jobs(size: Table1Size, rows: Sequence[str], tasks: Sequence[str] = tuple(TASKS)) -> list[dict[str, Any]]:
     """Every fit; rows share their truths and data, so that they can be compared in pairs. Cheap rounds come first."""
     shared = {"budget": size.budget, "actions": size.actions, "seed": size.seed}
     jobs = []

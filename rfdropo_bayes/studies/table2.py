@@ -27,14 +27,14 @@ from rfdropo_bayes.audit.verdict import NO_VERDICT
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.model.experiment_file import describe, read_tables, self_contained
+from rfdropo_bayes.model.run_folder import CHECKPOINTS, LOG, run_ended, run_folder
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.style import CYCLE, WIDTH, styled
-from rfdropo_bayes.workflow.audit import run_audit
-from rfdropo_bayes.workflow.audited import AUDIT, EXTENDED
-from rfdropo_bayes.workflow.calibration import run_calibration
-from rfdropo_bayes.workflow.experiment_file import describe, read_tables, self_contained
-from rfdropo_bayes.workflow.files import CHECKPOINTS, LOG, run_ended, run_folder
-from rfdropo_bayes.workflow.training import CSV, POLICY, run_evaluation, run_training
+from rfdropo_bayes.results.audited import AUDIT, EXTENDED
+from rfdropo_bayes.verbs.audit import run_audit
+from rfdropo_bayes.verbs.calibrate import run_calibration
+from rfdropo_bayes.verbs.train import CSV, POLICY, run_evaluation, run_training
 
 THRESHOLDS = (0.01525, 0.02157, 0.030)  # m, those of the paper's Table II
 PAPER = {"15.25": 0.32, "21.57": 0.56, "30": 0.60}  # RF-DROPO, TrunkPush on hardware
@@ -46,7 +46,7 @@ ASKED = "asked.toml"
 
 
 @dataclass(frozen=True)
-class Row:
+class TrainingRow:
     """How the parameters of a row's trainings are chosen.
 
     Attributes:
@@ -67,14 +67,14 @@ class Row:
 
 
 ROWS = {
-    "no randomisation": Row(),
-    "UDR": Row("udr", {}, "posterior", each=True),
-    "BayesSim": Row("bayessim", {}, "posterior"),
-    "NPDR": Row("npdr", {"rounds": 10}, "posterior"),
-    "RF-DROPO as published": Row("rfdropo", {"mended": False}, "phi"),
-    "ours": Row("laplace", {}, "posterior"),
-    "ours after the audit": Row("laplace", {}, "posterior", extended=True),
-    "oracle": Row(on_target=True),
+    "no randomisation": TrainingRow(),
+    "UDR": TrainingRow("udr", {}, "posterior", each=True),
+    "BayesSim": TrainingRow("bayessim", {}, "posterior"),
+    "NPDR": TrainingRow("npdr", {"rounds": 10}, "posterior"),
+    "RF-DROPO as published": TrainingRow("rfdropo", {"mended": False}, "phi"),
+    "ours": TrainingRow("laplace", {}, "posterior"),
+    "ours after the audit": TrainingRow("laplace", {}, "posterior", extended=True),
+    "oracle": TrainingRow(on_target=True),
 }
 OURS, ORACLE = "ours after the audit", "oracle"
 WITHOUT_CUBE = ("no randomisation", "ours", "oracle")
@@ -82,7 +82,7 @@ WITHOUT_CUBE = ("no randomisation", "ours", "oracle")
 
 
 @dataclass(frozen=True)
-class Size:
+class Table2Size:
     """How large the study is; seeds and steps may grow when it is resumed.
 
     Attributes:
@@ -116,7 +116,7 @@ class Study:
     target: Path
     audit: Path
     out: Path
-    size: Size
+    size: Table2Size
 
 
 def run_table2(
@@ -124,7 +124,7 @@ def run_table2(
     target: Path,
     audit: Path,
     out: Path,
-    size: Size,
+    size: Table2Size,
     *,
     rows: Sequence[str] = (),
     resume: bool = False,
@@ -139,7 +139,7 @@ def run_table2(
         target: experiment file of the robot that policies are evaluated on, with its true values.
         audit: experiment file of the audit that extends the model.
         out: folder to write to; one folder for each experiment in it.
-        size: see `Size`.
+        size: see `Table2Size`.
         rows: names of `ROWS` to do, in this order; by default all where there is a cube, and `WITHOUT_CUBE` elsewhere.
             The tables hold all that is done.
         resume: keep what an interrupted study has done.

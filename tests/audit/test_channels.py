@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rfdropo_bayes.audit.audit_record import next_experiment, record
 from rfdropo_bayes.audit.pipeline import audit, base_model
-from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.audit.score import span
 from rfdropo_bayes.audit.screen import null_residuals
 from rfdropo_bayes.bayes.channels import Weighed

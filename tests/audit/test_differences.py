@@ -9,18 +9,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rfdropo_bayes.audit.audit_record import next_experiment, record
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.differences import Groups, with_differences
 from rfdropo_bayes.audit.fixed_quantities import families
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.pipeline import AuditProblem, audit, first_target
-from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.bayes.channels import Markers
-from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
-from rfdropo_bayes.workflow.between import find_groups
+from rfdropo_bayes.verbs.between import find_groups
 
 from .toys import BASE, Toy, problem, recordings
 

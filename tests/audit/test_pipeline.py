@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.audit import pipeline
+from rfdropo_bayes.audit.audit_record import _doubt, next_experiment, record
 from rfdropo_bayes.audit.candidates import lead
 from rfdropo_bayes.audit.deadline import Deadline
 from rfdropo_bayes.audit.experiment_design import Hypothesis, at_hand, outlooks
-from rfdropo_bayes.audit.extension import ExtensionSearch, Rules, Step
+from rfdropo_bayes.audit.extension import Added, ExtensionSearch, Rules
 from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
 from rfdropo_bayes.audit.gain import Difference, Gain
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import gather_measurements
 from rfdropo_bayes.audit.pipeline import audit, base_model
-from rfdropo_bayes.audit.record import _doubt, next_experiment, record
 from rfdropo_bayes.audit.screen import p_in_words
 from rfdropo_bayes.audit.sentence import _adoption, _named
 from rfdropo_bayes.audit.verdict import decide
@@ -433,7 +433,7 @@ def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it(
     whole = climb(target, base.x, with_play)
     assert early.log_evidence < whole.log_evidence - 100.0  # what it is about
     both = climb(target, whole.x, np.array([*with_play, *creep.indices], dtype=int))
-    step = Step(
+    step = Added(
         "creep", ("creep",), replace(screen, fit=early), both, both.log_evidence - early.log_evidence, {}, target
     )
     again = search._climbed_again(step)
@@ -541,8 +541,8 @@ def test_a_step_that_a_later_one_carries_is_not_adopted():
     first = climb(target, base.x, np.array([*base.free, *useless.indices]))
     both = climb(target, first.x, np.array([*first.free, *play.indices]))
     steps = [
-        Step("creep", ("creep",), screen, first, 0.0, {}, target),
-        Step("play", ("play",), screen, both, 9.0, {}, target),
+        Added("creep", ("creep",), screen, first, 0.0, {}, target),
+        Added("play", ("play",), screen, both, 9.0, {}, target),
     ]
     held_out = pipeline._held_out(asked, target, search, base, steps)
     assert held_out.supported() == 2
@@ -571,7 +571,7 @@ def test_a_step_that_a_later_one_makes_needless_is_taken_out():
         one = climb(target, base.x, np.array([*base.free, *order[first].indices]))
         both = climb(target, one.x, np.array([*one.free, *order[second].indices]))
         fits = {first: one, second: both}
-        steps = [Step(name, (name,), screen, fit, 1.0, {}, target) for name, fit in fits.items()]
+        steps = [Added(name, (name,), screen, fit, 1.0, {}, target) for name, fit in fits.items()]
         kept = search._without_needless(base, steps)
         assert [step.name for step in kept] == left
         assert set(kept[-1].fit.free) == {*base.free, *(index for name in left for index in order[name].indices)}

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rfdropo_bayes.audit.audit_record import next_experiment, record
 from rfdropo_bayes.audit.fixed_quantities import with_fixed_quantities
 from rfdropo_bayes.audit.omnibus import BLOCK
 from rfdropo_bayes.audit.pipeline import Answer, audit
-from rfdropo_bayes.audit.record import next_experiment, record
 from rfdropo_bayes.bayes.space import ParameterSpace
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.parameters import specs_of

@@ -13,10 +13,10 @@ from rfdropo_bayes.audit.separation import effects, separate
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.experiment import SeparationTable
 from rfdropo_bayes.report.separation_table import separation_figure, separation_markdown
 from rfdropo_bayes.tables import parse_table
-from rfdropo_bayes.workflow.experiment import SeparationTable
-from rfdropo_bayes.workflow.separation import record_separation
+from rfdropo_bayes.verbs.separate import record_separation
 
 from .toys import NOISE, problem
 

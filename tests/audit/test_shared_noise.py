@@ -9,7 +9,7 @@ from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.audit.screen import null_residuals, tail
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED, Autoregression, mixed, shrunk_correlation
 from rfdropo_bayes.bayes.noise.stacked import Stacked
-from rfdropo_bayes.bayes.repeats import repeat_shift
+from rfdropo_bayes.bayes.repeat_noise import repeat_shift
 
 from .toys import measurements
 

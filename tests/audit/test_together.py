@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.audit import extension
-from rfdropo_bayes.audit.extension import ExtensionSearch, Step
+from rfdropo_bayes.audit.extension import Added, ExtensionSearch
 from rfdropo_bayes.audit.fit import climb
 from rfdropo_bayes.audit.pipeline import audit, base_model
 
@@ -58,7 +58,7 @@ def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drum
     stopped, extended = stuck(target, halved, right.free), stuck(target, made_up, np.array([*right.free, *gains]))
     gained = extended.log_evidence - stopped.log_evidence
     assert gained > 100.0
-    step = Step("cable_gains", ("cable_gains",), replace(screen, fit=stopped), extended, gained, {}, target)
+    step = Added("cable_gains", ("cable_gains",), replace(screen, fit=stopped), extended, gained, {}, target)
     monkeypatch.setattr(extension, "climb", stuck)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
     again = search._climbed_again(step)

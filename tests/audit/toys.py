@@ -15,10 +15,10 @@ from rfdropo_bayes.audit.forward import Lanes
 from rfdropo_bayes.audit.measurements import Measurements
 from rfdropo_bayes.audit.pipeline import AuditProblem
 from rfdropo_bayes.bayes.channels import Markers, MotorAngle, Tension, Weighed, WeighedParts
-from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.repeats import mean_of, spread
+from rfdropo_bayes.bayes.repeat_noise import mean_of, spread
 from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.simulators.commands import commands_on_grid
 from rfdropo_bayes.simulators.parameters import ParameterSpec

@@ -12,29 +12,29 @@ import pytest
 from numpyro.infer.util import log_density
 from scipy import stats
 
-from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels import Markers, MotorAngle
 from rfdropo_bayes.bayes.channels.motor_angle import MOTOR_ANGLE_NOISE
-from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.held_readings import hold_time
 from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.mechanisms.registry import REGISTRY, mechanisms_named
+from rfdropo_bayes.model.assembly import build_model, build_simulator, measurement_specs
+from rfdropo_bayes.model.experiment import Experiment
+from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.robots import Robot, load_robot
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
 from rfdropo_bayes.simulators.mechanisms import Mechanism, inside_drive
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
-from rfdropo_bayes.workflow.assembly import build_model, build_simulator, measurement_specs
-from rfdropo_bayes.workflow.experiment import Experiment
-from rfdropo_bayes.workflow.model_spec import spec_of
 
 STEP = 0.02  # [s], of the simulation and of the recording
 LAG = REGISTRY["actuator_lag"]()

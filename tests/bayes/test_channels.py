@@ -9,17 +9,17 @@ import pytest
 from numpyro.infer.util import log_density
 from scipy import stats
 
-from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels import Markers, MotorAngle, ObjectPose, Tension, Weighed, WeighedParts
 from rfdropo_bayes.bayes.channels.motor_angle import MOTOR_ANGLE_NOISE
 from rfdropo_bayes.bayes.channels.object_pose import OBJECT_CORRELATION_TIME, OBJECT_NOISE, OBJECT_TURN_NOISE
 from rfdropo_bayes.bayes.channels.tension import TENSION_NOISE
-from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import Autoregression, noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.repeats import group_recordings, with_noise_of_repeats
+from rfdropo_bayes.bayes.repeat_noise import group_recordings, with_noise_of_repeats
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods

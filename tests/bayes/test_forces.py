@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels import Markers, Seen, Tension, Weighed, WeighedParts
 from rfdropo_bayes.bayes.channels.channel import ABOVE_ZERO
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN, TENSION_NOISE
-from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels import Markers
-from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.inference import methods

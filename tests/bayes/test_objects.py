@@ -10,20 +10,20 @@ from numpyro.infer.util import log_density
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from rfdropo_bayes.bayes.calibration import CalibrationProblem
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels import Markers, ObjectPose
 from rfdropo_bayes.bayes.channels.object_pose import LEVER, draw_object_error
-from rfdropo_bayes.bayes.model import TrajectoryModel
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.space import build_space
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.assembly import SWITCHED
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
-from rfdropo_bayes.workflow.assembly import SWITCHED
 
 STEP = 0.1  # [s]
 START = np.array([0.02, 0.0, 0.1])

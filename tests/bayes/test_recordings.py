@@ -8,9 +8,9 @@ import pytest
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.assembly import build_simulator
+from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import load_robot
-from rfdropo_bayes.workflow.assembly import build_simulator
-from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 
 @pytest.mark.parametrize(("unit", "message"), [("m", None), ("rad", "commands are in rad, the robot's in m")])

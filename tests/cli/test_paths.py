@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rfdropo_bayes.cli.prediction import _from_here
+from rfdropo_bayes.cli.prediction_commands import _from_here
 
 
 def test_a_file_here_is_meant_before_one_beside_the_experiment(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 
-from rfdropo_bayes.cli.results import show_audit, show_calibration
+from rfdropo_bayes.cli.terminal_summary import show_audit, show_calibration
 from rfdropo_bayes.inference.progress import Progress
 
 WORDS = "raise [simulator] refine, [bold]never[/bold] [/] :warning: [model.groups]"

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from rfdropo_bayes.data import CsvColumns, Trajectory, find_faults, read_plain_csv
-from rfdropo_bayes.data.clock import check_times, clock_notes, read_stamps, sample_time
 from rfdropo_bayes.data.held_readings import hold_time
+from rfdropo_bayes.data.sample_times import check_times, clock_notes, read_stamps, sample_time
 from rfdropo_bayes.errors import InputError
 
 STEP = 0.01  # [s]

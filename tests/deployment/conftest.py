@@ -11,11 +11,11 @@ import can
 import pytest
 
 from rfdropo_bayes.deployment import objects
+from rfdropo_bayes.deployment.bench.hub import Hub, HubBus
+from rfdropo_bayes.deployment.bench.plant import PlantHere, SpringCables
+from rfdropo_bayes.deployment.bench.simulated_bus import SimulatedDrives, SimulationTable
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork
 from rfdropo_bayes.deployment.drives import Drive, Drives, Guards
-from rfdropo_bayes.deployment.hub import Hub, HubBus
-from rfdropo_bayes.deployment.plant import PlantHere, SpringCables
-from rfdropo_bayes.deployment.simulation import SimulatedDrives, SimulationTable
 from rfdropo_bayes.robots import Robot, load_robot
 
 ROBOT = "motor_arm"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rfdropo_bayes.deployment import objects
-from rfdropo_bayes.deployment.cia402 import Command, State, controlword_towards
+from rfdropo_bayes.deployment.cia402 import Controlword, DriveState, controlword_towards
 from rfdropo_bayes.deployment.drives import Drives, Guards, Identity
 from rfdropo_bayes.deployment.objects import Object
 from rfdropo_bayes.errors import InputError
@@ -22,9 +22,9 @@ def enable(drives: Drives) -> None:
     for _ in range(20):
         for drive in drives.all:
             if drive.state is not None:
-                drive.controlword = controlword_towards(drive.state, State.OPERATION_ENABLED, drive.controlword)
+                drive.controlword = controlword_towards(drive.state, DriveState.OPERATION_ENABLED, drive.controlword)
         assert drives.exchange(LONG)
-        if all(drive.state is State.OPERATION_ENABLED for drive in drives.all):
+        if all(drive.state is DriveState.OPERATION_ENABLED for drive in drives.all):
             return
     raise AssertionError([drive.state for drive in drives.all])
 
@@ -83,7 +83,7 @@ def test_a_drive_found_enabled_is_switched_off_before_anything_else(rig) -> None
     second.configure(0.01, notes.append)
     assert len(notes) == 4
     assert "found powered" in notes[0]
-    assert all(drive.state is State.SWITCH_ON_DISABLED for drive in rig.simulated.drives)
+    assert all(drive.state is DriveState.SWITCH_ON_DISABLED for drive in rig.simulated.drives)
     enable(second)
     assert all(abs(length) < 1e-6 for length in rig.simulated.lengths())  # nothing jumped
 
@@ -98,18 +98,18 @@ def test_a_quick_stop_wins_over_a_cycle_that_is_being_sent(rig) -> None:
     def cycles() -> None:
         while not done.is_set():
             for drive in drives.all:
-                drive.controlword = int(Command.ENABLE_OPERATION)
+                drive.controlword = int(Controlword.ENABLE_OPERATION)
             drives.exchange(LONG)
 
     thread = threading.Thread(target=cycles)
     thread.start()
     time.sleep(0.05)
     assert drives.quick_stop() == []
-    until(lambda: all(drive.state is State.QUICK_STOP_ACTIVE for drive in rig.simulated.drives))
+    until(lambda: all(drive.state is DriveState.QUICK_STOP_ACTIVE for drive in rig.simulated.drives))
     time.sleep(0.1)
     done.set()
     thread.join()
-    assert all(drive.state is State.QUICK_STOP_ACTIVE for drive in rig.simulated.drives)
+    assert all(drive.state is DriveState.QUICK_STOP_ACTIVE for drive in rig.simulated.drives)
 
 
 def test_two_threads_may_read_one_drive(rig) -> None:

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rfdropo_bayes.deployment.bench.hub import FRAME, Hub, HubBus, address_of, decode, encode
 from rfdropo_bayes.deployment.bus import BusTable, open_bus
-from rfdropo_bayes.deployment.hub import FRAME, Hub, HubBus, address_of, decode, encode
 from rfdropo_bayes.errors import InputError
 
 frames = st.builds(

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from rfdropo_bayes.deployment import objects
+from rfdropo_bayes.deployment.bench.hub import HubBus
 from rfdropo_bayes.deployment.bus import LoggedNetwork
-from rfdropo_bayes.deployment.cia402 import Command, State, controlword_towards
+from rfdropo_bayes.deployment.cia402 import Controlword, DriveState, controlword_towards
 from rfdropo_bayes.deployment.drives import Drive, Drives, Guards, Identity
-from rfdropo_bayes.deployment.hub import HubBus
 from rfdropo_bayes.deployment.objects import Nmt, NmtState, Object
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
@@ -68,7 +68,7 @@ def until(condition: Callable[[], bool]) -> None:
         time.sleep(0.002)
 
 
-def bring(drives: Drives, target: State) -> None:
+def bring(drives: Drives, target: DriveState) -> None:
     (drive,) = drives.all
     for _ in range(12):
         if drive.state is not None:
@@ -103,44 +103,49 @@ def test_aborts_are_told_with_their_object(drives: Drives) -> None:
 def test_mapping_states_set_points_and_status(drives: Drives) -> None:
     (drive,) = drives.all
     drives.configure(0.01, lambda text: None)
-    bring(drives, State.OPERATION_ENABLED)
+    bring(drives, DriveState.OPERATION_ENABLED)
     for target in (0, 1, -1, 2**31 - 1, -(2**31), 25_000):
         drive.target = target
         assert drives.exchange(1.0)
         assert drives.exchange(1.0)  # this slave applies a set-point when it comes, and samples on SYNC
         assert drive.reading is not None
         assert drive.reading.position == target
-    bring(drives, State.SWITCH_ON_DISABLED)
+    bring(drives, DriveState.SWITCH_ON_DISABLED)
 
 
 def test_every_state_is_reached_and_left(drives: Drives) -> None:
     drives.configure(0.01, lambda text: None)
-    for state in (State.READY_TO_SWITCH_ON, State.OPERATION_ENABLED, State.SWITCHED_ON, State.SWITCH_ON_DISABLED):
+    for state in (
+        DriveState.READY_TO_SWITCH_ON,
+        DriveState.OPERATION_ENABLED,
+        DriveState.SWITCHED_ON,
+        DriveState.SWITCH_ON_DISABLED,
+    ):
         bring(drives, state)
 
 
 def test_the_quick_stop_needs_no_sync_and_stays(drives: Drives) -> None:
     (drive,) = drives.all
     drives.configure(0.01, lambda text: None)
-    bring(drives, State.OPERATION_ENABLED)
+    bring(drives, DriveState.OPERATION_ENABLED)
     assert drives.quick_stop() == []
     until(lambda: drive.read(Object.STATUSWORD) & 0x6F == 0x07)
-    drive.controlword = int(Command.ENABLE_OPERATION)
+    drive.controlword = int(Controlword.ENABLE_OPERATION)
     for _ in range(5):
         assert drives.exchange(1.0)
-    assert drive.state is State.QUICK_STOP_ACTIVE
+    assert drive.state is DriveState.QUICK_STOP_ACTIVE
 
 
 def test_emergencies_faults_and_their_reset(drives: Drives) -> None:
     (drive,) = drives.all
     drives.configure(0.01, lambda text: None)
-    bring(drives, State.OPERATION_ENABLED)
+    bring(drives, DriveState.OPERATION_ENABLED)
     drive.write(Object.SIMULATED_FAULT, 4, read_back=False)
     until(lambda: len(drives.emergencies) > 0)
     assert drives.emergencies[0].code == 0x2310
     assert drives.exchange(1.0)
-    assert drive.state is State.FAULT
-    bring(drives, State.OPERATION_ENABLED)  # through the reset, with its rising edge
+    assert drive.state is DriveState.FAULT
+    bring(drives, DriveState.OPERATION_ENABLED)  # through the reset, with its rising edge
 
 
 def test_heartbeats_and_network_management(drives: Drives) -> None:

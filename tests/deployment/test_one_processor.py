@@ -16,7 +16,7 @@ PATIENCE = 60.0  # [s]: the processes need six to import what they need
 
 PLANTS = """
 import threading, time
-from rfdropo_bayes.deployment.plant import SpringCables
+from rfdropo_bayes.deployment.bench.plant import SpringCables
 
 def with_threads(robot):
     # As numerical libraries have them.
@@ -40,7 +40,7 @@ import psutil
 from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork, open_bus
 from rfdropo_bayes.deployment.drives import Drive
-from rfdropo_bayes.deployment.simulation import SimulationTable, simulated_drives
+from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.robots import load_robot
 
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # here: a fork before it would copy what JAX holds

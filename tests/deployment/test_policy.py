@@ -10,7 +10,7 @@ import pytest
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.deployment.causes import Cause, Stop
-from rfdropo_bayes.deployment.policy import OnnxPolicy, RecordedCommands, Scene
+from rfdropo_bayes.deployment.policy import OnnxPolicy, PolicyScene, RecordedCommands
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import ObservationPart
@@ -20,12 +20,12 @@ from .policies import linear_policy
 INPUTS = 16  # four commands, four markers
 
 
-def scene(robot: Robot, seed: int = 0) -> Scene:
+def scene(robot: Robot, seed: int = 0) -> PolicyScene:
     random = np.random.default_rng(seed)
     markers, channels = len(robot.marker_names), len(robot.channel_names)
     motion = [random.normal(size=(markers, 3)) for _ in range(2)]
     command, length, tension = (1e-3 * random.normal(size=channels) for _ in range(3))
-    return Scene(*motion, command, length, tension)
+    return PolicyScene(*motion, command, length, tension)
 
 
 def matrix(robot: Robot, seed: int = 1) -> np.ndarray:

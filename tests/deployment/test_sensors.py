@@ -9,7 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rfdropo_bayes.deployment.plant import PlantProcess, SpringCables, build_plant
+from rfdropo_bayes.deployment.bench.plant import PlantProcess, SpringCables, build_plant
+from rfdropo_bayes.deployment.bench.simulated_bus import DATAGRAM, MAGIC
 from rfdropo_bayes.deployment.sensors import (
     MarkerView,
     NatNetMarkers,
@@ -19,7 +20,6 @@ from rfdropo_bayes.deployment.sensors import (
     Sighting,
     SimulatedMarkers,
 )
-from rfdropo_bayes.deployment.simulation import DATAGRAM, MAGIC
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 

@@ -13,6 +13,7 @@ import pytest
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.bus import BusTable
 from rfdropo_bayes.deployment.causes import Cause
 from rfdropo_bayes.deployment.homing import Home, HomingResult, load_homing
@@ -29,7 +30,6 @@ from rfdropo_bayes.deployment.settings import (
     SimulationSettings,
     load_deployment,
 )
-from rfdropo_bayes.deployment.simulation import SimulationTable, simulated_drives
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot, load_robot
 

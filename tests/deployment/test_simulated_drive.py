@@ -8,9 +8,9 @@ import struct
 import pytest
 
 from rfdropo_bayes.deployment import objects
-from rfdropo_bayes.deployment.cia402 import Command, State, Status, state_of
+from rfdropo_bayes.deployment.bench.simulated_drive import SimulatedDrive, SimulatedFault
+from rfdropo_bayes.deployment.cia402 import Controlword, DriveState, Status, state_of
 from rfdropo_bayes.deployment.objects import EmergencyCode, Nmt, NmtState, Object
-from rfdropo_bayes.deployment.simulated_drive import SimulatedDrive, SimulatedFault
 
 NODE = 5
 
@@ -58,11 +58,11 @@ class Bench:
 
     def enable(self, target: int = 0) -> None:
         self.operational()
-        for word in (Command.SHUTDOWN, Command.SWITCH_ON, Command.ENABLE_OPERATION):
+        for word in (Controlword.SHUTDOWN, Controlword.SWITCH_ON, Controlword.ENABLE_OPERATION):
             self.cycle(word, target)
 
     @property
-    def state(self) -> State | None:
+    def state(self) -> DriveState | None:
         return state_of(self.drive.statusword())
 
 
@@ -133,7 +133,7 @@ def test_commands_to_other_nodes_are_left_alone(bench: Bench) -> None:
 
 def test_set_points_are_applied_on_sync_alone(bench: Bench) -> None:
     bench.enable()
-    bench.take(objects.RPDO1 + NODE, objects.SETPOINT.pack(Command.ENABLE_OPERATION, 500))
+    bench.take(objects.RPDO1 + NODE, objects.SETPOINT.pack(Controlword.ENABLE_OPERATION, 500))
     bench.wait(0.05)
     assert bench.drive.position == 0.0
     bench.take(objects.SYNC, b"")
@@ -143,8 +143,8 @@ def test_set_points_are_applied_on_sync_alone(bench: Bench) -> None:
 
 def test_the_command_alone_needs_no_sync(bench: Bench) -> None:
     bench.enable()
-    bench.take(objects.RPDO2 + NODE, objects.COMMAND.pack(Command.QUICK_STOP))
-    assert bench.state is State.QUICK_STOP_ACTIVE
+    bench.take(objects.RPDO2 + NODE, objects.COMMAND.pack(Controlword.QUICK_STOP))
+    assert bench.state is DriveState.QUICK_STOP_ACTIVE
 
 
 def test_position_follows_and_stops_at_the_drives_own_limits(bench: Bench) -> None:
@@ -152,7 +152,7 @@ def test_position_follows_and_stops_at_the_drives_own_limits(bench: Bench) -> No
     bench.sdo(Object.POSITION_LIMIT, 2, 300)
     bench.enable()
     for _ in range(20):
-        word, position, _ = bench.cycle(Command.ENABLE_OPERATION, 5000 if bench.now < 1 else 0)
+        word, position, _ = bench.cycle(Controlword.ENABLE_OPERATION, 5000 if bench.now < 1 else 0)
     assert position == pytest.approx(300, abs=1)
     assert word & Status.LIMIT_ACTIVE
 
@@ -161,7 +161,7 @@ def test_speed_is_limited(bench: Bench) -> None:
     bench.sdo(Object.MAX_MOTOR_SPEED, 0, 60)  # one turn of 2048 counts a second
     bench.sdo(Object.FOLLOWING_WINDOW, 0, 10**6)
     bench.enable()
-    positions = [bench.cycle(Command.ENABLE_OPERATION, 10**5)[1] for _ in range(20)]
+    positions = [bench.cycle(Controlword.ENABLE_OPERATION, 10**5)[1] for _ in range(20)]
     steps = [after - before for before, after in itertools.pairwise(positions)]
     assert max(steps) <= 2048 * 0.01 + 1
 
@@ -173,41 +173,46 @@ def test_an_unfollowed_set_point_faults(bench: Bench) -> None:
     bench.sdo(Object.FOLLOWING_TIMEOUT, 0, 30, 2)
     seen = []
     for _ in range(8):
-        bench.take(objects.RPDO1 + NODE, objects.SETPOINT.pack(Command.ENABLE_OPERATION, 1000))
+        bench.take(objects.RPDO1 + NODE, objects.SETPOINT.pack(Controlword.ENABLE_OPERATION, 1000))
         bench.now += 0.01
         seen += bench.take(objects.SYNC, b"")
     codes = [objects.EMERGENCY.unpack(data)[0] for identifier, data in seen if identifier == objects.EMCY + NODE]
     assert codes == [EmergencyCode.FOLLOWING_ERROR]
-    assert bench.state is State.FAULT
+    assert bench.state is DriveState.FAULT
 
 
 def test_a_fault_needs_a_rising_edge_and_tells_its_end(bench: Bench) -> None:
     bench.enable()
     bench.sdo(Object.SIMULATED_FAULT, 0, SimulatedFault.OVER_CURRENT, 1)
-    assert bench.state is State.FAULT
+    assert bench.state is DriveState.FAULT
     assert bench.sdo(Object.ERROR_CODE) == EmergencyCode.OVER_CURRENT
-    bench.cycle(Command.ENABLE_OPERATION, 0)
-    assert bench.state is State.FAULT
-    sent = bench.take(objects.RPDO2 + NODE, objects.COMMAND.pack(Command.FAULT_RESET))
-    assert bench.state is State.SWITCH_ON_DISABLED
+    bench.cycle(Controlword.ENABLE_OPERATION, 0)
+    assert bench.state is DriveState.FAULT
+    sent = bench.take(objects.RPDO2 + NODE, objects.COMMAND.pack(Controlword.FAULT_RESET))
+    assert bench.state is DriveState.SWITCH_ON_DISABLED
     assert [objects.EMERGENCY.unpack(data)[0] for identifier, data in sent if identifier == objects.EMCY + NODE] == [0]
 
 
 @pytest.mark.parametrize(
     ("option", "state"),
-    [(0, State.OPERATION_ENABLED), (1, State.FAULT), (2, State.SWITCH_ON_DISABLED), (3, State.QUICK_STOP_ACTIVE)],
+    [
+        (0, DriveState.OPERATION_ENABLED),
+        (1, DriveState.FAULT),
+        (2, DriveState.SWITCH_ON_DISABLED),
+        (3, DriveState.QUICK_STOP_ACTIVE),
+    ],
 )
-def test_a_lost_master_is_answered_as_object_6007_says(bench: Bench, option: int, state: State) -> None:
+def test_a_lost_master_is_answered_as_object_6007_says(bench: Bench, option: int, state: DriveState) -> None:
     bench.sdo(Object.ABORT_CONNECTION, 0, option, 2)
     bench.sdo(Object.QUICK_STOP_OPTION, 0, 6, 2)
     bench.sdo(Object.CONSUMER_HEARTBEAT, 1, 127 << 16 | 60)
     bench.enable()
     bench.wait(0.5)
-    assert bench.state is State.OPERATION_ENABLED  # guarded from the first heartbeat on
+    assert bench.state is DriveState.OPERATION_ENABLED  # guarded from the first heartbeat on
     for _ in range(5):
         bench.take(objects.HEARTBEAT + 127, bytes([5]))
         bench.wait(0.04)
-    assert bench.state is State.OPERATION_ENABLED
+    assert bench.state is DriveState.OPERATION_ENABLED
     bench.wait(0.03)
     assert bench.state is state
     codes = [objects.EMERGENCY.unpack(d)[0] for i, d in bench.sent if i == objects.EMCY + NODE]
@@ -220,9 +225,9 @@ def test_a_lost_sync_is_noticed_after_one_and_a_half_cycles(bench: Bench) -> Non
     bench.sdo(Object.CYCLE_PERIOD, 0, 10_000)
     bench.enable()
     bench.wait(0.012)
-    assert bench.state is State.OPERATION_ENABLED
+    assert bench.state is DriveState.OPERATION_ENABLED
     bench.wait(0.006)
-    assert bench.state is State.QUICK_STOP_ACTIVE
+    assert bench.state is DriveState.QUICK_STOP_ACTIVE
 
 
 def test_a_short_set_point_is_refused_and_told(bench: Bench) -> None:
@@ -238,9 +243,9 @@ def test_a_quick_stop_brakes_on_the_ramp(bench: Bench) -> None:
     bench.sdo(Object.QUICK_STOP_OPTION, 0, 6, 2)
     bench.enable()
     for number in range(30):
-        bench.cycle(Command.ENABLE_OPERATION, 100 * number)
+        bench.cycle(Controlword.ENABLE_OPERATION, 100 * number)
     start, speed = bench.drive.position, bench.drive.velocity
-    bench.take(objects.RPDO2 + NODE, objects.COMMAND.pack(Command.QUICK_STOP))
+    bench.take(objects.RPDO2 + NODE, objects.COMMAND.pack(Controlword.QUICK_STOP))
     bench.wait(0.5)
     assert bench.drive.velocity == 0.0
     assert bench.drive.position - start == pytest.approx(speed**2 / 2e5, rel=0.1)
@@ -342,7 +347,7 @@ def test_an_event_driven_status_comes_with_a_change_and_with_its_timer(bench: Be
     bench.sent.clear()
     bench.wait(0.1)
     assert statuses(bench) == 1
-    bench.sdo(Object.CONTROLWORD, value=Command.SHUTDOWN, size=2)
+    bench.sdo(Object.CONTROLWORD, value=Controlword.SHUTDOWN, size=2)
     bench.wait(0.1)
     assert statuses(bench) == 1
     bench.take(objects.NMT, bytes([Nmt.PRE_OPERATIONAL, NODE]))
@@ -373,10 +378,10 @@ def test_a_lost_heartbeat_does_what_the_error_behaviour_says(bench: Bench, behav
         assert bench.sdo(Object.ERROR_FIELD, 1) == 0
 
 
-@pytest.mark.parametrize(("option", "state"), [(2, State.SWITCH_ON_DISABLED), (6, State.QUICK_STOP_ACTIVE)])
-def test_a_quick_stop_ends_as_its_option_says(bench: Bench, option: int, state: State) -> None:
+@pytest.mark.parametrize(("option", "state"), [(2, DriveState.SWITCH_ON_DISABLED), (6, DriveState.QUICK_STOP_ACTIVE)])
+def test_a_quick_stop_ends_as_its_option_says(bench: Bench, option: int, state: DriveState) -> None:
     bench.sdo(Object.QUICK_STOP_OPTION, 0, option, 2)
     bench.enable()
-    bench.cycle(Command.QUICK_STOP, 0)
+    bench.cycle(Controlword.QUICK_STOP, 0)
     bench.wait(0.1)
     assert bench.state is state

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from rfdropo_bayes.deployment import objects
+from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.bus import open_bus
 from rfdropo_bayes.deployment.causes import Cause
 from rfdropo_bayes.deployment.drives import Drive, Drives, Guards, Identity
@@ -18,7 +19,6 @@ from rfdropo_bayes.deployment.objects import Object
 from rfdropo_bayes.deployment.sensors import SimulatedMarkers
 from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, HomingTable, SafetyTable, load_deployment
-from rfdropo_bayes.deployment.simulation import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.vendors import STANDARD, WITHOUT, Units, told_counts
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Motor, load_robot

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes import fem
-from rfdropo_bayes.fem.drives import DriveLimits
+from rfdropo_bayes.fem.cable_drive import DriveLimits
 from rfdropo_bayes.fem.effects import BodyEffects
 from rfdropo_bayes.fem.integrators import STAGES
-from rfdropo_bayes.fem.native.layered import NativeLayered
+from rfdropo_bayes.fem.native.layered_engine import NativeLayered
 from rfdropo_bayes.fem.native.layered_session import LayeredSession
 from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
-from rfdropo_bayes.fem.pushing import PushScene, layered_spheres, push_scene
+from rfdropo_bayes.fem.pushing import PushGeometry, layered_spheres, push_scene
 from rfdropo_bayes.fem.rigid_body import Cube, cube_at
 from rfdropo_bayes.fem.tetrahedra import locate, route_cables, tetrahedral_body
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, tetrahedral_system
@@ -28,7 +28,7 @@ REST = PLATE + DISTANCE + SIDE / 2
 
 
 @functools.cache
-def bar(layers: int = 4) -> tuple[fem.System, fem.PointMap, PushScene]:
+def bar(layers: int = 4) -> tuple[fem.System, fem.PointMap, PushGeometry]:
     """A soft bar with three cables above a plate."""
     body = fem.uniform_body(LENGTH, 0.01, 0.01, layers)
     angle = np.pi / 2 * np.arange(3) + 0.1

@@ -11,7 +11,7 @@ import pytest
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.fem.effects import BodyEffects
-from rfdropo_bayes.fem.native.layered import NativeLayered
+from rfdropo_bayes.fem.native.layered_engine import NativeLayered
 
 STEPS, BATCH, TIME_STEP = 25, 5, 0.01
 AGREEMENT = {"float64": 1e-9, "float32": 3e-5}  # [m]

@@ -11,7 +11,7 @@ import pytest
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.native.layered import NativeLayered
+from rfdropo_bayes.fem.native.layered_engine import NativeLayered
 
 TIME_STEP = 0.01
 STEPS = 25

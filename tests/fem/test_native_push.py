@@ -12,8 +12,8 @@ import pytest
 from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall
-from rfdropo_bayes.fem.native.layered import NativeLayered
-from rfdropo_bayes.fem.pushing import PushScene, layered_spheres, push_scene
+from rfdropo_bayes.fem.native.layered_engine import NativeLayered
+from rfdropo_bayes.fem.pushing import PushGeometry, layered_spheres, push_scene
 from rfdropo_bayes.fem.rigid_body import Cube, cube_at, solid_gyration_radius
 
 BATCH, STEPS, TIME_STEP, LENGTH, LAYERS, SIDE, PLATE = 11, 60, 0.01, 0.12, 6, 0.03, -0.055
@@ -21,7 +21,7 @@ AGREEMENT = {"float64": 1e-9, "float32": 3e-5}  # [m]
 
 
 @functools.cache
-def bar() -> tuple[fem.System, fem.PointMap, PushScene]:
+def bar() -> tuple[fem.System, fem.PointMap, PushGeometry]:
     """A soft bar with three cables above a plate."""
     body = fem.uniform_body(LENGTH, 0.01, 0.01, LAYERS)
     angle = np.pi / 2 * np.arange(3) + 0.1

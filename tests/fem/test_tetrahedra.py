@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import levels as level_systems
-from rfdropo_bayes.fem.drives import DriveLimits
+from rfdropo_bayes.fem.cable_drive import DriveLimits
 from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
 from rfdropo_bayes.fem.tetrahedra import (
     FRAMES,

@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.plain.problem import problem_from_numpyro
+from rfdropo_bayes.inference.plain.plain_problem import problem_from_numpyro
 
 from .plain.test_problem import SCHOOLS, schools, schools_by_quadrature
 from .toys import Decay

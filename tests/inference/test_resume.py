@@ -19,7 +19,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.plain.problem import problem_from_numpyro
+from rfdropo_bayes.inference.plain.plain_problem import problem_from_numpyro
 from rfdropo_bayes.inference.progress import Progress
 
 from .toys import Decay, Spring

@@ -12,10 +12,10 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
+from rfdropo_bayes.model.assembly import build_simulator
+from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import load_robot
 from rfdropo_bayes.simulators.commands import commands_on_grid
-from rfdropo_bayes.workflow.assembly import build_simulator
-from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.01

@@ -10,7 +10,7 @@ import pytest
 
 from rfdropo_bayes.inference.result import stage_cautions
 from rfdropo_bayes.posteriors import ParameterInfo
-from rfdropo_bayes.report.randomisation import judge
+from rfdropo_bayes.report.randomisation_safety import judge
 from rfdropo_bayes.report.summary import bound_reached, build_summary
 
 CORRELATED = {"all": {"correlated": True, "narrowing": 2.4}}

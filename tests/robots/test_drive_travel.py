@@ -13,10 +13,10 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import group_of, in_group
+from rfdropo_bayes.model.assembly import with_groups
+from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.robots import DriveTravel, Robot, load_robot, travel_in
 from rfdropo_bayes.robots.drive_travel import unstated_travel
-from rfdropo_bayes.workflow.assembly import with_groups
-from rfdropo_bayes.workflow.model import Model
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 CONFIG = "reports/sim2real_trunk/config.toml"

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rfdropo_bayes.simulators.differences import usable_difference, with_differences
+from rfdropo_bayes.simulators.finite_differences import usable_difference, with_differences
 
 
 class Ends(NamedTuple):

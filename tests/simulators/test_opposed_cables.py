@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rfdropo_bayes.model.assembly import build_robot_simulator
+from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.simulators.control_session import Session
 from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.protocol import Result
-from rfdropo_bayes.simulators.session import Session
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
-from rfdropo_bayes.workflow.assembly import build_robot_simulator
-from rfdropo_bayes.workflow.model_spec import ModelSpec
 
 
 def test_a_notched_trunk_between_opposed_cables_stays_whole():

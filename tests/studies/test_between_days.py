@@ -10,8 +10,8 @@ import pytest
 import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.workflow.commands import random_walk
-from rfdropo_bayes.workflow.experiment import CommandsTable
+from rfdropo_bayes.model.experiment import CommandsTable
+from rfdropo_bayes.verbs.random_commands import random_walk
 
 SIMULATOR = {"refine": 1, "time_step": 0.01}
 PRIORS = {

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rfdropo_bayes.model.experiment import load_experiment
 from rfdropo_bayes.studies.hidden_effects import Setting, hide
-from rfdropo_bayes.workflow.audit import run_audit
-from rfdropo_bayes.workflow.experiment import load_experiment
+from rfdropo_bayes.verbs.audit import run_audit
 
 # Friction runs on the slower engine; it has its own test.
 FRICTION = ("coulomb_friction", "capstan_friction")

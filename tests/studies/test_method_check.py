@@ -38,8 +38,8 @@ def test_the_layered_arm_is_calibrated(tmp_path):
 @pytest.mark.slow
 def test_simulated_data_fit_their_own_truth():
     """Whitened residuals of a data set at its truth are standard normal: mean square 1 to five standard errors."""
+    from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.studies.method_check import simulate_data_set
-    from rfdropo_bayes.workflow.model import Model
 
     model, _ = Model.read(EXPERIMENT)
     problem = model.problem(model.recordings("fit"))

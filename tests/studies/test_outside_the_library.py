@@ -12,7 +12,7 @@ import pytest
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.studies.hidden_effects import Setting, hide
-from rfdropo_bayes.workflow.audit import run_audit
+from rfdropo_bayes.verbs.audit import run_audit
 
 SHOP: dict = {}
 COARSE = {"refine": 1, "time_step": 0.01}

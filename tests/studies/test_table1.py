@@ -16,7 +16,7 @@ from rfdropo_bayes.studies import table1
 from rfdropo_bayes.studies.comparison import fit, misleads, scores
 from rfdropo_bayes.studies.fits import run_fits
 from rfdropo_bayes.studies.table1 import (
-    Size,
+    Table1Size,
     ahead_of_ours,
     as_markdown,
     by_caution,
@@ -26,7 +26,7 @@ from rfdropo_bayes.studies.table1 import (
     run_table1,
     summarise,
 )
-from rfdropo_bayes.studies.tasks import TASKS, draw_truth, excited, task_problem
+from rfdropo_bayes.studies.virtual_tasks import TASKS, draw_truth, excited, task_problem
 
 STUCK = Caution(Code.PARTICLES_STUCK, "the last moves left the particles where they were", grave=True).as_dict()
 AT_BOUND = Caution(Code.AT_BOUND, "friction sits on its lower bound").as_dict()
@@ -169,16 +169,16 @@ def test_off_centre_truths_stay_out_of_the_middle():
 def rows():
     rng = np.random.default_rng(3)
     found = []
-    for job in list_jobs(Size(truths=8, rival_truths=4), list(table1.ROWS), ["TrunkReach"]):
+    for job in list_jobs(Table1Size(truths=8, rival_truths=4), list(table1.ROWS), ["TrunkReach"]):
         worse = 3.0 if job["row"] in table1.RIVALS else 1.0
         figures = {name: worse * (1.0 + 0.1 * rng.uniform()) for name in table1.FIGURES}
         found.append({**job, **figures, "inside_90": [True] * 9 + [False]})
-    found[-1] = {**list_jobs(Size(truths=8), ["ours"], ["TrunkReach"])[-1], "failed": "no reason"}
+    found[-1] = {**list_jobs(Table1Size(truths=8), ["ours"], ["TrunkReach"])[-1], "failed": "no reason"}
     return found
 
 
 def test_the_paper_s_truth_is_repeated_less_often_than_truths_are_drawn():
-    jobs = list_jobs(Size(truths=8, rival_truths=2, repeats=3), ["ours", "UDR"], ["TrunkReach"])
+    jobs = list_jobs(Table1Size(truths=8, rival_truths=2, repeats=3), ["ours", "UDR"], ["TrunkReach"])
     count = {
         (row, kind): sum((j["row"], j["truths"]) == (row, kind) for j in jobs)
         for row in ("ours", "UDR")
@@ -265,21 +265,21 @@ def test_what_another_row_does_better_is_said():
 
 def test_a_run_writes_its_files(tmp_path, monkeypatch):
     monkeypatch.setattr(table1, "fit", lambda job: {**dict.fromkeys(table1.FIGURES, 1.0), "inside_90": [True]})
-    run_table1(tmp_path, Size(1, 1), rows=["prior", "ours"], command="rfdropo benchmark table1")
+    run_table1(tmp_path, Table1Size(1, 1), rows=["prior", "ours"], command="rfdropo benchmark table1")
     content = json.loads((tmp_path / "table1.json").read_text())
     assert {cell["row"] for cell in content["cells"]} == {"prior", "ours"}
     assert (tmp_path / "table1.png").stat().st_size > 5000
     assert "rfdropo benchmark table1" in (tmp_path / "table1.md").read_text()
     assert content["not_done"] == 0
     monkeypatch.setattr(table1, "fit", None)  # nothing is done where only what is done is wanted
-    partly = run_table1(tmp_path, Size(2, 1), rows=["prior", "ours"], only_done=True)
+    partly = run_table1(tmp_path, Table1Size(2, 1), rows=["prior", "ours"], only_done=True)
     assert partly["not_done"] == 4  # ours, of the second truth and data set of two tasks
     assert partly["cells"] == content["cells"]
     assert "4 fits that were not done" in (tmp_path / "table1.md").read_text()
     with pytest.raises(InputError, match="unknown row"):
-        run_table1(tmp_path, Size(1, 1), rows=["theirs"])
+        run_table1(tmp_path, Table1Size(1, 1), rows=["theirs"])
     with pytest.raises(InputError, match="unknown task"):
-        run_table1(tmp_path, Size(1, 1), tasks=["TrunkPull"])
+        run_table1(tmp_path, Table1Size(1, 1), tasks=["TrunkPull"])
 
 
 @pytest.mark.slow

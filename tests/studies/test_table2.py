@@ -12,14 +12,14 @@ import pytest
 from scipy.stats import binomtest
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.experiment import load_experiment
+from rfdropo_bayes.model.experiment_file import describe, read_tables
 from rfdropo_bayes.studies import table2
-from rfdropo_bayes.studies.table2 import ROWS, WITHOUT_CUBE, Size, Study, claims, list_jobs, run_table2, summarise
-from rfdropo_bayes.workflow.experiment import load_experiment
-from rfdropo_bayes.workflow.experiment_file import describe, read_tables
+from rfdropo_bayes.studies.table2 import ROWS, WITHOUT_CUBE, Study, Table2Size, claims, list_jobs, run_table2, summarise
 
 VIRTUAL = Path(__file__).resolve().parents[2] / "experiments" / "virtual"
 PUSH, REACH, TRUTH, AUDIT = (VIRTUAL / f"{name}.toml" for name in ("push", "reach", "truth", "audit"))
-SMALL = Size(seeds=2, steps=1000, episodes=20, budget=100, minutes=1.0)
+SMALL = Table2Size(seeds=2, steps=1000, episodes=20, budget=100, minutes=1.0)
 
 
 def keep(out: Path, row: str, seed: int, distances: np.ndarray) -> None:
@@ -111,7 +111,7 @@ def test_what_cannot_be_is_refused(tmp_path) -> None:
     with pytest.raises(InputError, match="unknown row 'RFDROPO'"):
         run_table2([PUSH], TRUTH, AUDIT, tmp_path, SMALL, rows=["RFDROPO"])
     with pytest.raises(InputError, match="seeds = 0"):
-        Size(seeds=0)
+        Table2Size(seeds=0)
 
 
 def test_an_interval_knows_that_the_episodes_of_a_policy_succeed_together() -> None:
@@ -149,7 +149,7 @@ def test_starting_anew_keeps_nothing(tmp_path, monkeypatch) -> None:
 
 @pytest.mark.slow
 def test_a_small_study_from_recording_to_table_goes_on_where_it_stopped(tmp_path) -> None:
-    size = Size(seeds=1, steps=2048, episodes=4, budget=200)
+    size = Table2Size(seeds=1, steps=2048, episodes=4, budget=200)
     run = [[REACH], TRUTH, AUDIT, tmp_path / "study", size]
     first = run_table2(*run, rows=["no randomisation"])
     assert [row["row"] for row in first["rows"]] == ["no randomisation"]

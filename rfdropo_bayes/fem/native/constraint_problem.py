@@ -50,7 +50,7 @@ ROUNDING = 0.03
 RATIO = TANGENT_SOFTNESS / NORMAL_SOFTNESS
 
 
-class Problem(NamedTuple):
+class ConstraintProblem(NamedTuple):
     """Constraints of a step in one lane block; rows are those of cables, of runs of guides, of contacts (three each).
 
     Lines are the rows of cables and runs. The last axis is the lane.
@@ -81,7 +81,7 @@ class Problem(NamedTuple):
     column: Int[np.ndarray, " rows"]  # of L that act in any lane: row of a line or of a contact's column
 
 
-def problem_storage(lines: int, contacts: int, lanes: int, dtype: type) -> Problem:
+def problem_storage(lines: int, contacts: int, lanes: int, dtype: type) -> ConstraintProblem:
     """Zeroed, aligned storage of one lane block."""
     rows = lines + 3 * contacts
     sizes = {
@@ -92,7 +92,7 @@ def problem_storage(lines: int, contacts: int, lanes: int, dtype: type) -> Probl
         "tilted": rows**2, "factor": rows**2, "answer": rows, "going": 1,
     }  # fmt: skip
     arrays = {name: aligned_zeros((max(size, 1), lanes), dtype) for name, size in sizes.items()}
-    return Problem(**arrays, column=np.zeros(max(rows, 1), dtype=np.int64))
+    return ConstraintProblem(**arrays, column=np.zeros(max(rows, 1), dtype=np.int64))
 
 
 @kernel

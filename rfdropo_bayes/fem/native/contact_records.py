@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.native.simd import aligned_zeros
-from rfdropo_bayes.fem.pushing import PushScene
+from rfdropo_bayes.fem.pushing import PushGeometry
 
 CUBE_STATE, CUBE_VALUES, CORNERS = 13, 4, 8
 """Rows of a cube: centre, quaternion (x, y, z, w), velocity, spin; and mass, side, radius of gyration, friction."""
@@ -19,7 +19,7 @@ MISSED = {"float64": 1e-9, "float32": 1e-5}
 """[m/s] Velocity at which a surface may go through another that it was not taken to touch in a step."""
 
 
-class Scene(NamedTuple):
+class ContactScene(NamedTuple):
     """What can touch; sphere s is bound to the rows ``place[k]`` of a field, k in ``first[s]:first[s + 1]``.
 
     Its centre is bound to those before ``within[s]`` only.
@@ -50,7 +50,7 @@ class PushOutput(NamedTuple):
     pose: Float[np.ndarray, "batch records 7"]
 
 
-class Touch(NamedTuple):
+class ContactRecords(NamedTuple):
     """Cubes and contacts of one lane block; the last axis is the lane.
 
     A pair is a corner of the cube and the plate, a sphere and the cube, or a sphere and the plate. Pairs that are near
@@ -84,7 +84,7 @@ def pairs_of(spheres: int) -> int:
     return CORNERS + 2 * spheres
 
 
-def touch_storage(spheres: int, lanes: int, dtype: type) -> Touch:
+def touch_storage(spheres: int, lanes: int, dtype: type) -> ContactRecords:
     """Zeroed, aligned storage of one lane block."""
     pairs = pairs_of(spheres)
     sizes = {
@@ -95,12 +95,12 @@ def touch_storage(spheres: int, lanes: int, dtype: type) -> Touch:
     }  # fmt: skip
     arrays = {name: aligned_zeros((size, lanes), dtype) for name, size in sizes.items()}
     numbers = np.zeros(pairs, dtype=np.int64), np.zeros(pairs, dtype=np.int64), np.zeros(4, dtype=np.int64)
-    return Touch(**arrays, pair=numbers[0], contact=numbers[1], count=numbers[2])
+    return ContactRecords(**arrays, pair=numbers[0], contact=numbers[1], count=numbers[2])
 
 
 def scene_tables(
-    scene: PushScene, shape: Float[np.ndarray, "nodes nodes"], number: Int[np.ndarray, " nodes"], dtype: type
-) -> Scene:
+    scene: PushGeometry, shape: Float[np.ndarray, "nodes nodes"], number: Int[np.ndarray, " nodes"], dtype: type
+) -> ContactScene:
     """Tables of a scene.
 
     Args:
@@ -123,7 +123,7 @@ def scene_tables(
         within.append(first[-1] + len(central))
         first.append(len(place))
     table = np.array(values, dtype=dtype).reshape(-1, 4)
-    return Scene(
+    return ContactScene(
         first=np.array(first, dtype=np.int64),
         within=np.array(within, dtype=np.int64),
         place=np.array(place, dtype=np.int64),

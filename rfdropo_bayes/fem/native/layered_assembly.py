@@ -9,7 +9,6 @@ only, held in ``factors``. ``tables``, ``samples``, ``factors`` and ``work`` are
 from __future__ import annotations
 
 from rfdropo_bayes.fem.corotational import POLAR_ITERATIONS
-from rfdropo_bayes.fem.native.cable_strings import add_string_reaction, add_strings, measure_strings
 from rfdropo_bayes.fem.native.fields import clear
 from rfdropo_bayes.fem.native.layered_effects import (
     BENDING,
@@ -21,7 +20,8 @@ from rfdropo_bayes.fem.native.layered_effects import (
     subtract_surroundings_product,
 )
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, store
-from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral
+from rfdropo_bayes.fem.native.stiffening_kernels import resist_lateral
+from rfdropo_bayes.fem.native.string_kernels import add_string_reaction, add_strings, measure_strings
 
 
 @kernel

@@ -7,7 +7,7 @@ skipped by flags that are the same for all lanes; cables and softening are a few
 from __future__ import annotations
 
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, square_root, store, where_greater
-from rfdropo_bayes.fem.native.tension_stiffening import add_dyad
+from rfdropo_bayes.fem.native.stiffening_kernels import add_dyad
 from rfdropo_bayes.fem.surroundings import STILL, WALL_SOFTNESS
 
 BENDING, BRANCH, SURROUNDED, FRICTION = range(4)

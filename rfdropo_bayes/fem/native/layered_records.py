@@ -16,7 +16,7 @@ KINDS = 2
 """Coulomb's friction and the capstan's."""
 
 
-class Samples(NamedTuple):
+class LayeredSamples(NamedTuple):
     """Rollout parameters of one lane block; the last axis is the lane."""
 
     moduli: Float[np.ndarray, "3 lanes"]  # [Pa], see ``layer_moduli``
@@ -51,7 +51,7 @@ class Factors(NamedTuple):
     going: Float[np.ndarray, "1 lanes"]  # share of the change of velocity in the stage before that is carried on
 
 
-class Work(NamedTuple):
+class LayeredWork(NamedTuple):
     """State and scratch of one lane block; the last axis is the lane."""
 
     position: Float[np.ndarray, "values lanes"]

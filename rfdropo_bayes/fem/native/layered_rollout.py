@@ -15,7 +15,7 @@ from rfdropo_bayes.fem.native.kernel_cache import named_by
 from rfdropo_bayes.fem.native.layered_assembly import follow_branch, layer_frame
 from rfdropo_bayes.fem.native.layered_constraints import constrained_stage
 from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, LAW
-from rfdropo_bayes.fem.native.layered_records import Factors, Samples, Work
+from rfdropo_bayes.fem.native.layered_records import Factors, LayeredSamples, LayeredWork
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
 from rfdropo_bayes.fem.native.layered_step import set_factors, solve_statics
 from rfdropo_bayes.fem.native.section_modes import LayeredTables, border_panels
@@ -43,7 +43,7 @@ class Batch(NamedTuple):
     displacement_pitch: int
 
 
-class Output(NamedTuple):
+class LayeredOutput(NamedTuple):
     """What a batch returns; recorded row 0 is the initial state."""
 
     position: Float[np.ndarray, "batch records points 3"]
@@ -54,7 +54,7 @@ class Output(NamedTuple):
     records: int
 
 
-class Schedule(NamedTuple):
+class LayeredSchedule(NamedTuple):
     """How a rollout runs."""
 
     time_step: float
@@ -67,10 +67,10 @@ class Schedule(NamedTuple):
     refinements: int  # of every stage's linear solution
     count: int = 1  # stages of a step
     stages: tuple[Stage, Stage] = (EULER, EULER)  # in seconds; the first ``count`` of them
-    resumed: int = 0  # 1 goes on from the state in ``Work`` instead of starting anew
+    resumed: int = 0  # 1 goes on from the state in ``LayeredWork`` instead of starting anew
 
 
-def storage(tables: LayeredTables, lanes: int, dtype: type) -> tuple[Samples, Factors, Work]:
+def storage(tables: LayeredTables, lanes: int, dtype: type) -> tuple[LayeredSamples, Factors, LayeredWork]:
     """Zeroed, aligned storage of one lane block."""
     modes, stations, cables = tables.modes, tables.stations, tables.cables
     size, panels, layers = 3 * modes, border_panels(cables), stations - 1
@@ -95,7 +95,7 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> tuple[Samples, Fa
         around=3 * stations, unsolved=1, accepted=1, lost=1, failed=1, relaxation=1, imbalance=1, softness=1,
     )  # fmt: skip
     factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))
-    return Samples(**samples, present=np.zeros(FLAGS, dtype=np.int64)), factors, Work(**work)
+    return LayeredSamples(**samples, present=np.zeros(FLAGS, dtype=np.int64)), factors, LayeredWork(**work)
 
 
 @kernel

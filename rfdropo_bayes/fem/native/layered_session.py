@@ -18,13 +18,13 @@ from jaxtyping import Float, Int
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import Material
 from rfdropo_bayes.fem.native.contact_records import Cubes
-from rfdropo_bayes.fem.native.layered import NativeLayered, Records, Run, in_blocks
-from rfdropo_bayes.fem.native.layered_records import Samples
+from rfdropo_bayes.fem.native.layered_engine import NativeLayered, Records, Run, in_blocks
+from rfdropo_bayes.fem.native.layered_records import LayeredSamples
 from rfdropo_bayes.fem.native.simd import aligned_zeros
 from rfdropo_bayes.fem.rollouts import Motion
 
 KEPT = {
-    "samples": tuple(name for name in Samples._fields if name != "present"),
+    "samples": tuple(name for name in LayeredSamples._fields if name != "present"),
     "work": ("position", "velocity", "tension", "commanded", "branch", "softness", "lost", "failed", "imbalance"),
     "friction": ("mobilised", "segment"),
     "touch": ("cube", "values", "memory"),
@@ -78,7 +78,7 @@ class LayeredSession:
         self._rubs = False
         self._places: list[_Place] = []
         self._local = threading.local()
-        self._equilibria: OrderedDict[bytes, _Lane] = OrderedDict()
+        self._equilibria: OrderedDict[bytes, _SessionLane] = OrderedDict()
 
     def reset(
         self,
@@ -179,7 +179,7 @@ class LayeredSession:
                 remedy="give every lane the same mechanisms; a null value switches one off",
             )
 
-    def _settled(self, run: Run) -> _Lane:
+    def _settled(self, run: Run) -> _SessionLane:
         """The initial states of a batch."""
         engine, count = self.engine, run.batch.count
         run = engine.with_output(run)
@@ -194,9 +194,9 @@ class LayeredSession:
                 there[:, place.first : place.last] = part.T[: len(there)]
 
         in_blocks(block, count, engine.lanes, engine.threads)
-        return _Lane(state, run.motion._replace(pose=None))
+        return _SessionLane(state, run.motion._replace(pose=None))
 
-    def _with_cubes(self, lanes: _Lane, cubes: Cubes) -> _Lane:
+    def _with_cubes(self, lanes: _SessionLane, cubes: Cubes) -> _SessionLane:
         """Lanes with cubes at the start: those of a body that was settled before may have been others."""
         fields = {"cube": cubes.state, "values": cubes.values, "memory": 0.0}
         for place in self._places:
@@ -204,7 +204,7 @@ class LayeredSession:
                 lanes.state[:, place.first : place.last] = fields[place.name]
         return lanes
 
-    def _remember(self, known: OrderedDict[bytes, _Lane], found: dict[bytes, _Lane]) -> None:
+    def _remember(self, known: OrderedDict[bytes, _SessionLane], found: dict[bytes, _SessionLane]) -> None:
         """Keep what was found last, as far as the memory set aside for it goes."""
         for key, lane in found.items():
             known[key] = lane
@@ -230,7 +230,7 @@ class LayeredSession:
         return self._local.records[block]
 
 
-class _Lane(NamedTuple):
+class _SessionLane(NamedTuple):
     """State of a lane, or of several, and what it shows of its body."""
 
     state: Float[np.ndarray, "*lane values"]

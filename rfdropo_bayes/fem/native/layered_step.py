@@ -18,7 +18,7 @@ from rfdropo_bayes.fem.native.layered_assembly import (
 )
 from rfdropo_bayes.fem.native.layered_effects import GAIN, GIVE, SHARE, SURROUNDED, add_surroundings
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, square_root, store, where_greater
-from rfdropo_bayes.fem.native.tension_stiffening import resist_lateral, stiffen, sum_cable_forces
+from rfdropo_bayes.fem.native.stiffening_kernels import resist_lateral, stiffen, sum_cable_forces
 
 LARGEST = 1e30
 """Tensions beyond this [N] are not finite."""

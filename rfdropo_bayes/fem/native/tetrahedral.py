@@ -40,7 +40,7 @@ class Mesh(NamedTuple):
     polar: bool
 
 
-class Samples(NamedTuple):
+class TetrahedralSamples(NamedTuple):
     """Parameters of the rollouts of one lane block; the last axis is the lane."""
 
     first_lame: Float[np.ndarray, "1 lanes"]
@@ -52,7 +52,7 @@ class Samples(NamedTuple):
     gravity: Float[np.ndarray, "3 lanes"]
 
 
-class Work(NamedTuple):
+class TetrahedralWork(NamedTuple):
     """State and scratch of one lane block; the last axis is the lane."""
 
     position: Float[np.ndarray, "nodes3 lanes"]

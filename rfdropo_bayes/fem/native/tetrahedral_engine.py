@@ -10,21 +10,28 @@ import scipy.sparse as sparse
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.cable_drive import DriveLimits
 from rfdropo_bayes.fem.cables import CableLayout, routes
-from rfdropo_bayes.fem.drives import DriveLimits
 from rfdropo_bayes.fem.dynamics import LOST, POISSON_LIMIT
 from rfdropo_bayes.fem.integrators import Integrator, timed_stages
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
-from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, Problem, problem_storage
-from rfdropo_bayes.fem.native.contact_records import PushOutput, Touch, cube_rows, pairs_of, scene_tables, touch_storage
+from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, ConstraintProblem, problem_storage
+from rfdropo_bayes.fem.native.contact_records import (
+    ContactRecords,
+    PushOutput,
+    cube_rows,
+    pairs_of,
+    scene_tables,
+    touch_storage,
+)
 from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
-from rfdropo_bayes.fem.native.layered import available_threads, in_blocks
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
+from rfdropo_bayes.fem.native.layered_engine import available_threads, in_blocks
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
-from rfdropo_bayes.fem.native.tetrahedral import Mesh, Samples, Work
-from rfdropo_bayes.fem.pushing import PushScene
+from rfdropo_bayes.fem.native.tetrahedral import Mesh, TetrahedralSamples, TetrahedralWork
+from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
 
@@ -48,7 +55,7 @@ class TetrahedralEngine:
         *,
         dtype: type = np.float64,
         threads: int | None = None,
-        scene: PushScene | None = None,
+        scene: PushGeometry | None = None,
         integrator: Integrator = "euler",
     ) -> None:
         self.integrator: Integrator = integrator
@@ -128,7 +135,7 @@ class TetrahedralEngine:
         in_blocks(run, samples, self.lanes, self.threads)
         return result
 
-    def _constraints(self) -> tuple[Touch | None, Rows, Problem, Int[np.ndarray, " free"]]:
+    def _constraints(self) -> tuple[ContactRecords | None, Rows, ConstraintProblem, Int[np.ndarray, " free"]]:
         """Contacts, their rows, the problem of a step, and the nodes that contacts reach, of one lane block."""
         cables, kind, free, spheres = len(self._cables.limit), self.dtype.type, self._mesh.free, 0
         if self._scene is not None:
@@ -148,11 +155,11 @@ class TetrahedralEngine:
         copy[...] = moved
         return copy
 
-    def _samples(self, values: Mapping[str, np.ndarray]) -> Samples:
+    def _samples(self, values: Mapping[str, np.ndarray]) -> TetrahedralSamples:
         young, poisson = np.asarray(values["young_modulus"]), np.minimum(values["poisson_ratio"], POISSON_LIMIT)
         shear = young / (2.0 * (1.0 + poisson))
         scale = values.get("stiffness_scale", np.ones((self.lanes, len(self.body.element))))
-        return Samples(
+        return TetrahedralSamples(
             self._lanes_last((2.0 * shear * poisson / (1.0 - 2.0 * poisson))[:, None]),
             self._lanes_last(shear[:, None]),
             self._lanes_last(scale[:, self._elements]),
@@ -162,7 +169,7 @@ class TetrahedralEngine:
             self._lanes_last(values["gravity"]),
         )
 
-    def _work(self) -> Work:
+    def _work(self) -> TetrahedralWork:
         nodes, free, rows = len(self.body.rest), self._mesh.free, 3 * self._pattern.border
         cables = len(self._cables.limit)
         sizes = {
@@ -174,7 +181,7 @@ class TetrahedralEngine:
             "commanded": cables, "target": cables, "accepted": 1, "lost": 1,
             "unsolved": 1, "wide": 1, "narrow": 1, "going": 1, "axes": 9, "turned": 12,
         }  # fmt: skip
-        work = Work(**{name: aligned_zeros((size, self.lanes), self.dtype) for name, size in sizes.items()})
+        work = TetrahedralWork(**{name: aligned_zeros((size, self.lanes), self.dtype) for name, size in sizes.items()})
         work.position[...] = self._rest[:, None]
         return work
 

@@ -52,7 +52,7 @@ class Cables(NamedTuple):
     rate: float  # largest change of the displacement in a step, against the one measured a step before [m]
 
 
-class Schedule(NamedTuple):
+class TetrahedralSchedule(NamedTuple):
     """How a rollout runs."""
 
     time_step: float
@@ -65,7 +65,7 @@ class Schedule(NamedTuple):
     stages: tuple[Stage, Stage]  # in seconds; the first ``count`` of them
 
 
-class Output(NamedTuple):
+class TetrahedralOutput(NamedTuple):
     """What a lane block records; the last axis is the lane."""
 
     node: Int[np.ndarray, "points weights"]

@@ -76,7 +76,7 @@ class LevenbergState(NamedTuple):
     converged: bool
 
 
-class StepInfo(NamedTuple):
+class ClimbStep(NamedTuple):
     """One step: the gain in log posterior, the gain the quadratic model promised, and the tries it took."""
 
     gain: float
@@ -121,7 +121,7 @@ def _solved(matrix: Float[np.ndarray, "d d"], right: Float[np.ndarray, " d"]) ->
         return np.linalg.lstsq(matrix, right)[0]
 
 
-def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[LevenbergState, StepInfo]:
+def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[LevenbergState, ClimbStep]:
     """One Levenberg-Marquardt step; damping grows until the log posterior rises.
 
     Damping acts on the curvature's diagonal (Marquardt's scaling), so that units do not matter. All dampings of a step
@@ -141,7 +141,7 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
     newton = _solved(curvature + 1e-12 * diagonal, gradient)
     promised = 0.5 * float(gradient @ newton)
     if promised < tolerance:
-        return state._replace(converged=True), StepInfo(0.0, promised, 0)
+        return state._replace(converged=True), ClimbStep(0.0, promised, 0)
     tried = np.clip(state.position + moves, low, high)
     densities = target.density(tried)
     best = int(np.argmax(densities))
@@ -154,7 +154,7 @@ def step(target: Climbable, state: LevenbergState, tolerance: float) -> tuple[Le
         moved = LevenbergState(position, density, state.damping * 1e5, stuck)
     else:
         moved = LevenbergState(position, density, float(np.clip(dampings[best], 1e-9, 1e9)), False)
-    return moved, StepInfo(gain, promised, len(dampings))
+    return moved, ClimbStep(gain, promised, len(dampings))
 
 
 def with_fitting_noise(target: Climbable, u: Float[np.ndarray, " d"], width: float = 12.0) -> np.ndarray:

@@ -29,8 +29,8 @@ from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.climb import Laplace
-from rfdropo_bayes.inference.modes.search import LaplaceConfig, Modes, find_modes
-from rfdropo_bayes.inference.plain.problem import CentredProblem, NumpyroProblem, centred
+from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, Modes, find_modes
+from rfdropo_bayes.inference.plain.plain_problem import CentredProblem, NumpyroProblem, centred
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import (
     InferenceResult,

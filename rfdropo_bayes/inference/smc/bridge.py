@@ -30,7 +30,7 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import evaluate_prior
 from rfdropo_bayes.inference.modes.climb import SAME, Laplace, divergence
-from rfdropo_bayes.inference.modes.search import LaplaceConfig, Modes, find_modes, mode_values
+from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, Modes, find_modes, mode_values
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook, run_digest
 from rfdropo_bayes.inference.result import (
     Draws,

@@ -116,7 +116,7 @@ class SmcConfig:
         return Tuning(self.target_ess, self.kernel, self.degrees, self.acceptance, self.correlation, self.max_moves)
 
 
-class Plan(NamedTuple):
+class ReplicatePlan(NamedTuple):
     """Sizes that are fixed before a replicate starts.
 
     Attributes:
@@ -167,7 +167,7 @@ def decided(n_rows: int, config: SmcConfig) -> SmcConfig:
     return replace(config, replicates=int(np.clip(config.rollouts / one, 1, MOST_REPLICATES)))
 
 
-def make_plan(problem: Problem, config: SmcConfig) -> Plan:
+def make_plan(problem: Problem, config: SmcConfig) -> ReplicatePlan:
     """Fix particles and blocks so that the budget can be kept.
 
     Raises:
@@ -189,10 +189,10 @@ def make_plan(problem: Problem, config: SmcConfig) -> Plan:
             where="[inference] rollouts",
             remedy=f"allow at least {config.chains * least * (looks + 1.0):.0f}, or use fewer particles",
         )
-    return Plan(least, horizons, budget, flow_of(problem) if config.kernel == "hamiltonian" else None)
+    return ReplicatePlan(least, horizons, budget, flow_of(problem) if config.kernel == "hamiltonian" else None)
 
 
-def init(key: PRNGKeyArray, problem: Problem, plan: Plan, config: SmcConfig) -> SmcState:
+def init(key: PRNGKeyArray, problem: Problem, plan: ReplicatePlan, config: SmcConfig) -> SmcState:
     """Prior draws, no rollouts yet.
 
     Draws that their coordinates cannot hold keep their share of the prior, without weight.
@@ -215,7 +215,7 @@ def init(key: PRNGKeyArray, problem: Problem, plan: Plan, config: SmcConfig) -> 
 
 
 def step(
-    key: PRNGKeyArray, state: SmcState, problem: Problem, plan: Plan, config: SmcConfig
+    key: PRNGKeyArray, state: SmcState, problem: Problem, plan: ReplicatePlan, config: SmcConfig
 ) -> tuple[SmcState, StageInfo]:
     """One stage: look further ahead if the block is used up, reweight, resample, move.
 
@@ -277,7 +277,7 @@ def _evaluate(problem: Problem, horizon: int, ledger: Ledger, u: np.ndarray) -> 
     return evaluate_prior(problem, u), evaluate_rows(problem, u, horizon, ledger)
 
 
-def _affordable_moves(state: SmcState, plan: Plan, horizon: int, n_rows: int, *, last: bool = False) -> int:
+def _affordable_moves(state: SmcState, plan: ReplicatePlan, horizon: int, n_rows: int, *, last: bool = False) -> int:
     """Moves a stage may make. What the rest of the run cannot do without is held back first, and a stage takes at most
     half of what is then left, so that later stages find something."""
     if not np.isfinite(plan.budget):
@@ -333,7 +333,7 @@ def run(
 def _replicate(
     problem: Problem,
     config: SmcConfig,
-    plan: Plan,
+    plan: ReplicatePlan,
     key: PRNGKeyArray,
     checkpoint: Checkpoint,
     report: Callable[[SmcState], None],
@@ -366,7 +366,7 @@ def unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SmcState:
     return SmcState(population, prefix_log_evidence=prefixes, ledger=ledger, **named)
 
 
-def _result(problem: Problem, config: SmcConfig, plan: Plan, states: list[SmcState]) -> InferenceResult:
+def _result(problem: Problem, config: SmcConfig, plan: ReplicatePlan, states: list[SmcState]) -> InferenceResult:
     count = min(len(state.population.position) for state in states)  # some had rollouts left for another round
     draws = chains(problem, [state.population.position[:count] for state in states])
     values = np.array([state.log_evidence for state in states])

@@ -31,10 +31,10 @@ from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, WarmStart
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.climb import Laplace, laplace, maximise
-from rfdropo_bayes.inference.modes.search import LaplaceConfig, Modes, find_modes, screened
+from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, Modes, find_modes, screened
 from rfdropo_bayes.inference.modes.targets import make_target, prior_derivatives
 from rfdropo_bayes.inference.plain import refinement
-from rfdropo_bayes.inference.plain.problem import NumpyroProblem
+from rfdropo_bayes.inference.plain.plain_problem import NumpyroProblem
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook, run_digest
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.smc import bridge, sampler

@@ -9,10 +9,10 @@ import pytest
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.modes import search as laplace
+from rfdropo_bayes.inference.modes import mode_search as laplace
 from rfdropo_bayes.inference.modes.climb import Laplace, maximise
 from rfdropo_bayes.inference.modes.mixture import draw_mixture, mixture_weights, rivals
-from rfdropo_bayes.inference.modes.search import LaplaceConfig
+from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig
 from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
 from rfdropo_bayes.inference.smc import bridge, sampler
 from rfdropo_bayes.inference.smc.bridge import BridgeConfig

@@ -13,7 +13,7 @@ from scipy.stats import gamma, multivariate_normal
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
-from rfdropo_bayes.inference.plain.problem import problem_from_numpyro
+from rfdropo_bayes.inference.plain.plain_problem import problem_from_numpyro
 from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc.sampler import SmcConfig
 

@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal, multivariate_t
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.modes.climb import Laplace
 from rfdropo_bayes.inference.plain import refinement
-from rfdropo_bayes.inference.plain.problem import CentredProblem, centred, problem_from_numpyro
+from rfdropo_bayes.inference.plain.plain_problem import CentredProblem, centred, problem_from_numpyro
 from rfdropo_bayes.inference.plain.refinement import _clusters
 from rfdropo_bayes.inference.smc.bridge import ModeMixture
 

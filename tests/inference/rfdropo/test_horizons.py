@@ -7,7 +7,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rfdropo_bayes.inference.rfdropo.search import linear_horizon, paper_horizon
+from rfdropo_bayes.inference.rfdropo.phi_search import linear_horizon, paper_horizon
 
 
 def test_published_schedule_is_the_formula_and_never_sees_the_last_row():

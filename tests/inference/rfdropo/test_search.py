@@ -8,10 +8,10 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference.rfdropo import search as rfdropo
-from rfdropo_bayes.inference.rfdropo.scores import motion_scale, step_log_likelihood
-from rfdropo_bayes.inference.rfdropo.search import RfdropoConfig, default_population, make_optimiser
-from rfdropo_bayes.inference.rfdropo.space import search_space
+from rfdropo_bayes.inference.rfdropo import phi_search as rfdropo
+from rfdropo_bayes.inference.rfdropo.candidate_scores import motion_scale, step_log_likelihood
+from rfdropo_bayes.inference.rfdropo.phi_search import RfdropoConfig, default_population, make_optimiser
+from rfdropo_bayes.inference.rfdropo.phi_space import search_space
 
 from ..toys import Spring
 

@@ -10,7 +10,7 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.evaluations import Ledger
-from rfdropo_bayes.inference.modes import search as laplace
+from rfdropo_bayes.inference.modes import mode_search as laplace
 from rfdropo_bayes.inference.modes.climb import Laplace
 from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc import start as starts

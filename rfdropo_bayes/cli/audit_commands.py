@@ -1,0 +1,135 @@
+"""Commands around the audit: what the simulator lacks, what to measure next, how often the audit is right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from rfdropo_bayes.cli.options import (
+    AsJson,
+    ExperimentFile,
+    OutFolder,
+    Overrides,
+    Overwrite,
+    Quiet,
+    Resume,
+    Seed,
+    folder_for,
+    say_progress,
+    see_calibration,
+)
+from rfdropo_bayes.cli.terminal_summary import say, show_audit
+from rfdropo_bayes.errors import InputError
+
+Base = Annotated[
+    Path | None, typer.Option("--base", help="folder of an earlier calibration, to start the base model from")
+]
+
+
+def audit(
+    experiment: ExperimentFile,
+    out: OutFolder = None,
+    base: Base = None,
+    between: Annotated[
+        tuple[str, str] | None,
+        typer.Option(
+            "--between", metavar="GROUP GROUP", help="two of [model.groups]: say what differs, all else being shared"
+        ),
+    ] = None,
+    separate: Annotated[
+        bool,
+        typer.Option("--separate", help="say which mechanisms of [separation] the recordings tell apart, and no more"),
+    ] = False,
+    seed: Seed = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    overrides: Overrides = None,
+) -> None:
+    """Say what the simulator lacks, by name: writes audit.json, extended.toml and report.html."""
+    see_calibration(base, "--base")
+    if separate and between is not None:
+        raise InputError("groups are compared by the search only", where="--separate", remedy="leave --between out")
+    command = "separate" if separate else "audit"
+    folder = folder_for(command, experiment, out, overrides, resume=resume, overwrite=overwrite)
+    if separate:
+        from rfdropo_bayes.verbs.separate import TABLE, run_separation
+
+        said: dict[str, Any] = {"overrides": overrides or [], "base": base, "seed": seed}
+        said |= {"resume": resume, "overwrite": overwrite}
+        told = run_separation(experiment, folder, **said, report=say_progress(quiet))
+        say(told, (folder / TABLE).read_text(encoding="utf-8"), quiet=quiet, as_json=as_json)
+        return
+    from rfdropo_bayes.verbs.audit import run_audit
+
+    found = run_audit(
+        experiment,
+        folder,
+        overrides=overrides or [],
+        base=base,
+        between=between,
+        seed=seed,
+        resume=resume,
+        overwrite=overwrite,
+        report=say_progress(quiet),
+    )
+    show_audit(found, folder, quiet=quiet, as_json=as_json)
+
+
+def design(
+    experiment: ExperimentFile,
+    out: OutFolder = None,
+    base: Base = None,
+    adapt: Annotated[
+        bool, typer.Option("--adapt", help="the shortest commands that determine another day, for rfdropo adapt")
+    ] = False,
+    seconds: Annotated[float, typer.Option(help="with --adapt: no proposal is longer")] = 10.0,
+    group: Annotated[
+        str | None,
+        typer.Option("--group", help="with --adapt: recordings whose drives the day has; the last one's by default"),
+    ] = None,
+    seed: Seed = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    overrides: Overrides = None,
+) -> None:
+    """Propose the commands that best separate the leading explanations: writes next_commands.csv and design.json."""
+    see_calibration(base, "--base")
+    if adapt and base is None:
+        raise InputError("a day is found under a calibration", where="--adapt", remedy="name its folder with --base")
+    folder = folder_for("design", experiment, out, overrides, overwrite=overwrite)
+    from rfdropo_bayes.verbs.design import COMMANDS, run_design
+    from rfdropo_bayes.verbs.design_day import run_day_design
+
+    options: dict[str, Any] = {"overrides": overrides or [], "seed": seed, "overwrite": overwrite}
+    options["report"] = say_progress(quiet)
+    if adapt and base is not None:
+        found = run_day_design(experiment, base, folder, seconds=seconds, group=group, **options)
+    else:
+        found = run_design(experiment, folder, base=base, **options)
+    say(found, found["sentence"], f"commands: {folder / COMMANDS}", quiet=quiet, as_json=as_json)
+
+
+def benchmark_audit(
+    datasets: Annotated[int, typer.Option(help="data sets per condition")] = 100,
+    seed: Annotated[int, typer.Option(help="seed of the study")] = 0,
+    condition: Annotated[list[str] | None, typer.Option(help="one condition; may be given several times")] = None,
+    hide: Annotated[
+        list[str] | None, typer.Option(help="mechanism to hide, all by default; may be given several times")
+    ] = None,
+    exclude: Annotated[
+        list[str] | None, typer.Option(help="mechanism to leave out; may be given several times")
+    ] = None,
+    cluster: Annotated[str | None, typer.Option(help="local, or HOST:PORT of a Dask scheduler")] = None,
+    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/audit_power"),
+) -> None:
+    """Hide effects in recordings, audit them, and count hits, misses and confusions; goes on where it was stopped."""
+    from rfdropo_bayes.studies.audit_study import TABLE, run_study
+
+    chosen = {"conditions": condition or [], "mechanisms": hide or [], "exclude": exclude or []}
+    run_study(out, datasets, seed, cluster=cluster, **chosen)
+    typer.echo((out / TABLE).read_text(encoding="utf-8"))

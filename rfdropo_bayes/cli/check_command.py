@@ -1,0 +1,37 @@
+"""The command that says what an experiment is, before anything long is run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rfdropo_bayes.cli.options import ExperimentFile, Overrides
+
+PROBLEMS = 2
+
+
+def check(
+    experiment: ExperimentFile,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="folder of the pictures; reports/<experiment>-check by default")
+    ] = None,
+    overrides: Overrides = None,
+) -> None:
+    """Say in words what was read (robot, markers, commands, units, rows, masks, model) and draw every recording."""
+    from rfdropo_bayes.verbs.check import run_check
+
+    found = run_check(experiment, out or Path("reports") / f"{experiment.stem}-check", overrides or [])
+    width = max(len(label) for label, _ in found.lines)
+    for label, text in found.lines:
+        typer.echo(f"{label:<{width}}  {text}")
+    for note in found.notes:
+        typer.echo(f"\nnote: {note}")
+    for file in found.files:
+        typer.echo(f"\npicture: {file}")
+    for problem in found.problems:
+        typer.echo(f"\nPROBLEM: {problem}")
+    if found.problems:
+        raise typer.Exit(PROBLEMS)
+    typer.echo("\nnothing keeps this experiment from running")

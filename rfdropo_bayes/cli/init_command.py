@@ -1,0 +1,206 @@
+"""The command that writes a first robot file and experiment file."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from rfdropo_bayes.errors import InputError
+
+if TYPE_CHECKING:
+    from rfdropo_bayes.robots.outline import RobotOutline
+
+UNITS = ("mm", "cm", "m", "deg", "rad")
+MILLIMETRES = 1e-3
+LENGTHS = ("length", "radius", "tip_radius", "inner_radius", "disk_thickness", "cable_radius", "spool_radius")
+FACTORS = {**dict.fromkeys(LENGTHS, MILLIMETRES), "mass": 1e-3, "young_modulus": 1e6}
+"""From the units of options to SI."""
+
+
+class Questions:
+    """Answers from options, else from the person at the terminal, else defaults, which are then marked as assumed."""
+
+    def __init__(self, ask: bool) -> None:
+        self.ask, self.assumed = ask, set[str]()
+
+    def answer(self, key: str, given: Any, question: str, default: Any) -> Any:
+        """The answer that an option gave, or what a question brings."""
+        if given is not None:
+            return given
+        reply = typer.prompt(question, default=default) if self.ask else default
+        if reply == default:
+            self.assumed.add(key)
+        return reply
+
+
+Recordings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--recording",
+        help="CSV, Motive export, ROS bag, MCAP file or LeRobotDataset to fit, or a quoted pattern; may be given "
+        "several times",
+    ),
+]
+Commands = Annotated[
+    list[str] | None,
+    typer.Option("--commands", help="CSV of each recording's commands, or a quoted pattern, if they are not in it"),
+]
+Shape = Annotated[str | None, typer.Option(help="cylinder, cone, tube, or disks (on a backbone)")]
+Length = Annotated[float | None, typer.Option("--length-mm", help="length of the body")]
+Radius = Annotated[float | None, typer.Option("--radius-mm", help="its outer radius, at the base")]
+TipRadius = Annotated[float | None, typer.Option("--tip-radius-mm", help="that at the tip, of a cone or tube")]
+InnerRadius = Annotated[
+    float | None, typer.Option("--inner-radius-mm", help="radius of a tube's hollow, or of the disks' backbone")
+]
+NumberOfDisks = Annotated[int, typer.Option("--disks", help="number of disks")]
+DiskThickness = Annotated[float, typer.Option("--disk-thickness-mm", help="their thickness")]
+Segments = Annotated[int | None, typer.Option(help="segments with cables of their own")]
+Cables = Annotated[int | None, typer.Option(help="cables of each segment")]
+CableRadius = Annotated[
+    float | None, typer.Option("--cable-radius-mm", help="their distance from the axis, at the base")
+]
+Pairs = Annotated[bool | None, typer.Option(help="opposite cables share a motor")]
+CommandUnit = Annotated[
+    str | None, typer.Option(help="mm, cm or m of cable, or deg or rad of a motor; guessed from a recording")
+]
+PositionUnit = Annotated[str | None, typer.Option(help="mm, cm or m; guessed from a recording")]
+SpoolRadius = Annotated[float | None, typer.Option("--spool-radius-mm", help="of the motors")]
+Gravity = Annotated[
+    str | None, typer.Option(help="where things fall: +z for a robot that hangs, -z for one that stands, -y, ...")
+]
+Mass = Annotated[float | None, typer.Option("--mass-g", help="of the body; silicone's by default")]
+Modulus = Annotated[float | None, typer.Option("--modulus-mpa", help="Young's modulus of the body")]
+Markers = Annotated[
+    str | None, typer.Option(help='heights in mm, in the order of the columns: "low=66,middle=133,tip=200"')
+]
+Defaults = Annotated[bool, typer.Option("--defaults", help="ask nothing: take defaults, and mark them")]
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder to write to; the robot takes its name")],
+    recording: Recordings = None,
+    commands: Commands = None,
+    shape: Shape = None,
+    length: Length = None,
+    radius: Radius = None,
+    tip_radius: TipRadius = None,
+    inner_radius: InnerRadius = None,
+    disks: NumberOfDisks = 10,
+    disk_thickness: DiskThickness = 3.0,
+    segments: Segments = None,
+    cables: Cables = None,
+    cable_radius: CableRadius = None,
+    pairs: Pairs = None,
+    command_unit: CommandUnit = None,
+    position_unit: PositionUnit = None,
+    spool_radius: SpoolRadius = None,
+    gravity: Gravity = None,
+    mass: Mass = None,
+    modulus: Modulus = None,
+    markers: Markers = None,
+    defaults: Defaults = False,
+) -> None:
+    """Write a commented robot file and experiment file from a few answers, options, and the columns of a recording."""
+    from rfdropo_bayes.verbs.init import (
+        guess_units,
+        matching_commands,
+        matching_recordings,
+        write_first_files,
+    )
+
+    ask = Questions(sys.stdin.isatty() and not defaults)
+    files = matching_recordings(recording or [])
+    sent = matching_commands(commands or [], files)
+    guess = guess_units(files[0], sent[0] if sent else None, command_unit, position_unit) if files else None
+    unit = guess.command_unit if guess else ask.answer("command_unit", command_unit, "Commands in", "mm")
+    if unit not in UNITS:
+        raise InputError(f"commands in {unit!r}", where="--command-unit", remedy=f"use one of {', '.join(UNITS)}")
+    answers = _body(ask, shape, length, radius, tip_radius)
+    answers |= {"inner_radius": inner_radius, "disk_thickness": disk_thickness, "cable_radius": cable_radius}
+    answers["segments"] = ask.answer("segments", segments, "Segments with cables of their own", 1)
+    answers["cables"], answers["pairs"] = _cables(ask, guess, answers["segments"], cables, pairs)
+    if unit in ("deg", "rad"):
+        answers["spool_radius"] = ask.answer("spool_radius", spool_radius, "Radius of the spools [mm]", 10.0)
+    answers["gravity"] = ask.answer("gravity", gravity, "Things fall along (+z: hangs, -z: stands, -y: level)", "+z")
+    answers["mass"] = ask.answer("mass", mass, "Mass of the body [g]; 0: that of silicone", 0.0) or None
+    answers["young_modulus"] = ask.answer("young_modulus", modulus, "Young's modulus [MPa]", 1.0)
+    answers["markers"] = _markers(ask, guess, markers, answers["length"])
+    outline = _outline(_name(folder), disks, unit, answers, ask.assumed)
+    for path in write_first_files(folder, outline, files, sent, guess):
+        typer.echo(f"wrote {path}")
+    if ask.assumed:
+        typer.echo(f"assumed, and marked ASSUMED in the robot file: {', '.join(sorted(ask.assumed))}")
+    typer.echo(f"next: rfdropo check {folder / 'experiment.toml'}")
+
+
+def _body(
+    ask: Questions, shape: str | None, length: float | None, radius: float | None, tip: float | None
+) -> dict[str, Any]:
+    """Shape and size of the body [mm]."""
+    form = ask.answer("shape", shape, "Shape: cylinder, cone, tube or disks", "cylinder")
+    long = ask.answer("length", length, "Length of the body [mm]", 200.0)
+    wide = ask.answer("radius", radius, "Radius at the base [mm]", 12.0)
+    if form == "cone":
+        tip = ask.answer("tip_radius", tip, "Radius at the tip [mm]", 0.6 * wide)
+    return {"shape": form, "length": long, "radius": wide, "tip_radius": tip}
+
+
+def _outline(name: str, disks: int, unit: str, answers: dict[str, Any], assumed: set[str]) -> RobotOutline:
+    """The robot, in SI units."""
+    from rfdropo_bayes.robots.outline import RobotOutline
+
+    given = {key: value for key, value in answers.items() if value is not None}
+    for key, factor in FACTORS.items():
+        if key in given:
+            given[key] = factor * given[key]
+    given["markers"] = {marker: MILLIMETRES * height for marker, height in given["markers"].items()}
+    kind: Literal["m", "rad"] = "rad" if unit in ("deg", "rad") else "m"
+    return RobotOutline(name, disks=disks, command_unit=kind, assumed=frozenset(assumed), **given)
+
+
+def _name(folder: Path) -> str:
+    """A robot's name from that of a folder."""
+    letters = "".join(c if c.isascii() and c.isalnum() else "_" for c in folder.resolve().name.lower()).strip("_")
+    return letters if letters[:1].isalpha() else f"robot_{letters}".rstrip("_")
+
+
+def _cables(ask: Questions, guess: Any, parts: int, cables: int | None, pairs: bool | None) -> tuple[int, bool]:
+    """Cables of a segment, and whether opposite ones share a motor: as many channels as a recording has commands."""
+    if guess is None:
+        return ask.answer("cables", cables, "Cables of each segment", 4), bool(pairs)
+    commands = len(guess.commands)
+    paired = commands != parts * cables if pairs is None and cables is not None else bool(pairs)
+    number = cables if cables is not None else commands * (2 if paired else 1) // parts
+    if parts * number != commands * (2 if paired else 1):
+        raise InputError(
+            f"{commands} commands ({', '.join(guess.commands)}) for {parts} segments of {number} cables",
+            where="--recording",
+            remedy="give --segments and --cables, and --pairs where opposite cables share a motor",
+        )
+    return number, paired
+
+
+def _markers(ask: Questions, guess: Any, given: str | None, length: float) -> dict[str, float]:
+    """Heights [mm] of the markers by name; evenly spaced where they are not given."""
+    names = guess.markers if guess is not None else ["m1", "m2", "m3"]
+    spaced = ",".join(f"{name}={length * (k + 1) / len(names):.4g}" for k, name in enumerate(names))
+    text = ask.answer("markers", given, "Markers and their heights [mm]", spaced)
+    heights: dict[str, float] = {}
+    for part in text.split(","):
+        name, equals, height = part.partition("=")
+        try:
+            heights[name.strip()] = float(height)
+        except ValueError:
+            equals = ""
+        if not equals or not name.strip():
+            raise InputError(f"{part!r} is not NAME=HEIGHT", where="--markers", remedy="e.g. low=66,middle=133,tip=200")
+    if guess is not None and len(heights) != len(guess.positions):
+        raise InputError(
+            f"{len(heights)} markers for {len(guess.positions)} in the recording ({', '.join(guess.markers)})",
+            where="--markers",
+            remedy="name one for each, in the order of the columns",
+        )
+    return heights

@@ -1,0 +1,108 @@
+"""Commands around policies."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rfdropo_bayes.cli.options import AsJson, ExperimentFile, OutFolder, Overrides, Overwrite, Quiet, Resume, folder_for
+from rfdropo_bayes.cli.terminal_summary import say
+from rfdropo_bayes.model.run_folder import check_folder
+
+
+def train(
+    experiment: ExperimentFile,
+    out: OutFolder = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    overrides: Overrides = None,
+) -> None:
+    """Train a policy under the experiment's randomisation: writes policy.onnx, its card, and how it learnt."""
+    folder = folder_for("train", experiment, out, overrides, resume=resume, overwrite=overwrite)
+    from rfdropo_bayes.verbs.train import CARD, POLICY, run_training
+
+    found = run_training(experiment, folder, overrides=overrides or [], resume=resume, overwrite=overwrite)
+    last = found["evaluation"]
+    learnt = (
+        f"half of the episodes end within {1e3 * last['distance_median']:.2f} mm of the goal, 95 % within "
+        f"{1e3 * last['distance_q95']:.2f} mm, after {found['steps']} steps in {found['seconds']:.0f} s"
+    )
+    say(found, learnt, f"policy: {folder / POLICY}", f"card: {folder / CARD}", quiet=quiet, as_json=as_json)
+
+
+def evaluate(
+    experiment: ExperimentFile,
+    policy: Annotated[
+        list[Path], typer.Option("--policy", help="policy.onnx, or the folder of a training; may be repeated")
+    ],
+    out: OutFolder = None,
+    episodes: Annotated[int, typer.Option(help="of each policy, the same for all")] = 200,
+    seed: Annotated[int, typer.Option(help="of the episodes' parameters and goals")] = 0,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    overrides: Overrides = None,
+) -> None:
+    """Play policies on the same episodes: writes success with intervals, every episode, a figure and animations."""
+    folder = folder_for("evaluate", experiment, out, overrides, overwrite=overwrite)
+    from rfdropo_bayes.verbs.train import TABLE, evaluation_table, run_evaluation
+
+    found = run_evaluation(
+        experiment, policy, folder, episodes=episodes, seed=seed, overrides=overrides or [], overwrite=overwrite
+    )
+    say(found, evaluation_table(found), f"table: {folder / TABLE}", quiet=quiet, as_json=as_json)
+
+
+VIRTUAL = Path("experiments/virtual")
+
+
+def table2(
+    experiments: Annotated[
+        list[Path] | None, typer.Argument(metavar="EXPERIMENT.toml", help="one file for each task")
+    ] = None,
+    target: Annotated[Path, typer.Option(help="experiment file of the robot that policies are evaluated on")] = VIRTUAL
+    / "truth.toml",
+    audited: Annotated[Path, typer.Option("--audit", help="experiment file of the audit")] = VIRTUAL / "audit.toml",
+    out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/table2"),
+    seeds: Annotated[int, typer.Option(help="policies of every row")] = 3,
+    steps: Annotated[int, typer.Option(help="environment steps of a training")] = 1_000_000,
+    episodes: Annotated[int, typer.Option(help="of an evaluation, the same for all policies")] = 200,
+    budget: Annotated[int, typer.Option(help="rollouts of a fit")] = 10_000,
+    minutes: Annotated[float, typer.Option(help="bound of the audit")] = 65.0,
+    exact_oracle: Annotated[
+        bool, typer.Option("--exact-oracle", help="train the oracle on the target's own mesh and time step; slower")
+    ] = False,
+    rows: Annotated[list[str] | None, typer.Option("--row", help="only this row; may be repeated")] = None,
+    resume: Annotated[bool, typer.Option(help="keep what an interrupted study has done")] = False,
+    only_done: Annotated[bool, typer.Option(help="tables of what an interrupted study has done")] = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """The paper's Table II: policies of every method on a robot they never touched: table2.json, .md and .png."""
+    check_folder(out, "benchmark table2", resume=resume or only_done, overwrite=overwrite)
+    from rfdropo_bayes.studies.table2 import Table2Size, run_table2
+
+    content = run_table2(
+        experiments or [VIRTUAL / "push.toml", VIRTUAL / "reach.toml"],
+        target,
+        audited,
+        out,
+        Table2Size(seeds, steps, episodes, budget, minutes, exact_oracle),
+        rows=rows or (),
+        resume=resume,
+        only_done=only_done,
+        overwrite=overwrite,
+        command=shlex.join(["rfdropo", *sys.argv[1:]]),
+    )
+    for claim in content["claims"]:
+        typer.echo(f"{'holds' if claim['holds'] else 'FAILS'}: {claim['task']}, {claim['claim']}: {claim['value']:.2f}")
+    for cell, why in content["failed"].items():
+        typer.echo(f"failed: {cell}: {why}")
+    if content["not_done"]:
+        typer.echo(f"{content['not_done']} cells are not done: go on with --resume")
+    typer.echo(f"table: {out / 'table2.md'}")

@@ -1,0 +1,121 @@
+"""Commands that predict, and that take a calibration to another day."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rfdropo_bayes.cli.options import AsJson, Overrides, Overwrite, Quiet, see_calibration
+from rfdropo_bayes.cli.terminal_summary import show_calibration, show_prediction
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.experiment_file import look_through
+from rfdropo_bayes.model.run_folder import check_folder
+
+Group = Annotated[
+    str | None, typer.Option("--group", help="the day or robot it belongs to; as [model.groups] has it by default")
+]
+PredictedGroup = Annotated[
+    str | None,
+    typer.Option("--group", help="the day or robot; by default that of adapt, or else as [model.groups] has it"),
+]
+
+
+def predict(
+    experiment: Annotated[
+        Path,
+        typer.Argument(metavar="EXPERIMENT.toml|DIR", help="the calibrated experiment, or a run's folder"),
+    ],
+    commands: Annotated[str, typer.Option("--commands", help="file of commands, in the format of the experiment")],
+    out: Annotated[Path, typer.Option("--out", help="folder to write to")],
+    posterior: Annotated[
+        Path | None, typer.Option("--posterior", help="folder of its calibration; DIR by default")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option("--start", help="file whose first row is the start pose, where it is another file")
+    ] = None,
+    rows: Annotated[str | None, typer.Option("--rows", help="FIRST:LAST observation rows, both included")] = None,
+    seed: Annotated[int | None, typer.Option(help="seed of the draws; that of the experiment by default")] = None,
+    group: PredictedGroup = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    overrides: Annotated[list[str] | None, typer.Option("--set", help="as in calibrate")] = None,
+) -> None:
+    """Predict commands that were never run: mean, 50 and 90 % bands as NetCDF and CSV (m, base frame)."""
+    if experiment.is_dir():
+        posterior, experiment = posterior or experiment, experiment / "config.toml"
+    if posterior is None:
+        raise InputError("no posterior was named", where="predict", remedy="add --posterior, or give a run's folder")
+    see_calibration(posterior, "--posterior")
+    look_through(experiment, overrides or [])
+    check_folder(out, "predict", overwrite=overwrite)
+    from rfdropo_bayes.verbs.predict import run_prediction
+
+    facts = run_prediction(
+        experiment,
+        posterior,
+        _from_here(commands),
+        out,
+        start=None if start is None else _from_here(start),
+        rows=_window(rows),
+        overrides=overrides or [],
+        seed=seed,
+        group=group,
+        overwrite=overwrite,
+    )
+    show_prediction(facts, quiet=quiet, as_json=as_json)
+
+
+def adapt(
+    run: Annotated[Path, typer.Argument(metavar="DIR", help="folder of a calibration")],
+    recording: Annotated[str, typer.Option("--recording", help="file of observations, in the experiment's format")],
+    out: Annotated[Path, typer.Option("--out", help="folder to write to")],
+    commands: Annotated[
+        str | None, typer.Option("--commands", help="file of its commands, where the format has one of their own")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(help="look at so much of its beginning; all by default")] = None,
+    group: Group = None,
+    experiment: Annotated[
+        Path | None, typer.Option("--experiment", help="the experiment file, where DIR holds a posterior alone")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="seed; that of the experiment by default")] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    overrides: Overrides = None,
+) -> None:
+    """Move what a day changes to one short recording of it; the body keeps its posterior."""
+    see_calibration(run, "DIR")
+    check_folder(out, "adapt", overwrite=overwrite)
+    from rfdropo_bayes.verbs.adapt import run_adaptation
+
+    found = run_adaptation(
+        run,
+        _from_here(recording),
+        out,
+        commands=None if commands is None else _from_here(commands),
+        seconds=seconds,
+        group=group,
+        experiment=experiment,
+        overrides=overrides or [],
+        seed=seed,
+        overwrite=overwrite,
+        show=False if quiet else None,
+    )
+    show_calibration(found, quiet=quiet, as_json=as_json)
+
+
+def _from_here(name: str) -> str:
+    """A path that counts from the current folder, where there is such a recording; else as the experiment has it."""
+    return str(Path(name).resolve()) if Path(name).exists() else name
+
+
+def _window(rows: str | None) -> tuple[int, int] | None:
+    if rows is None:
+        return None
+    first, _, last = rows.partition(":")
+    if not (first.isdecimal() and last.isdecimal()):
+        raise InputError(f"{rows!r} is not FIRST:LAST", where="--rows", remedy="e.g. --rows 10000:15000")
+    return int(first), int(last)

@@ -1,0 +1,142 @@
+"""What a calibration or an audit found, on the terminal: the verdict, a table of parameters, where the report is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from rfdropo_bayes.results.calibrated import Calibration
+
+GOOD, FAIR, BAD = "green", "yellow", "red"
+COLOURS = {
+    "safe": GOOD,
+    "with care": FAIR,
+    "unsafe": BAD,
+    "no_discrepancy": GOOD,
+    "no_verdict": FAIR,
+    "explained": GOOD,
+    "equivalent": FAIR,
+    "partly_explained": FAIR,
+    "unexplained": BAD,
+}
+CALIBRATED = ("title", "status", "headline", "randomisation", "parameters", "rmse", "log_evidence", "cautions")
+AUDITED = ("verdict", "sentence", "findings", "gain", "next_experiment")
+MOST_ROWS = 20
+
+
+def say(found: Mapping[str, Any], *lines: str, quiet: bool, as_json: bool) -> None:
+    """Print a result as JSON, or lines of words about it, or nothing."""
+    if as_json:
+        typer.echo(json.dumps(found, indent=2))
+    elif not quiet:
+        for line in lines:
+            typer.echo(line)
+
+
+def show_calibration(found: Calibration, *, quiet: bool, as_json: bool) -> None:
+    """Print the result of a finished calibration: headline, table of parameters, cautions, and where the report is."""
+    summary, folder = found.content, found.folder or Path()
+    report = folder / "report.html"
+    if as_json or quiet:
+        chosen = {key: summary[key] for key in CALIBRATED if key in summary}
+        say({**chosen, "folder": str(folder), "report": str(report)}, quiet=quiet, as_json=as_json)
+        return
+    console = _console()
+    for sentence in summary["headline"]:
+        style = COLOURS[found.verdict] if sentence == found.sentence else ""
+        console.print(Text(sentence, style=style), soft_wrap=True)
+    moved = summary["details"].get("moved", [])  # by an adaptation: what the reader looks for
+    rows = [(name, row, "derived" if row.get("derived") else "") for name, row in summary["parameters"].items()]
+    rows.sort(key=lambda row: row[0] not in moved)
+    console.print(_parameters(rows[:MOST_ROWS]))
+    if len(rows) > MOST_ROWS:
+        console.print(f"and {len(rows) - MOST_ROWS} more in {folder / 'summary.json'}", soft_wrap=True)
+    for caution in found.cautions:
+        console.print(Text(f"caution: {caution.sentence}", style=BAD if caution.grave else FAIR), soft_wrap=True)
+    if summary["method"] == "adapt":
+        seen = next(run for run in summary["recordings"] if run["split"] == "fit")
+        if seen["masked"]:
+            console.print(f"left out: {seen['masked']} of {seen['positions']} positions", soft_wrap=True)
+        console.print(f"next: rfdropo predict {folder} --commands FILE --out OUT", soft_wrap=True)
+    console.print(f"report: {report}", soft_wrap=True)
+
+
+def show_audit(found: Mapping[str, Any], folder: Path, *, quiet: bool, as_json: bool) -> None:
+    """Print the result of an audit; ``found`` is the content of audit.json."""
+    files = {"folder": str(folder), "report": str(folder / "report.html"), "extended": str(folder / "extended.toml")}
+    if as_json or quiet:
+        say({**{key: found[key] for key in AUDITED if key in found}, **files}, quiet=quiet, as_json=as_json)
+        return
+    console = _console()
+    verdict = Text(found["verdict"], style=f"bold {COLOURS.get(found['verdict'], '')}")
+    console.print(verdict + Text(f": {found['sentence']}", style="not bold"), soft_wrap=True)
+    rows = [
+        (name, row, finding["mechanism"].replace("_", " "))
+        for finding in found["findings"]
+        for name, row in finding["parameters"].items()
+    ]
+    if rows:
+        console.print(_parameters(rows[:MOST_ROWS]))
+    console.print(f"next: {found['next_experiment']['sentence']}", soft_wrap=True)
+    console.print(f"report: {files['report']}; extended model: {files['extended']}", soft_wrap=True)
+
+
+def show_simulation(found: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
+    """Print how far a simulation is from its recordings; ``found`` is the content of simulation.json."""
+    runs = found["recordings"].items()
+    lines = [f"{name}: {run['status']}{_off(run['error_mm'])}; {run['files'][0]}" for name, run in runs]
+    if found["error_mm"] is not None and len(lines) > 1:
+        lines.append(f"all of them{_off(found['error_mm'])}")
+    say(found, *lines, quiet=quiet, as_json=as_json)
+
+
+def _off(error: Mapping[str, float] | None) -> str:
+    """How far markers are off."""
+    if error is None:
+        return ""
+    return (
+        f", the last marker off by {error['rms_last_marker']:.3g} mm in root mean square, "
+        f"all markers by {error['mean']:.3g} mm on average and {error['max']:.3g} mm at most"
+    )
+
+
+def show_prediction(facts: Mapping[str, Any], *, quiet: bool, as_json: bool) -> None:
+    """Print what a prediction is of; ``facts`` is the content of prediction.json."""
+    start = "from the measured first row" if facts["start_pose_known"] else "without a measured first row"
+    lines = [f"{facts['rows']} rows {start}, under {facts['draws']} draws of {facts['posterior']}"]
+    if facts["group_fitted"] is not None:
+        values = "fitted" if facts["group_fitted"] else "not fitted: its values are drawn from the spread of groups"
+        lines.append(f"group {facts['group']}, {values}")
+    lines += [f"caution: {caution['sentence']}" for caution in facts["cautions"]]
+    lines += ["mean, 50 and 90 % bands in m:", *(f"  {file}" for file in facts["files"])]
+    say(facts, *lines, quiet=quiet, as_json=as_json)
+
+
+def _console() -> Console:
+    """A terminal that shows text as it is: "[simulator] refine" is a table of a file, not a style."""
+    return Console(highlight=False, markup=False, emoji=False)
+
+
+def _parameters(rows: Iterable[tuple[str, Mapping[str, Any], str]]) -> Table:
+    """Name, unit, mean, 5 and 95 % quantiles, and a remark."""
+    from rfdropo_bayes.report.units import display_unit
+
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for title in ("parameter", "unit"):
+        table.add_column(title)
+    for title in ("mean", "5 %", "95 %"):
+        table.add_column(title, justify="right")
+    table.add_column("")
+    for name, row, remark in rows:
+        factor, unit = display_unit(row["unit"], max(abs(row["q05"]), abs(row["q95"])))
+        bound = Text("at a bound", style=BAD) if row.get("at_bound") else Text(remark, style="dim")
+        table.add_row(Text(name), Text(unit), *(f"{row[key] / factor:.4g}" for key in ("mean", "q05", "q95")), bound)
+    return table

@@ -1,0 +1,307 @@
+"""The compiled engine for layered bodies: rollouts of a whole batch on CPUs, the same numbers as ``fem.rollouts``.
+
+Samples fill the lanes of vector registers, blocks of lanes are spread over threads. Lanes never mix and a block knows
+nothing of the others: a rollout's result does not depend on its batch, on its place in it or on the number of threads.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import count as counting
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.fem.dynamics import POISSON_LIMIT, Material, System
+from rfdropo_bayes.fem.equilibrium import ITERATIONS
+from rfdropo_bayes.fem.integrators import STAGES, Integrator, timed_stages
+from rfdropo_bayes.fem.layered import PointMap
+from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, ConstraintProblem, problem_storage
+from rfdropo_bayes.fem.native.contact_records import (
+    MISSED,
+    ContactRecords,
+    Cubes,
+    PushOutput,
+    cube_rows,
+    pairs_of,
+    scene_tables,
+    touch_storage,
+)
+from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, law_rows
+from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
+from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
+from rfdropo_bayes.fem.native.layered_records import (
+    KINDS,
+    Factors,
+    Friction,
+    LayeredSamples,
+    LayeredWork,
+    friction_storage,
+    runs_of,
+)
+from rfdropo_bayes.fem.native.layered_rollout import Batch, LayeredOutput, LayeredSchedule, compile_rollout, storage
+from rfdropo_bayes.fem.native.section_modes import border_panels, layered_tables
+from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
+from rfdropo_bayes.fem.pushing import PushGeometry
+from rfdropo_bayes.fem.rollouts import Motion
+
+Precision = Literal["float64", "float32"]
+# When a step's impulses are found and what counts as a missed contact, as far as the precision resolves them;
+# refinements of every step's linear solution.
+_NUMERICS = {
+    name: (SETTLED[name], SOFTNESS[name], MISSED[name], number) for name, number in (("float64", 0), ("float32", 1))
+}
+
+
+class Run(NamedTuple):
+    """Rollouts of a batch: what they are computed from, how they run, and what they record."""
+
+    batch: Batch
+    cubes: Cubes | None
+    schedule: LayeredSchedule
+    output: LayeredOutput | None = None
+    poses: PushOutput | None = None
+
+    @property
+    def motion(self) -> Motion:
+        """What has been recorded."""
+        output = self.output
+        assert output is not None
+        pose = None if self.poses is None else self.poses.pose
+        codes = output.diverged.view(bool), output.imbalance, output.converged.view(bool)
+        return Motion(output.position, output.tension, *codes, pose)
+
+
+class Records(NamedTuple):
+    """What a lane block works on; None where cables do not rub, and where there is no cube."""
+
+    samples: LayeredSamples
+    factors: Factors
+    work: LayeredWork
+    friction: Friction | None
+    touch: ContactRecords | None
+    rows: Rows
+    problem: ConstraintProblem
+
+
+@cache
+def _kernel() -> Callable:
+    """The rollout kernel."""
+    return compile_rollout(kernel_sources("layered_rollout"))
+
+
+def available_threads() -> int:
+    """Processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class NativeLayered:
+    """Rollouts of one layered body with its cables.
+
+    Args:
+        system: body, cables, and how many stations are held.
+        points: the points whose positions are recorded.
+        time_step: of one step [s].
+        precision: of all arithmetic; parameters, commands and results are float64 in any case.
+        threads: lane blocks computed at the same time; None for all processors this process may use.
+        lanes: samples side by side; None for as many as a vector register holds.
+        scene: what the body pushes a cube on; None for a body that touches nothing.
+        integrator: how a step is taken.
+
+    Raises:
+        InputError: unknown precision, or a number of threads or lanes that makes no sense.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        points: PointMap,
+        time_step: float,
+        *,
+        precision: Precision = "float64",
+        threads: int | None = None,
+        lanes: int | None = None,
+        scene: PushGeometry | None = None,
+        integrator: Integrator = "euler",
+    ) -> None:
+        if precision not in _NUMERICS:
+            raise InputError(f"precision {precision!r}", remedy=f"use one of {', '.join(_NUMERICS)}")
+        if threads is not None and threads < 1:
+            raise InputError(f"{threads} threads", remedy="use at least one, or None for all processors")
+        self.system, self.time_step, self.integrator = system, float(time_step), integrator
+        self.precision, self.dtype = precision, np.dtype(precision)
+        self.threads = threads or available_threads()
+        self.lanes = lanes or native_lanes(self.dtype)
+        self.points = len(points.node)
+        self.tables = layered_tables(system, points, self.dtype.type)
+        self._runs = runs_of(system.cables)
+        numbers, shape = np.arange(system.body.nodes), np.asarray(self.tables.shape, dtype=float)
+        self._scene = None if scene is None else scene_tables(scene, shape, numbers, self.dtype.type)
+        self._token = lane_token(self.lanes)
+        self._local = threading.local()
+
+    def rollout(
+        self,
+        material: Material,
+        displacement: Float[np.ndarray, "*batch steps cables"],
+        *,
+        start: Float[np.ndarray, "*batch cables"] | None = None,
+        before: Float[np.ndarray, "*batch cables"] | None = None,
+        steps: int | None = None,
+        stride: int = 1,
+        cube: tuple[Float[np.ndarray, "*batch 13"], Float[np.ndarray, "*batch 4"]] | None = None,
+    ) -> Motion:
+        """Roll out a batch.
+
+        Args:
+            material: fields with a leading batch axis, or without one to serve the whole batch.
+            displacement: cable displacements [m] at the end of every step, one sequence for all or one per rollout.
+            start: cable displacements [m] whose static equilibrium is the initial state, as in
+                ``fem.static_equilibrium``; None starts undeformed.
+            before: cable displacements [m] before the first step of a body that starts undeformed; zero by default.
+                Stages within the step take theirs from the way to its end.
+            steps: compute only so many steps.
+            stride: record every so many steps.
+            cube: of an engine with a scene: centre [m], unit quaternion (x, y, z, w), velocity [m/s] and spin [rad/s]
+                at the start; mass [kg], side [m], radius of gyration [m] and coefficient of friction.
+
+        Raises:
+            InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
+        """
+        run = self.run_of(material, displacement, start, before, steps, stride, cube)
+        rubs = material.effects.rubs
+        in_blocks(
+            lambda first: self.run_block(run, self.records(rubs), first), run.batch.count, self.lanes, self.threads
+        )
+        return run.motion
+
+    def records(self, rubs: bool) -> Records:
+        """What a block works on in the calling thread; ``rubs``: with friction of the cables."""
+        kept = self._local.__dict__.setdefault("records", {})
+        if rubs not in kept:
+            tables, made = self.tables, (self.lanes, self.dtype.type)
+            runs = KINDS * self._runs.count if rubs else 0
+            pairs = 0 if self._scene is None else pairs_of(self._scene.spheres)
+            beside, border = (runs + 2) // 3 + pairs, border_panels(tables.cables)
+            kept[rubs] = Records(
+                *storage(tables, *made),
+                friction_storage(self._runs, *made) if rubs else None,
+                None if self._scene is None else touch_storage(self._scene.spheres, *made),
+                row_storage(3 * tables.stations * tables.modes, beside, border, *made),
+                problem_storage(tables.cables + runs, pairs, *made),
+            )
+        return kept[rubs]
+
+    def run_block(self, run: Run, records: Records, first: int) -> None:
+        """Run one lane block, whose first rollout is ``first``, on `records`."""
+        runs = None if records.friction is None else self._runs
+        batch, cubes, schedule, output, poses = run
+        _kernel()(self.tables, runs, self._scene, batch, cubes, *records, schedule, output, poses, first, self._token)
+
+    def run_of(
+        self,
+        material: Material,
+        displacement: np.ndarray,
+        start: np.ndarray | None,
+        before: np.ndarray | None,
+        steps: int | None,
+        stride: int,
+        cube: tuple[np.ndarray, np.ndarray] | None,
+    ) -> Run:
+        """What the kernels read and write; arguments as `rollout`."""
+        displacement = np.asarray(displacement, dtype=float)
+        cables = self.tables.cables
+        if displacement.ndim not in (2, 3) or displacement.shape[-1] != cables:
+            raise InputError(f"displacement has shape {displacement.shape} for {cables} cables", where="rollout")
+        given = before if start is None else start
+        begin = np.zeros(cables) if given is None else np.asarray(given, dtype=float)
+        if begin.ndim not in (1, 2) or begin.shape[-1] != cables:
+            raise InputError(f"start has shape {begin.shape} for {cables} cables", where="rollout")
+        moves = displacement.reshape(-1, displacement.shape[-2] * cables)
+        batch = self._batch(material, {"start": begin.reshape(-1, cables), "displacement": moves})
+        steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
+        if (cube is None) != (self._scene is None):
+            raise InputError("a scene without a cube, or a cube without a scene", where="rollout")
+        cubes = None if cube is None else cube_rows(*cube, batch.count, self.dtype)
+        settling = 0 if start is None else ITERATIONS
+        stages = timed_stages(self.integrator, self.time_step)
+        schedule = LayeredSchedule(self.time_step, steps, int(stride), settling, *_NUMERICS[self.precision], *stages)
+        return self.with_output(Run(batch, cubes, schedule))
+
+    def with_output(self, run: Run) -> Run:
+        """The same run with room for what it records."""
+        count, records = run.batch.count, 1 + run.schedule.steps // run.schedule.stride
+        output = LayeredOutput(
+            np.zeros((count, records, self.points, 3)),
+            np.zeros((count, records, self.tables.cables)),
+            np.zeros(count, dtype=np.uint8),
+            np.zeros(count, dtype=np.uint8),
+            np.zeros(count),
+            records,
+        )
+        poses = None if self._scene is None else PushOutput(np.zeros((count, records, 7)))
+        return run._replace(output=output, poses=poses)
+
+    def _batch(self, material: Material, commands: dict[str, np.ndarray]) -> Batch:
+        """Parameters and commands in the precision of the kernels."""
+        layers = self.tables.stations - 1
+        width = {"gravity": (3,), "stiffness_scale": (layers,), "point_mass": (layers + 1,)}
+        given, effects = material._asdict(), material.effects
+        del given["effects"]
+        values = {name: np.asarray(value, dtype=float) for name, value in given.items()}
+        sizes = {len(value) for name, value in values.items() if value.ndim > len(width.get(name, ()))}
+        sizes |= {len(value) for value in commands.values()}
+        count = max(sizes)
+        if sizes - {1, count}:
+            raise InputError(f"batch axes of lengths {sorted(sizes)}", where="rollout")
+        rows = {}
+        for name, value in values.items():
+            shape = width.get(name, ())
+            if value.shape not in (shape, (1, *shape), (count, *shape)):
+                raise InputError(f"{name} has shape {value.shape}, expected {(count, *shape)}", where="material")
+            rows[name] = np.broadcast_to(value, (count, *shape))
+        modulus, ratio = rows["young_modulus"], np.minimum(rows["poisson_ratio"], POISSON_LIMIT)
+        shear = modulus / (2.0 * (1.0 + ratio))
+        lame = 2.0 * shear * ratio / (1.0 - 2.0 * ratio)
+        first = modulus if self.system.body.sectional else lame
+        arrays = {
+            "moduli": np.stack([first, shear, 2.0 * lame * shear / (lame + 2.0 * shear)], axis=1),
+            "density": rows["density"][:, None],
+            "damping": np.stack([rows["rayleigh_mass"], rows["rayleigh_stiffness"]], axis=1),
+            "gravity": rows["gravity"],
+            "layer_scale": rows["stiffness_scale"],
+            "point_mass": rows["point_mass"],
+            "law": law_rows(effects, self.system.body, modulus, shear, rows["stiffness_scale"]),
+            "effects": effect_rows(effects, count, STAGES[self.integrator], self.time_step),
+            **commands,
+        }
+        arrays = {name: np.ascontiguousarray(array, dtype=self.dtype) for name, array in arrays.items()}
+        pitches = {f"{name}_pitch": value.shape[1] if len(value) > 1 else 0 for name, value in commands.items()}
+        return Batch(**arrays, present=effect_flags(effects), count=count, **pitches)
+
+
+@cache
+def _workers(threads: int, process: int) -> ThreadPoolExecutor:
+    """Threads that wait for lane blocks; a forked ``process`` has none of its parent's."""
+    return ThreadPoolExecutor(threads, f"lanes_{process}")
+
+
+def in_blocks(block: Callable[[int], None], count: int, lanes: int, threads: int) -> None:
+    """Call for the first rollout of every lane block, in this thread or in several."""
+    threads = min(threads, -(-count // lanes))
+    following = counting(0, lanes)
+
+    def work() -> None:
+        while (first := next(following)) < count:
+            block(first)
+
+    waiting = [_workers(threads - 1, os.getpid()).submit(work) for _ in range(threads - 1)]
+    work()
+    for other in waiting:
+        other.result()

@@ -1,0 +1,313 @@
+"""From what a model means to the simulator, the probabilistic program and the problem that make it up."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from rfdropo_bayes.bayes.calibration_problem import Batch, CalibrationProblem
+from rfdropo_bayes.bayes.channels import (
+    Channel,
+    Markers,
+    MotorAngle,
+    ObjectPose,
+    Series,
+    Tension,
+    WeighedParts,
+)
+from rfdropo_bayes.bayes.channels.motor_angle import MOTOR_ANGLE_NOISE
+from rfdropo_bayes.bayes.channels.object_pose import OBJECT_CORRELATION_TIME, OBJECT_NOISE, OBJECT_TURN_NOISE
+from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN, TENSION_NOISE
+from rfdropo_bayes.bayes.noise import (
+    NOISE_CORRELATION_TIME,
+    NOISE_MODELS,
+    OBSERVATION_NOISE,
+    Autoregression,
+    noise_specs,
+)
+from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
+from rfdropo_bayes.bayes.pooling import Pooled
+from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
+from rfdropo_bayes.bayes.repeat_noise import group_recordings, with_noise_of_repeats
+from rfdropo_bayes.bayes.space import ParameterSpace, build_space
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
+from rfdropo_bayes.data import DataSpec, Trajectory, find_data_file, load_recordings
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import Patterns, gather_groups
+from rfdropo_bayes.mechanisms import mechanisms_named
+from rfdropo_bayes.mechanisms.registry import REGISTRY
+from rfdropo_bayes.model.engines import backend
+from rfdropo_bayes.model.experiment import matching
+from rfdropo_bayes.model.model_spec import DataChannels, ModelSpec
+from rfdropo_bayes.robots import DriveTravel, Robot
+from rfdropo_bayes.robots.meshes import read_tetrahedra
+from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
+from rfdropo_bayes.simulators.engine import Engine
+from rfdropo_bayes.simulators.mechanisms import Mechanism
+from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, assemble_mesh
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
+
+Entry = TypeVar("Entry")
+AnySimulator = RobotSimulator | BlackBoxSimulator
+
+KNOWN = (REPEATS, STATED)  # noise of the positions that is not inferred
+
+SWITCHED = {  # channels beside the markers, by the key of [model] that makes their readings data
+    "tension": (TENSION_NOISE, TENSION_GAIN),
+    "motor_angle": (MOTOR_ANGLE_NOISE,),
+    "object_pose": (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME),
+}
+
+
+def robot_of(spec: ModelSpec) -> Robot:
+    """The robot of a model, where only a robot will do.
+
+    Raises:
+        InputError: a black box.
+    """
+    if isinstance(spec.robot, BlackBox):
+        raise InputError("a black box has no body", where=spec.robot.name, remedy="use a robot")
+    return spec.robot
+
+
+def build_simulator(spec: ModelSpec) -> AnySimulator:
+    """The simulator of a model, mechanisms included."""
+    if isinstance(spec.robot, BlackBox):
+        return BlackBoxSimulator(spec.robot, tuple(choice.made_for(spec.robot) for choice in spec.mechanisms))
+    return build_robot_simulator(spec)
+
+
+def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
+    """The same where only a robot will do: body, engine and mechanisms.
+
+    Raises:
+        InputError: a black box.
+    """
+    table, robot = spec.simulator, with_drives(robot_of(spec), spec.drives, spec.groups)
+    if table.drives == "direct":
+        robot = robot.without_command_timing()
+    time_step = table.time_step or robot.time_step_s
+    mechanisms = tuple(choice.made_for(robot) for choice in spec.mechanisms)
+    trunk: TrunkSimulator | MeshTrunkSimulator
+    if table.body == "tetrahedra" and table.tetrahedra is not None:
+        options = table.tetrahedra
+        mesh = read_tetrahedra(find_data_file(options.mesh, spec.folder), options.unit)
+        bound = assemble_mesh(robot, mesh, options)
+        engine = Engine(bound, time_step, backend(table, False), integrator=table.integrator)
+        trunk = MeshTrunkSimulator(robot, engine, bound, options, time_step, mechanisms)
+    else:
+        discretisation = Discretisation(time_step, table.nodes_across, table.refine)
+        assembly = assemble(robot, discretisation)
+        settled = robot.initial_state == "equilibrium"
+        engine = Engine(assembly, time_step, backend(table, True), settled, integrator=table.integrator)
+        trunk = TrunkSimulator(robot, engine, assembly, discretisation, mechanisms)
+    return trunk.pushing() if table.push else trunk
+
+
+def with_drives(robot: Robot, drives: Sequence[DriveTravel], groups: Patterns) -> Robot:
+    """A robot with what an experiment states of its drives, and the groups that it states it for.
+
+    Raises:
+        InputError: a cable that the robot does not have.
+    """
+    stated = (*robot.drives, *drives)
+    return robot.with_changes(drives=stated).grouped(groups) if stated else robot
+
+
+def with_groups(simulator: AnySimulator, groups: Patterns) -> AnySimulator:
+    """The same simulator, whose drives take commands as is stated for these groups of recordings."""
+    if isinstance(simulator, BlackBoxSimulator) or not simulator.robot.drives:
+        return simulator
+    return replace(simulator, robot=simulator.robot.grouped(groups))  # type: ignore[type-var]
+
+
+def measurement_specs(noise: str, channels: DataChannels) -> tuple[ParameterSpec, ...]:
+    """Parameters of the channels that are data: the noise of the positions, and of what else is measured."""
+    own = () if noise in KNOWN else noise_specs(noise)
+    further = [spec for key, chosen in asdict(channels).items() if chosen for spec in SWITCHED[key]]
+    if noise == "white":
+        further = [spec for spec in further if spec != OBJECT_CORRELATION_TIME]
+    return (*own, *(s for s in further if noise != REPEATS or s == TENSION_GAIN))
+
+
+def model_specs(spec: ModelSpec, simulator: AnySimulator) -> tuple[ParameterSpec, ...]:
+    """Every parameter of a model: of the simulator, and of the channels that are data."""
+    return simulator.parameters + measurement_specs(spec.noise, spec.channels)
+
+
+def fixed_values(spec: ModelSpec, simulator: AnySimulator) -> dict[str, float]:
+    """Values of [model.fixed], checked against names and hard bounds."""
+    specs = model_specs(spec, simulator)
+    check_used(spec.fixed, spec, simulator, where="[model.fixed]")
+    by_name = {each.name: each for each in specs}
+    given = expand_groups(spec.fixed, specs)
+    return {name: check_value(by_name[name], value, where="[model.fixed]") for name, value in given.items()}
+
+
+def physical_values(spec: ModelSpec, simulator: AnySimulator) -> dict[str, float]:
+    """Those of `fixed_values` that the simulator is given."""
+    known = {each.name for each in simulator.parameters}
+    return {name: value for name, value in fixed_values(spec, simulator).items() if name in known}
+
+
+def check_used(names: Iterable[str], spec: ModelSpec, simulator: AnySimulator, *, where: str) -> None:
+    """Raise InputError for a parameter that the model does not have, and say what would bring it in."""
+    specs, chosen = model_specs(spec, simulator), asdict(spec.channels)
+    known = [each.name for each in specs]
+    further = {f"set [model] {key} = true": found for key, found in SWITCHED.items() if not chosen[key]}
+    further['let the noise last, [model] noise = "auto"'] = (OBJECT_CORRELATION_TIME,)
+    further |= {f'set [model] noise = "{model}"': noise_specs(model) for model in NOISE_MODELS}
+    for mechanism in mechanisms_named(REGISTRY, simulator.robot):
+        further[f"add {mechanism.name!r} to [model] mechanisms"] = mechanism.parameters
+    for name in names:
+        if name in known or any(each.startswith(f"{name}_") for each in known):
+            continue
+        for remedy, absent in further.items():
+            if name in [each.name for each in absent]:
+                raise InputError(f"the model has no parameter {name!r}", where=where, remedy=f"{remedy}, or remove it")
+        check_names([name], specs, where=where)
+
+
+def load_data(data: DataSpec | None, folder: Path, role: Literal["fit", "test"]) -> list[Trajectory]:
+    """The recordings of one role, ``"fit"`` or ``"test"``."""
+    if data is None:
+        raise InputError("the experiment has no [data]", remedy="name the recordings to fit")
+    return load_recordings(data, folder, role=role)
+
+
+def expand_groups(table: Mapping[str, Entry], specs: Sequence[ParameterSpec]) -> dict[str, Entry]:
+    """Write out the keys that stand for several parameters: ``offset`` for ``offset_x``, ``offset_y``, ``offset_z``."""
+    known = [spec.name for spec in specs]
+    expanded: dict[str, Entry] = {}
+    for name, entry in table.items():
+        members = [name] if name in known else [spec for spec in known if spec.startswith(f"{name}_")]
+        expanded |= dict.fromkeys(members or [name], entry)
+    return expanded
+
+
+def pooling(
+    spec: ModelSpec, specs: Sequence[ParameterSpec], fitted: Sequence[str], others: Sequence[str] = ()
+) -> dict[str, Pooled]:
+    """The parameters of [model.per_group], with the recordings of each group that has one to fit.
+
+    Raises:
+        InputError: a name that is none of ``specs``, those of the simulator: noise is the same for all recordings.
+    """
+    groups = gather_groups([*fitted, *others], spec.groups)
+    known = {group: members for group, members in groups.items() if set(members) & set(fitted)}
+    found: dict[str, Pooled] = {}
+    for family, spread in spec.per_group.items():
+        members = expand_groups({family: spread}, specs)
+        check_names(members, specs, where="[model.per_group]")
+        found |= {name: Pooled(spread, known, family) for name in members}
+    return found
+
+
+def build_model(spec: ModelSpec, simulator: AnySimulator, trajectories: Sequence[Trajectory]) -> TrajectoryModel:
+    """The probabilistic program of a model for the given recordings.
+
+    Raises:
+        InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
+    """
+    recordings = gather_recordings(simulator, trajectories)
+    space = model_space(spec, simulator, model_specs(spec, simulator), recordings.names)
+    channels = gather_channels(spec, simulator, trajectories, recordings, space.names)
+    return TrajectoryModel(simulator, space, fixed_values(spec, simulator), recordings, channels)
+
+
+def model_space(
+    spec: ModelSpec,
+    simulator: AnySimulator,
+    specs: Sequence[ParameterSpec],
+    fitted: Sequence[str],
+    others: Sequence[str] = (),
+    later: Sequence[Mechanism] = (),
+) -> ParameterSpace:
+    """What is inferred: parameters of the model, those of ``later`` mechanisms after all others.
+
+    The noise parameters are always inferred, unless [model.fixed] holds them; the gain of tensions with a prior only.
+
+    Args:
+        spec: says which have a prior.
+        simulator: with all mechanisms.
+        specs: parameters that may be inferred.
+        fitted: names of the recordings that are fitted; others: of those that are not, which may belong to groups.
+        later: mechanisms whose parameters come last, such as the candidates of an audit.
+
+    Raises:
+        InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
+    """
+    fixed = fixed_values(spec, simulator)
+    check_used(spec.priors, spec, simulator, where="[model.priors]")
+    check_used(spec.per_recording, spec, simulator, where="[model.per_recording]")
+    known, last = {each.name for each in specs}, [each.name for m in later for each in m.parameters]
+    added = [each.name for mechanism in simulator.mechanisms if mechanism not in later for each in mechanism.parameters]
+    measured = [s.name for s in specs if s not in simulator.parameters and s != TENSION_GAIN]
+    every = model_specs(spec, simulator)
+    given = {name: entry for name, entry in expand_groups(spec.priors, every).items() if name in known}
+    both = sorted(set(fixed) & set(given))
+    if both:
+        raise InputError(f"{both[0]!r} has a prior and a fixed value", where="[model]", remedy="remove one of them")
+    shared = expand_groups(spec.per_recording, every)
+    defaults = [name for name in (*added, *shared, *measured) if name not in fixed and name not in given]
+    priors: dict[str, Any] = {name: given.get(name, {}) for name in (*given, *defaults) if name not in last}
+    priors |= {name: given.get(name, {}) for name in last if name not in fixed and name not in priors}
+    scopes = {
+        name: matching(fitted, patterns, where=f"[model.per_recording] {name}") for name, patterns in shared.items()
+    }
+    return build_space(specs, priors, scopes, fitted, pooled=pooling(spec, simulator.parameters, fitted, others))
+
+
+def gather_channels(
+    spec: ModelSpec,
+    simulator: AnySimulator,
+    trajectories: Sequence[Trajectory],
+    recordings: RecordingSet,
+    inferred: Sequence[str],
+    fitted: int | None = None,
+) -> tuple[Channel, ...]:
+    """What was measured and is to be used, markers first and weighed parts last.
+
+    ``inferred`` are the names of parameters, of which some may be weighed; ``fitted`` is the number of recordings, the
+    first ones, that need what [model] asks for; all by default.
+    """
+    chosen, length = spec.channels, recordings.time.shape[1]
+    stated = stated_noise(spec, recordings, trajectories[0]) if spec.noise == STATED else None
+    channels: list[Channel] = [Markers.gather(recordings, spec.noise, stated)]
+    if chosen.tension:
+        channels.append(Tension.gather(simulator, trajectories, length, fitted))
+    if chosen.motor_angle:
+        channels.append(MotorAngle.gather(trajectories, length, fitted))
+    if chosen.object_pose:
+        channels.append(ObjectPose.gather(simulator, trajectories, length, lasting=spec.noise != "white"))
+    if spec.noise == REPEATS:
+        groups = group_recordings(recordings, trajectories)
+        channels = [with_noise_of_repeats(channel, groups) for channel in channels if isinstance(channel, Series)]
+    if spec.weighed:
+        channels.append(WeighedParts(spec.weighed).named(inferred))
+    return tuple(channels)
+
+
+def stated_noise(spec: ModelSpec, recordings: RecordingSet, first: Trajectory) -> Autoregression:
+    """The noise of the positions that is stated.
+
+    Raises:
+        InputError: none is stated.
+    """
+    noise = spec.stated
+    if noise is None or noise.standard_deviation == 0.0:
+        raise InputError("no noise is stated", where='[model] noise = "stated"', remedy="give [noise]")
+    values = {OBSERVATION_NOISE.name: noise.standard_deviation}
+    if noise.correlation_time is not None:
+        values[NOISE_CORRELATION_TIME.name] = noise.correlation_time
+    return Markers.gather(recordings, STATED).stated(values, float(first.dataset.attrs["sample_time"]))
+
+
+def build_problem(model: TrajectoryModel, earlier: Batch | None = None) -> CalibrationProblem:
+    """The model as the inference methods see it, in chunks that suit its engine; ``earlier``: see the problem."""
+    lanes = model.simulator.lanes
+    return CalibrationProblem(model, chunk=max(1, lanes // len(model.recordings.names)), earlier=earlier)

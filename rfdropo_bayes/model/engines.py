@@ -1,0 +1,20 @@
+"""What computes the motion of the body."""
+
+from __future__ import annotations
+
+import jax
+
+from rfdropo_bayes.model.experiment import SimulatorTable
+from rfdropo_bayes.simulators.engine import Backend
+
+
+def backend(table: SimulatorTable, layered: bool) -> Backend:
+    """The backend that [simulator] asks for.
+
+    "auto" takes the compiled one for meshes, as JAX takes minutes to compile one, and for layers where JAX has only a
+    CPU.
+    """
+    compiled = table.engine == "numba"
+    if table.engine == "auto":
+        compiled = not layered or jax.default_backend() == "cpu"
+    return Backend("numba", table.precision, table.threads) if compiled else Backend("jax")

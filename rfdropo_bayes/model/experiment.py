@@ -1,0 +1,311 @@
+"""The experiment file: one TOML that names robot, data, priors, mechanisms, method, budget and seed.
+
+Names and numbers, as the file has them; `model_spec` says what they mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from rfdropo_bayes.data import DataSpec
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.experiment_file import override, read_tables
+from rfdropo_bayes.policies.training_config import TrainingTable
+from rfdropo_bayes.robots import DriveTravel
+from rfdropo_bayes.simulators.mesh_body import TetrahedraTable
+from rfdropo_bayes.tables import parse_table
+
+NoiseModel = Literal["auto", "white", "ar1", "student-t", "repeats", "stated"]
+
+
+class ExperimentTable(BaseModel):
+    """A table of the experiment file: unknown keys are errors, values do not change once read."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class WeighedTable(ExperimentTable):
+    """[[model.weighed]]: parts that were weighed, or other sums of parameters that were measured."""
+
+    parameters: list[str] = Field(
+        min_length=1, description="parameters whose sum was measured; payload_mass@NAME is that of the recording NAME"
+    )
+    value: float = Field(description="the sum, in their unit")
+    sd: float = Field(gt=0.0, description="standard deviation of the measurement")
+
+
+class ModelTable(ExperimentTable):
+    """[model]: what is added to the robot's base simulator, and what is inferred."""
+
+    mechanisms: list[str] = Field(
+        default_factory=list,
+        description="effects on top of the base simulator, by name, or file.py:ClassName of one's own",
+    )
+    noise: NoiseModel = Field(
+        default="auto",
+        description="noise of the positions: white and lasting (auto), white, lasting (ar1), heavy-tailed (student-t);"
+        " of all that is measured, what repeats differ by (repeats); what [noise] says (stated);"
+        " see docs/likelihood.md",
+    )
+    priors: dict[str, dict[str, Any]] = Field(
+        default_factory=dict,
+        description="what is inferred: parameter = prior; {} asks for the default prior",
+    )
+    fixed: dict[str, float] = Field(default_factory=dict, description="values of parameters that are not inferred")
+    per_recording: dict[str, str | list[str]] = Field(
+        default_factory=dict,
+        description='parameters that are free in each of the named recordings instead of shared: "all", or names with'
+        " wildcards",
+    )
+    groups: dict[str, str | list[str]] = Field(
+        default_factory=dict,
+        description="recordings that have a set-up in common (a day, a robot), by names or wildcards; one in no group"
+        " is a group of its own",
+    )
+    drives: list[DriveTravel] = Field(
+        default_factory=list,
+        description="what is known of the drives, beside what the robot file says",
+    )
+    per_group: dict[str, float] = Field(
+        default_factory=dict,
+        description="parameters that differ between groups about the value they share: the scale of the half-normal "
+        "prior of their standard deviation between groups, in their unit, which is inferred; a name such as "
+        "initial_displacement stands for those of all cables, with one standard deviation",
+    )
+    tension: bool = Field(
+        default=False,
+        description="the recordings' cable tensions are data, with a relative noise tension_noise that is inferred "
+        "and a tension_gain that is 1 unless it has a prior",
+    )
+    motor_angle: bool = Field(
+        default=False,
+        description="the recordings' motor angles are data, with a noise motor_angle_noise that is inferred",
+    )
+    object_pose: bool = Field(
+        default=False,
+        description="the recordings' poses of the pushed body are data, with object_noise, object_turn_noise and, "
+        "unless noise is white, object_correlation_time; it starts at the first of them",
+    )
+    weighed: list[WeighedTable] = Field(
+        default_factory=list,
+        description="parameters, or sums of them, known from measurements of their own",
+    )
+
+
+class SimulatorTable(ExperimentTable):
+    """[simulator]: body, engine and discretisation; what is left out is the robot's own."""
+
+    body: Literal["layered", "tetrahedra"] = Field(
+        default="layered",
+        description="layers of the robot's section profile, or the mesh under [simulator.tetrahedra]; a body that is "
+        "not chosen has no effect",
+    )
+    push: bool = Field(default=False, description="put the robot's cube and plate before the trunk")
+    drives: Literal["robot", "direct"] = Field(
+        default="robot",
+        description='"direct": commands act at once, without the robot\'s ramp and dead time; what drives do is left '
+        "to mechanisms such as command_delay",
+    )
+    tetrahedra: TetrahedraTable | None = Field(default=None, description="the mesh")
+    engine: Literal["auto", "jax", "numba"] = Field(
+        default="auto",
+        description='"auto" is the compiled one, or JAX where it has a GPU and the body is layered',
+    )
+    precision: Literal["float64", "float32"] = Field(
+        default="float64",
+        description="of the compiled engine; stiff bodies lose their answer in float32",
+    )
+    time_step: float | None = Field(default=None, gt=0.0, le=0.1, description="time step [s]; the robot's by default")
+    integrator: Literal["euler", "sdirk2"] = Field(
+        default="euler",
+        description='"euler" takes one solve a step, as SOFA does; "sdirk2", of second order, takes two and comes '
+        "about ten times nearer to the converged motion",
+    )
+    nodes_across: Literal[2, 3] = Field(default=2, description="nodes along a side of a layer")
+    refine: int = Field(default=1, ge=1, le=16, description="each layer is cut into so many")
+    threads: int | None = Field(default=None, ge=1, description="of the compiled engine; one per processor by default")
+
+    @model_validator(mode="after")
+    def _has_mesh(self) -> SimulatorTable:
+        if self.body == "tetrahedra" and self.tetrahedra is None:
+            raise InputError(
+                'body = "tetrahedra" without a mesh',
+                where="[simulator]",
+                remedy="add a table [simulator.tetrahedra] with mesh, unit and clamp_height",
+            )
+        return self
+
+
+class InferenceTable(BaseModel):
+    """[inference]: method and budget; the method's own options are checked by the method."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    method: str = Field(
+        default="smc",
+        description="see docs/reference/methods.md; options of the method stand beside it",
+    )
+    rollouts: int = Field(default=20000, ge=1, description="budget in full-length rollouts")
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of the method, without the name and the budget."""
+        return dict(self.model_extra or {})
+
+
+class CommandsTable(ExperimentTable):
+    """[commands]: a random command sequence to simulate, where no recording is replayed."""
+
+    duration: float = Field(gt=0.0, description="length of a recording [s]")
+    interval: float = Field(
+        gt=0.0,
+        description="time between changes [s]: one channel, chosen at random, moves up or down",
+    )
+    step: float = Field(gt=0.0, description="size of a change, in the robot's unit of commands")
+    low: float = Field(description="least command")
+    high: float = Field(description="greatest command")
+    sample_time: float = Field(gt=0.0, description="time between observations [s]")
+    recordings: list[str] = Field(min_length=1, description="a name for each recording")
+    markers: list[str] = Field(default_factory=list, description="markers that are observed; all by default")
+    blind: bool = Field(
+        default=False, description="leave the parameters out of the recordings, for data whose truth is to be guessed"
+    )
+
+
+class NoiseTable(ExperimentTable):
+    """[noise]: noise of marker positions whose size is known."""
+
+    standard_deviation: float = Field(ge=0.0, description="of one coordinate of one marker [m]")
+    correlation_time: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="over which the noise forgets its sign [s]; white by default",
+    )
+
+
+class AuditTable(ExperimentTable):
+    """[audit]: candidates and effort of ``rfdropo audit``."""
+
+    candidates: list[str] = Field(
+        default_factory=list,
+        description="mechanisms that are tried beside the registry's, e.g. mine.py:MyMechanism",
+    )
+    exclude: list[str] = Field(default_factory=list, description="mechanisms that are not tried")
+    bootstraps: int = Field(default=999, ge=199, description="simulated data sets that the p-values rest on")
+    minutes: float = Field(
+        default=30.0,
+        gt=0.0,
+        description="bound of the whole run: when they are up, it finishes with what it knows",
+    )
+
+
+class DesignTable(ExperimentTable):
+    """[design]: effort of ``rfdropo design``."""
+
+    minutes: float = Field(
+        default=10.0,
+        gt=0.0,
+        description="bound of the whole run: when they are up, it proposes the best of what it has looked at",
+    )
+
+
+class SeparationTable(ExperimentTable):
+    """[separation]: mechanisms that ``rfdropo audit --separate`` compares."""
+
+    mechanisms: list[str] = Field(
+        min_length=2,
+        description="that join the base model, to see which of them the recordings tell apart",
+    )
+    groups: dict[str, list[str]] = Field(
+        default_factory=dict,
+        description="sets of them that are asked for together, such as all ways to be late",
+    )
+
+    @model_validator(mode="after")
+    def _has_members(self) -> SeparationTable:
+        for name, members in self.groups.items():
+            for member in members:
+                if member not in self.mechanisms:
+                    raise InputError(
+                        f"{member!r} is none of the mechanisms",
+                        where=f"[separation.groups] {name}",
+                        remedy=f"use {', '.join(self.mechanisms)}",
+                    )
+            if name in self.mechanisms or not members:
+                raise InputError(
+                    f"{name!r} is a mechanism itself" if members else "is empty",
+                    where=f"[separation.groups] {name}",
+                    remedy="give a group a name of its own, and members",
+                )
+        return self
+
+
+class Experiment(ExperimentTable):
+    """An experiment as read from its file; see `load_experiment`."""
+
+    robot: str = Field(
+        description="name of a robot that comes with the package, or path of a robot file, relative to this file",
+    )
+    seed: int = Field(default=0, description="of all that is random")
+    title: str = Field(default="", description="heading of the report; the file's name by default")
+    data: DataSpec | None = Field(default=None, description="the recordings")
+    commands: CommandsTable | None = Field(
+        default=None,
+        description="random commands to simulate, where no recording is replayed",
+    )
+    noise: NoiseTable | None = Field(
+        default=None,
+        description="noise that simulate adds to positions, and what an audit without repeats takes for known",
+    )
+    model: ModelTable = Field(
+        default_factory=ModelTable,
+        description="what is added to the base simulator, and what is inferred",
+    )
+    simulator: SimulatorTable = Field(default_factory=SimulatorTable, description="body, engine and discretisation")
+    inference: InferenceTable = Field(
+        default_factory=InferenceTable,
+        description="method, budget and the method's options",
+    )
+    audit: AuditTable = Field(default_factory=AuditTable, description="candidates and effort of rfdropo audit")
+    design: DesignTable = Field(default_factory=DesignTable, description="effort of rfdropo design")
+    training: TrainingTable | None = Field(default=None, description="what rfdropo train learns, and how")
+    separation: SeparationTable | None = Field(default=None, description="what rfdropo audit --separate compares")
+
+
+def load_experiment(path: Path, overrides: Sequence[str] = ()) -> tuple[Experiment, dict[str, Any]]:
+    """Read an experiment file.
+
+    Args:
+        path: the TOML file.
+        overrides: assignments that replace entries of the file: ``table.key=value`` (value in TOML syntax), or
+            ``name=value`` for the value of a parameter ([model.fixed]; its prior is then dropped).
+
+    Returns:
+        the experiment, and its tables as they were read with the overrides in place, for the record.
+
+    Raises:
+        InputError: no such file, not TOML, an unknown key or a value of the wrong type.
+    """
+    tables = read_tables(path)
+    for assignment in overrides:
+        override(tables, assignment, Experiment.model_fields)
+    return parse_table(Experiment, tables, where=str(path)), tables
+
+
+def matching(names: Sequence[str], patterns: str | Sequence[str], *, where: str) -> list[str]:
+    """Recordings that ``"all"``, a name or a wildcard pattern stand for; InputError if one stands for none."""
+    from fnmatch import fnmatchcase
+
+    if patterns == "all":
+        return list(names)
+    chosen: list[str] = []
+    for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        found = [pattern] if pattern in names else [name for name in names if fnmatchcase(name, pattern)]
+        if not found:
+            raise InputError(f"no recording matches {pattern!r}", where=where, remedy=f"recordings: {', '.join(names)}")
+        chosen += [name for name in found if name not in chosen]
+    return chosen

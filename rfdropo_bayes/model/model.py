@@ -1,0 +1,184 @@
+"""A model: what is simulated, what is inferred, and what is measured, whether a file or a program says so."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import pandas as pd
+
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
+from rfdropo_bayes.bayes.noise.autoregression import STATED
+from rfdropo_bayes.bayes.priors import table_of
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.model.assembly import (
+    build_model,
+    build_problem,
+    build_simulator,
+    expand_groups,
+    fixed_values,
+    load_data,
+    measurement_specs,
+    model_specs,
+)
+from rfdropo_bayes.model.experiment import Experiment, load_experiment
+from rfdropo_bayes.model.experiment_file import ROBOT_COPY, describe
+from rfdropo_bayes.model.model_spec import ModelSpec, RunSettings, Workpiece, spec_of
+from rfdropo_bayes.prediction.predictive import Batch
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.tables import parse_table
+
+
+class Model:
+    """Robot or black box, with mechanisms, priors and noise.
+
+    Args:
+        robot: name of a robot that comes with the package, path of a robot file, a `Robot`, or a `BlackBox`.
+        priors: what is inferred: {parameter: prior}. A prior is a numpyro distribution, a table such as
+            ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``, or ``{}`` for the parameter's default.
+            For a black box, all its parameters with their own priors by default.
+        mechanisms: effects on top of the base simulator: names of the library, ``"file.py:ClassName"``, or mechanisms
+            of one's own, as classes or objects.
+        noise: of the positions, by name as in an experiment file; or, where it is known,
+            ``{"standard_deviation": m}``, perhaps with a ``correlation_time`` [s].
+        fixed: values of parameters that are not inferred.
+        simulator: body, engine and discretisation: the keys of an experiment file's [simulator].
+        folder: that paths are relative to.
+        more: further keys of an experiment file's [model], such as ``tension = True`` or ``per_recording``.
+
+    Attributes:
+        spec: what it means, as objects.
+        settings: what its experiment says beside the model.
+
+    Raises:
+        InputError: an unknown robot, key or mechanism, or a distribution that cannot be a prior. What is wrong with a
+            prior's numbers is said when recordings are there.
+    """
+
+    def __init__(
+        self,
+        robot: str | Path | Robot | BlackBox,
+        *,
+        priors: Mapping[str, Any] | None = None,
+        mechanisms: Sequence[Any] = (),
+        noise: str | Mapping[str, float] = "auto",
+        fixed: Mapping[str, float] | None = None,
+        simulator: Mapping[str, Any] | None = None,
+        folder: Path | str = Path(),
+        **more: Any,
+    ) -> None:
+        fixed = dict(fixed or {})
+        if priors is None and isinstance(robot, BlackBox):
+            priors = {name: {} for name in robot.parameters if name not in fixed}
+        given = {name: table_of(prior, where=f"priors, {name}") for name, prior in (priors or {}).items()}
+        stated = dict(noise) if isinstance(noise, Mapping) else None
+        described = {"priors": given, "noise": noise if stated is None else STATED, "fixed": fixed, **more}
+        made = None if isinstance(robot, str | Path) else robot
+        tables: dict[str, Any] = {"robot": str(robot) if made is None else "", "model": described}
+        if stated is not None:
+            tables["noise"] = stated
+        if simulator:
+            tables["simulator"] = dict(simulator)
+        experiment = parse_table(Experiment, tables, where="Model")
+        self.spec = spec_of(experiment, Path(folder), made, mechanisms)
+        self.settings = RunSettings()
+
+    @classmethod
+    def of(cls, spec: ModelSpec, settings: RunSettings | None = None) -> Model:
+        """The model that is meant, with what its experiment says beside it."""
+        model = cls.__new__(cls)
+        model.spec, model.settings = spec, settings or RunSettings()
+        return model
+
+    @classmethod
+    def of_experiment(cls, experiment: Experiment, folder: Path) -> Model:
+        """The model that an experiment file describes; ``folder`` is that of the file."""
+        return cls.of(spec_of(experiment, folder), RunSettings.of(experiment))
+
+    @classmethod
+    def read(cls, path: Path, overrides: Sequence[str] = ()) -> tuple[Model, dict[str, Any]]:
+        """The model of an experiment file, and the file's tables with the overrides in place, for the record."""
+        experiment, tables = load_experiment(path, overrides)
+        return cls.of_experiment(experiment, Path(path).resolve().parent), tables
+
+    def recordings(self, role: Literal["fit", "test"]) -> list[Trajectory]:
+        """The recordings that its experiment file names."""
+        return load_data(self.settings.data, self.folder, role)
+
+    @property
+    def robot(self) -> Workpiece:
+        """The robot, or the black box."""
+        return self.spec.robot
+
+    @property
+    def folder(self) -> Path:
+        """That paths are relative to."""
+        return self.spec.folder
+
+    @cached_property
+    def simulator(self) -> RobotSimulator | BlackBoxSimulator:
+        """The simulator, mechanisms included."""
+        return build_simulator(self.spec)
+
+    @property
+    def name(self) -> str:
+        """That of the robot."""
+        return self.robot.name
+
+    @property
+    def mechanisms(self) -> tuple[str, ...]:
+        """Names of its mechanisms."""
+        return tuple(mechanism.name for mechanism in self.simulator.mechanisms)
+
+    @property
+    def parameters(self) -> pd.DataFrame:
+        """Every parameter of simulator and measurement: unit, hard bounds, nominal value, prior where inferred."""
+        specs = model_specs(self.spec, self.simulator)
+        given = expand_groups(self.spec.priors, specs)
+        added = {spec.name for mechanism in self.simulator.mechanisms for spec in mechanism.parameters}
+        added |= {spec.name for spec in measurement_specs(self.spec.noise, self.spec.channels)}
+        fixed = fixed_values(self.spec, self.simulator)
+        rows = {}
+        for spec in specs:
+            inferred = spec.name in given or (spec.name in added and spec.name not in fixed)
+            prior = dict(given.get(spec.name) or spec.prior) if inferred else None
+            value = None if inferred else fixed.get(spec.name, spec.nominal)
+            rows[spec.name] = {"unit": spec.unit, "low": spec.low, "high": spec.high, "value": value, "prior": prior}
+        return pd.DataFrame.from_dict(rows, orient="index")
+
+    def with_mechanisms(self, *names: Any) -> Model:
+        """The same model with more mechanisms."""
+        return Model.of(self.spec.with_mechanisms(*names), self.settings)
+
+    def numpyro(self, runs: Sequence[Trajectory]) -> TrajectoryModel:
+        """The model of these recordings as a numpyro model: a callable with sample sites for all that is inferred.
+
+        Raises:
+            InputError: unknown names, or priors outside the bounds.
+        """
+        return build_model(self.spec, self.simulator, runs)
+
+    def problem(self, runs: Sequence[Trajectory], earlier: Batch | None = None) -> CalibrationProblem:
+        """The posterior given these recordings, as the inference methods see it."""
+        return build_problem(self.numpyro(runs), earlier)
+
+    def tables(self) -> dict[str, Any]:
+        """The tables of an experiment file that says the same, as far as a file can."""
+        robot = ROBOT_COPY if self.texts() else self.spec.named or self.name
+        return {"robot": robot, **self.settings.tables(), **self.spec.tables()}
+
+    def texts(self) -> dict[str, str]:
+        """Files that the tables name and no folder holds: the description of a robot that was made in Python."""
+        if isinstance(self.robot, Robot) and not self.spec.named:
+            return {ROBOT_COPY: describe(self.robot.model_dump(mode="json", exclude_none=True))}
+        return {}
+
+    def _repr_html_(self) -> str:
+        rows = self.parameters
+        inferred = rows[[prior is not None for prior in rows["prior"]]]
+        return f"<p><b>{self.name}</b>, {len(inferred)} of {len(rows)} parameters inferred</p>{inferred.to_html()}"

@@ -1,0 +1,226 @@
+"""What an experiment file means: the model as objects, and what the verbs are told. The file is names and numbers.
+
+A file is parsed once, by `spec_of` and `RunSettings.of`. What is changed afterwards is changed here, with
+`dataclasses.replace`, and checked again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import BaseModel
+
+from rfdropo_bayes.bayes.channels import Weighed
+from rfdropo_bayes.data import DataSpec
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import Patterns
+from rfdropo_bayes.mechanisms.registry import MechanismChoice, choose_mechanisms
+from rfdropo_bayes.model.experiment import (
+    AuditTable,
+    CommandsTable,
+    DesignTable,
+    Experiment,
+    InferenceTable,
+    NoiseModel,
+    NoiseTable,
+    SeparationTable,
+    SimulatorTable,
+)
+from rfdropo_bayes.policies.training_config import TrainingTable
+from rfdropo_bayes.robots import DriveTravel, Robot, load_robot
+from rfdropo_bayes.simulators.black_box import BlackBox
+from rfdropo_bayes.tables import nearest
+
+Workpiece = Robot | BlackBox
+"""What is simulated."""
+
+
+@dataclass(frozen=True)
+class DataChannels:
+    """What of the recordings is data beside the markers: tensions, motor angles, poses of an object."""
+
+    tension: bool = False
+    motor_angle: bool = False
+    object_pose: bool = False
+
+
+@dataclass(frozen=True)
+class ModelSpec:
+    """What is simulated, what is inferred, and what is data.
+
+    Attributes:
+        robot: robot or black box, without the ``drives`` that are stated here.
+        named: name or path by which a file asks for the robot; empty where it was made in Python.
+        mechanisms: effects on top of the base simulator.
+        simulator: body, engine and discretisation.
+        priors: what is inferred: tables of priors by parameter; an empty one is the parameter's default.
+        fixed: values of parameters that are not inferred.
+        noise: of the positions, by name.
+        stated: the noise of the positions where its size is known; what `simulate` adds.
+        per_recording: parameters that are free in each of the recordings that match.
+        groups: recordings that have a set-up in common.
+        per_group: scale of the spread between groups of parameters that differ between them, in their unit.
+        drives: what is known of the drives, beside what the robot says.
+        channels: what is data beside the markers.
+        weighed: sums of parameters that were measured.
+        folder: that the mesh of the body, and code of one's own, are relative to.
+
+    Raises:
+        InputError: no robot, an unknown noise, or drives of cables that the robot does not have.
+    """
+
+    robot: Workpiece
+    named: str = ""
+    mechanisms: tuple[MechanismChoice, ...] = ()
+    simulator: SimulatorTable = field(default_factory=SimulatorTable)
+    priors: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    noise: str = "auto"
+    stated: NoiseTable | None = None
+    per_recording: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
+    groups: Patterns = field(default_factory=dict)
+    per_group: Mapping[str, float] = field(default_factory=dict)
+    drives: tuple[DriveTravel, ...] = ()
+    channels: DataChannels = field(default_factory=DataChannels)
+    weighed: tuple[Weighed, ...] = ()
+    folder: Path = Path()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.robot, Robot | BlackBox):
+            raise InputError(
+                f"{type(self.robot).__name__} is no robot",
+                where="Model",
+                remedy="give a name, a path, a Robot or a BlackBox",
+            )
+        if self.noise not in get_args(NoiseModel):
+            remedy = nearest(self.noise, get_args(NoiseModel))
+            raise InputError(f"unknown noise {self.noise!r}", where="[model] noise", remedy=remedy)
+        if self.drives and isinstance(self.robot, BlackBox):
+            raise InputError("a black box has no drives", where="[[model.drives]]", remedy="let the box have them")
+        for drives in self.drives:
+            drives.columns(self.robot.channel_names)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names under which a file would ask for the mechanisms."""
+        return tuple(choice.source for choice in self.mechanisms)
+
+    def with_mechanisms(self, *names: Any) -> ModelSpec:
+        """The same with more mechanisms: names, classes or objects.
+
+        Raises:
+            InputError: an unknown name, or no mechanism.
+        """
+        return replace(self, mechanisms=(*self.mechanisms, *choose_mechanisms(names, folder=self.folder)))
+
+    def tables(self) -> dict[str, Any]:
+        """The tables [noise], [simulator] and [model] of a file that says the same, as far as a file can."""
+        drives = [each.model_dump(mode="json", exclude_unset=True, exclude_none=True) for each in self.drives]
+        weighed = [{"parameters": list(each.parameters), "value": each.value, "sd": each.sd} for each in self.weighed]
+        given = {
+            "priors": {name: dict(prior) for name, prior in self.priors.items()},
+            "fixed": dict(self.fixed),
+            "per_recording": dict(self.per_recording),
+            "groups": dict(self.groups),
+            "drives": drives,
+            "per_group": dict(self.per_group),
+            **vars(self.channels),
+            "weighed": weighed,
+        }
+        model = {"noise": self.noise, **{key: value for key, value in given.items() if value}}
+        rest = {"noise": self.stated, "simulator": self.simulator}
+        return {**_dumped(rest), "model": {**model, "mechanisms": list(self.sources)}}
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What an experiment says beside its model: see the fields of these names in `Experiment`."""
+
+    seed: int = 0
+    title: str = ""
+    data: DataSpec | None = None
+    commands: CommandsTable | None = None
+    inference: InferenceTable = field(default_factory=InferenceTable)
+    audit: AuditTable = field(default_factory=AuditTable)
+    design: DesignTable = field(default_factory=DesignTable)
+    training: TrainingTable | None = None
+    separation: SeparationTable | None = None
+
+    @classmethod
+    def of(cls, experiment: Experiment) -> RunSettings:
+        """What a file says."""
+        return cls(
+            seed=experiment.seed,
+            title=experiment.title,
+            data=experiment.data,
+            commands=experiment.commands,
+            inference=experiment.inference,
+            audit=experiment.audit,
+            design=experiment.design,
+            training=experiment.training,
+            separation=experiment.separation,
+        )
+
+    def tables(self) -> dict[str, Any]:
+        """The keys and tables of a file that says the same."""
+        plain = {"seed": self.seed, "title": self.title}
+        rest = {name: value for name, value in vars(self).items() if name not in plain}
+        return {**{name: value for name, value in plain.items() if value}, **_dumped(rest)}
+
+
+def _dumped(tables: Mapping[str, BaseModel | None]) -> dict[str, Any]:
+    """What of some tables was given, as a file has it."""
+    given = {
+        name: table.model_dump(mode="json", exclude_unset=True, exclude_none=True)
+        for name, table in tables.items()
+        if table is not None
+    }
+    return {name: table for name, table in given.items() if table}
+
+
+def spec_of(
+    experiment: Experiment, folder: Path, robot: Workpiece | None = None, mechanisms: Sequence[Any] | None = None
+) -> ModelSpec:
+    """What a file says of the model.
+
+    Args:
+        experiment: the file.
+        folder: that its paths are relative to.
+        robot: instead of the one that the file names.
+        mechanisms: names, classes or objects, instead of those that it names.
+
+    Raises:
+        InputError: as `ModelSpec`; or an unknown robot or mechanism.
+    """
+    table = experiment.model
+    asked = table.mechanisms if mechanisms is None else mechanisms
+    return ModelSpec(
+        robot=find_robot(experiment.robot, folder) if robot is None else robot,
+        named=experiment.robot if robot is None else "",
+        mechanisms=choose_mechanisms(asked, folder=folder),
+        simulator=experiment.simulator,
+        priors=table.priors,
+        fixed=table.fixed,
+        noise=table.noise,
+        stated=experiment.noise,
+        per_recording=table.per_recording,
+        groups=table.groups,
+        per_group=table.per_group,
+        drives=tuple(table.drives),
+        channels=DataChannels(table.tension, table.motor_angle, table.object_pose),
+        weighed=tuple(Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed),
+        folder=folder,
+    )
+
+
+def find_robot(name: str, folder: Path) -> Robot:
+    """The robot that an experiment file names: one that comes with the package, or a file relative to the experiment's.
+
+    Raises:
+        InputError: no such robot.
+    """
+    beside = folder / name
+    return load_robot(beside if beside.suffix == ".toml" and beside.is_file() else name)

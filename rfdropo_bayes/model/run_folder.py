@@ -1,0 +1,222 @@
+"""Folders that runs write to: what may be written there, what was run, and whether it came to its end."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rfdropo_bayes import __version__
+from rfdropo_bayes.errors import InputError, Interrupted
+from rfdropo_bayes.files import output_folder, unwritten, write_text
+from rfdropo_bayes.interrupts import interrupted, running
+from rfdropo_bayes.model.experiment_file import ROBOT_COPY, describe, self_contained
+
+RUN, CONFIG, LOG, CHECKPOINTS = "run.json", "config.toml", "log.jsonl", "checkpoints"
+RUNNING, INTERRUPTED, FAILED, DONE = "running", "interrupted", "failed", "done"
+SCHEMA_VERSION = 1
+NAMED_DIFFERENCES = 3
+# What a run computes does not depend on these; they say how it is headed and how far it goes.
+FREE_TO_CHANGE = (
+    "experiment.title",
+    "experiment.audit.minutes",
+    "experiment.design.minutes",
+    "experiment.training.steps",
+)
+
+
+class RunKind(NamedTuple):
+    """What a command writes: the first of ``results`` says that it has ended; and whether it can be resumed."""
+
+    results: tuple[str, ...]
+    resumable: bool = False
+
+
+COMMANDS = {
+    "calibrate": RunKind(("summary.json", "posterior.nc", "report.html"), resumable=True),
+    "adapt": RunKind(("summary.json", "posterior.nc", "report.html")),
+    "check": RunKind(("sbc.json", "sbc.jsonl"), resumable=True),
+    "simulate": RunKind(("simulation.json",)),
+    "predict": RunKind(("prediction.json", "prediction.nc", "prediction.csv")),
+    "audit": RunKind(("audit.json", "extended.toml", "report.html"), resumable=True),
+    "separate": RunKind(("separation.json", "separation.md", "separation.png"), resumable=True),
+    "design": RunKind(("design.json", "next_commands.csv")),
+    "train": RunKind(("summary.json", "policy.onnx", "card.md", "curve.png", "episodes.jsonl"), resumable=True),
+    "evaluate": RunKind(("evaluation.json", "evaluation.md", "episodes.csv", "success.png")),
+    "benchmark table1": RunKind(("table1.json", "table1.md", "table1.png", "fits.jsonl"), resumable=True),
+    "benchmark table2": RunKind(("table2.json", "table2.md", "table2.png"), resumable=True),
+}
+
+
+@contextmanager
+def run_folder(
+    out: Path,
+    command: str,
+    *,
+    tables: Mapping[str, Any] | None = None,
+    folder: Path = Path(),
+    options: Mapping[str, Any] | None = None,
+    data: Mapping[str, str] | None = None,
+    texts: Mapping[str, str] | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+) -> Iterator[Path]:
+    """The folder of one run, which holds ``run.json`` and what is needed to run it again: ``config.toml``, the robot.
+
+    A run that has ended is not replaced, and one that was interrupted not started anew, unless ``overwrite`` asks for
+    it. A run goes on with the settings it began with.
+
+    Args:
+        out: the folder.
+        command: that runs, one of `COMMANDS`.
+        tables: of the experiment, where there is one; folder: that of its file.
+        options: settings of the command line that results depend on.
+        data: hashes of the recordings, by their names.
+        texts: files that the tables name and no folder holds, such as the description of a robot made in Python.
+        resume: go on with the run that the folder holds, if any.
+        overwrite: start anew whatever the folder holds.
+
+    Yields:
+        the folder.
+
+    Raises:
+        InputError: a folder that cannot be written, that holds another run, or whose run had other settings.
+        Interrupted: Ctrl-C.
+    """
+    out = output_folder(out)
+    earlier = _read(out / RUN)
+    settings: dict[str, Any] = {"experiment": {}, "options": dict(options or {}), "data": dict(data or {})}
+    check_folder(out, command, resume=resume, overwrite=overwrite)
+    for name, text in (texts or {}).items():
+        write_text(out / name, text)
+    if tables is not None:
+        contained = self_contained(tables, folder, out)
+        settings["experiment"] = contained
+        settings["robot"] = _digest(out / ROBOT_COPY)
+    if resume and earlier is not None:
+        _check_settings(out, earlier["settings"], settings)
+    if not resume:
+        _clear(out, COMMANDS[command].results)
+    if tables is not None:
+        write_text(out / CONFIG, describe(contained))
+    record = {"schema_version": SCHEMA_VERSION, "command": command, "version": __version__, "settings": settings}
+    _write(out, record, RUNNING)
+    try:
+        with running(checks=COMMANDS[command].resumable):
+            yield out
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt) or interrupted():
+            with suppress(InputError):
+                _write(out, record, INTERRUPTED)
+            raise Interrupted(str(out), "--resume" if COMMANDS[command].resumable else None) from None
+        with suppress(InputError):
+            _write(out, record, FAILED)
+        if isinstance(error, OSError) and not isinstance(error, FileNotFoundError):
+            raise unwritten(error, Path(error.filename or out)) from None
+        raise
+    _write(out, record, DONE)
+
+
+def hashes(recordings: Iterable[Any]) -> dict[str, str]:
+    """Hash of the content of each recording (`Trajectory`), by its name."""
+    return {recording.name: recording.sha256[:12] for recording in recordings}
+
+
+def run_ended(out: Path) -> bool:
+    """Whether a folder holds a run that came to its end."""
+    found = _read(out / RUN)
+    return found is not None and found.get("status") == DONE
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        return found if isinstance(found["settings"], dict) and found["command"] else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _write(out: Path, record: Mapping[str, Any], status: str) -> None:
+    write_text(out / RUN, json.dumps({**record, "status": status}, indent=2, default=str) + "\n")
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+
+
+def _clear(out: Path, results: Sequence[str]) -> None:
+    """Remove what an earlier run of this command has left."""
+    try:
+        for name in (*results, LOG):
+            (out / name).unlink(missing_ok=True)
+        shutil.rmtree(out / CHECKPOINTS, ignore_errors=True)
+    except OSError as error:
+        raise unwritten(error, Path(error.filename or out)) from None
+
+
+def check_folder(out: Path, command: str, *, resume: bool = False, overwrite: bool = False) -> None:
+    """See that a command may write to a folder.
+
+    Raises:
+        InputError: the folder holds a run that neither option asks to go on with or to replace.
+    """
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite contradict each other", remedy="give one of them")
+    if overwrite:
+        return
+    earlier = _read(out / RUN)
+    ran = earlier["command"] if earlier else command
+    if resume:
+        if ran != command:
+            raise InputError(
+                f"holds a run of {ran}, which {command} cannot resume",
+                where=str(out),
+                remedy="choose another folder with --out",
+            )
+        return
+    if (earlier is not None and earlier.get("status") == DONE) or (out / COMMANDS[command].results[0]).exists():
+        raise InputError(
+            f"holds a finished run of {ran}",
+            where=str(out),
+            remedy="choose another folder with --out, or replace it with --overwrite",
+        )
+    if (
+        earlier is not None
+        and (out / CHECKPOINTS).is_dir()
+        and any(path.is_file() for path in (out / CHECKPOINTS).rglob("*"))
+    ):
+        remedy = "go on with --resume, or start anew with --overwrite"
+        if ran != command:
+            remedy = "choose another folder with --out, or replace it with --overwrite"
+        raise InputError(f"holds an interrupted run of {ran}", where=str(out), remedy=remedy)
+
+
+def _check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise InputError where the run began with other settings; names the first few."""
+    old, new = dict(_flat(before)), dict(_flat(json.loads(json.dumps(now, default=str))))
+    differing = [name for name in {**old, **new} if name not in FREE_TO_CHANGE and old.get(name) != new.get(name)]
+    if not differing:
+        return
+    absent = "not set"
+    words = [
+        f"{name.removeprefix('experiment.')} was {old.get(name, absent)} and is now {new.get(name, absent)}"
+        for name in differing[:NAMED_DIFFERENCES]
+    ]
+    more = f", and {len(differing) - NAMED_DIFFERENCES} more" if len(differing) > NAMED_DIFFERENCES else ""
+    raise InputError(
+        f"cannot resume a run with other settings: {', '.join(words)}{more}",
+        where=str(out),
+        remedy="resume with the settings it began with, or start anew with --overwrite",
+    )
+
+
+def _flat(tables: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in tables.items():
+        if isinstance(value, dict) and value:
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value

@@ -1,0 +1,91 @@
+"""Environments from a few names: task, mechanisms, randomisation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms import mechanisms_named
+from rfdropo_bayes.policies.episodes import Episodes, Settings
+from rfdropo_bayes.policies.randomisation import Point, Randomisation
+from rfdropo_bayes.policies.tasks import task_named
+from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.simulators.engine import Backend, Engine, Integrator
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
+
+
+def trunk_simulator(
+    robot: Robot,
+    *,
+    push: bool = False,
+    mechanisms: Sequence[str] = (),
+    precision: Literal["float32", "float64"] = "float32",
+    threads: int | None = None,
+    time_step: float | None = None,
+    integrator: Integrator = "euler",
+    folder: Path = Path(),
+) -> RobotSimulator:
+    """The layered trunk on the compiled engine, as episodes want it.
+
+    Args:
+        push: put the robot's cube and plate before it.
+        mechanisms: extensions by name, or of a file relative to ``folder``.
+        precision: of the body's motion; single precision is twice as fast and moves the tip by 0.01 mm.
+        threads: that the engine may use; all processors by default.
+        time_step: [s]; the robot's own by default.
+        integrator: how a time step is taken.
+    """
+    discretisation = Discretisation(time_step or robot.time_step_s)
+    assembly = assemble(robot, discretisation)
+    backend = Backend("numba", precision, threads)
+    settled = robot.initial_state == "equilibrium"
+    engine = Engine(assembly, discretisation.time_step, backend, settled, integrator=integrator)
+    found = mechanisms_named(list(mechanisms), robot, folder=folder)
+    trunk = TrunkSimulator(robot, engine, assembly, discretisation, found)
+    return trunk.pushing() if push else trunk
+
+
+def make_episodes(
+    task: str,
+    lanes: int,
+    *,
+    simulator: RobotSimulator | None = None,
+    robot: str | Robot | None = None,
+    mechanisms: Sequence[str] = (),
+    parameters: Mapping[str, float] | None = None,
+    randomisation: Randomisation | None = None,
+    precision: Literal["float32", "float64"] = "float32",
+    threads: int | None = None,
+    **settings: Any,
+) -> Episodes:
+    """Lanes of a task.
+
+    Args:
+        task: name of the environment.
+        lanes: how many.
+        simulator: to use as it is; made from the next arguments by default.
+        robot: name, file or description; the task's own by default.
+        mechanisms, precision, threads: see `trunk_simulator`.
+        parameters: fixed values; the others are nominal.
+        randomisation: of parameters; instead of ``parameters``.
+        settings: see `Settings`.
+
+    Raises:
+        InputError: unknown names, or settings that do not fit the robot.
+    """
+    chosen = task_named(task)
+    if simulator is None:
+        described = robot if isinstance(robot, Robot) else load_robot(robot or chosen.robot)
+        simulator = trunk_simulator(
+            described, push=chosen.push, mechanisms=mechanisms, precision=precision, threads=threads
+        )
+    if randomisation is not None and parameters:
+        raise InputError("fixed parameters beside a randomisation", where=task, remedy="give one of the two")
+    known = set(Settings.__dataclass_fields__)
+    for name in settings:
+        if name not in known:
+            raise InputError(f"unknown setting {name!r}", where=task, remedy=f"use one of {', '.join(sorted(known))}")
+    return Episodes(simulator, chosen, lanes, randomisation or Point(parameters or {}), Settings(**settings))

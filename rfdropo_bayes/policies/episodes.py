@@ -1,0 +1,275 @@
+"""Many episodes of a task at once, each lane with its own parameters, goal, commands and age.
+
+What Gymnasium and Stable-Baselines3 want of an environment differs in form only; `gym_env` and `vec_env` give this the
+one form or the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.policies.randomisation import Randomisation, fitting
+from rfdropo_bayes.policies.tasks import (
+    EPISODE,
+    FLOOR,
+    Actions,
+    Observed,
+    Task,
+    distance_to,
+    layout_of,
+    parts_seen,
+    resting_height,
+    reward,
+)
+from rfdropo_bayes.simulators.control_session import Session
+from rfdropo_bayes.simulators.parameters import check_names, check_value
+from rfdropo_bayes.simulators.protocol import Observation, Result
+
+REDRAWS = 200
+"""Times that a lane whose initial state was not found is given other parameters. Of the ranges that uniform
+randomisation fits to the virtual trunk, one draw in eight hangs clear of the cube: one reset in 10^11 is given up."""
+LEVER = 0.0175
+"""Half a side of the paper's cube [m]: where motion capture sees the points that tell how the cube is turned."""
+
+
+class EpisodeStep(NamedTuple):
+    """What came of an action in every lane."""
+
+    observation: Float[np.ndarray, "lane size"]
+    reward: Float[np.ndarray, " lane"]
+    terminated: Bool[np.ndarray, " lane"]
+    truncated: Bool[np.ndarray, " lane"]
+    distance: Float[np.ndarray, " lane"]  # [m]; that of the last good state where the simulation failed
+    diverged: Bool[np.ndarray, " lane"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a task is played.
+
+    Attributes:
+        actions, observed, period, step: see `layout_of`.
+        noise: standard deviation of white noise on what is seen of the markers and of points of the cube [m]. What a
+            marker has moved is the difference of two sightings, as on a robot.
+        near: an episode ends within this distance of the goal [m]; None lets it go on, which keeps the reward of
+            staying there.
+    """
+
+    actions: Actions = "discrete"
+    observed: Observed = "paper"
+    period: float = 0.05
+    step: float = 0.005
+    noise: float = 0.0
+    near: float | None = None
+
+
+class Episodes:
+    """Lanes of a task.
+
+    Args:
+        simulator: whose parameters are drawn, with mechanisms or without.
+        task: goal and reward.
+        lanes: how many.
+        randomisation: where parameters come from.
+        settings: how the task is played.
+
+    Attributes:
+        layout: of observations and actions.
+        redrawn: parameter sets that were drawn anew because no initial state was found.
+        goal: of every lane [m].
+        parameters: of every lane, those that were drawn or given.
+
+    Raises:
+        InputError: a randomisation that does not fit the simulator, or a task that does not fit the robot.
+    """
+
+    def __init__(
+        self, simulator: Any, task: Task, lanes: int, randomisation: Randomisation, settings: Settings
+    ) -> None:
+        self.task, self.settings, self.lanes = task, settings, lanes
+        self.simulator, self.robot = simulator, simulator.robot
+        self.layout = layout_of(task, self.robot, settings.actions, settings.observed, settings.period, settings.step)
+        self._specs = {spec.name: spec for spec in simulator.parameters}
+        self.randomisation = fitting(randomisation, simulator.parameters)
+        self.session = Session(simulator, lanes, settings.period)
+        self.redrawn = 0
+        self.generators = [np.random.default_rng(child) for child in np.random.SeedSequence().spawn(lanes)]
+        self.parameters: list[dict[str, float]] = [{} for _ in range(lanes)]
+        markers = len(self.robot.marker_names)
+        self.goal, self.commands = np.zeros((lanes, 3)), np.zeros((lanes, len(self.layout.channels)))
+        self.age = np.zeros(lanes, dtype=int)
+        self.first = np.ones(lanes)
+        self.marker = np.zeros((lanes, markers, 3))
+        self.pose = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (lanes, 1)) if task.push else None
+        self.seen, self.seen_before, self.seen_pose = self.marker, self.marker, self.pose
+
+    def seed(self, lane: int, seed: int | np.random.SeedSequence) -> None:
+        """Let a lane draw from a generator with this seed from now on; without, no two episodes are alike."""
+        self.generators[lane] = np.random.default_rng(seed)
+
+    def reset(
+        self, rows: Sequence[int] | Int[np.ndarray, " row"], options: Sequence[Mapping[str, Any]] | None = None
+    ) -> Float[np.ndarray, "row size"]:
+        """Begin an episode in some lanes; the others stay where they are.
+
+        Args:
+            rows: lanes.
+            options: for each row what is not drawn: ``parameters``, values by name, and ``goal`` [m].
+
+        Returns:
+            The first observations of these rows.
+
+        Raises:
+            InputError: an unknown option or parameter, values outside their bounds, or no initial state after
+                `REDRAWS` draws.
+        """
+        rows = np.asarray(rows, dtype=int)
+        given = [dict(option) for option in options] if options else [{} for _ in rows]
+        for option in given:
+            _check_options(option)
+        for row, option in zip(rows, given, strict=True):
+            low, high = np.array(self.task.goal_low), np.array(self.task.goal_high)
+            drawn = self.generators[row].uniform(low, high)
+            self.goal[row] = np.asarray(option.get("goal", drawn), dtype=float)
+        waiting = {int(row): option.get("parameters") for row, option in zip(rows, given, strict=True)}
+        for attempt in range(REDRAWS + 1):
+            found = self._begin(waiting)
+            good = np.asarray(found.status) == int(Result.OK)
+            self._take(np.array(list(waiting))[good], _rows_of(found, good))
+            failed = [row for row, well in zip(waiting, good, strict=True) if not well]
+            if not failed:
+                return self._observe(rows)
+            fixed = [row for row in failed if waiting[row] is not None]
+            if fixed or attempt == REDRAWS:
+                row, code = failed[0], Result(int(np.asarray(found.status)[~good][0]))
+                raise InputError(
+                    f"no initial state for {_brief(self.parameters[row])} ({code.name.lower().replace('_', ' ')})",
+                    where=f"{self.task.name}, lane {row}",
+                    remedy=code.remedy,
+                )
+            self.redrawn += len(failed)
+            waiting = dict.fromkeys(failed)
+        raise AssertionError("unreachable")
+
+    def act(self, actions: np.ndarray) -> EpisodeStep:
+        """One action in every lane.
+
+        Raises:
+            InputError: actions that are not finite, or no action of the layout.
+        """
+        actions = np.asarray(actions)
+        if not np.all(np.isfinite(actions)):
+            raise InputError(
+                f"{int(np.sum(~np.isfinite(actions)))} numbers of the actions are not finite",
+                where=self.task.name,
+                remedy="look for NaN in the policy",
+            )
+        change = self.layout.change(actions.reshape(self.lanes, *actions.shape[1:]))
+        self.commands = np.clip(self.commands + change, self.layout.low, self.layout.high)
+        found = self.session.act(self.commands)
+        good = (np.asarray(found.status) == int(Result.OK)) & np.isfinite(found.position).all(axis=(1, 2))
+        self.marker = np.where(good[:, None, None], found.position, self.marker)
+        if self.pose is not None:
+            self.pose = np.where(good[:, None], np.asarray(found.object_pose), self.pose)
+        self.age += 1
+        self.seen_before = self.seen
+        self._look(np.arange(self.lanes))
+        distance = self.distance()
+        gained = np.where(good, reward(distance, self.first), FLOOR * (EPISODE - self.age + 1))
+        ended = ~good if self.settings.near is None else ~good | (distance <= self.settings.near)
+        return EpisodeStep(
+            self._observe(np.arange(self.lanes)), gained, ended, (self.age >= EPISODE) & ~ended, distance, ~good
+        )
+
+    def distance(self) -> Float[np.ndarray, " lane"]:
+        """Distance of the tip, or of the cube, to the goal [m]."""
+        place = self.marker[:, -1] if self.pose is None else self.pose[:, :3]
+        return distance_to(self.task, place, self.goal)
+
+    def begun_with(self, lane: int) -> dict[str, Any]:
+        """What the episode of a lane began with, enough to begin it again as an option of `reset`."""
+        return {"parameters": dict(self.parameters[lane]), "goal": self.goal[lane].tolist()}
+
+    def _begin(self, waiting: Mapping[int, Mapping[str, float] | None]) -> Observation:
+        """Start lanes, with the parameters that are given or with draws."""
+        rows = list(waiting)
+        for row, values in waiting.items():
+            drawn = self.randomisation.draw(self.generators[row]) if values is None else dict(values)
+            check_names(drawn, self._specs.values(), where=self.task.name)
+            for name, value in drawn.items():
+                check_value(self._specs[name], value, where=self.task.name)
+            self.parameters[row] = {name: float(value) for name, value in drawn.items()}
+        names = list(dict.fromkeys(name for row in rows for name in self.parameters[row]))
+        values_of = {
+            name: np.array([self.parameters[row].get(name, self._specs[name].nominal) for row in rows])
+            for name in names
+        }
+        if self.task.push:
+            side = values_of.get("cube_side", np.full(len(rows), self._specs["cube_side"].nominal))
+            up = int(np.argmax(np.abs(self.robot.gravity)))
+            values_of[f"cube_{'xyz'[up]}"] = resting_height(self.robot, side)
+        return self.session.reset(np.array(rows), values_of)
+
+    def _take(self, rows: Int[np.ndarray, " row"], found: Observation) -> None:
+        """Let lanes be where an observation shows them, at the start of an episode."""
+        if not len(rows):
+            return
+        self.marker = self.marker.copy()
+        self.marker[rows] = found.position
+        if self.pose is not None:
+            self.pose = self.pose.copy()
+            self.pose[rows] = found.object_pose
+        self.commands[rows], self.age[rows] = 0.0, 0
+        self.first[rows] = self.distance()[rows]
+        self._look(rows)
+        self.seen_before = self.seen_before.copy()
+        self.seen_before[rows] = self.seen[rows]
+
+    def _look(self, rows: Int[np.ndarray, " row"]) -> None:
+        """Let some lanes be seen, with the errors of motion capture."""
+        noise, count = self.settings.noise, self.marker[0].size
+        if not noise:
+            self.seen, self.seen_pose = self.marker, self.pose
+            return
+        own = [self.generators[row] for row in rows]
+        errors = noise * np.stack([rng.normal(size=count + (0 if self.pose is None else 6)) for rng in own])
+        self.seen = self.seen.copy()
+        self.seen[rows] = self.marker[rows] + errors[:, :count].reshape(-1, *self.marker.shape[1:])
+        if self.pose is not None:
+            assert self.seen_pose is not None
+            turn = Rotation.from_rotvec(errors[:, count + 3 :] / LEVER) * Rotation.from_quat(self.pose[rows, 3:])
+            place = self.pose[rows, :3] + errors[:, count : count + 3]
+            self.seen_pose = self.seen_pose.copy()
+            self.seen_pose[rows] = np.concatenate([place, turn.as_quat()], axis=1)
+
+    def _observe(self, rows: Int[np.ndarray, " row"]) -> Float[np.ndarray, "row size"]:
+        seen, before = self.seen[rows], self.seen_before[rows]
+        pose = None if self.seen_pose is None else self.seen_pose[rows]
+        parts = parts_seen(self.layout, self.robot, seen, before, self.goal[rows], self.commands[rows], pose)
+        return self.layout.assemble(parts)
+
+
+def _rows_of(found: Observation, chosen: Bool[np.ndarray, " row"]) -> Observation:
+    """Some rows of an observation."""
+    parts: list[Any] = [None if part is None else np.asarray(part)[chosen] for part in found]
+    return Observation(*parts)
+
+
+def _check_options(option: Mapping[str, Any]) -> None:
+    unknown = set(option) - {"parameters", "goal"}
+    if unknown:
+        raise InputError(f"unknown option {sorted(unknown)[0]!r}", where="reset", remedy="use parameters and goal")
+    goal = option.get("goal")
+    if goal is not None and (np.shape(goal) != (3,) or not np.all(np.isfinite(np.asarray(goal, dtype=float)))):
+        raise InputError(f"goal = {goal!r}", where="reset", remedy="give three finite numbers in metres")
+
+
+def _brief(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} = {value:.4g}" for name, value in values.items()) or "nominal parameters"

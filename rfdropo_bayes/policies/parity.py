@@ -1,0 +1,132 @@
+"""Exported policies beside the models they are made from: before a training and after it.
+
+Some options of an algorithm change the network in ways that an export may not follow. A training of hours must not end
+there, so that the untrained policy is exported and compared first: as it is, and with numbers drawn for its weights,
+because the actions of an untrained policy are near zero, where a tanh or a limit that is missing does not show.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.policies.evaluation import Act
+from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy, policy_layers
+from rfdropo_bayes.robots.policy_layout import PolicyLayout
+
+ROWS = 512
+SMALLEST, USUAL, LARGEST = 0.01, 3.0, 20.0
+"""Observations in deviations from their mean: from almost none to what a trained policy meets, and to twice what a
+normalisation lets through."""
+DEVIATION = 0.1
+"""Of observations that are not normalised [m]."""
+
+TOLERANCE = 1e-3
+"""Of a continuous action, whose ends are -1 and 1. Float32 in another order changes it by less than a tenth of this; a
+missing layer by a hundred times as much."""
+TIES = 0.01
+"""Share of discrete actions that may differ: where two are worth the same to the last bit, either is right."""
+
+OUTPUT = 4.0
+"""Deviation of the last layer's output with drawn weights, in deviations of its input: twice where gSDE limits it."""
+
+
+def observations(normalisation: Any, size: int, largest: float = USUAL) -> Float[np.ndarray, "row size"]:
+    """Observations from near their mean to ``largest`` deviations away from it, as the environments give them.
+
+    Args:
+        normalisation: the ``VecNormalize`` of the policy, or None where it sees metres as they are.
+        size: of an observation.
+        largest: deviations of the last row.
+    """
+    rows = np.random.default_rng(0).normal(size=(ROWS, size)) * np.geomspace(SMALLEST, largest, ROWS)[:, None]
+    if normalisation is None or not normalisation.norm_obs:
+        return (DEVIATION * rows).astype(np.float32)
+    moments = normalisation.obs_rms
+    return (moments.mean + np.sqrt(moments.var + normalisation.epsilon) * rows).astype(np.float32)
+
+
+def difference(policy: ExportedPolicy, act: Act, seen: Float[np.ndarray, "row size"]) -> str | None:
+    """How an exported policy acts otherwise than ``act``, in words; None if it does not."""
+    found, wanted = policy.act(seen), np.asarray(act(seen))
+    if policy.layout.kind == "discrete":
+        share = float(np.mean(found != wanted))
+        return f"in {share:.0%} of its actions" if share > TIES else None
+    apart = np.abs(found - wanted)
+    row = np.unravel_index(np.argmax(np.where(np.isnan(apart), np.inf, apart)), apart.shape)
+    if apart[row] <= TOLERANCE:
+        return None
+    return f"{found[row]:.3f} for {wanted[row]:.3f} of an action from -1 to 1"
+
+
+def check_exportable(model: Any, normalisation: Any, act: Act, layout: PolicyLayout) -> None:
+    """Refuse a model whose export would act otherwise; model, normalisation and random generators stay as they are.
+
+    Args:
+        model: of Stable-Baselines3, untrained or not.
+        normalisation: the ``VecNormalize`` around its environments, or None.
+        act: from observations as the environments give them to the model's most likely actions.
+        layout: of its observation and action.
+
+    Raises:
+        InputError: a layer that cannot be exported, or another action.
+    """
+    modes = [(module, module.training) for module in model.policy.modules()]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "policy.onnx"
+        _compare(model, normalisation, act, layout, path)
+        with _drawn(model, normalisation):
+            _compare(model, normalisation, act, layout, path)
+    for module, mode in modes:  # a prediction ends the mode of training
+        module.training = mode
+
+
+def _compare(model: Any, normalisation: Any, act: Act, layout: PolicyLayout, path: Path) -> None:
+    policy = ExportedPolicy(export_policy(model, normalisation, layout, path, {}))
+    apart = difference(policy, act, observations(normalisation, layout.size, LARGEST))
+    if apart is not None:
+        raise InputError(
+            f"the exported policy would act otherwise than the trained one: {apart}",
+            where="[training.options]",
+            remedy="leave out the options that change the network, such as policy_kwargs",
+        )
+
+
+@contextmanager
+def _drawn(model: Any, normalisation: Any) -> Iterator[None]:
+    """A model with drawn weights and a normalisation with drawn moments, for as long as the context lasts.
+
+    Tensors and moments are exchanged and put back, not changed: what is trained afterwards is what was there before,
+    bit for bit.
+    """
+    import torch
+
+    rng = np.random.default_rng(1)
+    kept = [(parameter, parameter.data) for parameter in model.policy.parameters()]
+    last = policy_layers(model)[0][-1].modules()
+    outputs = [module.weight for module in last if isinstance(module, torch.nn.Linear)][-1]
+    moments = None if normalisation is None else normalisation.obs_rms
+    try:
+        for parameter, data in kept:
+            # He et al. (2015): with variance 2 / n of the weights neither ReLU nor tanh lets a signal die or blow up.
+            gain = OUTPUT if parameter is outputs else np.sqrt(2.0)
+            spread = gain / np.sqrt(max(data.shape[-1], 1)) if data.ndim > 1 else 0.5
+            parameter.data = torch.as_tensor(rng.normal(scale=spread, size=data.shape)).to(data)
+        if moments is not None:
+            drawn = moments.copy()
+            drawn.mean = rng.normal(scale=0.3, size=drawn.mean.shape)  # m, as a robot of that length
+            drawn.var = rng.uniform(1e-4, 1.0, size=drawn.var.shape)
+            normalisation.obs_rms = drawn
+        yield
+    finally:
+        for parameter, data in kept:
+            parameter.data = data
+        if moments is not None:
+            normalisation.obs_rms = moments

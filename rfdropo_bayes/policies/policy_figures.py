@@ -1,0 +1,59 @@
+"""Figures of policies: how one learnt, and how often each succeeds within which distance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from rfdropo_bayes.policies.evaluation import Episode
+from rfdropo_bayes.report.style import CYCLE, WIDTH, styled
+
+MILLIMETRES = 1e3
+
+
+@styled
+def curve_figure(curve: Sequence[Mapping[str, float]]) -> Figure:
+    """Reward and final distance of the evaluations during a training."""
+    figure = Figure(figsize=(WIDTH, 2.6))
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    steps = [row["steps"] for row in curve]
+    left.plot(steps, [row["reward"] for row in curve], marker=".")
+    left.set(xlabel="environment steps", ylabel="reward of an episode")
+    low, middle, high = ([MILLIMETRES * row[f"distance_{name}"] for row in curve] for name in ("q05", "median", "q95"))
+    right.fill_between(steps, low, np.nan_to_num(high, posinf=np.nan), alpha=0.25, label="5 to 95 %")
+    right.plot(steps, middle, marker=".", label="median")
+    right.set(xlabel="environment steps", ylabel="final distance to the goal [mm]", yscale="log")
+    right.legend()
+    return figure
+
+
+@styled
+def success_figure(policies: Mapping[str, Sequence[Episode]], thresholds: Sequence[float]) -> Figure:
+    """Share of the episodes that end within a distance, for every policy."""
+    figure = Figure(figsize=(WIDTH, 3.2))
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for colour, (name, episodes) in zip(CYCLE * len(policies), policies.items(), strict=False):
+        found = MILLIMETRES * np.sort([episode.distance for episode in episodes])
+        share = 100.0 * np.arange(1, len(found) + 1) / len(found)
+        finite = np.isfinite(found)
+        axes.step(found[finite], share[finite], where="post", color=colour, label=name)
+    for threshold in thresholds:
+        axes.axvline(MILLIMETRES * threshold, color="0.7", linewidth=0.8, zorder=0)
+    axes.set(xscale="log", xlabel="final distance to the goal [mm]", ylabel="episodes within it [%]", ylim=(0, 101))
+    axes.legend(loc="upper left")
+    return figure
+
+
+def save_animation(frames: Sequence[np.ndarray], path: Path, period: float) -> Path:
+    """Write pictures, one every ``period`` [s], as a GIF in real time."""
+    pictures: list[Any] = [Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE) for frame in frames]
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(1e3 * period), loop=0)
+    return path

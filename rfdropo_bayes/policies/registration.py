@@ -1,0 +1,19 @@
+"""Environments by their names in Gymnasium."""
+
+from __future__ import annotations
+
+NAMES = ("TrunkReach-v0", "TrunkPush-v0")
+
+
+def register() -> None:
+    """Make ``gymnasium.make`` and ``gymnasium.make_vec`` know the tasks."""
+    import gymnasium
+
+    for name in NAMES:
+        if name not in gymnasium.registry:
+            gymnasium.register(
+                name,
+                entry_point="rfdropo_bayes.policies.gym_env:TrunkEnv",
+                vector_entry_point="rfdropo_bayes.policies.gym_env:TrunkVectorEnv",
+                kwargs={"task": name},
+            )

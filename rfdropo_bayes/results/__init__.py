@@ -1,0 +1,1 @@
+"""What the verbs return, as objects that show themselves, draw their figures and write their files."""

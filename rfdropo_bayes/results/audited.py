@@ -1,0 +1,176 @@
+"""What an audit found, as an object that shows itself and writes its files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import write_json, write_text
+from rfdropo_bayes.model.experiment import Experiment
+from rfdropo_bayes.model.experiment_file import describe
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.model_spec import RunSettings, Workpiece, spec_of
+from rfdropo_bayes.report import audit_figures as figures
+from rfdropo_bayes.report.audit_figures import Shown
+from rfdropo_bayes.report.trajectory_figures import AXES
+from rfdropo_bayes.results.calibrated import axes_or_new
+from rfdropo_bayes.tables import nearest, parse_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+AUDIT, EXTENDED, REPORT = "audit.json", "extended.toml", "report.html"
+
+
+@dataclass(frozen=True)
+class Audit:
+    """What a simulator lacks, by name.
+
+    Attributes:
+        content: of audit.json.
+        tables: of the experiment extended by what was adopted, as a file has them.
+        page: of the report, HTML.
+        robot: that was audited, where it was made in Python; None where the tables name it.
+        base: folder that paths in the tables are relative to.
+        folder: that it was written to, if any.
+        shown: what its figures show; None where it was read from files.
+    """
+
+    content: Mapping[str, Any]
+    tables: Mapping[str, Any]
+    page: str
+    robot: Workpiece | None
+    base: Path
+    folder: Path | None = None
+    shown: Shown | None = None
+
+    @property
+    def verdict(self) -> str:
+        """explained, equivalent, partly_explained, unexplained, no_discrepancy or no_verdict."""
+        return str(self.content["verdict"])
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words that a lab can act on."""
+        return str(self.content["sentence"])
+
+    @cached_property
+    def findings(self) -> pd.DataFrame:
+        """One row per parameter of what was named: mean, 5 and 95 % quantile, unit, and how much it explains."""
+        columns = ("explained_fraction", "adjusted_p", "log_bayes_factor")
+        rows = [
+            {"mechanism": found["mechanism"], "parameter": name, **row, **{key: found[key] for key in columns}}
+            for found in self.content["findings"]
+            for name, row in found["parameters"].items()
+        ]
+        index = ["mechanism", "parameter"]
+        return pd.DataFrame(rows).set_index(index) if rows else pd.DataFrame(columns=["mean", "unit", *columns])
+
+    @cached_property
+    def candidates(self) -> pd.DataFrame:
+        """Every mechanism that was tried, with its statistics."""
+        return pd.DataFrame(self.content["candidates"])
+
+    @property
+    def gain(self) -> Mapping[str, Any] | None:
+        """Errors on unseen recordings without and with what was found; None where nothing was found."""
+        return self.content["gain"]
+
+    @property
+    def extended(self) -> Model:
+        """The model with the mechanisms that unseen recordings support, with priors for their parameters."""
+        experiment = parse_table(Experiment, self.tables, where=EXTENDED)
+        return Model.of(spec_of(experiment, self.base, self.robot), RunSettings.of(experiment))
+
+    def plot_residual(self, against: str = "time", ax: Axes | None = None) -> Axes:
+        """Draw what the base model leaves of the fitted recordings, beside what might have caused it.
+
+        Args:
+            against: time, command, rate, direction (sign of the rate), position, or tension.
+            ax: that it is drawn on; axes of a new figure by default.
+
+        Raises:
+            InputError: no such cause. As for all figures: the audit was read from files, which do not hold them.
+        """
+        residuals = self._shown().residuals
+        known = figures.causes(residuals)
+        if against not in known:
+            raise InputError(f"no cause {against!r}", where="audit", remedy=nearest(against, known))
+        axes = axes_or_new(ax)
+        figures.draw_residual(axes, residuals, against)
+        return axes
+
+    def plot_blocks(self, ax: Axes | None = None) -> Axes:
+        """Draw when each model fails: mean square of the means of blocks of rows, 1 where a model is right."""
+        axes = axes_or_new(ax)
+        figures.draw_blocks(axes, self._shown())
+        axes.legend()
+        return axes
+
+    def plot_likeness(self, ax: Axes | None = None) -> Axes:
+        """Draw how alike the candidates' signatures are: cosines, once the base parameters have done what they can."""
+        axes = axes_or_new(ax)
+        figures.draw_cosines(axes, self._shown())
+        return axes
+
+    def plot_unseen(self, axis: str = "x", ax: Axes | None = None) -> Axes:
+        """Draw the last marker of an unseen recording: measured, base model, extended model.
+
+        Raises:
+            InputError: no recording was left unseen, or nothing was named.
+        """
+        if self._shown().unseen is None:
+            raise InputError("no unseen recording was predicted", where="audit", remedy="give recordings as test=")
+        axes = axes_or_new(ax)
+        figures.draw_unseen(axes, self._shown(), AXES.index(axis))
+        axes.legend()
+        return axes
+
+    def plot_remainder(self, ax: Axes | None = None) -> Axes:
+        """Draw what the last model leaves of the last marker, with two standard deviations.
+
+        Raises:
+            InputError: it leaves nothing but noise.
+        """
+        if self._shown().remainder is None:
+            raise InputError("the last model leaves nothing but noise", where="audit", remedy="draw another figure")
+        axes = axes_or_new(ax)
+        figures.draw_remainder(axes, self._shown())
+        axes.legend()
+        return axes
+
+    def _shown(self) -> Shown:
+        if self.shown is None:
+            raise InputError(
+                "an audit that was read from files cannot draw",
+                where="audit",
+                remedy="see its report.html, or audit again",
+            )
+        return self.shown
+
+    def report(self, path: Path | str) -> Path:
+        """Write the report, one HTML page that needs nothing else; return its path."""
+        write_text(Path(path), self.page)
+        return Path(path)
+
+    def save(self, folder: Path | str) -> Path:
+        """Write audit.json, extended.toml and report.html; return the path of the report."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / AUDIT, self.content, finite=True)
+        write_text(folder / EXTENDED, describe(self.tables))
+        return self.report(folder / REPORT)
+
+    def _repr_html_(self) -> str:
+        table = self.findings.to_html(float_format=lambda x: f"{x:.3g}") if len(self.findings) else ""
+        return f"<p><b>{escape(self.verdict.replace('_', ' '))}</b>: {escape(self.sentence)}</p>{table}"
+
+    def __repr__(self) -> str:
+        return f"{self.verdict}: {self.sentence}"

@@ -1,1 +1,0 @@
-"""Policies: training with Stable-Baselines3, paired evaluation, export to ONNX with a model card."""

@@ -1,0 +1,489 @@
+"""What a simulator lacks, by name: ``audit``, and ``rfdropo audit`` for an experiment file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from rfdropo_bayes.audit.audit_record import next_experiment, record
+from rfdropo_bayes.audit.candidates import Candidate
+from rfdropo_bayes.audit.coordinates import Coordinates
+from rfdropo_bayes.audit.deadline import Deadline
+from rfdropo_bayes.audit.differences import Groups, with_differences
+from rfdropo_bayes.audit.extension import DISCRETISATION, Rules
+from rfdropo_bayes.audit.fit import widening
+from rfdropo_bayes.audit.fixed_quantities import OwnParameter, with_fixed_quantities
+from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
+from rfdropo_bayes.audit.journal import Journal
+from rfdropo_bayes.audit.pipeline import Answer, AuditProblem
+from rfdropo_bayes.audit.pipeline import audit as ask
+from rfdropo_bayes.bayes.channels import Series
+from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
+from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.bayes.recordings import commands_of, gather_recordings
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
+from rfdropo_bayes.mechanisms.registry import source_of
+from rfdropo_bayes.model.assembly import (
+    AnySimulator,
+    build_simulator,
+    expand_groups,
+    fixed_values,
+    gather_channels,
+    measurement_specs,
+    model_space,
+    stated_noise,
+)
+from rfdropo_bayes.model.experiment import AuditTable, NoiseTable
+from rfdropo_bayes.model.experiment_file import code_placed, describe, self_contained
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.model_spec import ModelSpec
+from rfdropo_bayes.model.run_folder import hashes, run_folder
+from rfdropo_bayes.report import software_versions
+from rfdropo_bayes.report.audit_page import render_audit, shown
+from rfdropo_bayes.report.run_files import SUMMARY
+from rfdropo_bayes.report.summary import combined_hash, read_summary
+from rfdropo_bayes.results.audited import Audit
+from rfdropo_bayes.results.calibrated import Calibration
+from rfdropo_bayes.robots import Robot, robot_shape
+from rfdropo_bayes.simulators.black_box import BlackBox
+from rfdropo_bayes.simulators.commands import Commands, stack_commands
+from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechanism, obstacle
+from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
+from rfdropo_bayes.simulators.trunk import TrunkSimulator
+from rfdropo_bayes.tables import changed, parse_table
+from rfdropo_bayes.verbs.between import Between, extend_groups, find_groups
+
+Workshop = dict[str, Lanes]
+
+JOURNAL = "checkpoints/audit"
+FINER = 2
+
+
+def audit(
+    model: Model,
+    runs: Sequence[Trajectory],
+    *,
+    test: Sequence[Trajectory] = (),
+    seed: int = 0,
+    base: Calibration | Path | None = None,
+    noise: Mapping[str, float] | None = None,
+    out: Path | str | None = None,
+    title: str = "",
+    resume: bool = False,
+    overwrite: bool = False,
+    workshop: Workshop | None = None,
+    report: Callable[[str], None] = lambda line: None,
+    inspect: Callable[[Answer], None] = lambda answer: None,
+    tables: Mapping[str, Any] | None = None,
+    between: Between | None = None,
+    **options: Any,
+) -> Audit:
+    """Say what a model lacks, by name, and measure what it gains with that.
+
+    Args:
+        model: what is simulated and inferred.
+        runs: recordings that are fitted and screened.
+        test: unseen recordings, which measure the gain.
+        seed: of all that is random. The same seed gives the same answer.
+        base: an earlier calibration, or its folder, from whose posterior means the base model starts.
+        noise: ``{"standard_deviation": m}`` of the positions, perhaps with a ``correlation_time`` [s]; it counts where
+            nothing was repeated.
+        out: folder that gets audit.json, extended.toml and report.html; None writes nothing.
+        title: heading of the report; the robot's name by default.
+        resume: go on from what an interrupted audit has left in ``out``.
+        overwrite: start anew whatever ``out`` holds.
+        workshop: see `build_problem`.
+        report: called with a line of words now and then.
+        inspect: called with the answer.
+        tables: of the experiment file that the model was read from, for the record.
+        between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared.
+            Two names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
+            What both lack is named, too.
+        options: keys of an experiment file's [audit]: ``candidates`` (names, or classes of one's own), ``exclude``,
+            ``bootstraps``, ``minutes``.
+
+    Raises:
+        InputError: bad input, before anything long has started.
+    """
+    model = _asked(model, noise, options)
+    spec, table, title = model.spec, model.settings.audit, title or model.name
+    deadline = Deadline(table.minutes)
+    groups = None
+    if between is not None:
+        groups, runs, test = find_groups(between, spec.groups, runs, test)
+    start = start_values(base)
+    problem = build_problem(spec, table, runs, test, seed, start=start, workshop=workshop, groups=groups)
+    tables = {**model.tables(), "title": title, "seed": seed} if tables is None else tables
+
+    def found(out: Path | None) -> Audit:
+        journal = None if out is None else Journal(out / JOURNAL, resume=resume)
+        answer = ask(problem, report, journal, deadline)
+        inspect(answer)
+        data = combined_hash([trajectory.sha256 for trajectory in [*runs, *test]])
+        return _audited(answer, model, tables, title, data, out)
+
+    if out is None:
+        return found(None)
+    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes([*runs, *test])}
+    given: dict[str, Any] = {"base": base.folder if isinstance(base, Calibration) else base, "seed": seed}
+    given |= {} if groups is None else {"between": {name: list(own) for name, own in groups.members.items()}}
+    settings |= {"options": given, "texts": model.texts()}
+    with run_folder(Path(out), "audit", **settings, resume=resume, overwrite=overwrite) as place:
+        answered = found(place)
+        answered.save(place)
+    return answered
+
+
+def _audited(
+    answer: Answer, model: Model, tables: Mapping[str, Any], title: str, data_sha256: str, out: Path | None
+) -> Audit:
+    """What an audit found as an object, with its page."""
+    versions, following = software_versions(), next_experiment(answer)
+    content = record(answer, versions=versions, data_sha256=data_sha256, next_experiment=following)
+    seen, shape = shown(answer), robot_shape(model.robot) if isinstance(model.robot, Robot) else None
+    page = render_audit(seen, content, title, describe(tables), shape)
+    extended = extended_tables(dict(tables), answer, model.folder, out)
+    made = None if model.spec.named else model.robot
+    return Audit(content, extended, page, made, out or model.folder, out, seen)
+
+
+def _asked(model: Model, noise: Mapping[str, float] | None, options: Mapping[str, Any]) -> Model:
+    """The model with the tables [audit] and [noise] of a call."""
+    spec, settings = model.spec, model.settings
+    if options:
+        chosen = {**settings.audit.model_dump(exclude_unset=True), **options}
+        if "candidates" in chosen:
+            chosen["candidates"] = [source_of(candidate) for candidate in chosen["candidates"]]
+        settings = replace(settings, audit=parse_table(AuditTable, chosen, where="audit"))
+    if noise is not None:
+        spec = replace(spec, stated=parse_table(NoiseTable, noise, where="audit, noise"))
+    return Model.of(spec, settings)
+
+
+def run_audit(
+    path: Path, out: Path, *, overrides: Sequence[str] = (), seed: int | None = None, **options: Any
+) -> dict[str, Any]:
+    """`audit` what an experiment file says; return the content of audit.json.
+
+    Args:
+        path: the experiment file.
+        out: folder to write to.
+        overrides: assignments that replace entries of the file.
+        seed: of the audit; that of the file by default.
+        options: further arguments of `audit`.
+    """
+    model, tables = Model.read(path, overrides)
+    found = audit(
+        model,
+        model.recordings("fit"),
+        test=model.recordings("test"),
+        seed=model.settings.seed if seed is None else seed,
+        out=out,
+        title=model.settings.title or path.stem,
+        tables=tables,
+        **options,
+    )
+    return dict(found.content)
+
+
+def build_problem(
+    spec: ModelSpec,
+    table: AuditTable,
+    fitted: Sequence[Trajectory],
+    tested: Sequence[Trajectory],
+    seed: int,
+    *,
+    start: dict[str, float] | None = None,
+    workshop: Workshop | None = None,
+    names: Sequence[str] | None = None,
+    groups: Groups | None = None,
+) -> AuditProblem:
+    """The base model with every candidate of the library in it, at its null value.
+
+    ``table`` is [audit]; ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names``
+    are the candidates, where it is not all; ``groups`` of recordings are compared.
+    """
+    spreads, robot = spec.per_group, spec.robot
+    if groups is not None:  # what the groups do not share is to be found
+        spec = replace(spec, per_group={})
+    trajectories = [*fitted, *tested]
+    left_out: dict[str, str] = {}
+    library = names is None
+    if names is None:
+        names = candidate_names(spec, table)
+        left_out = obstacles(spec, names, trajectories[0])
+        names = [name for name in names if name not in left_out]
+    simulator = build_simulator(spec.with_mechanisms(*names))
+    model, base = _model(spec, simulator, trajectories, len(fitted))
+    added, specs = simulator.mechanisms[len(spec.mechanisms) :], simulator.parameters
+    candidates = _named(table, model, names, added)
+    if library:
+        of_candidates = {spec.name for mechanism in added for spec in mechanism.parameters}
+        plain, stated = [s for s in specs if s.name not in of_candidates], expand_groups(spreads, specs)
+        model, candidates = _with_own(model, base, plain, candidates, groups, stated)
+        candidates = [c for c in candidates if c.name not in table.exclude]
+    nominal, limits = {s.name: s.nominal for s in specs}, {s.name: (s.low, s.high) for s in specs}
+    coordinates = Coordinates(model.space, base, tuple(nominal), nominal, model.fixed, limits)
+    workshop = {} if workshop is None else workshop
+    lanes = partial(_lanes, names=names, model=model, coordinates=coordinates, workshop=workshop)
+
+    def half(robot: Robot) -> tuple[Lanes, Commands]:
+        finer = _finer(spec, robot)
+        whole = build_simulator(finer.with_mechanisms(*names))
+        commands = stack_commands([commands_of(whole, trajectory) for trajectory in trajectories])
+        return lanes(finer, whole), commands
+
+    return AuditProblem(
+        lanes(spec, simulator),
+        None if isinstance(robot, BlackBox) else half(robot),
+        coordinates,
+        model,
+        list(fitted),
+        candidates,
+        _stated(spec, model, fitted[0]),
+        start,
+        Rules(bootstraps=table.bootstraps, minutes=table.minutes),
+        seed,
+        {name: why for name, why in left_out.items() if name not in table.exclude},
+        groups,
+    )
+
+
+def _named(
+    table: AuditTable, model: TrajectoryModel, names: Sequence[str], added: Sequence[Mechanism]
+) -> list[Candidate]:
+    """Mechanisms as candidates, less those that [audit] excludes."""
+    index = {p.spec.name: i for i, p in enumerate(model.space.parameters)}
+    return [
+        Candidate(m.name, tuple(index[spec.name] for spec in m.parameters if spec.name in index), m, name)
+        for name, m in zip(names, added, strict=True)
+        if name not in table.exclude
+    ]
+
+
+def _with_own(
+    model: TrajectoryModel,
+    base: int,
+    plain: Sequence[ParameterSpec],
+    candidates: list[Candidate],
+    groups: Groups | None,
+    spreads: Mapping[str, float],
+) -> tuple[TrajectoryModel, list[Candidate]]:
+    """The model with the robot's own parameters among its candidates, and all that may differ between groups."""
+    space, own = with_fixed_quantities(model.space, plain, tuple(model.fixed))
+    if groups is not None:
+        space, candidates = with_differences(
+            space, base, plain, candidates, groups, spreads=spreads, held=tuple(model.fixed)
+        )
+    return replace(model, space=space), [*candidates, *own]
+
+
+def candidate_names(spec: ModelSpec, table: AuditTable) -> list[str]:
+    """What may be in the model: the registry and the experiment's own, less what is in its base model.
+
+    Excluded ones are among them, so that what is compiled does not depend on what is excluded.
+
+    Raises:
+        InputError: a name to exclude that is not there.
+    """
+    known = [*REGISTRY, *(name for name in table.candidates if name not in REGISTRY)]
+    own = spec.robot.parameter_table() if isinstance(spec.robot, Robot) else {}
+    for name in table.exclude:
+        if name not in known and not any(parameter.startswith(f"{name}_") for parameter in own):
+            raise InputError(f"unknown mechanism {name!r}", where="[audit] exclude", remedy=nearest(name, known))
+    return [name for name in known if name not in spec.sources]
+
+
+def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> dict[str, str]:
+    """Which of the candidates cannot run on the experiment's body and engine, and why.
+
+    A mechanism of the library says where it runs; one of a user's own is tried, too.
+    """
+    simulator = build_simulator(spec)
+    engine = str(simulator.description["engine"])
+    commands = stack_commands([commands_of(simulator, recording)])
+    found = {}
+    for name in names:
+        (mechanism,) = mechanisms_named([name], spec.robot, folder=spec.folder, where="[audit] candidates")
+        body = BLACK_BOX if isinstance(spec.robot, BlackBox) else spec.simulator.body
+        why = obstacle(mechanism, body, engine)
+        if why is None and name not in REGISTRY:
+            why = _refusal(build_simulator(spec.with_mechanisms(name)), commands)
+        if why is not None:
+            found[name] = why
+    return found
+
+
+def _refusal(simulator: AnySimulator, commands: Commands) -> str | None:
+    """What a simulator says against rollouts of its mechanisms, before anything is computed."""
+    try:
+        jax.eval_shape(jax.vmap(lambda given: simulator.rollout({}, given)), commands)
+    except InputError as error:
+        return error.what
+    return None
+
+
+def _lanes(
+    spec: ModelSpec,
+    whole: AnySimulator,
+    *,
+    names: Sequence[str],
+    model: TrajectoryModel,
+    coordinates: Coordinates,
+    workshop: Workshop,
+) -> Lanes:
+    """The simulator with all candidates; those that would slow every rollout down get a simulator of their own. Lanes
+    that the workshop has are not made again."""
+    fields, markers = _fields(model), model.recordings.marker_index
+    made = (spec.robot, spec.simulator, spec.drives, spec.sources, names)
+    key = repr((*made, markers.tolist(), coordinates.fixed, fields))
+    if key not in workshop:
+        every = _brisk(whole, markers, fields)
+        slow = {m.name for m in whole.mechanisms if isinstance(whole, TrunkSimulator) and _costly(whole, m)}
+        added = whole.mechanisms[len(spec.mechanisms) :]
+        kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
+        if len(kept) < len(names):
+            fast = _brisk(build_simulator(spec.with_mechanisms(*kept)), markers, fields)
+            null = dict(coordinates.nominal) | dict(coordinates.fixed) | coordinates.named(coordinates.null)
+            every = RoutedLanes(fast, every, null)
+        workshop[key] = every
+    return workshop[key]
+
+
+def _brisk(simulator: AnySimulator, marker_index: np.ndarray, fields: Sequence[str]) -> Lanes:
+    """Lanes with one-sided differences where there are any: they are exact enough for climbs and scores."""
+    if isinstance(simulator, TrunkSimulator) and not simulator.pushes and simulator.engine.backend.name == "numba":
+        quick = simulator.with_backend(simulator.engine.backend._replace(one_sided=True))
+        return Lanes(quick, marker_index, slope_rollouts=2, fields=fields)
+    return Lanes(simulator, marker_index, fields=fields)
+
+
+def _costly(simulator: TrunkSimulator, mechanism: Mechanism) -> bool:
+    """Whether a mechanism acts on the body in a way that slows the compiled engine down."""
+    if simulator.pushes or not isinstance(mechanism, BodyMechanism) or simulator.engine.backend.name != "numba":
+        return False
+    values = simulator.complete({})
+    plain = replace(simulator, mechanisms=()).material(values)
+    return mechanism.embody(values, plain, simulator.assembly.system.body).effects.rubs
+
+
+def _finer(spec: ModelSpec, robot: Robot) -> ModelSpec:
+    """The model with half the time step, and twice the layers of a body of layers; a mesh stays as it is."""
+    table = spec.simulator
+    finer: dict[str, Any] = {"time_step": (table.time_step or robot.time_step_s) / FINER}
+    if table.body == "layered":
+        finer["refine"] = min(FINER * table.refine, 16)
+    elif table.tetrahedra is not None and table.tetrahedra.drive_rate is not None:  # which is per step
+        rate = table.tetrahedra.drive_rate / FINER
+        finer["tetrahedra"] = changed(table.tetrahedra, where="[simulator.tetrahedra]", drive_rate=rate)
+    return replace(spec, simulator=changed(table, where="[simulator]", **finer))
+
+
+def _model(
+    spec: ModelSpec,
+    simulator: AnySimulator,
+    trajectories: Sequence[Trajectory],
+    fitted: int,
+) -> tuple[TrajectoryModel, int]:
+    """The model with all candidates, and how many of its parameters are of the base model, which come
+    first. The noise of its channels is known, so that its parameters are not among them."""
+    recordings, added = gather_recordings(simulator, trajectories), simulator.mechanisms[len(spec.mechanisms) :]
+    gains = [each for each in measurement_specs(spec.noise, spec.channels) if each == TENSION_GAIN]
+    specs, groups = (*simulator.parameters, *gains), (recordings.names[:fitted], recordings.names[fitted:])
+    space = model_space(spec, simulator, specs, *groups, later=added)
+    space = space.holding(space.typical_scales)  # evidences are compared at one spread between groups
+    of_candidates = {each.name for mechanism in added for each in mechanism.parameters}
+    base = sum(p.spec.name not in of_candidates for p in space.parameters)
+    channels = gather_channels(spec, simulator, trajectories, recordings, space.names, fitted)
+    return TrajectoryModel(simulator, space, fixed_values(spec, simulator), recordings, channels), base
+
+
+def _fields(model: TrajectoryModel) -> list[str]:
+    """Parts of an observation that are data."""
+    series = [channel.name for channel in model.channels if isinstance(channel, Series)]
+    return ["position" if name == "markers" else name for name in series]
+
+
+def _stated(spec: ModelSpec, model: TrajectoryModel, first: Trajectory) -> Stacked | None:
+    """The noise that the experiment states, for recordings without repeats: that of the positions under [noise],
+    that of other channels under [model.fixed]; None where that of any channel is not stated."""
+    if spec.stated is None or spec.stated.standard_deviation == 0.0:
+        return None
+    parts = [stated_noise(spec, model.recordings, first)]
+    for channel in model.channels[1:]:
+        if isinstance(channel, Series):
+            known = [model.fixed.get(each.name) for each in channel.noise_specs]
+            if any(value is None for value in known):
+                return None
+            parts.append(channel.stated(model.fixed, float(first.dataset.attrs["sample_time"])))
+    return Stacked(tuple(parts))
+
+
+def start_values(base: Calibration | Path | None) -> dict[str, float] | None:
+    """Posterior means of an earlier calibration, or of its folder."""
+    if base is None:
+        return None
+    content = base.content if isinstance(base, Calibration) else read_summary(Path(base) / SUMMARY)
+    return {name: float(row["mean"]) for name, row in content["parameters"].items()}
+
+
+def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path, out: Path | None = None) -> dict[str, Any]:
+    """The experiment file with the mechanisms that the model adopts, for ``rfdropo calibrate``.
+
+    ``out`` is the folder that it is written to, which gets copies of the user's own files.
+    """
+    extended = self_contained(tables, folder, out)
+    model = extended.setdefault("model", {})
+    simulator = extended.setdefault("simulator", {})
+    for step in answer.adopted:
+        if step.name == DISCRETISATION:
+            assert answer.problem.finer is not None
+            if simulator.get("body", "layered") == "layered":
+                simulator["refine"] = FINER * int(simulator.get("refine", 1))
+            elif "drive_rate" in simulator["tetrahedra"]:
+                simulator["tetrahedra"]["drive_rate"] /= FINER
+            simulator["time_step"] = answer.problem.finer[0].simulator.description["time_step_s"]
+            continue
+        candidate = answer.problem.candidate(step.name)
+        assert candidate is not None
+        if candidate.group:
+            extend_groups(model, answer, candidate)
+        if isinstance(candidate.mechanism, OwnParameter):
+            if not candidate.group:
+                model.setdefault("priors", {}).update(sized_priors(answer, candidate))
+            continue
+        source = code_placed(candidate.source, folder, out)
+        if source not in model.get("mechanisms", []):
+            model["mechanisms"] = [*model.get("mechanisms", []), source]
+        model.setdefault("priors", {}).update(sized_priors(answer, candidate))
+    audit = extended.get("audit", {})
+    if "candidates" in audit:
+        adopted = {step.name for step in answer.adopted}
+        taken = {code_placed(c.source, folder, out) for c in answer.problem.candidates if c.name in adopted}
+        audit["candidates"] = [source for source in audit["candidates"] if source not in taken]
+    return extended
+
+
+def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, Any]]:
+    """The priors under which the sizes of a mechanism were found: no narrower than these sizes, see `widened`."""
+    coordinates = answer.problem.coordinates
+    factor = widening(answer.extended, coordinates)
+    found = {}
+    for index in candidate.indices:
+        parameter = coordinates.space.parameters[index]
+        table = dict(parameter.table or parameter.spec.prior)
+        if "loc" in table:  # a size in one group is measured from null
+            table["loc"] += coordinates.nominal[parameter.physical] - parameter.spec.nominal
+        if factor[index] > 1.0:
+            table["scale"] = float(f"{table['scale'] * factor[index]:.3g}")
+        found[parameter.spec.name] = table
+    return found

@@ -1,0 +1,366 @@
+"""Recordings and a model in, a posterior out: ``calibrate``, and ``rfdropo calibrate`` for an experiment file."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
+from rfdropo_bayes.bayes.space import SEPARATOR
+from rfdropo_bayes.cautions import Caution
+from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import Patterns
+from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
+from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.inference.result import InferenceResult
+from rfdropo_bayes.model.experiment import InferenceTable
+from rfdropo_bayes.model.experiment_file import describe
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
+from rfdropo_bayes.prediction.model_error import MODEL_ERROR, model_error
+from rfdropo_bayes.prediction.predictive import (
+    BEGUN,
+    FITTED,
+    HELD,
+    KNOWN_NOISE,
+    NOISE,
+    Batch,
+    match_cautions,
+    predict_fitted,
+    predict_new,
+    thin,
+)
+from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, build_summary, software_versions
+from rfdropo_bayes.report.object_scores import score_objects
+from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
+from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
+from rfdropo_bayes.report.summary import read_summary
+from rfdropo_bayes.results.calibrated import Calibration
+from rfdropo_bayes.robots import robot_shape
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+
+PREDICTIVE_DRAWS = 200
+PRIOR_DRAWS = 2000
+PRIOR_PREDICTIVE_DRAWS = 64
+START_DRAWS = 1000
+PAYLOAD = "payload_mass"  # which recordings may have for themselves
+CLIMBING = ("laplace", "bridge", "smc")  # smc where it starts at the optima
+
+
+def calibrate(
+    model: Model,
+    runs: Sequence[Trajectory],
+    method: Any = None,
+    *,
+    test: Sequence[Trajectory] = (),
+    seed: int = 0,
+    out: Path | str | None = None,
+    start: Calibration | Path | None = None,
+    title: str = "",
+    resume: bool = False,
+    overwrite: bool = False,
+    show: bool | None = None,
+    tables: Mapping[str, Any] | None = None,
+) -> Calibration:
+    """Fit a model to recordings.
+
+    Args:
+        model: what is simulated, inferred and measured.
+        runs: recordings that are fitted.
+        method: options of a method, such as ``SMC(rollouts=5000)``; SMC with 20000 rollouts by default.
+        test: recordings that no fit sees; the report says how well they are predicted.
+        seed: of all that is random. The same seed gives the same draws.
+        out: folder that gets posterior.nc, summary.json, report.html and checkpoints; None writes nothing.
+        start: an earlier calibration of the same robot, or its folder, perhaps with fewer mechanisms or other
+            recordings: climbs start from its optimum and draws. What is inferred, and from which data, does not change.
+        title: heading of the report; the robot's name by default.
+        resume: go on from the checkpoint of an interrupted run of the same experiment in ``out``.
+        overwrite: start anew whatever ``out`` holds.
+        show: whether to show progress, see `Progress`.
+        tables: of the experiment file that the model was read from, for the record.
+
+    Raises:
+        InputError: bad input, before anything long has started.
+    """
+    config = make_config("smc", {"rollouts": InferenceTable().rollouts}) if method is None else method
+    name = method_of(config)
+    problem = model.problem(runs, earlier_draws(start, name))
+    recordings, title = [*runs, *test], title or model.name
+    if tables is None:
+        options = {key: value for key, value in dataclasses.asdict(config).items() if value is not None}
+        tables = {**model.tables(), "title": title, "seed": seed, "inference": {"method": name, **options}}
+    fit = partial(_fit, Fitting(model, problem, config, runs, test, seed, title))
+    if out is None:
+        return fit(None, describe(tables), resume=False, show=show)
+    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(recordings)}
+    settings |= {"options": {"from": start.folder if isinstance(start, Calibration) else start}, "texts": model.texts()}
+    with run_folder(Path(out), "calibrate", **settings, resume=resume, overwrite=overwrite) as folder:
+        found = fit(folder, (folder / CONFIG).read_text(encoding="utf-8"), resume=resume, show=show)
+        found.save(folder)
+    return found
+
+
+class Fitting(NamedTuple):
+    """What is fitted to what, by which method; see `calibrate`."""
+
+    model: Model
+    problem: CalibrationProblem
+    config: Any
+    runs: Sequence[Trajectory]
+    test: Sequence[Trajectory]
+    seed: int
+    title: str
+
+
+def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: bool | None) -> Calibration:
+    """Run the method; ``text`` is the experiment as TOML, ``out`` the folder for log and checkpoints."""
+    model, problem, config, runs, test, seed, title = asked
+    method = method_of(config)
+    key, predicting = jax.random.split(jax.random.key(seed))
+    log, kept = (None, None) if out is None else (out / LOG, out / CHECKPOINTS)
+    with Progress(method, show=show, log=log, budget=getattr(config, "rollouts", None)) as progress:
+        problem = problem.telling(progress.spend)
+        result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
+    problem = problem.holding(result.held)
+    attributes = {**_attributes(model.name, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
+    record, unmatched = record_posterior(problem, result, test, predicting, attributes, model.spec.groups)
+    facts = gather_facts(title, seed, problem, result, runs, test, record, unmatched)
+    return Calibration(record, build_summary(record, facts), text, model, out)
+
+
+def run_calibration(
+    path: Path,
+    out: Path,
+    *,
+    overrides: Sequence[str] = (),
+    resume: bool = False,
+    overwrite: bool = False,
+    start: Path | None = None,
+    show: bool | None = None,
+) -> Calibration:
+    """`calibrate` what an experiment file says; ``overrides`` are assignments that replace entries of the file."""
+    model, tables = Model.read(path, overrides)
+    settings = model.settings
+    return calibrate(
+        model,
+        model.recordings("fit"),
+        make_config(settings.inference.method, inference_options(settings.inference)),
+        test=model.recordings("test"),
+        seed=settings.seed,
+        out=out,
+        start=start,
+        title=settings.title or path.stem,
+        resume=resume,
+        overwrite=overwrite,
+        show=show,
+        tables=tables,
+    )
+
+
+def earlier_draws(start: Calibration | Path | None, method: str) -> Batch | None:
+    """What an earlier calibration, or its folder, says of where climbs may start; None without one.
+
+    Its optimum where it has one, the first of the rows, and as often its draws: of many parameters that rollouts do not
+    take linearly a draw may fit far worse than the optimum that it was drawn around.
+
+    Raises:
+        InputError: a folder that holds no posterior, or a method that does not climb.
+    """
+    if start is None:
+        return None
+    if method not in CLIMBING:
+        raise InputError(
+            f"method {method!r} does not climb: it has no use for a start",
+            where="--from",
+            remedy=f"leave it out, or use one of {', '.join(CLIMBING)}",
+        )
+    if isinstance(start, Calibration):
+        record, content = start.record, start.content
+    else:
+        record = PosteriorRecord.load(Path(start) / POSTERIOR)
+        content = read_summary(Path(start) / SUMMARY) if (Path(start) / SUMMARY).is_file() else {}
+    draws = thin({info.name: record.posterior[info.name] for info in record.free}, START_DRAWS)
+    optimum = content.get("optimum") or {}
+    if not set(draws) <= set(optimum):
+        return draws
+    return {name: np.concatenate([np.full(len(column), optimum[name]), column]) for name, column in draws.items()}
+
+
+def inference_options(table: InferenceTable) -> dict[str, Any]:
+    """Options of the method; the budget is among them where the method takes one."""
+    options = table.options
+    fields = {field.name for field in dataclasses.fields(method_named(table.method).config)}
+    return {**options, "rollouts": table.rollouts} if "rollouts" in fields else options
+
+
+def record_posterior(
+    problem: CalibrationProblem,
+    result: InferenceResult,
+    tested: Sequence[Trajectory],
+    key: jax.Array,
+    attributes: dict[str, Any],
+    groups: Patterns,
+) -> tuple[PosteriorRecord, list[Caution]]:
+    """Draws, prior draws and predictions of every recording, with the combinations of parameters that rollouts see, and
+    what speaks against the predictions."""
+    prior_key, fit_key, test_key = jax.random.split(key, 3)
+    rows = row_log_likelihood(problem, result)
+    prior = {name: np.asarray(v) for name, v in problem.sample_prior(prior_key, PRIOR_DRAWS).items()}
+    values = thin(result.draws, PREDICTIVE_DRAWS)
+    before = {name: column[:PRIOR_PREDICTIVE_DRAWS] for name, column in prior.items()}
+    predictions: list[RecordingPrediction] = predict_fitted(problem, values, fit_key, prior=before)
+    fitted = list(problem.model.recordings.names)
+    lasting = result.details.get("lasting", {}).get(problem.model.markers.name)
+    left = model_error(predictions, 1.0 if lasting is None else np.array(lasting["widened"]))
+    cautions: list[Caution] = []
+    if tested:
+        found = predict_new(
+            problem.model, tested, values, test_key, chunk=problem.chunk, fitted=fitted, left=left, groups=groups
+        )
+        predictions += found.recordings
+        cautions = match_cautions(found)
+    record = PosteriorRecord(
+        tuple(
+            ParameterInfo(p.name, p.spec.unit, p.spec.low, p.spec.high, dict(p.table or {}), p.spec.description)
+            for p in problem.model.space.parameters
+        ),
+        result.draws,
+        prior,
+        tuple(predictions),
+        trace=result.trace,
+        block_scores=result.block_scores,
+        log_likelihood=rows,
+        attrs={
+            **attributes,
+            NOISE: problem.model.noise,
+            FITTED: fitted,
+            HELD: result.held,
+            MODEL_ERROR: None if left is None else left._asdict(),
+            **known_noise(problem),
+        },
+    )
+    return with_ratios(record, problem.names), cautions
+
+
+def row_log_likelihood(
+    problem: CalibrationProblem, result: InferenceResult
+) -> Float[np.ndarray, "chain draw row"] | None:
+    """Log density of each row given the rows before it, at every draw; None where the draws are no posterior.
+
+    Draws that the method kept without their rows are simulated once more, as predictions are: outside the budget.
+    """
+    if not method_named(result.method).posterior or result.log_likelihood is not None:
+        return result.log_likelihood
+    flat = {name: np.ravel(values) for name, values in result.draws.items()}
+    rows, _ = problem.row_log_likelihood(flat, problem.n_rows)
+    return rows.reshape(*next(iter(result.draws.values())).shape, -1)
+
+
+def check_fit(problem: CalibrationProblem, record: PosteriorRecord, counted: bool) -> dict[str, ResidualCheck]:
+    """Whether the residuals at the most likely draw are what the noise model says; empty without a likelihood."""
+    if record.log_likelihood is None:
+        return {}
+    best = int(np.argmax(record.log_likelihood.sum(axis=-1).ravel()))
+    white = problem.white_positions({name: float(record.flat(name)[best]) for name in problem.names})
+    return check_residuals(list(white), problem.model.recordings.markers, counted=counted)
+
+
+def with_ratios(record: PosteriorRecord, names: Sequence[str]) -> PosteriorRecord:
+    """The record with ratios that motion determines where single stiffnesses and masses are not: cables that impose
+    lengths leave the common scale of all stiffnesses and masses free.
+
+    Stiffness over mass, and each payload over both; a payload that is zero in some draw has none.
+    """
+    scales = [(name, unit) for name, unit in (("young_modulus", "kg/Pa"), ("trunk_mass", "-")) if name in names]
+    found = []
+    if len(scales) == 2:
+        powers = {"young_modulus": 1.0, "trunk_mass": -1.0}
+        words = "stiffness over mass: what the motion of a trunk with length-driven cables determines"
+        found.append(ProductOfPowers("young_modulus_over_trunk_mass", "Pa/kg", powers, words))
+    for payload in (name for name in names if name.partition(SEPARATOR)[0] == PAYLOAD):
+        own = payload.removeprefix(PAYLOAD)
+        for name, unit in scales:
+            powers = {payload: 1.0, name: -1.0}
+            words = f"payload over {name.replace('_', ' ')}: what motion determines, whatever their common scale is"
+            found.append(ProductOfPowers(f"{PAYLOAD}_over_{name}{own}", unit, powers, words))
+    drawn = [draws for draws in (record.posterior, record.prior) if draws]
+    return record.with_derived([p for p in found if all(np.all(draws[n] > 0.0) for draws in drawn for n in p.powers)])
+
+
+def gather_facts(
+    title: str,
+    seed: int,
+    problem: CalibrationProblem,
+    result: InferenceResult,
+    fitted: Sequence[Trajectory],
+    tested: Sequence[Trajectory],
+    record: PosteriorRecord,
+    unmatched: Sequence[Caution] = (),
+) -> RunFacts:
+    """What the report says beside the posterior."""
+    unseen = [prediction for prediction in record.recordings if prediction.split == "test"]
+    description = problem.model.simulator.description
+    simulator = problem.model.simulator
+    robot = simulator.robot if isinstance(simulator, RobotSimulator) else None
+    added: Any = description.get("mechanisms", ())
+    checks = check_fit(problem, record, problem.model.markers.name in result.details.get("lasting", {}))
+    floor = noise_floor([*fitted, *tested])
+    undriven = [] if robot is None else robot.unstated(run.name for run in (*fitted, *tested))
+    return RunFacts(
+        title=title,
+        robot=str(description["robot"]),
+        method=result.method,
+        engine=f"{description['engine']} {description['precision']}",
+        status="done",
+        seed=seed,
+        rollouts=float(result.rollouts),
+        seconds=result.seconds,
+        evaluations=result.evaluations,
+        log_evidence=result.log_evidence,
+        excluded=result.excluded,
+        cautions=[*result.cautions, *unmatched, *undriven, *residual_cautions(checks, problem.model.noise)],
+        residuals=checks,
+        recordings=[
+            *(RecordingFacts.of_trajectory(t, "fit") for t in fitted),
+            *(RecordingFacts.of_trajectory(t, "test") for t in tested),
+        ],
+        model={
+            "noise": problem.model.noise,
+            "mechanisms": ", ".join(added) or "none",
+            "fixed": ", ".join(f"{k} = {v:g}" for k, v in problem.model.fixed.items())
+            or "nothing beyond the nominal values",
+            **{key: str(value) for key, value in description.items() if key not in ("mechanisms", "robot")},
+        },
+        baselines=baseline_errors(list(fitted), list(tested)),
+        noise_floor=floor,
+        phi=result.phi,
+        optimum=result.optimum,
+        objects=score_objects(unseen, [*fitted, *tested]),
+        versions=software_versions(),
+        details=result.details,
+        outline=None if robot is None else robot_shape(robot),
+    )
+
+
+def known_noise(problem: CalibrationProblem) -> dict[str, Any]:
+    """The noise of the positions as an attribute of the posterior, where it is not among the parameters."""
+    known, markers = problem.model.markers.known, problem.model.recordings.markers
+    return {} if known is None else {KNOWN_NOISE: {"markers": list(markers), **known.as_dict()}}
+
+
+def _attributes(robot: str, seed: int, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
+    return {
+        "seed": seed,
+        "robot": robot,
+        "data_sha256": [trajectory.sha256 for trajectory in trajectories],
+        "versions": software_versions(),
+    }

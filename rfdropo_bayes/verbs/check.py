@@ -1,0 +1,271 @@
+"""``rfdropo check``: what an experiment's robot, recordings and model are, in words and as pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, astuple, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from rfdropo_bayes.data import (
+    RecordingEntry,
+    Trajectory,
+    check_channels,
+    load_recordings,
+    noise_floor,
+    shared_markers,
+)
+from rfdropo_bayes.data.repeats import group_repeats
+from rfdropo_bayes.data.sample_times import sample_time
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import output_folder
+from rfdropo_bayes.inference.methods import make_config
+from rfdropo_bayes.model.assembly import build_model, build_simulator, with_drives
+from rfdropo_bayes.model.experiment import Experiment, load_experiment
+from rfdropo_bayes.model.model_spec import find_robot, spec_of
+from rfdropo_bayes.model.robot_listings import robot_facts
+from rfdropo_bayes.report.trajectory_figures import save_recording
+from rfdropo_bayes.robots import Robot, Travel, robot_shape
+from rfdropo_bayes.tables import changed
+from rfdropo_bayes.verbs.calibrate import inference_options
+from rfdropo_bayes.verbs.placement import far_from_rest, placement_hints
+
+MILLIMETRES = 1e3
+IRREGULAR = 1.5
+"""A gap longer than so many median sample times is said."""
+MOST_NAMES = 12
+
+Result = TypeVar("Result")
+
+
+@dataclass
+class Check:
+    """What was read.
+
+    Attributes:
+        lines: what there is, as pairs of a label and a text; an empty label goes on with the one before.
+        notes: what is allowed, and perhaps not meant.
+        problems: what keeps the experiment from running.
+        files: pictures, one per recording.
+    """
+
+    lines: list[tuple[str, str]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+
+
+def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
+    """Read everything that an experiment names, and say what was read.
+
+    Args:
+        path: the experiment file.
+        out: folder for the pictures, ``NAME.png`` for each recording.
+        overrides: assignments that replace entries of the file.
+
+    Raises:
+        InputError: the experiment file or the robot cannot be read; whatever else is wrong is among the problems.
+    """
+    experiment, _ = load_experiment(path, overrides)
+    folder = Path(path).resolve().parent
+    robot = find_robot(experiment.robot, folder)
+    found = Check()
+    robot = _try(found, partial(with_drives, robot, experiment.model.drives, experiment.model.groups)) or robot
+    _say_robot(found, robot)
+    recordings = {role: list(_read(found, experiment, folder, role)) for role in ("fit", "test")}
+    for role, trajectories in recordings.items():
+        for trajectory in trajectories:
+            _say_recording(found, trajectory, role, robot)
+    named = [trajectory.name for trajectories in recordings.values() for trajectory in trajectories]
+    found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
+    _say_repeats(found, [*recordings["fit"], *recordings["test"]])
+    _say_model(found, experiment, folder, recordings["fit"])
+    if any(recordings.values()):
+        out = output_folder(out)
+    rest = robot_shape(robot)
+    for trajectory in (*recordings["fit"], *recordings["test"]):
+        file = out / f"{trajectory.name.replace('/', '_')}.png"
+        save_recording(trajectory, rest, file)
+        found.files.append(file)
+    return found
+
+
+def _try(found: Check, action: Callable[[], Result]) -> Result | None:
+    """What an action returns; what keeps it from that is a problem."""
+    try:
+        return action()
+    except InputError as error:
+        if str(error) not in found.problems:
+            found.problems.append(str(error))
+        return None
+
+
+def _say_robot(found: Check, robot: Robot) -> None:
+    facts = robot_facts(robot)
+    for label in ("robot", "body", "gravity", "starts", "commands", "cables", "markers"):
+        found.lines.append((label, facts[label]))
+
+
+def _read(found: Check, experiment: Experiment, folder: Path, role: str) -> Iterator[Trajectory]:
+    """The recordings of one role, those that can be read."""
+    spec = experiment.data
+    if spec is None:
+        if role == "fit":
+            found.lines.append(("recordings", "none: the experiment has no [data], and can only be simulated"))
+        return
+    entries: list[RecordingEntry] = spec.fit if role == "fit" else spec.test
+    for entry in entries:
+        alone = changed(spec, where="[data]", fit=[entry], test=[])
+        yield from _try(found, partial(load_recordings, alone, folder)) or []
+    _try(found, lambda: load_recordings(spec, folder, role="fit" if role == "fit" else "test"))
+
+
+def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Robot) -> None:
+    """Rows, markers, masks and commands of one recording, beside those of the robot."""
+    gaps = np.diff(trajectory.time)
+    step = sample_time(trajectory.time)
+    rows = f"{len(trajectory.time)} rows over {trajectory.time[-1]:.4g} s, one every {1e3 * step:.4g} ms"
+    found.notes += [f"{trajectory.name}: {note}" for note in trajectory.notes]
+    if gaps.max() > IRREGULAR * step:
+        rows += f"; the longest gap is {1e3 * gaps.max():.4g} ms, at {trajectory.time[np.argmax(gaps)]:.4g} s"
+    found.lines.append((f"{role}: {trajectory.name}", rows))
+    found.lines += [("", text) for text in (*_markers(found, trajectory, robot), *_commands(found, trajectory, robot))]
+    further = [
+        word
+        for word, values in (
+            ("cable tensions", trajectory.tension),
+            ("motor angles", trajectory.motor_angle),
+            ("poses of an object", trajectory.object_pose),
+        )
+        if values is not None
+    ]
+    if further:
+        found.lines.append(("", f"also {' and '.join(further)}"))
+    if trajectory.missing:
+        found.lines.append(("", f"left out: {trajectory.missing}"))
+
+
+def _markers(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[str]:
+    shared = _try(found, lambda: shared_markers([trajectory], robot.marker_names))
+    if shared is None:
+        yield f"markers {_names(trajectory.marker_names)}: NONE is the robot's"
+        return
+    unknown = [name for name in trajectory.marker_names if name not in shared]
+    unseen = [name for name in robot.marker_names if name not in shared]
+    words = f"markers {_names(shared)}: as the robot's"
+    if unknown:
+        words += f"; {_names(unknown)}: not the robot's, left out"
+    yield words + (f"; the robot's {_names(unseen)}: not measured" if unseen else "")
+    usable = trajectory.position[trajectory.position_mask]
+    if len(usable):
+        ranges = ", ".join(
+            f"{axis} {MILLIMETRES * low:.4g} to {MILLIMETRES * high:.4g}"
+            for axis, low, high in zip("xyz", usable.min(axis=0), usable.max(axis=0), strict=True)
+        )
+        yield f"positions in mm, in the robot's frame: {ranges}"
+    yield _masks(trajectory)
+    place = far_from_rest(robot, trajectory)
+    if place is None:
+        yield "first row: every position is masked"
+        return
+    distances = ", ".join(f"{name} {MILLIMETRES * value:.3g}" for name, value in place.items())
+    yield f"first row, distance from the undeformed robot in mm: {distances}"
+    found.notes += [f"{trajectory.name}: {hint}" for hint in placement_hints(robot, trajectory)]
+
+
+def _masks(trajectory: Trajectory) -> str:
+    masked, every = int((~trajectory.position_mask).sum()), trajectory.position_mask.size
+    if not masked:
+        return "no position is masked"
+    counts = trajectory.settings.get("faults", {})
+    kinds = ", ".join(f"{sum(each)} {kind}" for kind, each in counts.items() if sum(each) and kind != "breaks")
+    return f"{masked} of {every} positions are masked" + (f" (in the whole file: {kinds})" if kinds else "")
+
+
+def _commands(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[str]:
+    names, unit, command = trajectory.cable_names, trajectory.command_unit, trajectory.command
+    yield f"{len(names)} commands in {unit}: {_names(names)}; from {command.min():.4g} to {command.max():.4g}"
+    yield f"command before the first row: {trajectory.first_command}"
+    problems = len(found.problems)
+    _try(found, lambda: check_channels(trajectory, robot.channel_names, robot.command_unit))
+    if len(found.problems) > problems:
+        return
+    if tuple(names) != robot.channel_names:
+        yield f"the robot calls them {_names(robot.channel_names)}, in this order"
+    travel = _try(found, partial(robot.travel, trajectory.name, trajectory.initial_command))
+    if travel is not None:
+        yield from _travel(travel, robot)
+        command = travel.follow(trajectory.initial_command, command)
+    asked = command @ np.asarray(robot.channel_matrix({})).T
+    for cable, low, high, (least, most) in zip(
+        robot.cable_names, asked.min(axis=0), asked.max(axis=0), robot.displacement_limits(), strict=True
+    ):
+        if low < least - 1e-9 or high > most + 1e-9:
+            found.notes.append(
+                f"{trajectory.name}: cable {cable} is asked for {MILLIMETRES * low:.3g} to {MILLIMETRES * high:.3g} "
+                f"mm; beyond its displacement_limit_m, {MILLIMETRES * least:.3g} to {MILLIMETRES * most:.3g} mm, it is "
+                "held"
+            )
+
+
+def _travel(travel: Travel, robot: Robot) -> Iterator[str]:
+    """What is stated of the drives in one recording, channels alike together."""
+    alike: dict[str, list[str]] = {}
+    for name, low, high, lost, kept in zip(robot.channel_names, *astuple(travel), strict=True):
+        word = "lost" if lost else "kept" if kept else "clipped"
+        if np.isfinite(low) or np.isfinite(high):
+            alike.setdefault(f"{low:.4g} to {high:.4g} {robot.command_unit}, beyond: {word}", []).append(name)
+    for text, names in alike.items():
+        yield f"drives of {_names(names)}: {text}"
+
+
+def _say_repeats(found: Check, trajectories: Sequence[Trajectory]) -> None:
+    groups = [group for group in group_repeats(trajectories) if len(group) > 1]
+    for group in groups:
+        found.lines.append(("repeats", _names([trajectories[index].name for index in group])))
+    floor = _try(found, lambda: noise_floor(trajectories)) if groups else None
+    if floor:
+        words = ", ".join(f"{name} {MILLIMETRES * value:.3g}" for name, value in floor.items())
+        found.lines.append(("noise", f"spread of the repeats in mm: {words}"))
+    elif trajectories:
+        found.notes.append("no recording was repeated: nothing tells noise from what the simulator misses")
+
+
+def _say_model(found: Check, experiment: Experiment, folder: Path, fitted: list[Trajectory]) -> None:
+    """What is inferred, and how; a model that cannot be built is a problem."""
+    method, named = experiment.inference.method, experiment.model.mechanisms
+    _try(found, lambda: make_config(method, inference_options(experiment.inference)))
+    found.lines.append(("method", f"{method}, {experiment.inference.rollouts} rollouts, seed {experiment.seed}"))
+    found.lines.append(("mechanisms", ", ".join(named) or "none"))
+    spec = _try(found, lambda: spec_of(experiment, folder))
+    simulator = None if spec is None else _try(found, partial(build_simulator, spec))
+    if spec is None or simulator is None or not fitted:
+        return
+    step = float(simulator.description["time_step_s"])  # type: ignore[arg-type]
+    found.lines.append(("time step", f"{1e3 * step:.4g} ms"))
+    model = _try(found, lambda: build_model(spec, simulator, fitted))
+    if model is not None:
+        for index, parameter in enumerate(model.space.parameters):
+            table = parameter.table or {}
+            words = ", ".join(f"{k} {v:g}" for k, v in table.items() if k != "distribution")
+            text = f"{parameter.name} [{parameter.spec.unit}] ~ {table.get('distribution')}({words})"
+            found.lines.append(("inferred" if index == 0 else "", text))
+    recorded = {
+        "tension": any(t.tension is not None for t in fitted),
+        "motor_angle": any(t.motor_angle is not None for t in fitted),
+        "object_pose": any(t.object_pose is not None for t in fitted),
+    }
+    for key, there in recorded.items():
+        if there and not asdict(spec.channels)[key]:
+            words = key.replace("_", " ")
+            found.notes.append(f"{words} was recorded, and is no data: [model] {key} = true would make it so")
+
+
+def _names(names: Sequence[str]) -> str:
+    """Names with commas; of many the first and the last."""
+    if len(names) <= MOST_NAMES:
+        return ", ".join(names)
+    return f"{', '.join(names[:3])}, ..., {names[-1]} ({len(names)})"

@@ -1,0 +1,313 @@
+"""The next command sequence, and what it will decide: ``design``, and ``rfdropo design``."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from rfdropo_bayes.audit.deadline import Deadline, OutOfTime
+from rfdropo_bayes.audit.experiment_design import DesignOutlook, Hypothesis, at_hand, best, outlooks
+from rfdropo_bayes.audit.extension import DISCRETISATION, ExtensionSearch
+from rfdropo_bayes.audit.fit import Fit, FitTarget
+from rfdropo_bayes.audit.pipeline import AuditProblem, base_model
+from rfdropo_bayes.bayes.recordings import commands_after
+from rfdropo_bayes.data import DataSpec, Trajectory, asl_csv
+from rfdropo_bayes.data.asl_csv import FORMAT as ASL
+from rfdropo_bayes.data.plain_csv import command_columns
+from rfdropo_bayes.files import whole, write_json
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.run_folder import hashes, run_folder
+from rfdropo_bayes.results.calibrated import Calibration
+from rfdropo_bayes.simulators.commands import Commands, stack_commands
+from rfdropo_bayes.verbs.audit import build_problem, start_values
+
+COMMANDS, DESIGN = "next_commands.csv", "design.json"
+SEQUENCES, HYPOTHESES, KINDS = 24, 4, 4
+SCREENED_BY, REFITTED_BY = 0.7, 0.85  # shares of the time by which these parts have to end
+SCREENING = "screening of the candidates"
+
+
+class Clock(Deadline):
+    """The time that a design may take; each part of the work has to end by its share of it.
+
+    Attributes:
+        missed: parts that were given up, in words.
+    """
+
+    def __init__(self, minutes: float) -> None:
+        super().__init__(minutes, "[design] minutes")
+        self.missed: list[str] = []
+
+    @contextmanager
+    def part(self, share: float, words: str) -> Iterator[None]:
+        """Work that is given up when the time is up, which is then noted in ``words``."""
+        self.share = share
+        try:
+            yield
+        except OutOfTime:
+            self.missed.append(words)
+        finally:
+            self.share = math.inf
+
+
+@dataclass(frozen=True)
+class Design:
+    """The commands to record next, and what they will decide.
+
+    Attributes:
+        content: of design.json.
+        commands: the proposal, a column for the time and one for each channel, as the recordings have them.
+    """
+
+    content: Mapping[str, Any]
+    commands: pd.DataFrame
+
+    @property
+    def sentence(self) -> str:
+        """What to record, and what it will tell."""
+        return str(self.content["sentence"])
+
+    def save(self, folder: Path | str) -> Path:
+        """Write next_commands.csv and design.json; return the path of the commands."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        with whole(folder / COMMANDS) as partial:
+            self.commands.to_csv(partial, index=False, float_format="%.6f")
+        write_json(folder / DESIGN, {**self.content, "commands": str(folder / COMMANDS)})
+        return folder / COMMANDS
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(self.sentence)}</p>{self.commands.head().to_html()}"
+
+
+def design(
+    model: Model,
+    runs: Sequence[Trajectory],
+    *,
+    base: Calibration | Path | None = None,
+    seed: int = 0,
+    minutes: float | None = None,
+    report: Callable[[str], None] = lambda line: None,
+) -> Design:
+    """Propose the commands that best separate the leading explanations of what a model lacks.
+
+    The proposals stay within the range of commands that the recordings have used, are as long as the first recording
+    and of four kinds: random walks, holds, slow loops and chirps. Where no candidate is significant, the sequence that
+    tells most about the base parameters is proposed. When the time is up, it is the best of the sequences, and the
+    leading one of the explanations, that have been looked at.
+
+    Args:
+        model: what is simulated and inferred.
+        runs: recordings.
+        base: an earlier calibration, or its folder, from whose posterior means the base model starts.
+        seed: of all that is random.
+        minutes: bound of the whole run; that of the model's experiment, 10 by default.
+        report: called with a line of words now and then.
+
+    Raises:
+        InputError: bad input, or a base model that was not fitted in the time.
+    """
+    settings = model.settings
+    problem = build_problem(model.spec, settings.audit, runs, [], seed, start=start_values(base))
+    clock = Clock(settings.design.minutes if minutes is None else minutes)
+    rng = np.random.default_rng(problem.seed)
+    clock.share = 1.0
+    target, fitted = base_model(problem, problem.seed, report=report, deadline=clock)
+    report("base model fitted")
+    hypotheses = _hypotheses(
+        ExtensionSearch(target, problem.candidates, problem.rules, problem.seed), fitted, clock, report
+    )
+    tried = list(proposals(runs[0], runs, rng))
+    outlook = _outlooks(problem, target, fitted, hypotheses, runs[0], tried, clock, report)
+    chosen = best(outlook, len(hypotheses) > 1)
+    kind, times, value = tried[chosen]
+    now = at_hand(target, hypotheses)
+    content = {
+        "sentence": _sentence(kind, outlook[chosen], now, SCREENING not in clock.missed)
+        + units_said(settings.data)
+        + _unfinished(clock),
+        "kind": kind,
+        "hypotheses": [h.name for h in hypotheses],
+        "separation_now": {" / ".join(pair): value for pair, value in now.items()},
+        "separation_with_it": {" / ".join(pair): value for pair, value in outlook[chosen].pairs.items()},
+        "probability_of_the_right_decision": outlook[chosen].right if len(hypotheses) > 1 else None,
+        "information_gain_nats": outlook[chosen].information,
+        "tried": [
+            {"kind": k, "separation": o.separation, "information_nats": o.information}
+            for (k, _, _), o in zip(tried, outlook, strict=False)
+        ],
+        "not_finished": clock.missed,
+        "minutes": round((time.monotonic() - clock.began) / 60.0, 2),
+        "seed": problem.seed,
+        "schema_version": 1,
+    }
+    return Design(content, command_table(settings.data, runs[0], times, value, float(runs[0].time[-1])))
+
+
+def run_design(
+    path: Path,
+    out: Path,
+    *,
+    overrides: Sequence[str] = (),
+    base: Path | None = None,
+    seed: int | None = None,
+    overwrite: bool = False,
+    report: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """`design` what an experiment file says, and write design.json and next_commands.csv; return the former."""
+    model, tables = Model.read(path, overrides)
+    fitted = model.recordings("fit")
+    chosen = model.settings.seed if seed is None else seed
+    options = {"base": base, "seed": chosen}
+    settings = {"tables": tables, "folder": model.folder, "data": hashes(fitted), "options": options}
+    with run_folder(out, "design", **settings, overwrite=overwrite) as out:
+        found = design(model, fitted, base=base, seed=chosen, report=report)
+        return {**found.content, "commands": str(found.save(out))}
+
+
+def _hypotheses(search: ExtensionSearch, base: Fit, clock: Clock, report: Callable[[str], None]) -> list[Hypothesis]:
+    """The leading significant candidates, each refitted."""
+    found = None
+    with clock.part(SCREENED_BY, SCREENING):
+        found, _ = search.screened(base)
+    if found is None:
+        return []
+    rows = [row for row in found.rows if row.adjusted_p <= search.rules.family and row.name != DISCRETISATION]
+    report(f"{len(rows)} candidates are significant")
+    hypotheses = []
+    for row in rows[: 2 * HYPOTHESES]:
+        with clock.part(REFITTED_BY, f"refit with {row.name}"):
+            hypotheses.append(Hypothesis(row.name, search.refit(found.fit, row)))
+            report(f"hypothesis {row.name}")
+    hypotheses.sort(key=lambda h: -h.fit.log_evidence)
+    return hypotheses[:HYPOTHESES]
+
+
+def _outlooks(
+    problem: AuditProblem,
+    target: FitTarget,
+    base: Fit,
+    hypotheses: Sequence[Hypothesis],
+    first: Trajectory,
+    proposals: Sequence[tuple[str, np.ndarray, np.ndarray]],
+    clock: Clock,
+    report: Callable[[str], None],
+) -> list[DesignOutlook]:
+    """Outlooks of the proposals, one of each kind at a time; of the first few, whatever the time."""
+    simulator = problem.lanes.simulator
+    sequences = [commands_after(simulator, first, t, v) for _, t, v in proposals]
+    shaped = _shaped(sequences, problem.model.recordings.commands)
+    outlook = outlooks(target, base, hypotheses, shaped[:KINDS])
+    for start in range(KINDS, len(shaped), KINDS):
+        report(f"{start} of {len(shaped)} command sequences")
+        with clock.part(1.0, f"{len(shaped) - start} of {len(shaped)} command sequences"):
+            outlook += outlooks(target, base, hypotheses, shaped[start : start + KINDS])
+        if len(outlook) == start:
+            break
+    return outlook
+
+
+def command_table(
+    data: DataSpec | None, first: Trajectory, time: np.ndarray, value: np.ndarray, seconds: float
+) -> pd.DataFrame:
+    """The proposal, of so many seconds, in the columns of the experiment's recordings."""
+    if data is not None and data.format == ASL:
+        return pd.DataFrame(asl_csv.command_columns(time, value, seconds))
+    if data is not None and data.columns is not None:
+        return pd.DataFrame(command_columns(data.columns, time, value))
+    channels = {f"{c}_{first.command_unit}": value[:, k] for k, c in enumerate(first.cable_names)}
+    return pd.DataFrame({"time_s": time, **channels})
+
+
+def units_said(data: DataSpec | None) -> str:
+    """What the columns of `command_table` are in, where their names do not say it."""
+    if data is not None and data.format == ASL:
+        return " Columns u1 to u6 are in degrees, a row every 10 ms, as that format has them."
+    return ""
+
+
+def _shaped(sequences: Sequence[Commands], like: Commands) -> list[Commands]:
+    """Sequences padded and cut to the shape of the recordings at hand, which the compiled simulator expects."""
+    steps, rows = like.step.shape[1], like.sample_step.shape[1]
+    stacked = stack_commands([*sequences, Commands(*(np.asarray(part)[0] for part in like))])
+    return [
+        Commands(
+            np.asarray(stacked.initial)[k],
+            np.asarray(stacked.step)[k, :steps],
+            np.asarray(stacked.sample_step)[k, :rows],
+            np.asarray(stacked.sample_fraction)[k, :rows],
+        )
+        for k in range(len(sequences))
+    ]
+
+
+def proposals(
+    first: Trajectory, fitted: Sequence[Trajectory], rng: np.random.Generator
+) -> list[tuple[str, Float[np.ndarray, " k"], Float[np.ndarray, "k channel"]]]:
+    """Command sequences within the range that the recordings have used."""
+    low = np.min([np.min(t.command, axis=0) for t in fitted], axis=0)
+    high = np.max([np.max(t.command, axis=0) for t in fitted], axis=0)
+    low, high = np.minimum(low, first.initial_command), np.maximum(high, first.initial_command)
+    duration, channels = float(first.time[-1]), len(low)
+    found = []
+    for index in range(SEQUENCES):
+        kind = ("random walk", "holds", "slow loop", "chirp")[index % 4]
+        if kind in ("random walk", "holds"):
+            interval = duration / (25 if kind == "random walk" else rng.integers(4, 9))
+            time = interval * np.arange(int(duration / interval))
+            level = rng.uniform(low, high, (len(time), channels))
+            moved = rng.uniform(size=level.shape) < (0.3 if kind == "random walk" else 0.6)
+            value = _held(level, moved, first.initial_command)
+        else:
+            time = np.arange(0.0, duration, duration / 100)
+            turns = rng.integers(1, 4)
+            phase = turns * time / duration if kind == "slow loop" else 4.0 * turns * (time / duration) ** 2
+            swing = 0.5 - 0.5 * np.cos(2 * np.pi * phase)
+            weight = rng.dirichlet(np.ones(channels)) ** 0.5
+            value = first.initial_command + np.outer(swing, weight * (high - first.initial_command))
+        found.append((kind, time, np.clip(value, low, high)))
+    return found
+
+
+def _held(level: np.ndarray, moved: np.ndarray, initial: np.ndarray) -> np.ndarray:
+    """Channels that keep their command until they are moved."""
+    value, last = np.empty_like(level), np.array(initial, dtype=float)
+    for row in range(len(level)):
+        last = np.where(moved[row], level[row], last)
+        value[row] = last
+    return value
+
+
+def _unfinished(clock: Clock) -> str:
+    if not clock.missed:
+        return ""
+    return (
+        f" The {clock.minutes:g} minutes of [design] minutes were up before the end; not looked at: "
+        f"{', '.join(name.replace('_', ' ') for name in clock.missed)}."
+    )
+
+
+def _sentence(kind: str, outlook: DesignOutlook, now: dict[tuple[str, str], float], screened: bool) -> str:
+    if not outlook.pairs:
+        found = "No candidate is significant." if screened else "There was no time for the candidates."
+        return (
+            f"{found} The {kind} in {COMMANDS} would tell most about the base parameters: "
+            f"{outlook.information:.1f} nats."
+        )
+    pair = min(outlook.pairs, key=lambda p: outlook.pairs[p])
+    words = " and ".join(name.replace("_", " ") for name in pair)
+    return (
+        f"Record the {kind} in {COMMANDS}: it raises the expected log likelihood ratio of the pair that is hardest to "
+        f"tell apart, {words}, from {0.5 * now[pair]:.1f} to {0.5 * outlook.pairs[pair]:.1f} nats, and names the right "
+        f"one with probability {outlook.right:.2f}."
+    )

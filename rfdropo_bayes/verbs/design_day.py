@@ -1,0 +1,287 @@
+"""The morning's calibration: the shortest command sequence that determines a day, ``design_day``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
+from rfdropo_bayes.bayes.channels import Markers
+from rfdropo_bayes.bayes.channels.markers import noise_of_markers
+from rfdropo_bayes.bayes.noise.autoregression import STATED
+from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
+from rfdropo_bayes.data import Trajectory, actions
+from rfdropo_bayes.data.sample_times import sample_time
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.groups import Patterns, gather_groups, group_of, whole
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.run_folder import hashes, run_folder
+from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.prediction.day import physical_of_normal
+from rfdropo_bayes.prediction.own_fit import STEP
+from rfdropo_bayes.prediction.predictive import FITTED, Batch
+from rfdropo_bayes.report.run_files import POSTERIOR
+from rfdropo_bayes.results.calibrated import Calibration
+from rfdropo_bayes.tables import nearest
+from rfdropo_bayes.verbs.adapt import day_space, model_error_of
+from rfdropo_bayes.verbs.design import COMMANDS, Design, command_table, proposals, units_said
+from rfdropo_bayes.verbs.predict import fitted_parts, model_of
+
+LONGEST = 10.0  # [s] of a proposal, unless more is asked for
+DAY = "another day"
+PER_ACTION = "displacement_per_action"  # among the settings of a recording whose commands are actions
+
+
+class DayOutlook(NamedTuple):
+    """What a command sequence leaves unknown.
+
+    Attributes:
+        seconds: after which the day adds less to the error of the last marker than the model; infinite if never.
+        left: deviation [m] of the last marker, in the recordings at hand, by what is then not known of the day.
+    """
+
+    seconds: float
+    left: float
+
+    def as_dict(self) -> dict[str, float | None]:
+        """For design.json."""
+        return {
+            "seconds": self.seconds if np.isfinite(self.seconds) else None,
+            "tip_uncertain_after_mm": 1e3 * self.left,
+        }
+
+
+def design_day(
+    fit: Calibration,
+    runs: Sequence[Trajectory],
+    *,
+    seconds: float = LONGEST,
+    group: str | None = None,
+    seed: int = 0,
+    report: Callable[[str], None] = lambda line: None,
+) -> Design:
+    """Propose the shortest commands whose recording determines what a day changes.
+
+    Of random walks, holds, slow loops and chirps that the drives follow, each is looked at from its beginning. It is
+    long enough where the last marker, under the commands of the recordings at hand, is as uncertain by the day as it is
+    by what the model misses. The noise is that of `adapt`, and so are the day's parameters. Proposals stay within what
+    the drives did in the recordings at hand and what is stated of them; where commands are actions, which pull or
+    release one cable, proposals are made of these.
+
+    Args:
+        fit: a calibration, with its model.
+        runs: recordings at hand.
+        seconds: no proposal is longer.
+        group: among the recordings at hand, whose drives and commands the day is to have; that of the last by default.
+        seed: of the proposals.
+        report: called with a line of words now and then.
+
+    Raises:
+        InputError: nothing of the model differs between days, or no recording is of the group.
+    """
+    model, left = model_of(fit), model_error_of(fit.record)
+    day, known = _of_group(runs, model.spec.groups, group)
+    begun = _begun_like(known[0], seconds)
+    tried = _followed_proposals(model, begun, known[0], runs, np.random.default_rng(seed))
+    sequences = [_as_recording(begun, f"{begun.name}[proposal {k}]", *tried[k][1:]) for k in range(len(tried))]
+    problem, names, at = _problem(fit, sequences)
+    report(f"{len(sequences)} command sequences, {len(names)} parameters of a day")
+    white = problem.residual_batch(at, problem.n_rows).reshape(2, len(names), len(sequences), problem.n_rows, -1)
+    slope = (white[0] - white[1]) / (2.0 * STEP)
+    report("how the recordings at hand depend on them")
+    heads = [run.slice_rows(0, min(len(run.time) - 1, 2 * problem.n_rows)) for run in known[:2]]
+    at_hand, _, at = _problem(fit, heads)
+    position, _ = at_hand.predict(at)
+    tip = position[:, :, :, -1].reshape(2, len(names), -1)
+    weight = (tip[0] - tip[1]) / (2.0 * STEP)
+    rows = weight.shape[1] / 3.0
+    error = float(np.sqrt(np.sum(np.square(left.scale[-3:]))))
+
+    def uncertain(information: Float[np.ndarray, "k k"]) -> float:
+        covariance = np.linalg.inv(np.eye(len(names)) + information)
+        return float(np.sqrt(np.sum(weight * (covariance @ weight)) / rows))
+
+    found = [_outlook(slope[:, k], problem.model.recordings.time[k], uncertain, error) for k in range(len(sequences))]
+    best = min(range(len(found)), key=lambda k: (found[k].seconds, found[k].left))
+    kind, times, value = tried[best]
+    length = min(found[best].seconds, float(begun.time[-1]))
+    kept = times <= length
+    before = uncertain(np.zeros((len(names), len(names))))
+    content = {
+        "sentence": _sentence(kind, found[best], length, before, error) + units_said(model.settings.data),
+        "kind": kind,
+        "group": day,
+        "seconds": length,
+        "determined": bool(np.isfinite(found[best].seconds)),
+        "tip_uncertain_before_mm": 1e3 * before,
+        "tip_uncertain_after_mm": 1e3 * found[best].left,
+        "tip_error_of_the_model_mm": 1e3 * error,
+        "parameters_of_a_day": names,
+        "tried": [{"kind": k, **outlook.as_dict()} for (k, _, _), outlook in zip(tried, found, strict=True)],
+        "seed": seed,
+        "schema_version": 1,
+    }
+    table = command_table(model.settings.data, begun, times[kept], value[kept], length)
+    if PER_ACTION in known[0].settings:
+        table["action"] = actions.actions_of(value[kept], begun.initial_command)
+    return Design(content, table)
+
+
+def run_day_design(
+    path: Path,
+    base: Path,
+    out: Path,
+    *,
+    seconds: float = LONGEST,
+    group: str | None = None,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+    overwrite: bool = False,
+    report: Callable[[str], None] = lambda line: None,
+) -> dict[str, Any]:
+    """`design_day` for a calibration's folder, and write design.json and next_commands.csv; return the former."""
+    model, tables = Model.read(path, overrides)
+    runs = model.recordings("fit")
+    fit = Calibration(PosteriorRecord.load(base / POSTERIOR), {}, "", model, base)
+    chosen = model.settings.seed if seed is None else seed
+    options = {"base": base, "seed": chosen, "adapt": True, "seconds": seconds, "group": group}
+    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(runs), "options": options}
+    with run_folder(out, "design", **settings, overwrite=overwrite) as out:
+        found = design_day(fit, runs, seconds=seconds, group=group, seed=chosen, report=report)
+        return {**found.content, "commands": str(found.save(out))}
+
+
+def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationProblem, list[str], Batch]:
+    """Recordings of one day, the names of its parameters, and values a step up and a step down along each of these from
+    the middle of its prior, at the body's mean."""
+    model, left = model_of(fit), model_error_of(fit.record)
+    fixed, space = fitted_parts(fit)
+    recordings = gather_recordings(model.simulator, runs)
+    noise = noise_of_markers(left.every(sample_time(runs[0].time)), left.markers, recordings)
+    space = day_space(space, model, recordings.names, DAY, fit.record.attrs[FITTED])
+    drawn = fit.record.posterior
+    body = {name: value for name, value in space.typical_scales.items() if name not in drawn}
+    body |= {p.name: float(np.mean(drawn[p.name])) for p in space.parameters if p.name in drawn}
+    own = [p for p in space.parameters if p.name not in body]
+    if not own:
+        raise InputError(
+            "nothing of the model differs between days",
+            where="[model.per_group]",
+            remedy="name what does, and calibrate",
+        )
+    points = STEP * np.concatenate([np.eye(len(own)), -np.eye(len(own))])
+    values = {name: np.full(len(points), value) for name, value in body.items()}
+    values |= {p.name: physical_of_normal(p, x, values) for p, x in zip(own, points.T, strict=True)}
+    program = TrajectoryModel(model.simulator, space, fixed, recordings, (Markers.gather(recordings, STATED, noise),))
+    return CalibrationProblem(program, chunk=max(1, model.simulator.lanes // len(runs))), [p.name for p in own], values
+
+
+def _outlook(
+    slope: Float[np.ndarray, "k row column"],
+    time: Float[np.ndarray, " row"],
+    uncertain: Callable[[np.ndarray], float],
+    error: float,
+) -> DayOutlook:
+    """The first row at which a sequence has determined the day, by bisection: more rows never leave more unknown."""
+
+    def left(row: int) -> float:
+        seen = slope[:, : row + 1].reshape(len(slope), -1)
+        return uncertain(seen @ seen.T)
+
+    low, high = 0, len(time) - 1
+    if left(high) > error:
+        return DayOutlook(np.inf, left(high))
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if left(middle) <= error else (middle + 1, high)
+    return DayOutlook(float(time[low]), left(low))
+
+
+def _of_group(runs: Sequence[Trajectory], groups: Patterns, group: str | None) -> tuple[str, list[Trajectory]]:
+    """The group of that name, of the last recording by default, and its recordings.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = gather_groups([run.name for run in runs], groups)
+    day = group_of(runs[-1].name, groups) if group is None else group
+    if day not in found:
+        raise InputError(f"no recording at hand is of the group {day!r}", where="--group", remedy=nearest(day, found))
+    return day, [run for run in runs if run.name in found[day]]
+
+
+def _begun_like(run: Trajectory, seconds: float) -> Trajectory:
+    """A recording of so many seconds that begins as another one, is observed as often, by all of its markers."""
+    step = sample_time(run.time)
+    time = step * np.arange(max(2, int(seconds / step + 1e-6) + 1))
+    return _as_recording(run, whole(run.name), np.zeros(1), run.initial_command[None], time)
+
+
+def _followed_proposals(
+    model: Model, begun: Trajectory, like: Trajectory, runs: Sequence[Trajectory], rng: np.random.Generator
+) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Proposals, in the order of their kinds, that the drives follow: within what they did in the recordings at hand,
+    and made of actions where the commands of ``like`` are."""
+    simulator = model.simulator
+
+    def taken(run: Trajectory, value: np.ndarray) -> np.ndarray:
+        return simulator.taken(run.name, run.initial_command, value)
+
+    done = [
+        Trajectory(run.dataset.assign(command=run.dataset["command"].copy(data=taken(run, run.command))))
+        for run in runs
+    ]
+    found = []
+    for kind, time, value in sorted(proposals(begun, done, rng), key=lambda proposal: proposal[0]):
+        value = taken(begun, value)
+        if PER_ACTION in like.settings:
+            time, value = _as_actions(begun, float(np.median(np.diff(like.command_time))), time, value)
+        if len(value):
+            found.append((kind, time, value))
+    return found
+
+
+def _as_actions(begun: Trajectory, period: float, time: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same as far as actions can, one every ``period`` seconds."""
+    initial = begun.initial_command
+    due = period * np.arange(int(begun.time[-1] / period + 1e-6))
+    target = value[np.maximum(np.searchsorted(time, due + 1e-9, side="right") - 1, 0)]
+    sent = actions.actions_towards(target, initial)
+    return due[: len(sent)], initial + actions.cumulative_displacement(sent)
+
+
+def _as_recording(
+    like: Trajectory, name: str, time: np.ndarray, value: np.ndarray, seen: np.ndarray | None = None
+) -> Trajectory:
+    """Commands as a recording that begins as another one and is observed when that was, by all of its markers."""
+    observed = like.time if seen is None else seen
+    return Trajectory.build(
+        name=name,
+        robot=like.robot,
+        format="memory",
+        time=observed,
+        position=np.tile(like.position[:1], (len(observed), 1, 1)),
+        marker_names=like.marker_names,
+        command_time=time,
+        command=value,
+        command_unit=like.command_unit,
+        initial_command=like.initial_command,
+        cable_names=like.cable_names,
+        settings={"unseen": True},
+    )
+
+
+def _sentence(kind: str, outlook: DayOutlook, length: float, before: float, error: float) -> str:
+    what = f"Record the first {length:.3g} s of the {kind} in {COMMANDS}"
+    if length == 0.0:
+        what = "The first row of a recording is enough, before anything moves"
+    change = f"what is not known of the day then moves the last marker by {1e3 * outlook.left:.2g} mm"
+    change = f"{change}, and by {1e3 * before:.2g} mm without it"
+    if np.isfinite(outlook.seconds):
+        return f"{what}: {change}. The model's own error is {1e3 * error:.2g} mm."
+    return f"{what}: {change}. The model's own error is smaller, {1e3 * error:.2g} mm: allow more --seconds."

@@ -1,0 +1,138 @@
+"""``rfdropo export``: the distribution to randomise over as tables, or a posterior small enough to keep."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import output_folder, whole, write_json
+from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
+from rfdropo_bayes.report.summary import read_summary
+
+TABLE, TABLE_JSON, DRAWS = "phi.csv", "phi.json", "phi_draws.csv"
+MOST_DRAWS = 2000
+KEPT_DRAWS = 500
+SCHEMA_VERSION = 1
+LENGTH_POWER = {"m": 1, "N": 1, "Pa": -1, "J": 2, "W": 2}
+
+
+def millimetre_factor(unit: str) -> float:
+    """What a value in an SI unit is multiplied by in a system of mm, kg and s, as SOFA scenes often use.
+
+    Pa/kg is (kg/(m s2))/kg: 1e-3. Angles, times and pure numbers stay.
+    """
+    power = 0
+    for index, part in enumerate(unit.split("/")):
+        for symbol, exponent in re.findall(r"([A-Za-z]+)(-?\d*)", part):
+            if symbol in LENGTH_POWER:
+                power += (1 if index == 0 else -1) * LENGTH_POWER[symbol] * int(exponent or 1)
+    return 1000.0**power
+
+
+def export_phi(folder: Path, out: Path | None = None, *, overwrite: bool = False) -> list[Path]:
+    """Write phi of a run: a table (CSV and JSON) with units, and joint draws.
+
+    RF-DROPO's phi is written as found: independent normals before truncation, with their limits. Of any other method
+    the table holds mean, deviation and the central 99 % of each parameter; their correlations are in the JSON file and
+    in the draws, which are what to use where parameters are correlated.
+
+    Returns:
+        the files written, to ``out``, or to the run's folder.
+
+    Raises:
+        InputError: no finished run in ``folder``, or ``out`` cannot be written.
+    """
+    summary = read_summary(folder / SUMMARY)
+    record = PosteriorRecord.load(folder / POSTERIOR)
+    out = output_folder(out or folder)
+    _check_absent([out / TABLE, out / TABLE_JSON, out / DRAWS], overwrite)
+    names = [info.name for info in record.free]
+    stack = np.stack([record.flat(name) for name in names])
+    rows = _rows(record, summary)
+    drawn = stack[:, np.linspace(0, stack.shape[1] - 1, min(MOST_DRAWS, stack.shape[1])).round().astype(int)]
+    content = {
+        "schema_version": SCHEMA_VERSION,
+        "method": summary["method"],
+        "distribution": "independent truncated normals" if summary.get("phi") else "moments of the posterior draws",
+        "randomisation": summary.get("randomisation"),
+        "data_sha256": summary["data_sha256"],
+        "seed": summary["seed"],
+        "parameters": {row["parameter"]: {k: v for k, v in row.items() if k != "parameter"} for row in rows},
+        "correlation": _correlation(names, stack),
+        "draws": {"file": DRAWS, "number": drawn.shape[1], "units": "SI"},
+    }
+    paths = [out / TABLE, out / TABLE_JSON, out / DRAWS]
+    with whole(paths[0]) as partial:
+        pd.DataFrame(rows).to_csv(partial, index=False)
+    write_json(paths[1], content, finite=True)
+    with whole(paths[2]) as partial:
+        pd.DataFrame(drawn.T, columns=names).to_csv(partial, index=False)
+    return paths
+
+
+def export_posterior(folder: Path, out: Path | None, *, overwrite: bool = False) -> Path:
+    """Write posterior.nc with `KEPT_DRAWS` draws and no predictions: enough to predict with, or to start climbs from.
+
+    Returns:
+        the file written.
+
+    Raises:
+        InputError: no posterior in ``folder``, or ``out`` is that folder, or cannot be written.
+    """
+    record = PosteriorRecord.load(folder / POSTERIOR)
+    if out is None or out.resolve() == folder.resolve():
+        raise InputError(
+            "would replace the whole posterior", where=str(folder), remedy="name another folder with --out"
+        )
+    size = next(iter(record.posterior.values())).shape[1]
+    kept = np.linspace(0, size - 1, min(KEPT_DRAWS, size)).round().astype(int)
+    draws = {name: values[:, kept] for name, values in record.posterior.items()}
+    path = output_folder(out) / POSTERIOR
+    _check_absent([path], overwrite)
+    PosteriorRecord(record.parameters, draws, derived=record.derived, attrs=record.attrs).save(path)
+    return path
+
+
+def _check_absent(paths: Sequence[Path], overwrite: bool) -> None:
+    """Raise InputError where an earlier export would be replaced."""
+    there = [path for path in paths if path.exists()]
+    if there and not overwrite:
+        raise InputError(
+            "is there already",
+            where=str(there[0]),
+            remedy="choose another folder with --out, or replace it with --overwrite",
+        )
+
+
+def _rows(record: PosteriorRecord, summary: Mapping[str, Any]) -> list[dict[str, Any]]:
+    phi = summary.get("phi")
+    rows = []
+    for info in record.free:
+        if phi:
+            entry = phi[info.name]
+            found = {key: float(entry[key]) for key in ("mean", "std", "low", "high")}
+        else:
+            draws = record.flat(info.name)
+            low, high = np.quantile(draws, [0.005, 0.995])
+            found = {"mean": draws.mean(), "std": draws.std(), "low": low, "high": high}
+        factor = millimetre_factor(info.unit)
+        values = {key: float(value) for key, value in found.items()}
+        in_millimetres = {f"{key}_mm_kg_s": value * factor for key, value in values.items()}
+        rows.append({"parameter": info.name, "unit": info.unit, **values, **in_millimetres})
+    return rows
+
+
+def _correlation(names: list[str], stack: np.ndarray) -> dict[str, dict[str, float]]:
+    """Of the draws; a parameter that does not vary correlates with itself only."""
+    spread = stack.std(axis=1)
+    scaled = (stack - stack.mean(axis=1, keepdims=True)) / np.where(spread > 0.0, spread, 1.0)[:, None]
+    matrix = scaled @ scaled.T / stack.shape[1]
+    np.fill_diagonal(matrix, 1.0)
+    return {a: dict(zip(names, matrix[i].tolist(), strict=True)) for i, a in enumerate(names)}

@@ -1,0 +1,224 @@
+"""``rfdropo init``: a commented robot file and experiment file, to go on from."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+from rfdropo_bayes.data import lerobot, motive_csv, rosbag
+from rfdropo_bayes.data.mapped_formats import recognised_format
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import matching_files, output_folder
+from rfdropo_bayes.model.experiment import load_experiment
+from rfdropo_bayes.robots.catalogue import load_robot
+from rfdropo_bayes.robots.outline import RobotOutline, robot_text
+from rfdropo_bayes.verbs.column_names import Guess, guess_columns
+
+PRIORS = (
+    ("young_modulus", "how stiff"),
+    ("trunk_mass", "how heavy: weigh it, and state it under [[model.weighed]]"),
+    ("rayleigh_stiffness", "how damped"),
+    ("spool_radius", "cable wound up per angle"),
+)
+
+
+CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)
+"""Formats that come from motion capture, which loses markers now and then."""
+AXES = {"+z": ["x", "z", "-y"], "-z": ["x", "-z", "y"]}
+"""The base's axes in terms of Motive's, whose y axis points up: of a robot that hangs, and of one that stands."""
+
+
+def matching_recordings(patterns: list[str]) -> list[Path]:
+    """Files and folders of recordings that patterns stand for, in the order of the patterns.
+
+    Raises:
+        InputError: a pattern that matches nothing, or files of several formats.
+    """
+    files: list[Path] = []
+    for pattern in patterns:
+        named = Path(pattern)
+        anchor = Path(named.anchor)
+        below = named.relative_to(anchor) if named.is_absolute() else named
+        found = matching_files(anchor, below)
+        if not found:
+            raise InputError("matches no file", where=pattern, remedy="give the path of a recording; quote patterns")
+        files += [file for file in found if file not in files]
+    formats = {recognised_format(file): file for file in files}
+    if len(formats) > 1:
+        said = ", ".join(f"{format} ({file.name})" for format, file in formats.items())
+        raise InputError(f"recordings of several formats: {said}", where="--recording", remedy="give those of one")
+    return files
+
+
+def matching_commands(patterns: list[str], recordings: list[Path]) -> list[Path]:
+    """Files of commands that patterns stand for, one for each recording, or none.
+
+    Raises:
+        InputError: a pattern that matches nothing, or another number of files.
+    """
+    files = matching_recordings(patterns)
+    if files and len(files) != len(recordings):
+        raise InputError(
+            f"{len(files)} files of commands for {len(recordings)} recordings",
+            where="--commands",
+            remedy="give one for each, in the same order",
+        )
+    return files
+
+
+def guess_units(path: Path, commands: Path | None, command_unit: str | None, position_unit: str | None) -> Guess:
+    """What the columns of a recording are; units that are given take the place of guessed ones."""
+    guess = guess_columns(path, commands)
+    return guess._replace(
+        command_unit=command_unit or guess.command_unit, position_unit=position_unit or guess.position_unit
+    )
+
+
+def write_first_files(
+    folder: Path, outline: RobotOutline, recordings: list[Path], commands: list[Path], guess: Guess | None
+) -> tuple[Path, Path]:
+    """Write ``NAME.toml``, the robot, and ``experiment.toml``, and read both back.
+
+    Args:
+        folder: to write to; it is made.
+        outline: the robot.
+        recordings: files to fit; of several, the last one is for testing, as is the last episode of a dataset.
+        commands: the file of commands of each, where they have any.
+        guess: what their columns are; None without recordings, when random commands are simulated instead.
+
+    Raises:
+        InputError: files of these names are there already, or the folder cannot be written to.
+    """
+    folder = output_folder(folder)
+    robot, experiment = folder / f"{outline.name}.toml", folder / "experiment.toml"
+    for path in (robot, experiment):
+        if path.exists():
+            raise InputError("is there already", where=str(path), remedy="choose another folder, or move the file away")
+    robot.write_text(robot_text(outline), encoding="utf-8")
+    load_robot(robot)
+    data = _random_commands(outline) if guess is None else _data(folder, outline, recordings, commands, guess)
+    experiment.write_text("\n".join([*_head(outline.name), *data, *_model(outline, guess)]), encoding="utf-8")
+    load_experiment(experiment)
+    return robot, experiment
+
+
+def _head(name: str) -> list[str]:
+    return [
+        "# Written by rfdropo init; docs/reference/experiment.md has every key. Look it over, then: rfdropo check.",
+        f'title = "{name}"',
+        f'robot = "{name}.toml"',
+        "seed = 0",
+        "",
+    ]
+
+
+def _entries(folder: Path, recordings: list[Path], commands: list[Path], guess: Guess) -> list[str]:
+    """The recordings as entries of fit and test."""
+    names = [json.dumps(os.path.relpath(path, folder)) for path in recordings]
+    if commands:
+        sent = [json.dumps(os.path.relpath(path, folder)) for path in commands]
+        return [f"{{observations = {name}, commands = {file}}}" for name, file in zip(names, sent, strict=True)]
+    if guess.format == lerobot.FORMAT and len(names) == 1:
+        episodes = lerobot.episode_numbers(recordings[0])
+        parts = [episodes] if len(episodes) == 1 else [episodes[:-1], episodes[-1:]]
+        return [f"{{observations = {names[0]}, episodes = {part}}}" for part in parts]
+    return names
+
+
+def _data(folder: Path, outline: RobotOutline, recordings: list[Path], commands: list[Path], guess: Guess) -> list[str]:
+    entries = _entries(folder, recordings, commands, guess)
+    fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
+    masked = ['missing = "mask"  # positions that motion capture lost are left out'] if guess.format in CAPTURED else []
+    axes, assumed = ["x", "y", "z"], ""
+    if guess.format == motive_csv.FORMAT:
+        axes, assumed = AXES.get(outline.gravity, axes), "  # ASSUMED: Motive's y axis points up"
+    optional = [
+        f"{key} = {json.dumps(values)}"
+        for key, values in (("tensions", guess.tensions), ("motor_angles", guess.motor_angles))
+        if values
+    ]
+    left = [f"# not used: {', '.join(guess.left)}"] if guess.left else []
+    return [
+        "[data]",
+        f'format = "{guess.format}"',
+        f"fit = [{', '.join(fit)}]",
+        f"test = [{', '.join(test)}]  # recordings that no fit ever sees: they say how good the fit is",
+        *masked,
+        "",
+        "# Guessed from the names and sizes of the columns: look them over.",
+        "[data.columns]",
+        *_clock(guess),
+        f"commands = {json.dumps(guess.commands)}  # one for each of the robot's channels, in their order",
+        f'command_unit = "{guess.command_unit}"',
+        *_command_clock(guess),
+        "positions = [",
+        *(f"    {json.dumps(triple)}," for triple in guess.positions),
+        "]",
+        f'position_unit = "{guess.position_unit}"',
+        f"markers = {json.dumps(list(outline.markers))}  # the robot's names, in the order of positions",
+        "# x, y, z of the robot's base in terms of the file's axes: z runs away from the clamp.",
+        f"axes = {json.dumps(axes)}{assumed}",
+        *optional,
+        *left,
+        "",
+    ]
+
+
+def _clock(guess: Guess) -> list[str]:
+    """The times of the observations."""
+    if guess.time is None:
+        return ["sample_time = 0.05  # ASSUMED: seconds from row to row"]
+    if guess.format == rosbag.FORMAT:
+        return ['time = "header"  # stamps where messages have them; "log": the times at which they were received']
+    return [f"time = {json.dumps(guess.time)}", f'time_unit = "{guess.time_unit}"']
+
+
+def _command_clock(guess: Guess) -> list[str]:
+    """The times of commands in a file of their own."""
+    if guess.command_time is None:
+        return []
+    return [
+        f"command_time = {json.dumps(guess.command_time)}",
+        f'command_time_unit = "{guess.command_time_unit}"',
+        "# ASSUMED: both clocks begin together. Else: what the observations' clock shows [s] when this one shows zero.",
+        "command_offset = 0.0",
+    ]
+
+
+def _random_commands(outline: RobotOutline) -> list[str]:
+    step = 0.2 if outline.command_unit == "rad" else round(0.02 * outline.length, 4)
+    return [
+        "# No recording was given: simulate makes one from random commands. Put [data] in the place of this table.",
+        "[commands]",
+        "duration = 4.0",
+        "interval = 0.2",
+        f"step = {step:g}",
+        f"low = {0.0 if not outline.pairs else -3 * step:g}",
+        f"high = {3 * step:g}",
+        "sample_time = 0.05",
+        'recordings = ["try_1"]',
+        "",
+    ]
+
+
+def _model(outline: RobotOutline, guess: Guess | None) -> list[str]:
+    wanted = [(name, why) for name, why in PRIORS if name != "spool_radius" or outline.command_unit == "rad"]
+    uses = []
+    if guess is not None and guess.tensions:
+        uses.append("tension = true          # forces are data: they fix the scale of stiffness and mass")
+    if guess is not None and guess.motor_angles and outline.command_unit == "rad":
+        uses.append("motor_angle = true      # so are measured motor angles")
+    return [
+        "[model]",
+        "mechanisms = []         # effects on top of the base simulator: rfdropo mechanisms lists them",
+        *uses,
+        "",
+        "[model.priors]          # what to infer; {} asks for the robot file's prior",
+        *(f"{name} = {{}}  # {why}" for name, why in wanted),
+        "",
+        "[inference]",
+        'method = "smc"          # rfdropo methods lists them',
+        "rollouts = 20000        # the budget",
+        "",
+    ]

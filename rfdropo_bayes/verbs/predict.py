@@ -1,0 +1,386 @@
+"""What a calibrated simulator expects of commands that were never run: ``predict``, and ``rfdropo predict``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+import pandas as pd
+import xarray as xr
+from jaxtyping import Float
+
+from rfdropo_bayes.bayes.channels import Markers
+from rfdropo_bayes.bayes.channels.markers import noise_of_markers
+from rfdropo_bayes.bayes.noise import Autoregression
+from rfdropo_bayes.bayes.noise.autoregression import STATED
+from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
+from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
+from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
+from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
+from rfdropo_bayes.cautions import Caution
+from rfdropo_bayes.data import Trajectory, commands_alone, first_row_only, load_unseen, start_is_known
+from rfdropo_bayes.data.sample_times import sample_time
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import whole, write_json
+from rfdropo_bayes.groups import group_of, in_group
+from rfdropo_bayes.model.assembly import KNOWN, fixed_values, model_specs, with_groups
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.run_folder import hashes, run_folder
+from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.prediction.model_error import recorded_model_error
+from rfdropo_bayes.prediction.predictive import (
+    ADAPTED_TO,
+    BEGUN,
+    FITTED,
+    HELD,
+    KNOWN_NOISE,
+    NOISE,
+    match_cautions,
+    predict_new,
+    thin,
+)
+from rfdropo_bayes.report.run_files import CONFIG, POSTERIOR
+from rfdropo_bayes.report.trajectory_figures import draw_band
+from rfdropo_bayes.results.calibrated import Calibration, axes_or_new
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+DRAWS = 200
+LEVELS = {"q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
+SCHEMA_VERSION = 1
+OBJECT, POSE_UNITS = "object", "m, m, m, and unit quaternion x, y, z, w"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a calibrated simulator expects of commands that were never run.
+
+    Attributes:
+        bands: mean and 5, 25, 75 and 95 % quantiles [m] of what would be measured, (time, marker, axis).
+        drawn: the same as draws.
+        group: that the commands were taken to belong to.
+        group_fitted: whether the posterior has values of it; None where nothing differs between groups.
+        cautions: what speaks against the prediction.
+    """
+
+    bands: xr.Dataset
+    drawn: RecordingPrediction
+    group: str = ""
+    group_fitted: bool | None = None
+    cautions: list[Caution] = field(default_factory=list)
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """One row per time [s]; columns ``<marker>_<axis>_<statistic>`` [m]."""
+        return _columns(self.bands)
+
+    def plot(self, marker: str | int = -1, axis: str = "x", ax: Axes | None = None) -> Axes:
+        """Draw one coordinate of one marker over time, with its 50 % and 90 % bands."""
+        names = self.drawn.marker_names
+        index = names.index(marker) if isinstance(marker, str) else range(len(names))[marker]
+        axes = axes_or_new(ax)
+        draw_band(axes, self.drawn, index, "xyz".index(axis))
+        axes.set_xlabel("time [s]")
+        axes.legend()
+        return axes
+
+    def save(self, folder: Path | str) -> list[Path]:
+        """Write prediction.nc and prediction.csv; return their paths."""
+        files = [Path(folder) / "prediction.nc", Path(folder) / "prediction.csv"]
+        files[0].parent.mkdir(parents=True, exist_ok=True)
+        with whole(files[0]) as partial:
+            self.bands.to_netcdf(partial, engine="h5netcdf")
+        with whole(files[1]) as partial:
+            self.frame.to_csv(partial, index=False, float_format="%.6f")
+        return files
+
+    def _repr_html_(self) -> str:
+        return self.bands._repr_html_()
+
+
+def predict(
+    fit: Calibration,
+    commands: Trajectory | tuple[Any, Any],
+    *,
+    start: Any = None,
+    draws: int = DRAWS,
+    seed: int = 0,
+    group: str | None = None,
+) -> Prediction:
+    """Predict what the markers will do under given commands, from at most the start pose.
+
+    Args:
+        fit: a calibration, with its model.
+        commands: a recording, of which nothing but the commands and the first row is looked at; or a pair of times [s]
+            and commands (time, channel), in the robot's unit.
+        start: positions of the markers in the first row [m], (marker, 3), beside such a pair; unknown by default.
+        draws: of the posterior that are rolled out.
+        seed: of what is random.
+        group: the day, robot or other group that they belong to; by default the day that `adapt` has taken the fit to,
+            or else as [model.groups] has it.
+
+    Raises:
+        InputError: a calibration without its model, or commands of another robot.
+    """
+    record, model = fit.record, model_of(fit)
+    spec = model.spec
+    _check_noise(record, spec.noise)
+    unseen = first_row_only(commands) if isinstance(commands, Trajectory) else _commanded(model, *commands, start)
+    group = record.attrs.get(ADAPTED_TO) if group is None else group
+    groups = spec.groups if group is None else in_group(unseen.name, group, spec.groups)
+    simulator = with_groups(model.simulator, groups)
+    fixed, space = fitted_parts(fit)
+    recordings = gather_recordings(simulator, [unseen])
+    stated, step = spec.stated, sample_time(unseen.time)
+    lasts = stated.correlation_time if stated is not None and spec.noise == STATED else None
+    memory = None if lasts is None else np.array([1.0, np.exp(-step / lasts)])
+    channels = (_markers(recordings, spec.noise, record.attrs.get(KNOWN_NOISE), memory),)
+    program = TrajectoryModel(simulator, space, fixed, recordings, channels)
+    values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
+    belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
+    fitted = record.attrs.get(FITTED, belonging)
+    found = predict_new(
+        program,
+        [unseen],
+        values,
+        jax.random.key(seed),
+        chunk=simulator.lanes,
+        fitted=fitted,
+        left=recorded_model_error(record),
+        groups=groups,
+    )
+    predicted = found.recordings[0]
+    bands = summarise(predicted)
+    bands.attrs |= {"frame": unseen.dataset.attrs["frame"], "robot": model.name, "recording": unseen.name}
+    bands.attrs["draws_that_did_not_match_the_first_row"] = found.unmatched
+    group = bands.attrs["group"] = group_of(unseen.name, groups)
+    known = {p.recording for p in space.parameters if p.added_to}
+    cautions = match_cautions(found)
+    if isinstance(simulator, RobotSimulator):
+        cautions += simulator.robot.unstated([unseen.name])
+    return Prediction(bands, predicted, group, group in known if known else None, cautions)
+
+
+def model_of(fit: Calibration) -> Model:
+    """The model of a calibration.
+
+    Raises:
+        InputError: it was read from files that do not say which.
+    """
+    if fit.model is not None:
+        return fit.model
+    why = "no config.toml says which"
+    if fit.folder is not None and (fit.folder / CONFIG).is_file():
+        try:
+            return Model.read(fit.folder / CONFIG)[0]
+        except InputError as error:
+            why = error.what
+    raise InputError(
+        f"the calibration has no model: {why}",
+        where=str(fit.folder or "predict"),
+        remedy="give the one that was calibrated: rb.load(folder, model=model)",
+    )
+
+
+def fitted_parts(fit: Calibration) -> tuple[dict[str, float], ParameterSpace]:
+    """Values that a calibration took for known, and the parameters that it inferred."""
+    model = model_of(fit)
+    fixed = {**fixed_values(model.spec, model.simulator), **fit.record.attrs.get(HELD, {})}
+    return fixed, _fitted_space(fit.record, model_specs(model.spec, model.simulator))
+
+
+def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
+    """Commands as a recording whose measurements are unknown, but for the start pose."""
+    return commands_alone(
+        np.asarray(time, dtype=float),
+        np.asarray(command, dtype=float),
+        model.simulator.marker_names,
+        start=None if start is None else np.asarray(start, dtype=float)[None],
+        name="commands",
+        robot=model.name,
+        format="memory",
+        command_unit=model.simulator.command_unit,
+        cable_names=model.simulator.channel_names,
+    )
+
+
+def run_prediction(
+    path: Path,
+    posterior: Path,
+    commands: str,
+    out: Path,
+    *,
+    start: str | None = None,
+    rows: tuple[int, int] | None = None,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+    group: str | None = None,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Predict what the markers will do under the commands of a file, from at most the start pose.
+
+    Writes ``prediction.nc`` (mean and the 5, 25, 75 and 95 % quantiles of what would be measured, in metres, in the
+    robot's base frame), ``prediction.csv`` (the same, one row per time) and ``prediction.json``. Where the robot pushes
+    an object, it starts from its measured pose; its centre is in both files, every draw of its pose in the first.
+
+    Args:
+        path: the experiment file that was calibrated.
+        posterior: folder of its calibration.
+        commands, start: see `data.load_unseen`.
+        out: folder to write to.
+        rows: predict observation rows first to last only; the pose of the first is then that of row ``first``.
+        overrides: assignments that replace entries of the experiment file.
+        seed: of the draws; that of the experiment by default.
+        group: see `predict`.
+        overwrite: write whatever ``out`` holds.
+
+    Raises:
+        InputError: bad input, or a posterior that does not belong to the experiment.
+    """
+    model, tables = Model.read(path, overrides)
+    read, folder = model.settings, model.folder
+    if read.data is None:
+        raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format the commands are")
+    record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
+    unseen = load_unseen(read.data, folder, commands, start, rows, record.attrs.get(BEGUN))
+    fit = Calibration(record, {}, "", model)
+    found = predict(fit, unseen, seed=read.seed if seed is None else seed, group=group)
+    options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
+    options["group"] = group
+    settings: dict[str, Any] = {"tables": tables, "folder": folder, "options": options, "data": hashes([unseen])}
+    with run_folder(out, "predict", **settings, overwrite=overwrite) as out:
+        facts = {
+            "schema_version": SCHEMA_VERSION,
+            "experiment": str(path),
+            "posterior": str(posterior),
+            "commands": commands,
+            "start_pose_known": start_is_known(unseen),
+            "first_command": unseen.first_command,
+            "group": found.group,
+            "group_fitted": found.group_fitted,
+            "rows": len(found.drawn.time),
+            "draws": int(found.drawn.predicted.shape[0]),
+            "draws_that_did_not_match_the_first_row": found.bands.attrs["draws_that_did_not_match_the_first_row"],
+            "cautions": [caution.as_dict() for caution in found.cautions],
+            "unit": "m",
+            "frame": unseen.dataset.attrs["frame"],
+            "simulator": model.simulator.description,
+            "files": [str(file) for file in found.save(out)],
+        }
+        write_json(out / "prediction.json", facts)
+    return facts
+
+
+def _check_noise(record: PosteriorRecord, noise: str) -> None:
+    """Raise an InputError where an experiment's noise model is not the one that a posterior was fitted with."""
+    fitted = record.attrs.get(NOISE, noise)  # earlier posteriors do not say
+    if noise != fitted:
+        raise InputError(
+            f"the posterior was fitted with noise = {fitted!r}, the experiment says {noise!r}",
+            where="[model] noise",
+            remedy=f"add --set model.noise={fitted}, or predict with config.toml of the posterior's folder",
+        )
+
+
+def _markers(
+    recordings: RecordingSet, noise: str, known: Mapping[str, Any] | None, memory: Float[np.ndarray, " lag"] | None
+) -> Markers:
+    """The positions to predict, under the noise that was inferred, or that the posterior knows: with the memory that
+    these rows have, where it is given.
+
+    Raises:
+        InputError: a noise that is not inferred, and a posterior that does not hold it.
+    """
+    if noise not in KNOWN:
+        return Markers.gather(recordings, noise)
+    if known is None:
+        raise InputError(
+            "the posterior does not hold the noise of the positions",
+            where="--posterior",
+            remedy="predict with the experiment that was calibrated",
+        )
+    recalled = Autoregression.from_dict(known)
+    if memory is not None:
+        recalled = replace(recalled, autocorrelation=memory)
+    own = noise_of_markers(recalled, known["markers"], recordings)
+    return Markers.gather(recordings, noise, own)
+
+
+def _fitted_space(record: PosteriorRecord, specs: Sequence[ParameterSpec]) -> ParameterSpace:
+    """The parameters a posterior holds, with the recordings they belong to.
+
+    Raises:
+        InputError: a parameter that the experiment's model lacks.
+    """
+    scopes: dict[str, list[str]] = {}
+    priors: dict[str, dict[str, Any]] = {}
+    known = {spec.name for spec in specs}
+    pooled: dict[str, Pooled] = {}
+    families = [i.name.removesuffix(SPREAD) for i in record.free if i.name.endswith(SPREAD) and i.name not in known]
+    families.sort(key=len, reverse=True)  # the longest name that fits: one cable's own spread, before that of all
+    for info in record.free:
+        name, _, recording = info.name.partition(SEPARATOR)
+        shared = name.removesuffix(DEVIATION)
+        if name not in known and shared in known:
+            groups = pooled[shared].groups if shared in pooled else {}
+            family = next((key for key in families if shared == key or shared.startswith(f"{key}_")), "")
+            pooled[shared] = Pooled(float(dict(info.prior)["scale"]), {**groups, recording: ()}, family)
+            continue
+        if name.endswith(SPREAD) and name.removesuffix(SPREAD) in families:
+            continue
+        priors[name] = dict(info.prior)
+        if recording:
+            scopes.setdefault(name, []).append(recording)
+    missing = [name for name in priors if name not in known]
+    if missing:
+        raise InputError(
+            f"the posterior holds {missing[0]!r}, which the experiment's model lacks",
+            where="--posterior",
+            remedy="predict with the experiment that was calibrated, mechanisms included",
+        )
+    recordings = sorted({recording for names in scopes.values() for recording in names})
+    return build_space(specs, priors, scopes, recordings, pooled=pooled, where="posterior")
+
+
+def summarise(predicted: RecordingPrediction) -> xr.Dataset:
+    """Mean and quantiles of the draws of one prediction."""
+    dims = ("time", "marker", "axis")
+    data: dict[str, Any] = {"mean": (dims, predicted.central)}
+    quantiles = np.quantile(predicted.predicted, list(LEVELS.values()), axis=0)
+    data |= {name: (dims, quantile) for name, quantile in zip(LEVELS, quantiles, strict=True)}
+    coords = {"time": predicted.time, "marker": list(predicted.marker_names), "axis": list("xyz")}
+    dataset = xr.Dataset(data, coords, {"schema_version": SCHEMA_VERSION, "unit": "m"})
+    dataset["time"].attrs["units"] = "s"
+    for name in data:
+        dataset[name].attrs["units"] = "m"
+    return dataset if predicted.object_pose is None else dataset.assign(_object(predicted.object_pose))
+
+
+def _object(pose: Float[np.ndarray, "draw time 7"]) -> dict[str, xr.Variable]:
+    """Where a pushed object is: mean and quantiles of its centre, and every draw of its pose."""
+    found = {OBJECT: xr.Variable(("draw", "time", "pose"), pose.astype(np.float32), {"units": POSE_UNITS})}
+    centre = pose[..., :3]
+    quantiles = np.quantile(centre, list(LEVELS.values()), axis=0)
+    for name, value in (("mean", centre.mean(axis=0)), *zip(LEVELS, quantiles, strict=True)):
+        found[f"{OBJECT}_{name}"] = xr.Variable(("time", "axis"), value, {"units": "m"})
+    return found
+
+
+def _columns(table: xr.Dataset) -> pd.DataFrame:
+    """One row per time [s]; columns ``<marker>_<axis>_<statistic>`` [m]."""
+    columns: dict[str, Float[np.ndarray, " time"]] = {"time": table["time"].values}
+    for name in ("mean", *LEVELS):
+        for i, marker in enumerate(table["marker"].values):
+            for j, axis in enumerate("xyz"):
+                columns[f"{marker}_{axis}_{name}"] = table[name].values[:, i, j]
+        if OBJECT in table:
+            for j, axis in enumerate("xyz"):
+                columns[f"{OBJECT}_{axis}_{name}"] = table[f"{OBJECT}_{name}"].values[:, j]
+    return pd.DataFrame(columns)

@@ -1,0 +1,368 @@
+"""Days of a black box: their spread is inferred, and new ones are predicted with it, or adapted to."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+from typer.testing import CliRunner
+
+import rfdropo_bayes as rb
+from rfdropo_bayes.cautions import Code
+from rfdropo_bayes.cli.main import app
+from rfdropo_bayes.cli.terminal_summary import show_calibration, show_prediction
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.prediction.model_error import MODEL_ERROR
+from rfdropo_bayes.prediction.predictive import FITTED, NOISE
+from rfdropo_bayes.verbs import adapt as adaptation
+from rfdropo_bayes.verbs import design_day as day_design
+
+DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo" / "demo_1.nc"
+STEP, SIGMA, SPREAD = 0.02, 2e-4, 0.01
+GAIN, LAG = 1.4, 0.25
+
+
+def lag(parameters, command):
+    """The tip follows gain * (command + zero) with a time constant; many parameter sets at once."""
+    gain, share = parameters["gain"][:, None], 1.0 - np.exp(-STEP / parameters["time_constant"])
+    wanted = gain * (command[:, :, 0] + parameters["zero"][:, None])
+    place = [wanted[:, 0]]
+    for row in range(1, command.shape[1]):
+        place.append(place[-1] + share * (wanted[:, row] - place[-1]))
+    x = np.stack(place, axis=1)
+    return np.stack([x, np.zeros_like(x), np.full_like(x, 0.1)], axis=-1)[:, :, None]
+
+
+BOX = rb.BlackBox(
+    lag,
+    parameters={
+        "gain": {"low": 0.2, "high": 3.0},
+        "time_constant": {"low": 0.05, "high": 1.0, "unit": "s"},
+        "zero": {"low": -1.0, "high": 1.0, "unit": "m"},
+    },
+    markers=["tip"],
+    channels=["pull"],
+    time_step=STEP,
+    batched=True,
+    name="lag",
+)
+DAYS = {f"day_{k}": f"day_{k}_*" for k in range(5)}
+PRIORS = {"gain": {}, "time_constant": {}, "zero": {"distribution": "Normal", "loc": 0.0, "scale": 0.05}}
+
+
+def recorded(names, zeros, seed):
+    walk = {"duration": 2.0, "interval": 0.2, "step": 0.01, "low": -0.03, "high": 0.03, "sample_time": STEP}
+    runs = []
+    for k, (name, zero) in enumerate(zip(names, zeros, strict=True)):
+        truth = {"gain": GAIN, "time_constant": LAG, "zero": float(zero)}
+        noise = {"standard_deviation": SIGMA}
+        runs += rb.simulate(rb.Model(BOX), walk | {"recordings": [name]}, parameters=truth, noise=noise, seed=seed + k)
+    return runs
+
+
+@pytest.fixture(scope="module")
+def zeros():
+    return 0.005 + SPREAD * np.random.default_rng(4).normal(size=15)
+
+
+@pytest.fixture(scope="module")
+def fit(zeros):
+    """Fitted to five days; ten days that it has not seen are predicted from their first rows."""
+    model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"zero": 0.02})
+    runs = recorded([f"day_{k}_a" for k in range(5)], zeros[:5], 0)
+    unseen = recorded([f"new_{k}" for k in range(10)], zeros[5:], 10)
+    return rb.calibrate(model, runs, rb.Laplace(draws=800, starts=2, screen=32), test=unseen, seed=0, show=False)
+
+
+def test_a_model_of_days_whose_spread_is_held_keeps_start_data_and_listeners():
+    """Its climbs start where an earlier fit ended, fit the data that they were given, and say how far they are."""
+    model = rb.Model(BOX, noise="white", priors=PRIORS, groups=DAYS, per_group={"zero": 0.02})
+    earlier = {"gain": np.full(2, 1.1 * GAIN), "zero_deviation@day_1": np.full(2, 0.004)}
+    whole = model.problem(recorded(["day_0_a", "day_1_a"], [0.0, 0.01], 0), earlier)
+    other = {name: 2.0 * measured for name, measured in whole.measured.items()}
+    whole = whole.with_measured(other).counting({"markers": 0.5})
+    told: list[float] = []
+    held = whole.telling(told.append).holding(whole.typical_scales)
+    assert set(whole.names) - set(held.names) == {"zero_spread"}
+    starts = held.sample_starts(jax.random.key(0), 3)
+    np.testing.assert_allclose(starts["gain"], 1.1 * GAIN)
+    np.testing.assert_allclose(starts["zero_deviation@day_1"], 0.004)
+    assert (held.measured, held.shares) == (whole.measured, whole.shares)
+    held.row_log_likelihood(starts, held.n_rows)
+    assert sum(told) == pytest.approx(3.0)
+
+
+@pytest.mark.slow
+def test_the_spread_between_days_is_inferred(fit, zeros):
+    """The 90 % interval holds the truth, and each day's zero is found to a twentieth of the spread."""
+    row = fit.summary.loc["zero_spread"]
+    assert row["q05"] < SPREAD < row["q95"]
+    assert row["q95"] < 3.0 * SPREAD
+    for k in range(5):
+        own = fit.record.flat("zero") + fit.record.flat(f"zero_deviation@day_{k}")
+        assert own.mean() == pytest.approx(zeros[k], abs=0.05 * SPREAD)
+
+
+@pytest.mark.slow
+def test_days_that_no_fit_saw_are_in_the_bands(fit):
+    """Ten days, from their first rows: their zeros are known from these to about the noise."""
+    inside = []
+    for prediction in fit.record.recordings:
+        if prediction.split == "test":
+            low, high = np.quantile(prediction.predicted, [0.05, 0.95], axis=0)
+            inside.append(np.mean((prediction.observed >= low) & (prediction.observed <= high)))
+    assert len(inside) == 10
+    assert 0.8 < np.mean(inside) <= 1.0
+
+
+@pytest.fixture(scope="module")
+def known():
+    """What such a fit knows, written down: 60 draws, of which gain and time constant are known to 1 %."""
+    rng = np.random.default_rng(0)
+    normal = {"distribution": "Normal", "loc": 0.0, "scale": 0.02}
+    infos = {
+        "gain": ("-", {"distribution": "Uniform", "low": 0.2, "high": 3.0}),
+        "time_constant": ("s", {"distribution": "Uniform", "low": 0.05, "high": 1.0}),
+        "zero": ("m", PRIORS["zero"]),
+        "zero_spread": ("m", {"distribution": "HalfNormal", "scale": 0.02}),
+        "zero_deviation@day_0": ("m", normal),
+        "observation_noise": ("m", {"distribution": "LogNormal", "median": 0.002, "sigma": 1.5}),
+    }
+    middle = {"gain": GAIN, "time_constant": LAG, "zero": 0.005, "zero_spread": SPREAD, "zero_deviation@day_0": 0.0}
+    draws = {name: value * (1.0 + 0.01 * rng.normal(size=(1, 60))) for name, value in middle.items()}
+    draws["observation_noise"] = np.full((1, 60), SIGMA)
+    left = {"markers": ["tip"], "scale": [SIGMA] * 3, "correlation_time": STEP}
+    attributes = {MODEL_ERROR: left, FITTED: ["day_0_a"], NOISE: "white"}
+    parameters = tuple(ParameterInfo(name, unit, -1.0, 3.0, prior) for name, (unit, prior) in infos.items())
+    model = rb.Model(BOX, noise="white", priors=PRIORS, groups={**DAYS, "before": "morning"}, per_group={"zero": 0.02})
+    return rb.Calibration(PosteriorRecord(parameters, draws, attrs=attributes), {"title": "lag"}, "", model)
+
+
+@pytest.fixture(scope="module")
+def adapted(known, zeros, tmp_path_factory):
+    out = tmp_path_factory.mktemp("adapted") / "out"
+    run = recorded(["morning"], zeros[9:10], 30)[0]
+    return rb.adapt(known, run, seconds=0.5, group="today", seed=1, out=out, show=False)
+
+
+def test_a_short_recording_moves_the_day_and_not_the_body(known, adapted, zeros):
+    own = adapted.record.flat("zero") + adapted.record.flat("zero_deviation@today")
+    assert own.mean() == pytest.approx(zeros[9], abs=0.1 * SPREAD)
+    assert adapted.record.flat("gain").mean() == pytest.approx(known.record.flat("gain").mean(), abs=0.01)
+    assert not [caution for caution in adapted.cautions if caution.grave]
+    rest = adapted.prediction("morning")
+    assert not rest.mask[:26].any()
+    error = np.linalg.norm(rest.central - rest.observed, axis=-1)[rest.mask]
+    assert np.sqrt(np.mean(error**2)) < 5.0 * SIGMA
+
+
+def test_the_rest_of_the_day_is_predicted_from_the_folder(adapted, zeros):
+    """The day's values serve it alone: without a first row, the bands of another day have the spread between days."""
+    other = recorded(["later"], zeros[9:10], 40)[0]
+    error = rb.predict(adapted, other, group="today").bands["mean"].values - other.position
+    assert np.sqrt(np.mean(error**2)) < 5.0 * SIGMA
+    commands = other.time[:-1], other.command_at(other.time[:-1])
+    bands = [rb.predict(adapted, commands, group=day).bands for day in ("today", "tomorrow")]
+    today, tomorrow = (float(np.mean(b["q95"].values - b["q05"].values)) for b in bands)
+    assert tomorrow > 5.0 * today
+    by_default = rb.predict(adapted, commands)  # of its own day
+    np.testing.assert_array_equal(by_default.bands["mean"], bands[0]["mean"])
+    assert (by_default.group, by_default.group_fitted) == ("today", True)
+    assert not rb.predict(adapted, commands, group="tomorrow").group_fitted
+    back = rb.load(adapted.folder)
+    np.testing.assert_array_equal(back.record.flat("zero_spread"), adapted.record.flat("zero_spread"))
+    assert json.loads((adapted.folder / "summary.json").read_text())["method"] == "adapt"
+    assert (adapted.folder / "report.html").stat().st_size > 10_000
+
+
+def test_errors_last_as_long_in_rows_of_another_rate(adapted):
+    """The model's error forgets its sign over one row of the fit; nothing moves along y. Standard error: 0.02."""
+    for step in (STEP, 2.0 * STEP):
+        time = step * np.arange(50)
+        noise = rb.predict(adapted, (time, np.zeros((50, 1)))).drawn.predicted[:, :, 0, 1]
+        lag = np.mean(noise[:, 1:] * noise[:, :-1]) / np.mean(noise**2)
+        assert lag == pytest.approx(np.exp(-step / STEP), abs=0.08)
+
+
+def test_the_terminal_shows_the_day_first_and_what_comes_next(adapted, capsys):
+    show_calibration(adapted, quiet=False, as_json=False)
+    lines = capsys.readouterr().out.splitlines()
+    header = next(k for k, line in enumerate(lines) if line.startswith("parameter"))
+    assert lines[header + 1].startswith("zero_deviation@today")
+    assert f"next: rfdropo predict {adapted.folder} --commands FILE --out OUT" in lines
+    facts = {"start_pose_known": True, "rows": 3, "draws": 2, "posterior": "P", "files": ["f"]}
+    facts |= {"group": "today", "group_fitted": True, "cautions": [{"sentence": "1 draws did not converge"}]}
+    show_prediction(facts, quiet=False, as_json=False)
+    assert capsys.readouterr().out.splitlines()[1:3] == ["group today, fitted", "caution: 1 draws did not converge"]
+
+
+def test_as_many_draws_as_were_asked_for_are_no_verdict(adapted):
+    """Sixty draws cannot have a hundred effective ones."""
+    assert adapted.summary["ess_bulk"].min() < 100.0
+    assert "effective draws" not in adapted.sentence
+    assert adapted.verdict != "unsafe"
+
+
+def test_a_piece_of_a_recording_belongs_to_its_group(known, zeros):
+    """By name in the fit and in the prediction of a further piece."""
+    run = recorded(["morning"], zeros[9:10], 30)[0]
+    piece = rb.adapt(known, run.slice_rows(0, 25), group="today", seed=1, show=False)
+    assert "zero_deviation@today" in piece.record.posterior
+    assert not piece.cautions
+    found = rb.predict(piece, run.slice_rows(50, 90, lead_in=1.0), group="today")
+    assert found.group_fitted
+    assert np.sqrt(np.mean((found.bands["mean"].values - run.position[50:91]) ** 2)) < 5.0 * SIGMA
+
+
+def test_a_day_that_the_model_cannot_fit_has_a_caution(known, zeros):
+    """A drift that no parameter makes, ten times as large as the model's error."""
+    run = recorded(["b"], zeros[1:2], 51)[0]
+    drift = 10.0 * SIGMA * np.sqrt(3.0) * np.sin(40.0 * run.time)
+    off = rb.Trajectory(run.dataset.assign(position=run.dataset["position"] + xr.DataArray(drift, dims="time")))
+    said = [caution for caution in rb.adapt(known, off, show=False).cautions if caution.code == Code.DAY_UNMATCHED]
+    times = float(said[0].sentence.removeprefix("the day is fitted ").partition(" ")[0])
+    assert times == pytest.approx(np.sqrt(1.0 + 10.0**2 * 3.0 / 2.0), rel=0.25)
+    assert not [c for c in rb.adapt(known, run, show=False).cautions if "times worse" in c.sentence]
+
+
+def test_a_first_row_that_nothing_explains_has_a_caution(known, zeros):
+    """What a day's zero moves along x is matched; five millimetres along y are not."""
+    run = recorded(["b"], zeros[1:2], 51)[0]
+    assert not rb.predict(known, run).cautions
+    shift = xr.DataArray([0.0, 25.0 * SIGMA, 0.0], dims="axis")
+    off = rb.Trajectory(run.dataset.assign(position=run.dataset["position"] + shift))
+    (caution,) = rb.predict(known, off).cautions
+    assert caution.code == Code.FIRST_ROW_FAR
+    times = float(caution.sentence.removeprefix("the first row of b is ").partition(" ")[0])
+    assert times == pytest.approx(25.0 / np.sqrt(3.0), rel=0.1)  # a row's noise is 4 % of it
+
+
+def test_what_is_masked_after_the_first_seconds_is_no_rest(known, zeros):
+    run = recorded(["b"], zeros[1:2], 51)[0]
+    mask = run.position_mask & (run.time < 0.5)[:, None]
+    lost = rb.Trajectory(run.dataset.assign(position_mask=run.dataset["position_mask"].copy(data=mask)))
+    found = rb.adapt(known, lost, seconds=0.6, show=False)
+    assert [prediction.split for prediction in found.record.recordings] == ["fit"]
+
+
+def test_lost_markers_are_left_out(known, tmp_path, monkeypatch):
+    """The file is read as `predict` reads it, and what is left out is said."""
+    asked = {}
+
+    def read(spec, folder):
+        asked["missing"] = spec.missing
+        raise rb.InputError("read")
+
+    monkeypatch.setattr(adaptation, "load_recordings", read)
+    (tmp_path / "config.toml").write_text('robot = "smooth_arm"\n[data]\nformat = "netcdf"\nfit = ["a.nc"]\n')
+    with pytest.raises(rb.InputError, match="read"):
+        adaptation.run_adaptation(tmp_path, "b.nc", tmp_path / "out")
+    assert asked["missing"] == "mask"
+
+
+def test_what_was_left_out_is_printed(adapted, capsys):
+    recordings = [{**row, "masked": 2} for row in adapted.content["recordings"]]
+    show_calibration(
+        replace(adapted, content={**adapted.content, "recordings": recordings}), quiet=False, as_json=False
+    )
+    assert "left out: 2 of 26 positions" in capsys.readouterr().out
+
+
+def test_a_day_that_was_fitted_is_refused_before_a_folder_is_made(known, zeros, tmp_path):
+    run = recorded(["day_0_b"], zeros[:1], 52)[0]
+    with pytest.raises(rb.InputError, match=r"day_0_b belongs to day_0, which was fitted.*new --group"):
+        rb.adapt(known, run, out=tmp_path / "out", show=False)
+    assert not (tmp_path / "out").exists()
+    assert rb.adapt(known, run, group="anew", show=False).content["details"]["moved"] == ["zero_deviation@anew"]
+
+
+def test_the_shortest_commands_that_determine_a_day(known, zeros):
+    """One row of a marker that a zero moves says what there is to say; where it moves none, no commands do."""
+    runs = recorded(["day_0_a"], zeros[:1], 0)
+    found = rb.design_day(known, runs, seconds=1.0)
+    assert found.content["determined"]
+    assert found.content["seconds"] == 0.0
+    assert found.content["parameters_of_a_day"] == ["zero_deviation@another day"]
+    assert found.content["tip_uncertain_before_mm"] == pytest.approx(1e3 * GAIN * SPREAD, rel=0.1)
+    assert found.content["tip_uncertain_after_mm"] <= found.content["tip_error_of_the_model_mm"]
+    assert list(found.commands.columns) == ["time_s", "pull_m"]
+    assert "The first row of a recording is enough" in found.sentence
+    assert found.content["group"] == "day_0"
+    none = {**known.record.posterior, "zero_spread": np.full((1, 60), 1e-9)}
+    same = rb.design_day(replace(known, record=replace(known.record, posterior=none)), runs, seconds=1.0)
+    assert same.content["tip_uncertain_before_mm"] < 1e-3
+
+
+def test_proposals_are_as_long_as_asked_for(known, zeros):
+    """Longer than the recordings at hand, and from rest as they began; a group that none is of is refused."""
+    runs = [run.slice_rows(0, 25) for run in recorded(["day_0_a", "day_1_a"], zeros[:2], 0)]
+    begun = day_design._begun_like(runs[0], 5.0)
+    assert begun.name == "day_0_a"
+    np.testing.assert_allclose(begun.time, STEP * np.arange(251))
+    tried = day_design._followed_proposals(known.model, begun, runs[0], runs, np.random.default_rng(0))
+    assert max(time[-1] for _, time, _ in tried) > 4.5
+    assert rb.design_day(known, runs, seconds=1.0).content["group"] == "day_1"
+    with pytest.raises(rb.InputError, match="no recording at hand is of the group 'day_2'"):
+        rb.design_day(known, runs, group="day_2")
+
+
+@pytest.fixture
+def stated():
+    """An arm whose first drive ignores what is beyond 12 mm in April, and forgets it in January."""
+    named = {"january": "jan_*", "april": "apr_*"}
+    drives = [{"recordings": name, "low": 0.0, "high": 0.012, "beyond": "lost", "cables": ["up"]} for name in named]
+    return rb.Model("smooth_arm", groups=named, drives=[drives[0] | {"high": 0.03}, drives[1]])
+
+
+def test_proposals_are_what_the_drives_of_the_day_follow(stated):
+    """Commands of up to 40 mm were sent, of which the drives followed 30 mm in January and 12 mm in April."""
+    made = rb.Trajectory.load(DEMO)
+    command = 0.04 * np.linspace(0.0, 1.0, len(made.command))[:, None] * np.array([1.0, 0.5, 0.0, 0.0])
+    runs = [
+        rb.Trajectory(made.dataset.assign(command=made.dataset["command"].copy(data=command))).with_attributes(
+            name=name
+        )
+        for name in ("jan_1", "apr_1")
+    ]
+    for run, most in zip(runs, (0.03, 0.012), strict=True):
+        begun = day_design._begun_like(run, 2.0)
+        tried = day_design._followed_proposals(stated, begun, run, runs, np.random.default_rng(1))
+        top = np.max([value.max(axis=0) for _, _, value in tried], axis=0)
+        assert 0.6 * most < top[0] <= most
+        assert 0.01 < top[1] <= 0.02
+        for _, _, value in tried:  # as sent
+            taken = stated.simulator.taken(f"{run.name}[proposal 3]", run.initial_command, value)
+            np.testing.assert_array_equal(taken, value)
+
+
+def test_a_model_that_is_the_same_on_all_days_says_what_to_name(known, zeros):
+    record = known.record
+    shared = tuple(info for info in record.parameters if info.name in (*PRIORS, "observation_noise"))
+    draws = {info.name: record.posterior[info.name] for info in shared}
+    run = recorded(["b"], zeros[1:2], 51)[0]
+    same = replace(known, model=rb.Model(BOX, noise="white", priors=PRIORS))
+    with pytest.raises(rb.InputError, match="nothing of the model differs between days"):
+        rb.adapt(replace(same, record=replace(record, parameters=shared, posterior=draws)), run, show=False)
+    silent = {**record.attrs, MODEL_ERROR: None}
+    with pytest.raises(rb.InputError, match="does not say what its model leaves"):
+        rb.adapt(replace(known, record=replace(record, attrs=silent)), run, show=False)
+
+
+def test_the_command_refuses_a_folder_without_a_posterior(tmp_path):
+    found = CliRunner().invoke(app, ["adapt", str(tmp_path), "--recording", "x.csv", "--out", str(tmp_path / "out")])
+    assert isinstance(found.exception, rb.InputError)
+    assert "holds no posterior.nc" in str(found.exception)
+
+
+def test_a_day_that_one_row_determines_needs_no_motion() -> None:
+    assert day_design._sentence("chirp", day_design.DayOutlook(left=0.001, seconds=0.0), 0.0, 0.002, 0.005).startswith(
+        "The first row"
+    )
+    assert day_design._sentence("chirp", day_design.DayOutlook(left=0.001, seconds=1.5), 1.5, 0.02, 0.005).startswith(
+        "Record the first 1.5 s"
+    )

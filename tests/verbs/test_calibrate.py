@@ -1,0 +1,117 @@
+"""``rfdropo calibrate`` from recordings to report: what it writes, and that a killed run ends as if it had not been."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import arviz
+import numpy as np
+import pytest
+
+from rfdropo_bayes.cautions import Code
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, load_posterior
+from rfdropo_bayes.results.calibrated import Calibration
+from rfdropo_bayes.verbs.calibrate import earlier_draws, run_calibration
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+DEMO = REPOSITORY / "experiments" / "demo.toml"
+SHORT = [
+    'data.fit=[{observations="demo/demo_1.nc", rows=[0, 20]}]',
+    'data.test=["demo/demo_3.nc"]',
+    "simulator.refine=1",
+    "inference.particles=50",
+    "inference.rollouts=400",
+    "inference.blocks=3",
+]
+
+
+@pytest.mark.slow
+def test_a_calibration_writes_what_it_promises(tmp_path):
+    stated = 'model.drives=[{recordings="demo_1", high=1.0, beyond="lost"}]'
+    found = run_calibration(DEMO, tmp_path, overrides=[*SHORT, stated])
+    assert Code.DRIVES_UNSTATED in [caution.code for caution in found.cautions]  # of the test recording
+    assert found.verdict in ("safe", "with care", "unsafe")
+    assert (tmp_path / "report.html").read_text().startswith("<!DOCTYPE html>")
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["status"] == "done"
+    assert set(summary["parameters"]) >= {"young_modulus", "poisson_ratio", "trunk_mass", "observation_noise"}
+    assert summary["rmse"]["test"]["m4"] > 0
+    record = PosteriorRecord.load(tmp_path / "posterior.nc")
+    assert {r.split for r in record.recordings} == {"fit", "test"}
+    assert all(np.isfinite(record.flat(p.name)).all() for p in record.parameters)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Estimated shape parameter of Pareto")  # a hundred draws: k is 0.67 for one row
+@pytest.mark.filterwarnings("ignore:The inplace keyword")  # of pandas 3, in ArviZ
+def test_two_runs_of_the_same_data_are_compared_by_what_they_predict_of_each_row(tmp_path):
+    """Independent replicates are chains, and every row's log likelihood is there for ArviZ."""
+    runs = {}
+    for noise in ("white", "auto"):
+        overrides = [*SHORT, "inference.rollouts=4000", "inference.replicates=2", f'model.noise="{noise}"']
+        run_calibration(DEMO, tmp_path / noise, overrides=overrides)
+        runs[noise] = load_posterior(tmp_path / noise / "posterior.nc")
+        summary = json.loads((tmp_path / noise / "summary.json").read_text())
+        rows = [row for row in summary["parameters"].values() if not row.get("derived")]
+        assert runs[noise].posterior.sizes["chain"] == 2
+        assert all(np.isfinite(row["r_hat"]) for row in rows)
+        assert summary["rollouts"] <= 4400
+    compared = arviz.compare(runs, ic="loo")
+    assert set(compared.index) == set(runs)
+    assert np.isfinite(compared["elpd_loo"].astype(float)).all()
+    for data in runs.values():
+        rows = data.log_likelihood["row"].stack(sample=("chain", "draw")).values
+        assert len(rows) == 21
+        # What a row is worth to a fit that has not seen it is less than to one that has.
+        assert arviz.loo(data).elpd_loo < np.sum(np.logaddexp.reduce(rows, axis=1) - np.log(rows.shape[1]))
+
+
+def command(out: Path, *extra: str) -> list[str]:
+    overrides = [argument for override in SHORT for argument in ("--set", override)]
+    return [sys.executable, "-m", "rfdropo_bayes", "calibrate", str(DEMO), "--out", str(out), *overrides, *extra]
+
+
+@pytest.mark.slow
+def test_a_killed_run_resumes_to_the_same_posterior(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    subprocess.run(command(whole), env=environment, check=True, capture_output=True)
+    running = subprocess.Popen(command(killed), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    log = killed / "log.jsonl"
+    while not (log.exists() and len(log.read_text().splitlines()) >= 3):
+        assert running.poll() is None, "the run ended before it could be killed"
+        time.sleep(0.05)
+    running.send_signal(signal.SIGKILL)
+    running.wait()
+    assert not (killed / "posterior.nc").exists()
+    subprocess.run(command(killed, "--resume"), env=environment, check=True, capture_output=True)
+    first, second = (PosteriorRecord.load(folder / "posterior.nc") for folder in (whole, killed))
+    for parameter in first.parameters:
+        np.testing.assert_array_equal(first.flat(parameter.name), second.flat(parameter.name))
+
+
+def test_a_start_is_refused_where_it_would_be_ignored_or_is_not_there(tmp_path):
+    with pytest.raises(InputError, match="does not climb"):
+        earlier_draws(tmp_path, "nested")
+    with pytest.raises(InputError, match="no such file"):
+        earlier_draws(tmp_path, "laplace")
+    assert earlier_draws(None, "nested") is None
+
+
+def test_climbs_start_from_the_optimum_of_an_earlier_calibration(tmp_path):
+    """Draws of many parameters may all fit worse than the optimum; a folder without summary has draws alone."""
+    draws = {"young_modulus": np.array([[1e6, 2e6, 3e6]])}
+    info = ParameterInfo("young_modulus", "Pa", 0.0, np.inf, {}, "")
+    record = PosteriorRecord((info,), draws, {"young_modulus": draws["young_modulus"][0]}, ())
+    record.save(tmp_path / "posterior.nc")
+    np.testing.assert_allclose(earlier_draws(tmp_path, "laplace")["young_modulus"], [1e6, 2e6, 3e6])
+    for optimum, expected in (({"young_modulus": 5e6}, [5e6, 5e6, 5e6, 1e6, 2e6, 3e6]), (None, [1e6, 2e6, 3e6])):
+        found = earlier_draws(Calibration(record, {"optimum": optimum}, ""), "laplace")
+        np.testing.assert_allclose(found["young_modulus"], expected)

@@ -1,0 +1,166 @@
+"""``rfdropo check``: what it says of recordings that fit the robot, and of those that do not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.verbs.check import Check, run_check
+from rfdropo_bayes.verbs.placement import placement_hints
+
+DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo" / "demo_1.nc"
+EXPERIMENT = """
+robot = "smooth_arm"
+[data]
+format = "csv"
+fit = ["run.csv"]
+[data.columns]
+time = "t"
+commands = [{commands}]
+command_unit = "mm"
+positions = [["x1", "y1", "z1"], ["x2", "y2", "z2"], ["x3", "y3", "z3"], ["x4", "y4", "z4"]]
+position_unit = "mm"
+{more}
+[model.priors]
+{priors} = {{}}
+"""
+FOUR = '"c1", "c2", "c3", "c4"'
+
+
+def checked(
+    tmp_path: Path, commands: str = FOUR, more: str = "", priors: str = "young_modulus", time: np.ndarray | None = None
+) -> Check:
+    """What check says of a recording of the demo that was written as CSV, with other times where they are given."""
+    demo = Trajectory.load(DEMO)
+    columns = {"t": demo.time if time is None else time}
+    for k, point in enumerate(np.moveaxis(demo.position, 1, 0), start=1):
+        columns |= {f"{axis}{k}": 1e3 * point[:, i] for i, axis in enumerate("xyz")}
+    columns |= {f"c{k}": 1e3 * values for k, values in enumerate(demo.command_at(demo.time).T, start=1)}
+    pd.DataFrame(columns).to_csv(tmp_path / "run.csv", index=False)
+    path = tmp_path / "own.toml"
+    path.write_text(EXPERIMENT.format(commands=commands, more=more, priors=priors))
+    return run_check(path, tmp_path / "pictures")
+
+
+def text_of(found: Check) -> str:
+    return "\n".join(text for _, text in found.lines)
+
+
+def test_a_recording_that_fits_is_described_and_drawn(tmp_path):
+    found = checked(tmp_path)
+    assert not found.problems
+    for words in (
+        "61 rows over 3 s, one every 50 ms",
+        "markers m1, m2, m3, m4: as the robot's",
+        "no position is masked",
+        "4 commands in m: c1, c2, c3, c4; from 0 to 0.0125",
+        "the robot calls them up, left, down, right",
+        "young_modulus [Pa] ~ LogNormal(median 2e+06, sigma 0.5)",
+    ):
+        assert words in text_of(found)
+    (picture,) = found.files
+    assert np.asarray(Image.open(picture).convert("RGB")).std() > 10.0
+
+
+def test_a_recording_without_the_limits_of_others_has_a_note(tmp_path):
+    drives = '[[model.drives]]\nrecordings = "april_*"\nhigh = 0.1\nbeyond = "lost"\n'
+    found = checked(tmp_path, more=drives)
+    assert not found.problems
+    said = "the travel of up, left, down, right is stated for other recordings and not for run:"
+    assert [note for note in found.notes if note.startswith(said)]
+
+
+def test_markers_of_other_names_are_a_problem_that_says_what_to_write(tmp_path):
+    found = checked(tmp_path, more='markers = ["base", "low", "high", "tip"]')
+    assert any("base, low, high, tip" in p and "m1, m2, m3, m4" in p for p in found.problems)
+    assert any("[data.columns] markers" in p for p in found.problems)
+    assert len(found.problems) == 1
+
+
+def test_another_number_of_commands_is_a_problem(tmp_path):
+    found = checked(tmp_path, commands='"c1", "c2", "c3"')
+    assert any("3 channels" in p and "4 channels of commands (up, left, down, right)" in p for p in found.problems)
+    assert len(found.problems) == 1
+
+
+def test_everything_that_is_wrong_is_said_at_once(tmp_path):
+    found = checked(tmp_path, commands='"c1", "c2", "c3", "c9"', priors="youngs_modulus")
+    assert any("c9" in p for p in found.problems)
+    mistyped = checked(tmp_path, priors="youngs_modulus")
+    assert any("did you mean 'young_modulus'" in p for p in mistyped.problems)
+
+
+def moved(change) -> tuple[list[str], Trajectory]:
+    """Hints for a recording of the demo whose positions were changed."""
+    demo = Trajectory.load(DEMO)
+    dataset = demo.dataset.copy(deep=True)
+    dataset["position"] = dataset["position"].copy(data=change(demo.position))
+    return placement_hints(load_robot("smooth_arm"), Trajectory(dataset)), demo
+
+
+def test_a_recording_in_place_needs_no_hint():
+    assert moved(lambda position: position)[0] == []
+
+
+def test_a_moved_origin_is_named():
+    (hint,), _ = moved(lambda position: position + np.array([0.3, 0.0, -0.2]))
+    assert "a shift by (-2" in hint or "a shift by (-3" in hint
+    assert "origin" in hint
+
+
+@pytest.mark.parametrize("axes", [(2, 0, 1), (1, 2, 0)])
+def test_turned_axes_are_named(axes):
+    """An arm that is straight along z shows where z went, not how far it turned about itself."""
+    (hint,), _ = moved(lambda position: position[..., list(axes)])
+    named = hint.split("axes = ")[1].split("]")[0]
+    assert named.split(", ")[2].strip('"') == "xyz"[axes.index(2)]
+
+
+def test_markers_in_another_order_are_named():
+    (hint,), _ = moved(lambda position: position[:, ::-1])
+    assert "m1, m2, m3, m4 look like m4, m3, m2, m1" in hint
+
+
+def test_a_wrong_unit_stretches_the_robot():
+    hints, _ = moved(lambda position: 10.0 * position)
+    assert any("apart in the first row" in hint and "position_unit" in hint for hint in hints)
+
+
+ROWS = np.arange(61)
+STAMPS = 1_530_018_381_010_286_378 + 50_000_000 * ROWS  # [ns]
+
+
+def test_times_in_another_unit_are_a_problem_that_names_it_before_anything_is_simulated(tmp_path):
+    found = checked(tmp_path, time=STAMPS)
+    (problem,) = found.problems
+    assert problem.startswith("run: 61 rows over 3e+09 s would be ")
+    assert '"ns" taken for "s", with rows 50 ms apart: correct time_unit under [data.columns]' in problem
+    assert any(note.startswith("run: rows are 5e+07 s apart") for note in found.notes)
+
+
+def test_nanoseconds_are_read_to_the_last(tmp_path):
+    found = checked(tmp_path, more='time_unit = "ns"', time=STAMPS)
+    assert not found.problems
+    assert "61 rows over 3 s, one every 50 ms" in text_of(found)
+
+
+def test_stamps_coarser_than_rows_are_a_problem_that_names_sample_time(tmp_path):
+    (problem,) = checked(tmp_path, time=0.25 * (ROWS // 5)).problems
+    assert "run.csv, row 1: time does not increase (48 times)" in problem
+    assert "give sample_time = 0.05" in problem
+
+
+def test_stamps_of_arrival_and_a_clock_that_jumps_are_notes(tmp_path):
+    arrival = checked(tmp_path, time=0.3 * (ROWS // 6) + 3e-6 * (ROWS % 6))
+    assert any("stamps of arrival" in note and "give sample_time = 0.05" in note for note in arrival.notes)
+    assert "61 rows over 3 s, one every 50 ms" in text_of(arrival)
+    assert "no position is masked" in text_of(arrival)
+    assert not arrival.problems
+    jump = checked(tmp_path, time=0.05 * ROWS + 600.0 * (ROWS > 29))
+    assert any("run: the clock jumps by 600 s before row 30" in note for note in jump.notes)

@@ -1,0 +1,195 @@
+"""``import rfdropo_bayes as rb``: light to import, and every call on objects in memory."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+from matplotlib.figure import Figure
+
+import rfdropo_bayes as rb
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.verbs.predict import fitted_parts
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+STEP = 0.02
+SIGMA = 2e-4
+
+
+def lag(parameters, command):
+    """The tip follows gain * command with a time constant; many parameter sets at once."""
+    gain, share = parameters["gain"][:, None], 1.0 - np.exp(-STEP / parameters["time_constant"])
+    wanted = gain * command[:, :, 0]
+    place = [wanted[:, 0]]
+    for row in range(1, command.shape[1]):
+        place.append(place[-1] + share * (wanted[:, row] - place[-1]))
+    x = np.stack(place, axis=1)
+    return np.stack([x, np.zeros_like(x), np.full_like(x, 0.1)], axis=-1)[:, :, None]
+
+
+TRUTH = {"gain": 1.4, "time_constant": 0.25}
+BOX = rb.BlackBox(
+    lag,
+    parameters={"gain": {"low": 0.2, "high": 3.0}, "time_constant": {"low": 0.05, "high": 1.0, "unit": "s"}},
+    markers=["tip"],
+    channels=["pull"],
+    time_step=STEP,
+    batched=True,
+    name="lag",
+)
+WALK = {"duration": 2.0, "interval": 0.2, "step": 0.01, "low": -0.03, "high": 0.03, "sample_time": STEP}
+
+
+def test_the_import_is_light():
+    """Under 0.2 s on an idle machine; here that no heavy library is loaded before it is used."""
+    code = (
+        "import sys; import rfdropo_bayes as rb; heavy = {'jax', 'numba', 'torch', 'numpy', 'pandas', 'scipy'}; "
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules); assert 'calibrate' in dir(rb)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)
+
+
+def test_every_name_leads_somewhere():
+    for name in rb.__all__:
+        assert getattr(rb, name) is not None
+    assert callable(rb.audit)  # and not the room of that name
+    with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
+        rb.calibrat  # noqa: B018
+
+
+def test_what_is_no_model_is_told_so():
+    with pytest.raises(rb.InputError, match="did you mean 'noise'"):
+        rb.Model("smooth_arm", noize="white")
+    with pytest.raises(rb.InputError, match="Gamma cannot be a prior"):
+        rb.Model("smooth_arm", priors={"young_modulus": dist.Gamma(1.0)})
+    with pytest.raises(rb.InputError, match="dict is no robot"):
+        rb.Model({})
+    with pytest.raises(rb.InputError, match="holds neither a calibration nor an audit"):
+        rb.load(REPOSITORY / "docs")
+
+
+REPORTS = sorted(path.parent for path in (REPOSITORY / "reports").rglob("posterior.nc"))
+
+
+@pytest.mark.parametrize("folder", [pytest.param(f, id=str(f.relative_to(REPOSITORY / "reports"))) for f in REPORTS])
+def test_every_calibration_among_the_reports_predicts_commands(folder):
+    """An audit's answer that lies beside it changes nothing."""
+    fit = rb.load(folder)
+    assert isinstance(fit, rb.Calibration)
+    assert set(fitted_parts(fit)[1].names) == {info.name for info in fit.record.free}
+    rest = np.zeros((3, len(fit.model.simulator.channel_names)))
+    ahead = rb.predict(fit, (0.1 * np.arange(3), rest), draws=2)
+    assert np.isfinite(ahead.bands["mean"]).all()
+
+
+def test_a_robot_from_answers_goes_through_its_tables():
+    robot = rb.Robot.outline(name="finger", length=0.12, radius=0.012, markers={"tip": 0.12}, mass=0.04)
+    model = rb.Model(robot, priors={"young_modulus": {}})
+    assert model.tables()["robot"] == "robot.toml"
+    assert "finger" in model.texts()["robot.toml"]
+    assert model.parameters.loc["young_modulus", "prior"]["distribution"] == "LogNormal"
+    assert model.with_mechanisms("backlash").mechanisms == ("backlash",)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    names = {**WALK, "recordings": [f"run_{k}" for k in range(6)]}
+    return rb.simulate(rb.Model(BOX), names, parameters=TRUTH, noise={"standard_deviation": SIGMA}, seed=1)
+
+
+@pytest.fixture(scope="module")
+def fit(runs, tmp_path_factory):
+    model = rb.Model(BOX, noise="white", fixed={"observation_noise": SIGMA})
+    out = tmp_path_factory.mktemp("fit") / "out"
+    return rb.calibrate(model, runs[:2], rb.Laplace(draws=4000), test=runs[2:3], seed=0, show=False, out=out)
+
+
+def grid_posterior(runs):
+    """Means and standard deviations of gain and time constant by sums over a grid, with a simulation of its own."""
+    gain, constant = np.meshgrid(np.linspace(1.38, 1.42, 81), np.linspace(0.24, 0.26, 81), indexing="ij")
+    square = np.zeros(gain.shape)
+    for run in runs:
+        kept = np.exp(-STEP / constant)
+        place = gain * run.initial_command[0]
+        square += (run.position[0, 0, 0] - place) ** 2
+        for row, level in enumerate(run.command_at(run.time[:-1])[:, 0]):
+            place = kept * place + (1.0 - kept) * gain * level
+            square += (run.position[row + 1, 0, 0] - place) ** 2
+    weight = np.exp(-0.5 * (square - square.min()) / SIGMA**2)
+    weight /= weight.sum()
+    moments = {}
+    for name, values in (("gain", gain), ("time_constant", constant)):
+        mean = float(np.sum(weight * values))
+        moments[name] = mean, float(np.sqrt(np.sum(weight * (values - mean) ** 2)))
+    return moments
+
+
+@pytest.mark.slow
+def test_a_black_box_is_calibrated_as_the_grid_says(fit, runs):
+    """Means within .1 and deviations within 8 % of those of the grid: 4000 draws have errors of .016 and 1.1 %."""
+    for name, (mean, sd) in grid_posterior(runs[:2]).items():
+        row = fit.summary.loc[name]
+        assert abs(row["mean"] - mean) < 0.1 * sd
+        assert row["sd"] == pytest.approx(sd, rel=0.08)
+        assert abs(mean - TRUTH[name]) < 4.0 * sd
+    assert fit.verdict in ("safe", "with care")
+    assert fit.cautions == []
+
+
+@pytest.mark.slow
+def test_a_calibration_shows_itself_and_comes_back(fit, tmp_path):
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 3)
+    fit.plot_pair(ax=axes[0])
+    fit.plot_prior_posterior("gain", ax=axes[1])
+    fit.plot_fit("run_2", marker="tip", axis="x", ax=axes[2])
+    assert axes[2].get_ylabel() == "tip x [mm]"
+    plt.close(figure)
+    shown = fit._repr_html_()
+    assert "gain" in shown
+    assert "<img" in shown
+    assert fit.report(tmp_path / "page.html").read_text().startswith("<!DOCTYPE html>")
+    back = rb.load(fit.folder)
+    np.testing.assert_array_equal(back.posterior.posterior["gain"], fit.posterior.posterior["gain"])
+    with pytest.raises(InputError, match=r"has no model: .*'lag'.*rb.load\(folder, model=model\)"):
+        fitted_parts(back)  # no file describes a function
+    back = rb.load(fit.folder, model=fit.model)
+    assert set(fitted_parts(back)[1].names) == {"gain", "time_constant"}
+
+
+@pytest.mark.slow
+def test_commands_that_were_never_run_are_predicted(fit, runs):
+    ahead = rb.predict(fit, runs[3], seed=0)
+    inside = (ahead.bands["q05"] < runs[3].position) & (runs[3].position < ahead.bands["q95"])
+    assert 0.8 < float(inside.sel(axis="x").mean()) < 0.97
+    pair = rb.predict(fit, (runs[3].command_time, runs[3].command), start=runs[3].position[0], seed=0)
+    assert set(pair.bands["marker"].values) == {"tip"}
+
+
+@pytest.mark.slow
+def test_an_audit_of_a_black_box_names_a_hidden_delay(runs):
+    """A delay of the commands is found with its size, and mechanisms of a body are left out by name."""
+    late = rb.Model(BOX, mechanisms=["command_delay"], fixed={"command_delay": 0.06})
+    noise = {"standard_deviation": SIGMA}
+    seen = rb.simulate(late, runs, parameters=TRUTH, noise=noise, seed=2)
+    found = rb.audit(rb.Model(BOX, noise="white"), seen[:3], test=seen[3:], noise=noise, seed=0, bootstraps=199)
+    assert found.verdict in ("explained", "equivalent")
+    assert "payload" in found.content["left_out"]
+    members = found.content["findings"][0]["equivalence_class"]
+    assert "command_delay" in members
+    assert "command_delay" in found.extended.mechanisms or len(members) > 1
+    axes = Figure().add_subplot()
+    assert found.plot_residual("rate", ax=axes) is axes
+    assert axes.get_xlabel().startswith("rate of")
+    assert len(found.plot_blocks(Figure().add_subplot()).patches) == len(found.shown.models)
+    assert next(line.get_label() for line in found.plot_unseen("x", Figure().add_subplot()).lines) == "measured"
+    with pytest.raises(InputError, match="did you mean 'rate'"):
+        found.plot_residual("rates")
+    with pytest.raises(InputError, match="cannot draw"):
+        replace(found, shown=None).plot_blocks()

@@ -1,0 +1,173 @@
+"""``rfdropo init``: columns are recognised, files are written that can be read, and what does not fit is said."""
+
+from __future__ import annotations
+
+import gzip
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from rfdropo_bayes.cli import main
+from rfdropo_bayes.data import load_recordings
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.experiment import load_experiment, matching
+from rfdropo_bayes.model.model_spec import find_robot
+from rfdropo_bayes.verbs.column_names import guess_columns
+
+ROWS = 40
+TIME = 0.05 * np.arange(ROWS)
+MARKERS = np.array([100.0, 200.0])
+
+
+def table(time: str, position: str, command: str, scale: float = 1.0, factor: float = 1.0) -> pd.DataFrame:
+    """Two markers and four commands under names that patterns make."""
+    columns = {time: factor * TIME}
+    columns |= {command.format(k + 1): 0.4 * np.sin(TIME + k) for k in range(4)}
+    for k, height in enumerate(MARKERS):
+        for axis, value in zip("xyz", (5.0 * np.sin(TIME), 3.0 * np.cos(TIME), height + 0.0 * TIME), strict=True):
+            columns[position.format(marker=("low", "tip")[k], number=k + 1, axis=axis)] = scale * value
+    return pd.DataFrame(columns)
+
+
+@pytest.mark.parametrize(
+    ("time", "position", "command", "scale", "units", "markers"),
+    [
+        ("t", "{axis}{number}", "u{0}", 1.0, ("s", "m", "mm"), ["m1", "m2"]),
+        ("time [s]", "{marker} {axis} [mm]", "motor{0} [rad]", 1.0, ("s", "rad", "mm"), ["low", "tip"]),
+        ("timestamp", "{marker}_{axis}", "cmd_{0}", 1e-3, ("s", "m", "m"), ["low", "tip"]),
+        ("Time_s", "{marker}.{axis}", "theta_{0}_deg", 1.0, ("s", "deg", "mm"), ["low", "tip"]),
+    ],
+)
+def test_columns_are_recognised_by_their_names(tmp_path, time, position, command, scale, units, markers):
+    path = tmp_path / "run.csv"
+    table(time, position, command, scale).to_csv(path, index=False)
+    guess = guess_columns(path)
+    if "cmd" in command or command.startswith("u"):  # lengths: 0.4 is more than a cable moves in metres
+        units = (units[0], "mm", units[2])
+    assert (guess.time_unit, guess.command_unit, guess.position_unit) == units
+    assert guess.time == time
+    assert guess.commands == [command.format(k) for k in range(1, 5)]
+    assert [len(triple) for triple in guess.positions] == [3, 3]
+    assert guess.markers == markers
+
+
+def test_semicolons_decimal_commas_and_compression_are_seen_through(tmp_path):
+    text = table("t", "{marker}_{axis}", "pull{0}").to_csv(index=False, sep=";", decimal=",")
+    path = tmp_path / "run.csv.gz"
+    path.write_bytes(gzip.compress(text.encode()))
+    assert guess_columns(path).markers == ["low", "tip"]
+
+
+def test_milliseconds_forces_and_measured_angles_are_told_apart(tmp_path):
+    run = table("t", "{marker}_{axis}", "motor{0}", factor=1e3)
+    for k in range(1, 5):
+        run[f"tension{k}"], run[f"motor{k}_meas"] = 1.0, 0.0
+    run["battery"] = 12.0
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert guess.time_unit == "ms"
+    assert guess.commands == [f"motor{k}" for k in range(1, 5)]
+    assert guess.tensions == [f"tension{k}" for k in range(1, 5)]
+    assert guess.motor_angles == [f"motor{k}_meas" for k in range(1, 5)]
+    assert guess.left == ["battery"]
+
+
+def test_a_file_without_positions_is_refused(tmp_path):
+    table("t", "{marker}_{axis}", "u{0}").filter(regex="t$|u").to_csv(tmp_path / "run.csv", index=False)
+    with pytest.raises(InputError, match="found no positions"):
+        guess_columns(tmp_path / "run.csv")
+
+
+def init(monkeypatch, capsys, *words: str) -> tuple[int, str]:
+    monkeypatch.setattr(sys, "argv", ["rfdropo", "init", *words, "--defaults"])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    told = capsys.readouterr()
+    return int(stopped.value.code or 0), told.out + told.err
+
+
+def test_init_writes_files_that_read_the_recordings(tmp_path, monkeypatch, capsys):
+    for number in (1, 2, 3):
+        table("t", "{marker}_{axis}", "motor{0}").to_csv(tmp_path / f"run_{number}.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    status, told = init(monkeypatch, capsys, "Arm 7", "--recording", "run_*.csv", "--length-mm", "200")
+    assert status == 0
+    assert "rfdropo check" in told
+    experiment, _ = load_experiment(tmp_path / "Arm 7" / "experiment.toml")
+    robot = find_robot(experiment.robot, tmp_path / "Arm 7")
+    assert robot.name == "arm_7"
+    assert robot.command_unit == "rad"
+    fitted = load_recordings(experiment.data, tmp_path / "Arm 7")
+    assert [recording.name for recording in fitted] == ["run_1", "run_2"]
+    assert fitted[0].marker_names == robot.marker_names == ("low", "tip")
+    assert len(robot.channel_names) == fitted[0].command.shape[1] == 4
+    assert [entry.observations for entry in experiment.data.test] == ["../run_3.csv"]
+    status, told = init(monkeypatch, capsys, "Arm 7")
+    assert status == 2
+    assert "is there already" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--recording", "none_*.csv"), "matches no file"),
+        (("--recording", "run.csv", "--segments", "3"), "4 commands (u1, u2, u3, u4) for 3 segments"),
+        (("--recording", "run.csv", "--markers", "a=1,b=2,c=3"), "3 markers for 2 in the recording (low, tip)"),
+        (("--markers", "tip"), "'tip' is not NAME=HEIGHT"),
+        (("--command-unit", "turns"), "commands in 'turns'"),
+    ],
+)
+def test_what_does_not_fit_is_said_in_one_line(tmp_path, monkeypatch, capsys, words, message):
+    table("t", "{marker}_{axis}", "u{0}").to_csv(tmp_path / "run.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    status, told = init(monkeypatch, capsys, "arm", *words)
+    assert status == 2
+    assert message in told
+    assert told.count("\n") == 1
+    assert not (tmp_path / "arm").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "unit"),
+    [
+        ("t", 1e6, "us"),
+        ("timestamp", 1e9, "ns"),
+        ("%time", 1e9, "ns"),
+        ("time_us", 1e6, "us"),
+        ("t [ns]", 1e9, "ns"),
+        ("Time (ms)", 1e3, "ms"),
+        ("time_ms", 20.0, "ms"),  # 1 kHz: the name says what the size does not
+        ("t", 20e3, "us"),
+        ("t", 20e6, "ns"),
+    ],
+)
+def test_the_unit_of_times_is_told_by_their_name_or_size(tmp_path, name, factor, unit):
+    run = table(name, "{marker}_{axis}", "motor{0}", factor=factor)
+    run[name] = (run[name] + 1e3 * factor).round().astype("int64")
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.time, guess.time_unit) == (name, unit)
+    assert name not in guess.left
+
+
+def test_dates_are_times(tmp_path):
+    run = table("date", "{marker}_{axis}", "motor{0}")
+    run["date"] = "2024-05-01"
+    run["stamp"] = [date.isoformat() for date in pd.Timestamp("2024-05-01T10:00:00+02:00") + pd.to_timedelta(TIME, "s")]
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.time, guess.time_unit) == ("stamp", "s")
+
+
+def test_a_recording_with_signs_of_patterns_in_its_name(tmp_path, monkeypatch, capsys):
+    (tmp_path / "[lab] data").mkdir()
+    for name in ("run [1].csv", "run 1.csv"):
+        table("t", "{marker}_{axis}", "motor{0}").to_csv(tmp_path / "[lab] data" / name, index=False)
+    monkeypatch.chdir(tmp_path)
+    assert init(monkeypatch, capsys, "arm", "--recording", "[lab] data/run [1].csv", "--length-mm", "200")[0] == 0
+    experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
+    assert [run.name for run in load_recordings(experiment.data, tmp_path / "arm")] == ["run [1]"]
+    assert matching(["run [1]", "run 1"], "run [1]", where="here") == ["run [1]"]
+    assert matching(["run [2]", "run 1"], "run [1]", where="here") == ["run 1"]

@@ -1,0 +1,139 @@
+"""``rfdropo train`` and ``rfdropo evaluate`` from experiment files, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import rfdropo_bayes as rb
+from rfdropo_bayes.cli.main import app
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.policies.onnx_export import ExportedPolicy
+from rfdropo_bayes.verbs.train import run_evaluation, run_training
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+REACH = REPOSITORY / "experiments" / "reach_policy.toml"
+COMMITTED = REPOSITORY / "models" / "policies" / "reach"
+QUICK = [
+    "training.steps=1792",  # more than the hundred actions of an episode in each environment
+    "training.environments=16",
+    "training.evaluate_every=1792",
+    "training.evaluation_episodes=16",
+]
+
+
+SINGLE = {"precision": "float32"}
+
+
+def rfdropo(*words: object) -> None:
+    result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["TrunkReach-v0", "TrunkPush-v0"])
+def test_a_policy_is_trained_exported_and_evaluated(tmp_path, task) -> None:
+    settings = [part for entry in [*QUICK, f'training.task="{task}"'] for part in ("--set", entry)]
+    rfdropo("train", REACH, "--out", tmp_path / "policy", *settings)
+    assert {path.name for path in (tmp_path / "policy").iterdir()} >= {
+        "policy.onnx", "card.md", "summary.json", "curve.png", "episodes.jsonl", "config.toml", "run.json"
+    }  # fmt: skip
+    summary = json.loads((tmp_path / "policy" / "summary.json").read_text())
+    assert (summary["status"], summary["task"]) == ("done", task)
+    policy = ExportedPolicy(tmp_path / "policy" / "policy.onnx")
+    assert policy.layout.task == task
+    assert policy.facts["posterior_sha256"] == summary["posterior_sha256"]
+    rfdropo("evaluate", REACH, "--policy", tmp_path / "policy", "--out", tmp_path / "test", "--episodes", 8, *settings)
+    table = pd.read_csv(tmp_path / "test" / "episodes.csv")
+    assert len(table) == 8
+    assert table["distance"].gt(0.0).all()
+    assert (tmp_path / "test" / "policy.gif").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_the_committed_policy_reaches_its_goals(tmp_path) -> None:
+    """200 of 200 episodes ended within 5 mm. At 99 % a sample of 60 has fewer than 57 once in 300."""
+    found = run_evaluation(REACH, [COMMITTED], tmp_path, episodes=60, lanes=30, seed=5)
+    row = found["policies"]["reach"]
+    assert row["success_mm"]["5"]["share"] >= 57 / 60
+    assert row["median_mm"] < 2.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (['training.randomisation="posterior"'], "without a source"),
+        (['training.randomisation="posterior"', 'training.source="nowhere"'], "nowhere"),
+        (["training.ranges={}"], "no ranges"),
+        (["training.ranges={young_modulus = [1.0, 2.0]}"], "outside its hard bounds"),
+        (['training.algorithm="SACK"'], "did you mean 'SAC'"),
+        (["training.options={learning_rat = 1e-3}"], "did you mean 'learning_rate'"),
+        (["training.period=0.013"], "no whole number of time steps"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(tmp_path, overrides, words) -> None:
+    with pytest.raises(InputError, match=words):
+        run_training(REACH, tmp_path / "policy", overrides=[*QUICK, *overrides])
+
+
+def test_an_experiment_without_training_is_refused(tmp_path) -> None:
+    with pytest.raises(InputError, match=r"no table \[training\]"):
+        run_training(REPOSITORY / "experiments" / "sofa_reach_layered.toml", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ('training.task="TrunkPush-v0"', "task is TrunkReach-v0"),
+        ("training.period=0.1", "period_s is 0.05, here it is 0.1"),
+    ],
+)
+def test_a_policy_for_another_task_or_period_is_refused(tmp_path, override, words) -> None:
+    with pytest.raises(InputError, match=f"the policy's {words}"):
+        run_evaluation(REACH, [COMMITTED], tmp_path / "test", overrides=[override], episodes=2)
+
+
+def test_the_model_in_memory_makes_environments() -> None:
+    model = rb.Model("trunk_sofa", simulator=SINGLE, fixed={"young_modulus": 4e6})
+    venv = rb.make_vec("TrunkReach-v0", model, n=3, observation="markers", start={"trunk_mass": [0.3, 0.4]})
+    venv.seed(0)
+    assert venv.reset().shape == (3, 3 * 4 + 3 + 8 + 3 * 4)
+    drawn = [info["parameters"] for info in venv.reset_infos]
+    assert {values["young_modulus"] for values in drawn} == {4e6}
+    assert len({values["trunk_mass"] for values in drawn}) == 3
+    assert np.isfinite(venv.step(np.zeros((3, 8)))[1]).all()
+    with pytest.raises(rb.InputError, match="TrunkReach-v0"):
+        rb.make_vec("TrunkReech-v0", model)
+
+
+@pytest.mark.slow
+def test_same_seed_same_curve_from_python(tmp_path) -> None:
+    """Bit for bit, policies included; another seed is another curve. Evaluations of twins agree, too."""
+    model = rb.Model("trunk_sofa", simulator=SINGLE)
+    options = {"steps": 1024, "environments": 16, "evaluate_every": 512, "evaluation_episodes": 4}
+    ranges = {"randomisation": "uniform", "ranges": {"young_modulus": [4e6, 5e6]}}
+    runs = {}
+    for name, seed in (("first", 0), ("again", 0), ("other", 1)):
+        curve = rb.train(model, tmp_path / name, seed=seed, **options, **ranges)["curve"]
+        runs[name] = [{key: value for key, value in row.items() if key != "seconds"} for row in curve]
+    assert runs["first"] == runs["again"] != runs["other"]
+    twins = [tmp_path / "first", tmp_path / "again"]
+    found = rb.evaluate(model, twins, tmp_path / "test", episodes=4, film=False, **ranges)["policies"]
+    assert found["first"] == found["again"]
+    assert (tmp_path / "test" / "episodes.csv").exists()
+
+
+def test_policies_whose_folders_are_called_the_same_are_told_apart(tmp_path) -> None:
+    for day in ("monday", "tuesday"):
+        (tmp_path / day / "reach").mkdir(parents=True)
+        (tmp_path / day / "reach" / "policy.onnx").write_bytes((COMMITTED / "policy.onnx").read_bytes())
+    policies = [tmp_path / "monday" / "reach", tmp_path / "tuesday" / "reach" / "policy.onnx"]
+    found = run_evaluation(REACH, policies, tmp_path / "test", episodes=2, lanes=2, film=False)
+    assert set(found["policies"]) == {"monday_reach", "tuesday_reach"}
+    with pytest.raises(InputError, match="given twice"):
+        run_evaluation(REACH, [COMMITTED, COMMITTED], tmp_path / "twice", episodes=2)
