@@ -13,6 +13,7 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import LogFormatter
 
 from rfdropo_bayes.report import style
+from rfdropo_bayes.report.replay import Track
 from rfdropo_bayes.report.units import display_name
 
 MILLIMETRES = 1e3
@@ -65,6 +66,7 @@ class Shown:
         unseen: time [s] and position [m] of the last marker in the unseen recording that the base model predicts worst:
             measured, base model, extended model; None without one.
         remainder: time [s], mean and deviation [m] of what the final model leaves of the last marker; None if nothing.
+        tracks: unseen recordings as they are replayed.
     """
 
     residuals: Residuals
@@ -75,6 +77,7 @@ class Shown:
     cosines: Float[np.ndarray, "k k"]
     unseen: tuple[Float[np.ndarray, " row"], Mapping[str, Float[np.ndarray, "row 3"]]] | None
     remainder: tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row 3"], Float[np.ndarray, "row 3"]] | None
+    tracks: Sequence[Track] = ()
 
 
 def causes(residuals: Residuals) -> dict[str, tuple[str, np.ndarray]]:

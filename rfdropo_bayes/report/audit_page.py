@@ -12,6 +12,7 @@ from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.score import likeness
 from rfdropo_bayes.report import audit_figures as figures
 from rfdropo_bayes.report.page import render
+from rfdropo_bayes.report.replay import Track, replay
 from rfdropo_bayes.report.robot_figure import robot_figure
 from rfdropo_bayes.report.style import Picture, embed
 from rfdropo_bayes.report.units import display_name
@@ -45,6 +46,7 @@ def render_audit(
         title=title,
         sections=SECTIONS,
         pictures=_pictures(seen, outline),
+        replayed=replay(seen.tracks, outline),
         config=config,
     )
 
@@ -88,7 +90,7 @@ def shown(answer: Answer) -> figures.Shown:
     step = float(np.median(np.diff(answer.target.measurements.time[0])))
     probed = [row for row in answer.causes.screens[0].rows if row.probe is not None][:MOST_COSINES]
     marks = [row.probe.mark for row in probed if row.probe is not None]
-    unseen, found = None, answer.validation
+    unseen, found, tracks = None, answer.validation, list[Track]()
     if found.predictions is not None and found.unseen is not None and found.gain is not None:
         recordings, (base, extended) = found.unseen, map(found.unseen.predicted, found.predictions)
         valid = recordings.valid[..., : recordings.markers]
@@ -97,6 +99,12 @@ def shown(answer: Answer) -> figures.Shown:
         measured = np.where(valid, recordings.position, np.nan)
         series = {"measured": measured, "base model": base, "extended model": extended}
         unseen = (step * np.flatnonzero(seen), {name: path[worst, seen, -3:] for name, path in series.items()})
+        names = tuple(answer.problem.trajectories[0].marker_names)
+        for index in np.argsort([-each.rmse_base for each in found.gain.differences.values()]):
+            rows = slice(0, int(np.flatnonzero(valid[index].any(axis=1))[-1]) + 1)
+            moved = {name: path[index, rows].reshape(-1, len(names), 3) for name, path in series.items()}
+            time = step * np.arange(len(moved["measured"]))
+            tracks.append(Track(recordings.names[index], "unseen", time, names, moved))
     rest = answer.remainder
     return figures.Shown(
         residuals_of(answer),
@@ -107,6 +115,7 @@ def shown(answer: Answer) -> figures.Shown:
         np.array([[likeness(a, b) for b in marks] for a in marks]),
         unseen,
         (rest.time, rest.mean[0, :, -3:], rest.sd[0, :, -3:]) if rest.amplitude > 0.0 else None,
+        tracks,
     )
 
 

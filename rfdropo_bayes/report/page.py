@@ -17,6 +17,7 @@ from rfdropo_bayes.posteriors.bounds import PILED
 from rfdropo_bayes.report import check_figures, posterior_figures, trajectory_figures
 from rfdropo_bayes.report.coverage import coverage, transform_curve
 from rfdropo_bayes.report.headline import best_baseline
+from rfdropo_bayes.report.replay import replay, tracks_of
 from rfdropo_bayes.report.robot_figure import robot_figure
 from rfdropo_bayes.report.scores import MeasuredPath, settled_rows
 from rfdropo_bayes.report.style import Picture, embed
@@ -30,6 +31,7 @@ COVERAGE_CURVE = tuple(np.round(np.arange(0.1, 1.0, 0.1), 1))
 
 SECTIONS = (
     ("result", "Result"),
+    ("replay", "Replay"),
     ("errors", "Errors beside simpler predictors"),
     ("data", "Data"),
     ("model", "Model and priors"),
@@ -68,8 +70,10 @@ def render(template: str, **content: Any) -> str:
     environment.filters |= {"number": number, "words": display_name, "duration": duration, "breakable": breakable}
     environment.filters |= {"bootstrap_p": bootstrap_p, "p_value": p_value}
     environment.globals["interval"] = interval
-    stylesheet = environment.loader.get_source(environment, "page.css")[0] if environment.loader else ""
-    return environment.get_template(template).render(stylesheet=Markup(stylesheet), **content)
+    assets = {}
+    for name, file in (("stylesheet", "page.css"), ("script", "replay.js")):
+        assets[name] = Markup(environment.loader.get_source(environment, file)[0]) if environment.loader else ""
+    return environment.get_template(template).render(**assets, **content)
 
 
 def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str) -> str:
@@ -83,7 +87,8 @@ def render_page(record: PosteriorRecord, summary: Mapping[str, Any], config: str
     return render(
         "page.html.j2",
         summary=summary,
-        sections=SECTIONS,
+        sections=[section for section in SECTIONS if section[0] != "replay" or record.recordings],
+        replayed=replay(tracks_of(record.recordings), summary.get("outline")),
         tiles=_tiles(summary),
         rows=_posterior_rows(summary),
         priors=_prior_rows(record),

@@ -1,0 +1,91 @@
+"""A replay in three dimensions of what was measured and what was simulated, drawn by the page itself, offline.
+
+The page holds positions as whole tenths of a millimetre, and `templates/replay.js` draws them: turned by dragging,
+played, and moved to any instant.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from markupsafe import Markup
+
+from rfdropo_bayes.posteriors import RecordingPrediction
+
+FRAMES = 400  # of a recording, at most: eight recordings of four markers in three series are then 1 MB of the page
+TENTHS = 1e4  # of a millimetre in a metre
+MOST_RECORDINGS = 8
+
+
+@dataclass(frozen=True)
+class Track:
+    """One recording as it is replayed.
+
+    Attributes:
+        name: of the recording.
+        role: "fit", "test" or "unseen".
+        time: [s].
+        markers: names, base to tip.
+        series: positions [m] by what they are, "measured" first; not a number where nothing is known.
+    """
+
+    name: str
+    role: str
+    time: Float[np.ndarray, " time"]
+    markers: tuple[str, ...]
+    series: Mapping[str, Float[np.ndarray, "time marker 3"]]
+
+
+def tracks_of(recordings: Sequence[RecordingPrediction]) -> list[Track]:
+    """Recordings of a calibration: measured, and simulated before the fit (where that is kept) and after it."""
+    found = []
+    for recording in sorted(recordings, key=lambda r: r.split != "test")[:MOST_RECORDINGS]:
+        series = {"measured": np.where(recording.mask[..., None], recording.observed, np.nan)}
+        if recording.prior_predicted is not None:
+            series["before the fit"] = np.asarray(recording.prior_predicted).mean(axis=0)
+        series["after the fit"] = recording.central
+        found.append(Track(recording.name, recording.split, recording.time, recording.marker_names, series))
+    return found
+
+
+def replay(tracks: Sequence[Track], outline: Mapping[str, Any] | None) -> Markup | None:
+    """What a page's script draws, as JSON that may stand inside a script element; None without recordings.
+
+    Args:
+        tracks: to choose from; the first one is shown.
+        outline: of the robot, as `robots.robot_shape` makes it: where its base is, how wide it is, where gravity
+            points. Without one, markers are joined by a line, and the third axis points upwards.
+    """
+    if not tracks:
+        return None
+    content: dict[str, Any] = {"tracks": [_plain(track) for track in tracks[:MOST_RECORDINGS]], "outline": None}
+    if outline is not None:
+        content["outline"] = {
+            "base": [0, 0, round(TENTHS * outline["station"][0])],
+            "half_width": [round(TENTHS * float(np.mean(pair))) for pair in outline["half_width"]],
+            "gravity": list(outline["gravity"]),
+        }
+    text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+    return Markup(text.replace("<", "\\u003c"))  # a name may not end the script element
+
+
+def _plain(track: Track) -> dict[str, Any]:
+    rows = np.unique(np.linspace(0, len(track.time) - 1, min(FRAMES, len(track.time))).round().astype(int))
+    return {
+        "name": track.name,
+        "role": track.role,
+        "markers": list(track.markers),
+        "time": [round(float(t), 4) for t in track.time[rows] - track.time[0]],
+        "series": {name: _tenths(np.asarray(values)[rows]) for name, values in track.series.items()},
+    }
+
+
+def _tenths(position: Float[np.ndarray, "time marker 3"]) -> list[int | None]:
+    """All numbers in one row, None where a position is unknown."""
+    flat = TENTHS * np.asarray(position, float).reshape(-1)
+    return [None if not np.isfinite(value) else round(value) for value in flat.tolist()]
