@@ -34,7 +34,7 @@ from rfdropo_bayes.deployment.sensors import MarkerSensor, MarkerView, Simulated
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, load_deployment
 from rfdropo_bayes.deployment.vendors import LEFT_OUT
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import Motor, Robot, load_robot
+from rfdropo_bayes.robots import Motor, Robot
 
 
 class Mode(StrEnum):
@@ -109,7 +109,7 @@ def deploy(
     """
     settings = load_deployment(Path(settings)) if isinstance(settings, Path | str) else settings
     mode = Mode(mode)
-    robot = load_robot(settings.robot)
+    robot = Robot.load(settings.robot)
     if not robot.motors:
         raise InputError("has no motors", where=f"robot {robot.name}", remedy="add [[motors]], one per channel")
     with contextlib.ExitStack() as stack:

@@ -11,7 +11,7 @@ from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.policies.episodes import Episodes, Settings
 from rfdropo_bayes.policies.randomisation import Point, Randomisation
 from rfdropo_bayes.policies.tasks import task_named
-from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.engine import Backend, Engine, Integrator
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
@@ -78,7 +78,7 @@ def make_episodes(
     """
     chosen = task_named(task)
     if simulator is None:
-        described = robot if isinstance(robot, Robot) else load_robot(robot or chosen.robot)
+        described = robot if isinstance(robot, Robot) else Robot.load(robot or chosen.robot)
         simulator = trunk_simulator(
             described, push=chosen.push, mechanisms=mechanisms, precision=precision, threads=threads
         )

@@ -15,7 +15,7 @@ from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.data import Trajectory, actions
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, actions
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, group_of, whole
@@ -261,18 +261,17 @@ def _as_recording(
     """Commands as a recording that begins as another one and is observed when that was, by all of its markers."""
     observed = like.time if seen is None else seen
     return Trajectory.build(
-        name=name,
-        robot=like.robot,
-        format="memory",
-        time=observed,
-        position=np.tile(like.position[:1], (len(observed), 1, 1)),
-        marker_names=like.marker_names,
-        command_time=time,
-        command=value,
-        command_unit=like.command_unit,
-        initial_command=like.initial_command,
-        cable_names=like.cable_names,
-        settings={"unseen": True},
+        Origin(name=name, robot=like.robot, format="memory", settings={"unseen": True}),
+        SentCommands(
+            command_time=time,
+            command=value,
+            command_unit=like.command_unit,
+            cable_names=like.cable_names,
+            initial_command=like.initial_command,
+        ),
+        Measured(
+            time=observed, position=np.tile(like.position[:1], (len(observed), 1, 1)), marker_names=like.marker_names
+        ),
     )
 
 

@@ -22,7 +22,15 @@ from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution
-from rfdropo_bayes.data import Trajectory, commands_alone, first_row_only, load_unseen, start_is_known
+from rfdropo_bayes.data import (
+    Origin,
+    SentCommands,
+    Trajectory,
+    commands_alone,
+    first_row_only,
+    load_unseen,
+    start_is_known,
+)
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_json
@@ -198,16 +206,13 @@ def fitted_parts(fit: Calibration) -> tuple[dict[str, float], ParameterSpace]:
 
 def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
     """Commands as a recording whose measurements are unknown, but for the start pose."""
+    simulator = model.simulator
+    times, values = np.asarray(time, dtype=float), np.asarray(command, dtype=float)
     return commands_alone(
-        np.asarray(time, dtype=float),
-        np.asarray(command, dtype=float),
-        model.simulator.marker_names,
+        Origin("commands", model.name, "memory"),
+        SentCommands(times, values, simulator.command_unit, simulator.channel_names),
+        simulator.marker_names,
         start=None if start is None else np.asarray(start, dtype=float)[None],
-        name="commands",
-        robot=model.name,
-        format="memory",
-        command_unit=model.simulator.command_unit,
-        cable_names=model.simulator.channel_names,
     )
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.recordings import commands_of
-from rfdropo_bayes.data import Trajectory, shared_markers
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, shared_markers
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, whole, write_json
 from rfdropo_bayes.model.assembly import AnySimulator, physical_values, robot_of
@@ -180,17 +180,14 @@ def _generated(table: CommandsTable, name: str, simulator: AnySimulator, rng: np
     markers = _known_markers(table.markers or simulator.marker_names, simulator)
     places = simulator.marker_points()[[simulator.marker_names.index(name) for name in markers]]
     return Trajectory.build(
-        name=name,
-        robot=simulator.robot.name,
-        format="netcdf",
-        time=time,
-        position=np.tile(places, (len(time), 1, 1)),
-        command_time=command_time,
-        command=command,
-        command_unit=simulator.command_unit,
-        marker_names=markers,
-        cable_names=simulator.channel_names,
-        synthetic=True,
+        Origin(name=name, robot=simulator.robot.name, format="netcdf", synthetic=True),
+        SentCommands(
+            command_time=command_time,
+            command=command,
+            command_unit=simulator.command_unit,
+            cable_names=simulator.channel_names,
+        ),
+        Measured(time=time, position=np.tile(places, (len(time), 1, 1)), marker_names=markers),
     )
 
 
@@ -209,30 +206,31 @@ def _as_trajectory(found: Simulated, model: Model, values: Mapping[str, float], 
     if noise is not None:
         key = jax.random.fold_in(jax.random.key(seed), index)
         position = position + _noise(noise, key, source.time, position.shape[1])
-    settings: dict[str, Any] | None = {
+    settings: dict[str, Any] = {
         "simulator": simulator.description,
         "parameters": {spec.name: values.get(spec.name, spec.nominal) for spec in simulator.parameters},
         "noise": None if noise is None else noise.model_dump(),
         "seed": seed,
     }
     if model.settings.commands is not None and model.settings.commands.blind:
-        settings = None
+        settings = {}
     return Trajectory.build(
-        name=source.name,
-        robot=simulator.robot.name,
-        format="netcdf",
-        time=source.time,
-        position=position,
-        object_pose=found.pose,
-        command_time=source.command_time,
-        command=source.command,
-        command_unit=source.command_unit,
-        initial_command=source.initial_command,
-        marker_names=found.markers,
-        cable_names=source.cable_names,
-        synthetic=True,
-        provenance="synthetic: made by rfdropo simulate",
-        settings=settings,
+        Origin(
+            name=source.name,
+            robot=simulator.robot.name,
+            format="netcdf",
+            synthetic=True,
+            provenance="synthetic: made by rfdropo simulate",
+            settings=settings,
+        ),
+        SentCommands(
+            command_time=source.command_time,
+            command=source.command,
+            command_unit=source.command_unit,
+            cable_names=source.cable_names,
+            initial_command=source.initial_command,
+        ),
+        Measured(time=source.time, position=position, marker_names=found.markers, object_pose=found.pose),
     )
 
 

@@ -29,7 +29,7 @@ from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPr
 from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError
 from rfdropo_bayes.prediction.predictive import NOISE, _for_new_recordings
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.verbs.predict import run_prediction
 from rfdropo_bayes.verbs.simulate import simulate_all
@@ -308,7 +308,7 @@ def test_a_first_row_far_from_the_model_s_is_found_by_the_model_s_own_error():
 
 def test_noise_is_not_pooled():
     """It is the same for all recordings: a deviation of it would be drawn and never used."""
-    spec = ModelSpec(load_robot("smooth_arm"), per_group={"observation_noise": 1e-3})
+    spec = ModelSpec(Robot.load("smooth_arm"), per_group={"observation_noise": 1e-3})
     with pytest.raises(InputError, match="unknown parameter 'observation_noise'"):
         pooling(spec, (ParameterSpec("mass", "kg", 0.0, 1.0, 0.1, {}, ""),), ["a"])
 
@@ -338,7 +338,7 @@ def test_a_simulated_recording_is_predicted_from_its_first_row(name, sign, tmp_p
         "simulator": {"time_step": 0.005},
         "model": {"noise": "white", "mechanisms": [name], "priors": {"offset": {}}, "per_recording": {"offset": "all"}},
     }
-    specs = [spec for mechanism in mechanisms_named([name], load_robot("smooth_arm")) for spec in mechanism.parameters]
+    specs = [spec for mechanism in mechanisms_named([name], Robot.load("smooth_arm")) for spec in mechanism.parameters]
     values = {spec.name: beyond_null(spec, sign) for spec in specs}
     commands = {"duration": 0.8, "interval": 0.05, "step": 0.004, "low": 0, "high": 0.02, "sample_time": 0.05}
     made = experiment | {
