@@ -1,4 +1,4 @@
-"""The motion that commands produce: ``simulate``, and ``rfdropo simulate`` with its distance to the recordings."""
+"""The motion that commands produce, ``simulate``, and its distance to the recordings, ``simulate_all``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, shared_markers
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import output_folder, whole, write_json
+from rfdropo_bayes.files import whole, write_json
 from rfdropo_bayes.model.assembly import AnySimulator, physical_values, robot_of
 from rfdropo_bayes.model.experiment import CommandsTable, NoiseTable
 from rfdropo_bayes.model.model import Model
@@ -101,22 +101,8 @@ def _rollouts(
         yield Simulated(source, markers, np.asarray(observation.position)[:, chosen], pose, result, commands)
 
 
-def run_simulation(
-    path: Path, out: Path, *, overrides: Sequence[str] = (), balance: bool = False, overwrite: bool = False
-) -> dict[str, Any]:
-    """Simulate the recordings or commands of an experiment file into a folder of its own; see `simulate_all`.
-
-    Raises:
-        InputError: bad input, a folder that holds a run, or a rollout that did not end well.
-    """
-    model, tables = Model.read(path, overrides)
-    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "options": {"balance": balance}}
-    with run_folder(out, "simulate", **settings, overwrite=overwrite) as out:
-        return simulate_all(model, out, balance)
-
-
-def simulate_all(model: Model, out: Path, balance: bool = False) -> dict[str, Any]:
-    """Simulate every recording of a model's experiment, or the command sequences of its [commands] table.
+def simulate_all(model: Model, out: Path, *, balance: bool = False, overwrite: bool = False) -> dict[str, Any]:
+    """Simulate into a folder each recording of a model's experiment, or the command sequences of its [commands] table.
 
     Writes, per recording, ``<name>.nc`` (`Trajectory`) and ``<name>.csv`` (time in s, markers in mm, in the source's
     column names), called ``trajectory`` where there is only one recording. With ``balance``, forces and energies follow
@@ -127,14 +113,21 @@ def simulate_all(model: Model, out: Path, balance: bool = False) -> dict[str, An
         Where a cube is simulated, also how far its centre is from the measured one [mm] and its orientation [deg].
 
     Raises:
-        InputError: bad input, or a rollout that did not end well.
+        InputError: bad input, a folder that holds a run, or a rollout that did not end well.
     """
+    settings: dict[str, Any] = {"tables": model.tables(), "folder": model.folder, "options": {"balance": balance}}
+    settings |= {"texts": model.texts()}
+    with run_folder(Path(out), "simulate", **settings, overwrite=overwrite) as out:
+        return _simulate_into(out, model, balance)
+
+
+def _simulate_into(out: Path, model: Model, balance: bool) -> dict[str, Any]:
+    """See `simulate_all`."""
     robot_of(model.spec)
     simulator, measured = model.simulator, model.settings.data is not None
     assert isinstance(simulator, RobotSimulator)
     values = physical_values(model.spec, simulator)
     sources = _sources(model)
-    out = output_folder(out)
     report: dict[str, Any] = {"simulator": simulator.description, "parameters": values, "recordings": {}}
     distances = []
     for index, found in enumerate(_rollouts(simulator, values, sources)):

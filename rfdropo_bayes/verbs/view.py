@@ -95,7 +95,7 @@ def _predicted(dataset: xr.Dataset, robot: Robot) -> DrawnMotion:
 
 def _from_experiment(path: Path, overrides: list[str], recording: str | None) -> DrawnMotion:
     """Simulate one recording of an experiment."""
-    model, _ = Model.read(path, overrides)
+    model = Model.read(path, overrides)
     table, runs = model.settings.commands, {}
     if table is None:
         runs = {run.name: run for role in ("fit", "test") for run in model.recordings(role)}

@@ -26,7 +26,7 @@ YAW, SHIFT = 0.2, np.array([0.003, -0.002, 0.004])
 
 @pytest.fixture(scope="module")
 def simulator():
-    return Model.read(EXPERIMENTS / "sim2real_trunk.toml", ["simulator.push=true"])[0].simulator
+    return Model.read(EXPERIMENTS / "sim2real_trunk.toml", ["simulator.push=true"]).simulator
 
 
 def recording(simulator, rows: int = 4) -> Trajectory:
@@ -86,11 +86,10 @@ def test_a_prediction_holds_every_draw_of_the_cube_in_the_measuring_frame(simula
     PosteriorRecord(tuple(infos), draws).save(tmp_path / "posterior.nc")
     changes = ["simulator.push=true", "simulator.time_step=0.02", "data.format='netcdf'"]
     run_prediction(
-        EXPERIMENTS / "sim2real_trunk.toml",
+        Model.read(EXPERIMENTS / "sim2real_trunk.toml", changes),
         tmp_path,
         str(tmp_path / "commands.nc"),
         tmp_path / "out",
-        overrides=changes,
     )
     with xr.open_dataset(tmp_path / "out" / "prediction.nc") as opened:
         assert opened["object"].shape == (8, 4, 7)

@@ -16,11 +16,12 @@ from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import Deployment, SafetyTable
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import CommandsTable
+from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.verbs.audit import run_audit
-from rfdropo_bayes.verbs.calibrate import run_calibration
+from rfdropo_bayes.verbs.audit import audit
+from rfdropo_bayes.verbs.calibrate import calibrate
 from rfdropo_bayes.verbs.random_commands import random_walk
 from rfdropo_bayes.verbs.simulated_plant import trunk
 
@@ -140,7 +141,7 @@ def test_torques_in_the_log_break_the_scale_and_the_truth_is_recovered(tmp_path:
     path = experiment(tmp_path, ["one"], ["two"])
     deviations = {}
     for tension in ("true", "false"):
-        run_calibration(path, tmp_path / tension, overrides=[f"model.tension={tension}"])
+        calibrate(Model.read(path, [f"model.tension={tension}"]), out=tmp_path / tension)
         found = PosteriorRecord.load(tmp_path / tension / "posterior.nc")
         deviations[tension] = np.std(np.log(found.flat("young_modulus")))
         for name, true in TRUTH.items() if tension == "true" else ():
@@ -155,7 +156,8 @@ def test_torques_in_the_log_break_the_scale_and_the_truth_is_recovered(tmp_path:
 def test_the_audit_of_the_log_names_what_is_hidden_in_the_robot(tmp_path: Path) -> None:
     names = {"one": 1, "again": 1, "two": 2, "three": 3, "four": 4}
     record(tmp_path, names, f'model.mechanisms = ["backlash"]\nmodel.fixed.backlash = {PLAY}')
-    content = run_audit(experiment(tmp_path, ["one", "again", "two"], ["three", "four"]), tmp_path / "out")
+    model = Model.read(experiment(tmp_path, ["one", "again", "two"], ["three", "four"]))
+    content = audit(model, out=tmp_path / "out").content
     # Where in its play a drive stands when a session begins depends on the session before, which no log tells: the
     # verdict may be that something remains.
     assert content["verdict"] in ("explained", "equivalent", "partly_explained")

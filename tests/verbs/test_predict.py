@@ -64,7 +64,7 @@ def prior_of(median: float) -> dict[str, object]:
 
 
 def predict(posterior: Path, commands: str, out: Path, rows: tuple[int, int] = (0, 30), **options) -> xr.Dataset:
-    run_prediction(EXPERIMENTS / "demo.toml", posterior, commands, out, rows=rows, overrides=COARSE, **options)
+    run_prediction(Model.read(EXPERIMENTS / "demo.toml", COARSE), posterior, commands, out, rows=rows, **options)
     with xr.open_dataset(out / "prediction.nc") as opened:
         return opened.load()
 
@@ -172,9 +172,8 @@ def test_the_chosen_group_says_what_the_drives_follow(posterior, tmp_path):
     moved, said = {}, {}
     for group in (None, "april"):
         out = tmp_path / str(group)
-        facts = run_prediction(
-            EXPERIMENTS / "demo.toml", posterior, COMMANDS, out, rows=(0, 30), overrides=overrides, group=group
-        )
+        model = Model.read(EXPERIMENTS / "demo.toml", overrides)
+        facts = run_prediction(model, posterior, COMMANDS, out, rows=(0, 30), group=group)
         moved[group] = np.ptp(pd.read_csv(out / "prediction.csv")["m4_x_mean"])
         said[group] = [caution["code"] for caution in facts["cautions"]]
     assert said == {None: ["drives_unstated"], "april": []}
@@ -355,7 +354,7 @@ def test_a_simulated_recording_is_predicted_from_its_first_row(name, sign, tmp_p
     infos += [ParameterInfo(n, "m", -0.5, 0.5, {"distribution": "Normal", "loc": 0.0, "scale": 0.01}) for n in offset]
     draws = {n: np.full((1, 4), v) for n, v in fixed.items()} | offset
     PosteriorRecord(tuple(infos), draws).save(tmp_path / "posterior.nc")
-    run_prediction(tmp_path / "own.toml", tmp_path, "trajectory.nc", tmp_path / "out")
+    run_prediction(Model.read(tmp_path / "own.toml"), tmp_path, "trajectory.nc", tmp_path / "out")
     with xr.open_dataset(tmp_path / "out" / "prediction.nc") as opened:
         predicted = opened["mean"].values
     measured = Trajectory.load(tmp_path / "trajectory.nc").position
