@@ -280,7 +280,7 @@ def session(name: str, channel: str, port: int, folder: Path) -> None:
         safety=SafetyTable(settle_s=0.1, following_error_m=0.001, following_time_s=0.02, button_file=str(button)),
     )
     source = Policy(path, robot, {})
-    outcome = deploy(settings, "run", folder, bus=bus, sensor=sensor, source=source)  # type: ignore[arg-type]
+    outcome = deploy(settings, "run", folder, bus=bus, sensor=sensor, commands=source)  # type: ignore[arg-type]
     print(f"ENDED {outcome.cause.word}", flush=True)
 
 

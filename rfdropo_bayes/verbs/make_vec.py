@@ -87,7 +87,17 @@ def randomisation_of(
     """Where parameters come from: values that are held, what is randomised, and what differs between episodes.
 
     A task without a cube has no use for what the experiment says of one.
+
+    Raises:
+        InputError: a posterior beside another ``randomisation`` of [training]: one of the two is not meant.
     """
+    stated = table.randomisation if "randomisation" in table.model_fields_set else None
+    if posterior is not None and stated not in (None, "posterior"):
+        raise InputError(
+            f"a posterior was given, and randomisation = {stated!r}",
+            where="[training]",
+            remedy='leave one of them out, or set randomisation = "posterior"',
+        )
     absent = () if "cube_mass" in {spec.name for spec in simulator.parameters} else OBJECT
     held = replace(spec, fixed={name: value for name, value in spec.fixed.items() if name not in absent})
     parts: list[Randomisation] = [Point(physical_values(held, simulator))]

@@ -121,7 +121,7 @@ def test_a_session_is_recovered_from_its_journal(dry_run) -> None:
 
 def test_a_session_is_replayed(dry_run, tmp_path: Path) -> None:
     folder, settings = dry_run
-    outcome = deploy(settings, "replay", tmp_path / "again", simulated=True, recording=folder)
+    outcome = deploy(settings, "replay", tmp_path / "again", simulated=True, commands=folder)
     assert outcome.cause is Cause.FINISHED, outcome.detail
     first, second = (Trajectory.load(path / "session.nc") for path in (folder, tmp_path / "again"))
     rows = min(len(first.command), len(second.command)) - 2

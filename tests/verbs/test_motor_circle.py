@@ -98,7 +98,7 @@ def record(folder: Path, names: dict[str, int], hidden: str = "") -> None:
             walk(robot, name, seed).save(folder / f"{name}_commands.nc")
             outcome = deploy(
                 Deployment(robot="motor_arm", safety=patient), "replay", folder / name, simulated=True,
-                recording=folder / f"{name}_commands.nc", bus=open_bus(found), sensor=sensor,
+                commands=folder / f"{name}_commands.nc", bus=open_bus(found), sensor=sensor,
             )  # fmt: skip
             assert outcome.cause is Cause.FINISHED, outcome.detail
             (folder / f"{name}.nc").write_bytes((folder / name / "session.nc").read_bytes())

@@ -110,6 +110,16 @@ def test_the_model_in_memory_makes_environments() -> None:
         rb.make_vec("TrunkReech-v0", model)
 
 
+def test_a_posterior_beside_another_randomisation_is_refused(tmp_path) -> None:
+    """It would take the place of the ranges without a word."""
+    model = rb.Model("trunk_sofa", simulator=SINGLE)
+    ranges = {"randomisation": "uniform", "ranges": {"young_modulus": [4e6, 5e6]}}
+    with pytest.raises(InputError, match="a posterior was given, and randomisation = 'uniform'"):
+        rb.make_vec("TrunkReach-v0", model, posterior=tmp_path, **ranges)
+    with pytest.raises(InputError, match="posterior.nc"):  # which is looked for where the two agree
+        rb.make_vec("TrunkReach-v0", model, posterior=tmp_path, randomisation="posterior")
+
+
 @pytest.mark.slow
 def test_same_seed_same_curve_from_python(tmp_path) -> None:
     """Bit for bit, policies included; another seed is another curve. Evaluations of twins agree, too."""
