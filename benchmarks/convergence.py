@@ -26,7 +26,7 @@ from jaxtyping import Float
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators import Commands
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 
@@ -82,7 +82,7 @@ def walk(robot: Robot, motions: int, seconds: float) -> Float[np.ndarray, "motio
 @cache
 def inputs(robot: str, step_ms: float, motions: int, seconds: float) -> Any:
     """What the engine moves the body by, at nominal parameters; the same for every integrator."""
-    model = simulator(load_robot(robot), "euler", step_ms)
+    model = simulator(Robot.load(robot), "euler", step_ms)
     clock, values = PERIOD * np.arange(round(seconds / PERIOD) + 1), model.complete({})
     grid = [
         model.commands(clock[:-1], rows, np.zeros(rows.shape[1]), clock) for rows in walk(model.robot, motions, seconds)
@@ -96,7 +96,7 @@ def tip(
     robot: str, integrator: str, step_ms: float, damping: float | None, motions: int, seconds: float
 ) -> tuple[Float[np.ndarray, "motion time 3"], float]:
     """Path of the tip [m], and processor time of one rollout [s]."""
-    model = simulator(load_robot(robot), integrator, step_ms)
+    model = simulator(Robot.load(robot), integrator, step_ms)
     material, start, displacement = inputs(robot, step_ms, motions, seconds)
     if damping is not None:
         material = material._replace(rayleigh_stiffness=np.full(motions, damping))

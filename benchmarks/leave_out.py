@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("reports/leave_out"))
     parser.add_argument("--set", action="append", default=[], dest="overrides")
     given = parser.parse_args()
-    model, _ = rb.Model.read(given.experiment, given.overrides)
+    model = rb.Model.read(given.experiment, given.overrides)
     print("| " + " | ".join(HEAD) + " |\n" + "|---" * len(HEAD) + "|", flush=True)
     for pattern in given.patterns:
         out = given.out / pattern.replace("*", "")

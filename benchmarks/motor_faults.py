@@ -41,7 +41,7 @@ from rfdropo_bayes.deployment.sensors import Sighting, SimulatedMarkers
 from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, SafetyTable
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import ObservationPart, PolicyLayout
 
 ROBOT = "motor_arm"
@@ -107,7 +107,7 @@ class Observer:
     """Reads statusword and position of every drive by SDO, on a connection of its own."""
 
     def __init__(self, channel: str) -> None:
-        self.robot = load_robot(ROBOT)
+        self.robot = Robot.load(ROBOT)
         self._bus = HubBus(channel)
         self._done = threading.Event()
         self.seen: list[tuple[float, int, DriveState | None, float]] = []  # time, node, state, length
@@ -235,7 +235,7 @@ def session(name: str, channel: str, port: int, folder: Path) -> None:
     """Body of the session's process: says RUNNING and the time of the fault on its standard output."""
     from rfdropo_bayes.deployment.policy import OnnxPolicy
 
-    case, robot = CASES[name], load_robot(ROBOT)
+    case, robot = CASES[name], Robot.load(ROBOT)
     bus = FaultyBus(HubBus(channel), case.what if case.by == "bus" else "")
     sensor = FaultySensor(SimulatedMarkers(len(robot.marker_names), port), str(case.what))
     button = folder.parent / "button"
@@ -280,7 +280,7 @@ def session(name: str, channel: str, port: int, folder: Path) -> None:
         safety=SafetyTable(settle_s=0.1, following_error_m=0.001, following_time_s=0.02, button_file=str(button)),
     )
     source = Policy(path, robot, {})
-    outcome = deploy(settings, "run", folder, bus=bus, sensor=sensor, source=source)  # type: ignore[arg-type]
+    outcome = deploy(settings, "run", folder, bus=bus, sensor=sensor, commands=source)  # type: ignore[arg-type]
     print(f"ENDED {outcome.cause.word}", flush=True)
 
 
@@ -290,7 +290,7 @@ def _drives_table(case: Case, folder: Path) -> DrivesTable:
     if case.what == "product":
         return DrivesTable(product=0x12345678)
     if case.what == "node":
-        return DrivesTable(serial={load_robot(ROBOT).channel_names[1]: 77})
+        return DrivesTable(serial={Robot.load(ROBOT).channel_names[1]: 77})
     text = objects.SIMULATED_EDS.read_text()
     other = folder / "other.eds"  # of another drive of the same maker
     other.write_text(text.replace("ProductNumber=0x52464401", "ProductNumber=0x52464402"))
@@ -302,7 +302,7 @@ def write_policy(path: Path) -> None:
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-    robot = load_robot(ROBOT)
+    robot = Robot.load(ROBOT)
     channels, markers = robot.channel_names, len(robot.marker_names)
     layout = PolicyLayout(
         task="circle",

@@ -34,7 +34,7 @@ from rfdropo_bayes.policies.onnx_export import ExportedPolicy
 from rfdropo_bayes.policies.randomisation import Point
 from rfdropo_bayes.policies.tasks import observed_of, task_named
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.simulated_plant import true_simulator
 
 THRESHOLDS = (0.005, 0.01, 0.01525)  # [m]
@@ -49,7 +49,7 @@ class KeptOpen(SimulatedMarkers):
 
 def on_drives(settings: Deployment, goals: np.ndarray, folder: Path) -> list[dict[str, Any]]:
     """One session for every goal."""
-    sensor = KeptOpen(len(load_robot(settings.robot).marker_names))
+    sensor = KeptOpen(len(Robot.load(settings.robot).marker_names))
     simulation, hub = settings.simulation, BusTable(interface="hub", channel="127.0.0.1:0")
     table = SimulationTable(
         settings.robot, hub, simulation.plant, simulation.settings, simulation.own_process, sensor.address
@@ -85,7 +85,7 @@ def in_simulation(settings: Deployment, goals: np.ndarray, noise: float) -> np.n
     experiment = str(table.pop("experiment", ""))
     for name in ("marker_noise", "seed"):
         table.pop(name, None)
-    simulator, values = true_simulator(load_robot(settings.robot), experiment, table)
+    simulator, values = true_simulator(Robot.load(settings.robot), experiment, table)
     layout = policy.layout
     played = Settings(
         layout.kind, observed_of(layout), period=layout.period_s, step=float(np.max(layout.moves)), noise=noise

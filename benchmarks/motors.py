@@ -31,7 +31,7 @@ from rfdropo_bayes.deployment.log import read_journal
 from rfdropo_bayes.deployment.loop import Phase
 from rfdropo_bayes.deployment.policy import METADATA
 from rfdropo_bayes.deployment.settings import Deployment, PolicyTable
-from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import ObservationPart, PolicyLayout
 
 ROBOTS = ("motor_arm", "motor_trunk")
@@ -113,7 +113,7 @@ def percentiles(values: np.ndarray) -> dict[str, float]:
 
 def measure(name: str, seconds: float) -> dict[str, Any]:
     """One session."""
-    robot = load_robot(name)
+    robot = Robot.load(name)
     TimedDrives.times.clear()
     session.Drives = TimedDrives  # type: ignore[misc]
     before = idle()

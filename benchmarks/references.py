@@ -263,7 +263,7 @@ def recordings() -> Iterator[Reference]:
     )
     for name, file, overrides in runs:
         try:
-            model, _ = Model.read(EXPERIMENTS / file, overrides)
+            model = Model.read(EXPERIMENTS / file, overrides)
             with tempfile.TemporaryDirectory() as folder:
                 found = simulate_all(model, Path(folder))
         except InputError as error:

@@ -40,7 +40,7 @@ from rfdropo_bayes.model.assembly import build_robot_simulator
 from rfdropo_bayes.model.engines import backend
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.engine import Engine
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.trunk import Assembly
@@ -170,7 +170,7 @@ def sag_error(case: Case) -> float:
 def trunk_rollouts(case: Case) -> tuple[Run, Values]:
     """Rollouts of the trunk at the simulator."""
     robot = "trunk_sofa_mesh" if case.mesh else TRUNK
-    trunk = build_robot_simulator(ModelSpec(load_robot(robot), simulator=case.table))
+    trunk = build_robot_simulator(ModelSpec(Robot.load(robot), simulator=case.table))
     step = trunk.description["time_step_s"]
     channels, clock = len(trunk.channel_names), np.arange(0, SOLVES, 10) * step
     ends = np.array([0.0, SOLVES * step])

@@ -25,7 +25,7 @@ from rfdropo_bayes.fem.native.layered_engine import available_threads
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators import Commands
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 
@@ -51,7 +51,7 @@ def simulator(
     """The trunk of the paper on the compiled engine, alone or with its cube."""
     options = {"engine": "numba", "precision": precision, "threads": threads, "push": push, "integrator": integrator}
     table = SimulatorTable.model_validate(options)
-    built = build_simulator(ModelSpec(load_robot(ROBOT).with_changes(initial_state=state), simulator=table))
+    built = build_simulator(ModelSpec(Robot.load(ROBOT).with_changes(initial_state=state), simulator=table))
     assert isinstance(built, TrunkSimulator)
     return built
 

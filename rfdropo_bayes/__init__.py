@@ -46,14 +46,14 @@ _HOMES = {
     "deploy": "deployment.session",
     "design": "verbs.design",
     "design_day": "verbs.design_day",
-    "evaluate": "verbs.train:evaluate_policies",
+    "evaluate": "verbs.evaluate",
     "load": "results.load",
-    "make_vec": "verbs.train",
+    "make_vec": "verbs.make_vec",
     "predict": "verbs.predict",
     "read": "verbs.read",
     "section_profile": "robots.sections",
     "simulate": "verbs.simulate",
-    "train": "verbs.train:train_policy",
+    "train": "verbs.train",
 }
 """Where each name is defined: ``module`` under the same name, or ``module:name``."""
 _METHODS = {

@@ -17,7 +17,7 @@ from packaging.utils import canonicalize_name
 import rfdropo_bayes
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.model.experiment import load_experiment
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
@@ -95,7 +95,7 @@ def test_the_experiment_in_the_readme_is_one(tmp_path: Path) -> None:
         path = tmp_path / f"{name}.toml"
         path.write_text(tomli_w.dumps(tables))
         experiment, _ = load_experiment(path)
-        assert set(experiment.model.priors) <= set(load_robot(experiment.robot).parameters)
+        assert set(experiment.model.priors) <= set(Robot.load(experiment.robot).parameters)
 
 
 def test_the_two_commands_are_in_the_readme() -> None:

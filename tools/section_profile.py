@@ -31,7 +31,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from skfem.helpers import dot
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.body import poisson_terms
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 
@@ -366,7 +366,7 @@ def main() -> None:
     parser.add_argument("--stiffening", action="store_true", help="dependence on Poisson's ratio too")
     arguments = parser.parse_args()
 
-    robot = load_robot(arguments.robot)
+    robot = Robot.load(arguments.robot)
     station, ratio = np.array(robot.body.station_m), arguments.poisson_ratio
     mesh = read_mesh(arguments.mesh)
     how = Discretisation(arguments.element, arguments.refine, arguments.necks, arguments.equal_node_masses)

@@ -55,20 +55,20 @@ def audit(
         raise InputError("groups are compared by the search only", where="--separate", remedy="leave --between out")
     command = "separate" if separate else "audit"
     folder = folder_for(command, experiment, out, overrides, resume=resume, overwrite=overwrite)
-    if separate:
-        from rfdropo_bayes.verbs.separate import TABLE, run_separation
+    from rfdropo_bayes.model.model import Model
 
-        said: dict[str, Any] = {"overrides": overrides or [], "base": base, "seed": seed}
-        said |= {"resume": resume, "overwrite": overwrite}
-        told = run_separation(experiment, folder, **said, report=say_progress(quiet))
+    if separate:
+        from rfdropo_bayes.verbs.separate import TABLE, separate_mechanisms
+
+        model, said = Model.read(experiment, overrides), say_progress(quiet)
+        told = separate_mechanisms(model, folder, base=base, seed=seed, resume=resume, overwrite=overwrite, report=said)
         say(told, (folder / TABLE).read_text(encoding="utf-8"), quiet=quiet, as_json=as_json)
         return
-    from rfdropo_bayes.verbs.audit import run_audit
+    from rfdropo_bayes.verbs.audit import audit as ask
 
-    found = run_audit(
-        experiment,
-        folder,
-        overrides=overrides or [],
+    found = ask(
+        Model.read(experiment, overrides),
+        out=folder,
         base=base,
         between=between,
         seed=seed,
@@ -76,7 +76,7 @@ def audit(
         overwrite=overwrite,
         report=say_progress(quiet),
     )
-    show_audit(found, folder, quiet=quiet, as_json=as_json)
+    show_audit(found.content, folder, quiet=quiet, as_json=as_json)
 
 
 def design(
@@ -102,16 +102,21 @@ def design(
     if adapt and base is None:
         raise InputError("a day is found under a calibration", where="--adapt", remedy="name its folder with --base")
     folder = folder_for("design", experiment, out, overrides, overwrite=overwrite)
-    from rfdropo_bayes.verbs.design import COMMANDS, run_design
-    from rfdropo_bayes.verbs.design_day import run_day_design
+    from rfdropo_bayes.model.model import Model
+    from rfdropo_bayes.results.calibrated import Calibration
+    from rfdropo_bayes.verbs.design import COMMANDS
+    from rfdropo_bayes.verbs.design import design as propose
+    from rfdropo_bayes.verbs.design_day import design_day
 
-    options: dict[str, Any] = {"overrides": overrides or [], "seed": seed, "overwrite": overwrite}
-    options["report"] = say_progress(quiet)
+    model = Model.read(experiment, overrides)
+    options: dict[str, Any] = {"out": folder, "seed": seed, "overwrite": overwrite, "report": say_progress(quiet)}
     if adapt and base is not None:
-        found = run_day_design(experiment, base, folder, seconds=seconds, group=group, **options)
+        found = design_day(Calibration.of_posterior(base, model), seconds=seconds, group=group, **options)
     else:
-        found = run_design(experiment, folder, base=base, **options)
-    say(found, found["sentence"], f"commands: {folder / COMMANDS}", quiet=quiet, as_json=as_json)
+        found = propose(model, base=base, **options)
+    commands = folder / COMMANDS
+    content = {**found.content, "commands": str(commands)}
+    say(content, found.sentence, f"commands: {commands}", quiet=quiet, as_json=as_json)
 
 
 def benchmark_audit(

@@ -88,17 +88,12 @@ def calibrate(
     if check is not None:
         posterior_commands.check(experiment, folder, check, datasets, overrides or [], resume, overwrite)
         return
-    from rfdropo_bayes.verbs.calibrate import run_calibration
+    from rfdropo_bayes.model.model import Model
+    from rfdropo_bayes.verbs.calibrate import calibrate as fit
 
-    found = run_calibration(
-        experiment,
-        folder,
-        overrides=overrides or [],
-        resume=resume,
-        overwrite=overwrite,
-        start=start,
-        show=False if quiet else None,
-    )
+    shown = False if quiet else None
+    model = Model.read(experiment, overrides)
+    found = fit(model, out=folder, start=start, resume=resume, overwrite=overwrite, show=shown)
     show_calibration(found, quiet=quiet, as_json=as_json)
 
 
@@ -114,9 +109,10 @@ def simulate(
 ) -> None:
     """Simulate the experiment's commands: writes NetCDF and CSV, prints the error against the recordings."""
     folder = folder_for("simulate", experiment, out, overrides, overwrite=overwrite)
-    from rfdropo_bayes.verbs.simulate import run_simulation
+    from rfdropo_bayes.model.model import Model
+    from rfdropo_bayes.verbs.simulate import simulate_all
 
-    found = run_simulation(experiment, folder, overrides=overrides or [], balance=balance, overwrite=overwrite)
+    found = simulate_all(Model.read(experiment, overrides), folder, balance=balance, overwrite=overwrite)
     show_simulation(found, quiet=quiet, as_json=as_json)
 
 

@@ -43,7 +43,7 @@ def deploy(
         raise InputError(f"unknown mode {mode!r}", where="--mode", remedy=f"choose one of {', '.join(Mode)}")
     folder = out or Path("reports") / f"{deployment.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     show = not quiet and sys.stdout.isatty() and mode != "check"
-    outcome = run_session(deployment, mode, folder, simulated=simulated, recording=recording, show=show, keyboard=True)
+    outcome = run_session(deployment, mode, folder, simulated=simulated, commands=recording, show=show, keyboard=True)
     for channel, found in outcome.drives.items() if mode == "check" else ():
         typer.echo(f"{channel}: " + ", ".join(f"{name} {value:#x}" for name, value in found.items()))
     for channel, lacking in outcome.without.items() if mode == "check" else ():

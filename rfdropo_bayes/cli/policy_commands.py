@@ -25,9 +25,11 @@ def train(
 ) -> None:
     """Train a policy under the experiment's randomisation: writes policy.onnx, its card, and how it learnt."""
     folder = folder_for("train", experiment, out, overrides, resume=resume, overwrite=overwrite)
-    from rfdropo_bayes.verbs.train import CARD, POLICY, run_training
+    from rfdropo_bayes.model.model import Model
+    from rfdropo_bayes.verbs.train import CARD, POLICY
+    from rfdropo_bayes.verbs.train import train as learn
 
-    found = run_training(experiment, folder, overrides=overrides or [], resume=resume, overwrite=overwrite)
+    found = learn(Model.read(experiment, overrides), folder, resume=resume, overwrite=overwrite)
     last = found["evaluation"]
     learnt = (
         f"half of the episodes end within {1e3 * last['distance_median']:.2f} mm of the goal, 95 % within "
@@ -51,11 +53,12 @@ def evaluate(
 ) -> None:
     """Play policies on the same episodes: writes success with intervals, every episode, a figure and animations."""
     folder = folder_for("evaluate", experiment, out, overrides, overwrite=overwrite)
-    from rfdropo_bayes.verbs.train import TABLE, evaluation_table, run_evaluation
+    from rfdropo_bayes.model.model import Model
+    from rfdropo_bayes.verbs.evaluate import TABLE, evaluation_table
+    from rfdropo_bayes.verbs.evaluate import evaluate as play
 
-    found = run_evaluation(
-        experiment, policy, folder, episodes=episodes, seed=seed, overrides=overrides or [], overwrite=overwrite
-    )
+    model = Model.read(experiment, overrides)
+    found = play(model, policy, folder, episodes=episodes, seed=seed, overwrite=overwrite)
     say(found, evaluation_table(found), f"table: {folder / TABLE}", quiet=quiet, as_json=as_json)
 
 

@@ -36,9 +36,11 @@ def export(
 
 def check(path: Path, out: Path, name: str, datasets: int, overrides: list[str], resume: bool, overwrite: bool) -> None:
     """Run a check of an experiment's method and say what it found."""
+    from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.studies.method_check import run_check
 
-    found = run_check(path, out, name, datasets=datasets, overrides=overrides, resume=resume, overwrite=overwrite)
+    model = Model.read(path, overrides)
+    found = run_check(model, out, name, datasets=datasets, resume=resume, overwrite=overwrite)
     typer.echo(found["sentence"])
     typer.echo(f"details: {out / f'{name}.json'}")
 

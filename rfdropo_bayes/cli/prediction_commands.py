@@ -51,16 +51,16 @@ def predict(
     see_calibration(posterior, "--posterior")
     look_through(experiment, overrides or [])
     check_folder(out, "predict", overwrite=overwrite)
+    from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.predict import run_prediction
 
     facts = run_prediction(
-        experiment,
+        Model.read(experiment, overrides),
         posterior,
         _from_here(commands),
         out,
         start=None if start is None else _from_here(start),
         rows=_window(rows),
-        overrides=overrides or [],
         seed=seed,
         group=group,
         overwrite=overwrite,
@@ -89,17 +89,16 @@ def adapt(
     """Move what a day changes to one short recording of it; the body keeps its posterior."""
     see_calibration(run, "DIR")
     check_folder(out, "adapt", overwrite=overwrite)
-    from rfdropo_bayes.verbs.adapt import run_adaptation
+    from rfdropo_bayes.verbs.adapt import fitted_model, run_adaptation
 
     found = run_adaptation(
         run,
+        fitted_model(run, experiment, overrides),
         _from_here(recording),
         out,
         commands=None if commands is None else _from_here(commands),
         seconds=seconds,
         group=group,
-        experiment=experiment,
-        overrides=overrides or [],
         seed=seed,
         overwrite=overwrite,
         show=False if quiet else None,

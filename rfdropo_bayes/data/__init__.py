@@ -5,8 +5,10 @@ from rfdropo_bayes.data.commands_alone import commands_alone
 from rfdropo_bayes.data.faults import Faults, find_faults
 from rfdropo_bayes.data.first_command import common_beginning
 from rfdropo_bayes.data.matching import check_channels, shared_markers
+from rfdropo_bayes.data.named_columns import CsvColumns
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
-from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
+from rfdropo_bayes.data.plain_csv import read_plain_csv
+from rfdropo_bayes.data.recorded import Measured, Origin, SentCommands
 from rfdropo_bayes.data.repeats import group_repeats, noise_floor
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, load_recordings
@@ -19,7 +21,10 @@ __all__ = [
     "CsvColumns",
     "DataSpec",
     "Faults",
+    "Measured",
+    "Origin",
     "RecordingEntry",
+    "SentCommands",
     "Trajectory",
     "check_channels",
     "commands_alone",

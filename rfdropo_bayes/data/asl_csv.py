@@ -20,6 +20,7 @@ masked; for settled poses they are stale and left out.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ from rfdropo_bayes.data.commands_alone import commands_alone
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import Faults, fill_missing, find_faults
 from rfdropo_bayes.data.held_readings import hold_time
+from rfdropo_bayes.data.recorded import Measured, Origin, SentCommands
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 
@@ -43,14 +45,8 @@ _DISKS = [f"{axis}{disk}" for disk in (1, 2, 3) for axis in "xyz"]
 _COMMANDS = [f"u{motor}" for motor in range(1, MOTORS + 1)]
 _ANGLES = [f"phi{motor}" for motor in range(1, MOTORS + 1)]
 _SETTLED_ROWS = 20
-_FACTS: dict[str, Any] = {
-    "robot": "asl_trunk",
-    "format": FORMAT,
-    "marker_names": ["disk1", "disk2", "disk3"],
-    "cable_names": [f"motor{motor}" for motor in range(1, MOTORS + 1)],
-    "command_unit": "rad",
-    "frame": FRAME,
-}
+_MARKERS = ("disk1", "disk2", "disk3")
+_CABLES = [f"motor{motor}" for motor in range(1, MOTORS + 1)]
 
 
 class _Recording(NamedTuple):
@@ -59,6 +55,12 @@ class _Recording(NamedTuple):
     time: Float[np.ndarray, " rows"]
     position: Float[np.ndarray, "rows disk 3"]
     faults: Faults
+
+
+class _Content(NamedTuple):
+    sent: SentCommands
+    measured: Measured
+    settings: dict[str, Any]
 
 
 def read_asl_csv(observations: Path, commands: Path | None, *, mask_missing: bool = False) -> Trajectory:
@@ -76,20 +78,19 @@ def read_asl_csv(observations: Path, commands: Path | None, *, mask_missing: boo
     identity = table.numbers(["ID"])[:, 0].astype(int)
     position = table.points(_DISKS, allow_missing=mask_missing) @ MOCAP_TO_BASE.T
     time = np.arange(len(table)) / RATE
-    faults = find_faults(time, position, where=str(observations), names=_FACTS["marker_names"])
+    faults = find_faults(time, position, where=str(observations), names=_MARKERS)
     recording = _Recording(table, identity, time, position, faults)
     command = _read_commands(commands) if commands is not None else np.zeros((len(table) - 1, MOTORS))
-    content = (_settled_poses if len(set(identity)) < len(identity) else _motion)(recording, command, commands)
-    settings: dict[str, Any] = recording.faults.settings | content.pop("settings")
+    settled = len(set(identity)) < len(identity)
+    sent, measured, settings = (_settled_poses if settled else _motion)(recording, command, commands)
     payload = re.search(r"_(\d+)g$", _stem(observations))
-    settings["payload_mass"] = 1e-3 * float(payload.group(1)) if payload else 0.0
-    return Trajectory.build(
-        name=_stem(observations),
-        provenance=f"{observations.name}, commands {commands.name if commands else NO_COMMANDS}: ASL Trunk",
-        settings=settings,
-        **_FACTS,
-        **content,
-    )
+    settings = faults.settings | settings | {"payload_mass": 1e-3 * float(payload.group(1)) if payload else 0.0}
+    words = f"{observations.name}, commands {commands.name if commands else NO_COMMANDS}: ASL Trunk"
+    return Trajectory.build(_origin(_stem(observations), words, settings), sent, measured)
+
+
+def _origin(name: str, provenance: str, settings: Mapping[str, Any]) -> Origin:
+    return Origin(name, "asl_trunk", FORMAT, provenance=provenance, frame=FRAME, settings=settings)
 
 
 def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> Trajectory:
@@ -109,19 +110,17 @@ def read_asl_start(commands: Path, observations: Path | None, row: int = 0) -> T
             angle = np.full((len(command) + 1, MOTORS), np.nan)
             angle[0] = np.deg2rad(table.numbers(_ANGLES, allow_missing=True)[0])
     return commands_alone(
-        np.arange(len(command)) / RATE,
-        command,
+        _origin(_stem(observations or commands), commands.name, {}),
+        SentCommands(np.arange(len(command)) / RATE, command, "rad", _CABLES),
+        _MARKERS,
         start=start,
         row=row,
         start_file=str(observations),
-        name=_stem(observations or commands),
         motor_angle=angle,
-        provenance=commands.name,
-        **_FACTS,
     )
 
 
-def _motion(recording: _Recording, command: np.ndarray, commands: Path | None) -> dict[str, Any]:
+def _motion(recording: _Recording, command: np.ndarray, commands: Path | None) -> _Content:
     rows = len(recording.time)
     _check_consecutive(recording.identity, str(recording.table.path))
     if rows != len(command) + 1:
@@ -133,19 +132,20 @@ def _motion(recording: _Recording, command: np.ndarray, commands: Path | None) -
     angle = None
     if all(name in recording.table for name in _ANGLES):
         angle = np.deg2rad(recording.table.numbers(_ANGLES, allow_missing=True))
-    return {
-        "time": recording.time,
-        "position": fill_missing(recording.time, recording.position),
-        "position_mask": recording.faults.mask,
-        "command_time": recording.time[:-1],
-        "command": command,
-        "initial_command": command[0],
-        "motor_angle": angle,
-        "settings": {} if angle is None else {"motor_angle_hold": hold_time(recording.time, angle)},
-    }
+    return _Content(
+        SentCommands(recording.time[:-1], command, "rad", _CABLES, command[0]),
+        Measured(
+            recording.time,
+            fill_missing(recording.time, recording.position),
+            _MARKERS,
+            recording.faults.mask,
+            motor_angle=angle,
+        ),
+        {} if angle is None else {"motor_angle_hold": hold_time(recording.time, angle)},
+    )
 
 
-def _settled_poses(recording: _Recording, command: np.ndarray, commands: Path | None) -> dict[str, Any]:
+def _settled_poses(recording: _Recording, command: np.ndarray, commands: Path | None) -> _Content:
     numbers, first = np.unique(recording.identity, return_index=True)
     where = f"{recording.table.path} with {commands}"
     if np.any(np.diff(recording.identity) < 0):
@@ -166,15 +166,12 @@ def _settled_poses(recording: _Recording, command: np.ndarray, commands: Path | 
             good = recording.faults.mask[window, disk]
             mask[row, disk] = good.any()
             pose[row, disk] = np.median(recording.position[window, disk][good if good.any() else slice(None)], axis=0)
-    return {
-        "time": recording.time[end],
-        "position": fill_missing(recording.time[end], pose),
-        "position_mask": mask,
-        "command_time": recording.time[first[1:]],
-        "command": command[1:],
-        "initial_command": command[0],
-        "settings": {"settled_poses": True, "motor_angle": "stale, left out"},
-    }
+    time = recording.time[end]
+    return _Content(
+        SentCommands(recording.time[first[1:]], command[1:], "rad", _CABLES, command[0]),
+        Measured(time, fill_missing(time, pose), _MARKERS, mask),
+        {"settled_poses": True, "motor_angle": "stale, left out"},
+    )
 
 
 def _read_commands(path: Path) -> Float[np.ndarray, "rows 6"]:

@@ -9,13 +9,16 @@ a linear robot with a dead time and a lag would do, and the one that meets the f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.data.trajectory import FIRST_COMMAND, Trajectory
+from rfdropo_bayes.data.recorded import FIRST_COMMAND
 from rfdropo_bayes.errors import InputError
+
+if TYPE_CHECKING:
+    from rfdropo_bayes.data.trajectory import Trajectory
 
 Rule = Literal["first", "zero"] | Sequence[float]
 

@@ -11,10 +11,10 @@ import xarray as xr
 from jaxtyping import Float
 
 from rfdropo_bayes.data.faults import fill_missing, find_faults
-from rfdropo_bayes.data.first_command import MEMORY, Rule, begun_from
-from rfdropo_bayes.data.plain_csv import COMMAND_UNITS, METRES, CsvColumns, read_frame
+from rfdropo_bayes.data.first_command import MEMORY, Rule
+from rfdropo_bayes.data.named_columns import COMMAND_UNITS, METRES, CsvColumns, read_frame
+from rfdropo_bayes.data.recorded import AXES, Measured, Origin, Recorded, SentCommands
 from rfdropo_bayes.data.sample_times import PER_SECOND, check_times, read_stamps
-from rfdropo_bayes.data.trajectory import AXES, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.tables import nearest, parse_table
 
@@ -27,7 +27,6 @@ def from_arrays(
     markers: Sequence[str],
     channels: Sequence[str],
     command_time: Float[Any, " command"] | None = None,
-    initial_command: Any = None,
     time_unit: str = "s",
     position_unit: str = "m",
     command_unit: str = "m",
@@ -36,8 +35,8 @@ def from_arrays(
     object_pose: Float[Any, "time 7"] | None = None,
     name: str = "recording",
     robot: str = "",
-) -> Trajectory:
-    """A recording from arrays.
+) -> Recorded:
+    """A recording from arrays that begins with its first command; `Trajectory.from_arrays` is the way in.
 
     Args:
         time: of the observations, in ``time_unit``, or dates or durations of any type.
@@ -47,8 +46,6 @@ def from_arrays(
         markers, channels: their names, in the order of the arrays.
         command_time: from when each command is in force, on the clock of ``time``; the first times of the observations
             by default.
-        initial_command: in force before the first one: "first" (that one was already), "zero", or one value per
-            channel; recognised from motor angles or the first rows by default, as in files (`first_command`).
         time_unit: "s", "ms", "us" or "ns".
         position_unit: "m", "cm" or "mm"; also of ``object_pose``.
         command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor.
@@ -79,60 +76,32 @@ def from_arrays(
     pose = None
     if object_pose is not None:
         pose = _numbers(object_pose, "poses", rows | {"": 7}, name) * np.repeat([metres, 1.0], [3, 4])
-    recording = Trajectory.build(
-        name=name,
-        robot=robot,
-        format=MEMORY,
-        time=clock,
-        position=fill_missing(clock, place),
-        position_mask=faults.mask,
-        marker_names=markers,
-        command_time=stamps,
-        command=sent,
-        command_unit=unit,
-        initial_command=sent[0],
-        cable_names=channels,
-        tension=None if tension is None else _numbers(tension, "tensions", rows | width, name),
-        motor_angle=None if motor_angle is None else _numbers(motor_angle, "motor angles", rows | width, name),
-        object_pose=pose,
-        settings=faults.settings,
+    return Recorded(
+        Origin(name, robot, MEMORY, settings=faults.settings),
+        SentCommands(stamps, sent, unit, channels, sent[0]),
+        Measured(
+            clock,
+            fill_missing(clock, place),
+            markers,
+            faults.mask,
+            tension=None if tension is None else _numbers(tension, "tensions", rows | width, name),
+            motor_angle=None if motor_angle is None else _numbers(motor_angle, "motor angles", rows | width, name),
+            object_pose=pose,
+        ),
     )
-    return _begun(recording, initial_command, factor)
 
 
 def from_pandas(
-    frame: pd.DataFrame, columns: CsvColumns | Mapping[str, Any], name: str = "recording", *, mask_missing: bool = True
-) -> Trajectory:
-    """A recording from a table.
-
-    Args:
-        frame: one row per observation.
-        columns: what each column is, as in an experiment file's [data.columns]; see `CsvColumns`. The index is a
-            column under its name, or "index".
-        name: of the recording.
-        mask_missing: leave out and count positions that are not a number; else they are an error.
-
-    Raises:
-        InputError: a column that is not there or is no number, or columns that do not fit together.
-    """
+    frame: pd.DataFrame, columns: CsvColumns | Mapping[str, Any], name: str, mask_missing: bool
+) -> Recorded:
+    """A recording from a table; see `Trajectory.from_pandas`."""
     if not isinstance(columns, CsvColumns):
         columns = parse_table(CsvColumns, _as_lists(columns), where="columns")
-    return begun_from(read_frame(frame, columns, name, mask_missing=mask_missing), None)
+    return read_frame(frame, columns, name, mask_missing=mask_missing)
 
 
-def from_xarray(dataset: xr.Dataset, name: str = "recording", *, robot: str = "") -> Trajectory:
-    """A recording from a data set with ``position(time, marker, axis)`` and ``command(time, channel)``.
-
-    Dimensions may be in any order; ``command`` may have a clock of its own, ``command_time``. Markers and channels are
-    named by their coordinates, units stand in the variables' attribute ``units`` ("m" where it is missing, and "s" of
-    ``time``, which may hold dates). Further
-    variables are ``initial_command``, ``tension``, ``motor_angle`` and ``object_pose``.
-
-    Raises:
-        InputError: a variable, dimension or coordinate that is missing, or see `from_arrays`.
-    """
-    if "schema" in dataset.attrs:  # one of ours
-        return Trajectory(dataset)
+def labelled_arrays(dataset: xr.Dataset, name: str) -> dict[str, Any]:
+    """Arguments of `Trajectory.from_arrays` in a labelled data set; see `Trajectory.from_xarray`."""
     channel = "cable" if "cable" in dataset.dims else "channel"
     for key in ("position", "command", "marker", channel, "time"):
         if key not in dataset.variables:
@@ -147,35 +116,29 @@ def from_xarray(dataset: xr.Dataset, name: str = "recording", *, robot: str = ""
         if set(dataset[key].dims) != set(wanted):
             raise InputError(f"{key} has the dimensions {dataset[key].dims}, and not {wanted}", where=name)
     arrays: dict[str, Any] = {key: dataset[key].transpose(*wanted).values for key, wanted in known.items()}
-    return from_arrays(
-        time=dataset["time"].values,
-        command_time=dataset[clock].values[: len(arrays["command"])],
-        markers=[str(marker) for marker in dataset["marker"].values],
-        channels=[str(value) for value in dataset[channel].values],
-        position_unit=str(dataset["position"].attrs.get("units", "m")),
-        command_unit=str(dataset["command"].attrs.get("units", "m")),
-        time_unit=str(dataset["time"].attrs.get("units", "s")),
-        name=name,
-        robot=robot,
-        **arrays,
-    )
+    return arrays | {
+        "time": dataset["time"].values,
+        "command_time": dataset[clock].values[: len(arrays["command"])],
+        "markers": [str(marker) for marker in dataset["marker"].values],
+        "channels": [str(value) for value in dataset[channel].values],
+        "position_unit": str(dataset["position"].attrs.get("units", "m")),
+        "command_unit": str(dataset["command"].attrs.get("units", "m")),
+        "time_unit": str(dataset["time"].attrs.get("units", "s")),
+    }
 
 
-def _begun(recording: Trajectory, initial_command: Any, factor: float) -> Trajectory:
-    """The recording with the command before its first row as it is given, or recognised."""
-    if initial_command is None or isinstance(initial_command, str):
-        rules: dict[str | None, Rule | None] = {None: None, "first": "first", "zero": "zero"}
-        if initial_command not in rules:
-            raise InputError(
-                f"initial_command is {initial_command!r}",
-                where=recording.name,
-                remedy='give "first", "zero", or one value per channel',
-            )
-        return begun_from(recording, rules[initial_command])
-    given = factor * _numbers(
-        initial_command, "initial commands", {"channels": len(recording.cable_names)}, recording.name
-    )
-    return recording.with_initial_command(given, {"rule": "given", "why": "initial_command"})
+def beginning(rule: str | None, where: str) -> Rule | None:
+    """The rule for the command before the first row that has this name; None where it is to be recognised."""
+    rules: dict[str | None, Rule | None] = {None: None, "first": "first", "zero": "zero"}
+    if rule not in rules:
+        remedy = 'give "first", "zero", or one value per channel'
+        raise InputError(f"initial_command is {rule!r}", where=where, remedy=remedy)
+    return rules[rule]
+
+
+def initial_command(values: Any, unit: str, channels: int, where: str) -> Float[np.ndarray, " channel"]:
+    """Values of the command before the first row [m or rad] from those in ``unit``."""
+    return COMMAND_UNITS[unit][1] * _numbers(values, "initial commands", {"channels": channels}, where)
 
 
 def _unit(unit: str, known: Mapping[str, Any], where: str) -> Any:

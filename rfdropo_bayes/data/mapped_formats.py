@@ -8,14 +8,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from rfdropo_bayes.data import lerobot, motive_csv, plain_csv, rosbag
+from rfdropo_bayes.data import lerobot, motive_csv, named_columns, rosbag
 from rfdropo_bayes.data.csv_table import MOTIVE, CsvTable
-from rfdropo_bayes.data.plain_csv import CsvColumns, command_table, coordinates, read_tables
+from rfdropo_bayes.data.named_columns import CsvColumns, coordinates, read_tables
+from rfdropo_bayes.data.plain_csv import command_table
+from rfdropo_bayes.data.recorded import Origin
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.tables import changed
 
-MAPPED = (plain_csv.FORMAT, motive_csv.FORMAT, rosbag.FORMAT, lerobot.FORMAT)
+MAPPED = (named_columns.FORMAT, motive_csv.FORMAT, rosbag.FORMAT, lerobot.FORMAT)
 FOLDERS = (rosbag.FORMAT, lerobot.FORMAT)
 """Formats in which a recording, or several, may be a folder."""
 _MAGIC = {b"#ROSBAG": rosbag.FORMAT, b"\x89MCAP0": rosbag.FORMAT, b"SQLite format 3\x00": rosbag.FORMAT}
@@ -56,7 +58,9 @@ def recognised_format(path: Path) -> str:
     for magic, format in _MAGIC.items():
         if first.startswith(magic):
             return format
-    return motive_csv.FORMAT if first.removeprefix(b"\xef\xbb\xbf").startswith(MOTIVE.encode()) else plain_csv.FORMAT
+    return (
+        motive_csv.FORMAT if first.removeprefix(b"\xef\xbb\xbf").startswith(MOTIVE.encode()) else named_columns.FORMAT
+    )
 
 
 def observed_table(format: str, path: Path, columns: CsvColumns, episode: int | None = None) -> Observed:
@@ -119,12 +123,11 @@ def read_mapped(
         )
     for ending in (".csv", *rosbag.STORAGE):
         name = name.removesuffix(ending)
-    return read_tables(
+    recorded = read_tables(
         table,
         source or table,
         columns,
         mask_missing=mask_missing,
-        format=format,
-        name=name if episode is None else f"{name}_{episode}",
-        provenance=path.name,
+        origin=Origin(name if episode is None else f"{name}_{episode}", columns.robot, format, provenance=path.name),
     )
+    return Trajectory.build(*recorded)

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from rfdropo_bayes.data import actions
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import fill_missing, find_faults
+from rfdropo_bayes.data.recorded import Measured, Origin, SentCommands
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 
@@ -53,20 +54,26 @@ def read_optitrack_csv(path: Path, *, mask_missing: bool = False) -> Trajectory:
     faults = find_faults(time, position, where=str(path), names=names)
     _check_gaps(time, str(path))
     return Trajectory.build(
-        name=path.stem,
-        robot="trunk_physical",
-        format=FORMAT,
-        time=time,
-        position=fill_missing(time, position),
-        position_mask=faults.mask,
-        marker_names=names,
-        command_time=_sending_times(time, position),
-        command=actions.cumulative_displacement(acted),
-        command_unit="m",
-        cable_names=actions.CABLE_NAMES,
-        object_pose=table.pose(_CUBE, _MILLIMETRE, allow_missing=mask_missing),
-        provenance=f"{path.name}: OptiTrack",
-        settings=actions.SETTINGS | faults.settings,
+        Origin(
+            name=path.stem,
+            robot="trunk_physical",
+            format=FORMAT,
+            provenance=f"{path.name}: OptiTrack",
+            settings=actions.SETTINGS | faults.settings,
+        ),
+        SentCommands(
+            command_time=_sending_times(time, position),
+            command=actions.cumulative_displacement(acted),
+            command_unit="m",
+            cable_names=actions.CABLE_NAMES,
+        ),
+        Measured(
+            time=time,
+            position=fill_missing(time, position),
+            marker_names=names,
+            position_mask=faults.mask,
+            object_pose=table.pose(_CUBE, _MILLIMETRE, allow_missing=mask_missing),
+        ),
     )
 
 

@@ -22,7 +22,7 @@ import numpy as np
 import pandas as pd
 
 from rfdropo_bayes.data.csv_table import CsvTable, closest
-from rfdropo_bayes.data.plain_csv import CsvColumns, coordinates
+from rfdropo_bayes.data.named_columns import CsvColumns, coordinates
 from rfdropo_bayes.data.streams import Stream, commanded, in_order, observed, one_frame
 from rfdropo_bayes.errors import InputError
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from rfdropo_bayes.data import actions
 from rfdropo_bayes.data.csv_table import CsvTable
+from rfdropo_bayes.data.recorded import Measured, Origin, SentCommands
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 
@@ -40,20 +41,26 @@ def read_sofa_csv(path: Path) -> Trajectory:
     if all(name in table for name in _GOAL):
         settings["goal"] = (_MILLIMETRE * table.numbers(_GOAL)[0]).tolist()
     return Trajectory.build(
-        name=path.stem,
-        robot="trunk_sofa",
-        format=FORMAT,
-        time=time,
-        position=_MILLIMETRE * table.points(_COLUMNS),
-        marker_names=[f"p{point:02d}" for point in range(POINTS)],
-        command_time=time[:-1],
-        command=actions.cumulative_displacement(acted),
-        command_unit="m",
-        cable_names=actions.CABLE_NAMES,
-        object_pose=table.pose(_CUBE, _MILLIMETRE),
-        synthetic=True,
-        provenance=f"{path.name}: SOFA simulation",
-        settings=settings,
+        Origin(
+            name=path.stem,
+            robot="trunk_sofa",
+            format=FORMAT,
+            synthetic=True,
+            provenance=f"{path.name}: SOFA simulation",
+            settings=settings,
+        ),
+        SentCommands(
+            command_time=time[:-1],
+            command=actions.cumulative_displacement(acted),
+            command_unit="m",
+            cable_names=actions.CABLE_NAMES,
+        ),
+        Measured(
+            time=time,
+            position=_MILLIMETRE * table.points(_COLUMNS),
+            marker_names=[f"p{point:02d}" for point in range(POINTS)],
+            object_pose=table.pose(_CUBE, _MILLIMETRE),
+        ),
     )
 
 

@@ -13,8 +13,8 @@ from rfdropo_bayes.data import lerobot
 from rfdropo_bayes.data.asl_csv import NO_COMMANDS, read_asl_csv
 from rfdropo_bayes.data.first_command import begun_from
 from rfdropo_bayes.data.mapped_formats import FOLDERS, MAPPED, read_mapped
+from rfdropo_bayes.data.named_columns import CsvColumns
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
-from rfdropo_bayes.data.plain_csv import CsvColumns
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError

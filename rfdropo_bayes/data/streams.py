@@ -19,7 +19,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from rfdropo_bayes.data.csv_table import closest
-from rfdropo_bayes.data.trajectory import continuous_quaternions
+from rfdropo_bayes.data.recorded import continuous_quaternions
 from rfdropo_bayes.errors import InputError
 
 ADJACENT = 1.5

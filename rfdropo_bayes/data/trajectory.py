@@ -4,30 +4,37 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from rfdropo_bayes.data import checks
+from rfdropo_bayes.data import checks, in_memory
 from rfdropo_bayes.data.faults import NOTES
-from rfdropo_bayes.data.held_readings import new_readings, present_readings
-from rfdropo_bayes.data.sample_times import sample_time
+from rfdropo_bayes.data.first_command import begun_from
+from rfdropo_bayes.data.named_columns import CsvColumns
+from rfdropo_bayes.data.recorded import (
+    FIRST_COMMAND,
+    MISSING,
+    SCHEMA,
+    Measured,
+    Origin,
+    Recorded,
+    SentCommands,
+    assembled,
+    continuous_quaternions,
+)
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole
 
-AXES = ("x", "y", "z")
-POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
-SCHEMA = "rfdropo_bayes.trajectory/1"
-FIRST_COMMAND = "first_command"  # among the settings: which command was in force before the first row
 _HASHED = ("time", "command_time", "position", "position_mask", "command", "initial_command")
 _OPTIONAL = ("tension", "tension_mask", "motor_angle", "motor_angle_mask", "object_pose")
-MISSING = "missing_readings"  # among the settings: how many tensions, motor angles and poses a recording lacks
 
 
 @dataclass(frozen=True)
@@ -59,88 +66,73 @@ class Trajectory:
         object.__setattr__(self, "dataset", self.dataset.assign_attrs(sha256=_digest(self.dataset)))
 
     @classmethod
-    def build(
-        cls,
-        *,
-        name: str,
-        robot: str,
-        format: str,
-        time: Float[np.ndarray, " time"],
-        position: Float[np.ndarray, "time marker 3"],
-        command_time: Float[np.ndarray, " command_time"],
-        command: Float[np.ndarray, "command_time cable"],
-        command_unit: str,
-        marker_names: Sequence[str],
-        cable_names: Sequence[str],
-        initial_command: Float[np.ndarray, " cable"] | None = None,
-        position_mask: Bool[np.ndarray, "time marker"] | None = None,
-        tension: Float[np.ndarray, "time cable"] | None = None,
-        motor_angle: Float[np.ndarray, "time cable"] | None = None,
-        object_pose: Float[np.ndarray, "time 7"] | None = None,
-        synthetic: bool = False,
-        provenance: str = "",
-        frame: str = "robot base: x, y across, z along the axis away from the base",
-        settings: Mapping[str, Any] | None = None,
-    ) -> Trajectory:
-        """Assemble and check a recording; every array is in SI units, see the class for meanings and shapes.
+    def build(cls, origin: Origin, sent: SentCommands, measured: Measured) -> Trajectory:
+        """Assemble and check a recording, see the records for meanings and shapes.
 
-        ``initial_command`` defaults to zero; ``position_mask`` to all True. Times are shifted so that the first
-        observation is at 0. ``settings`` are facts about the recording that a model may need (JSON); of motor angles
-        with a ``motor_angle_hold`` [s] among them only new readings are to be used (`held_readings`). Tensions, motor
-        angles and poses that are not a number are missing: they are left out and counted.
+        Times are shifted so that the first observation is at 0. Tensions, motor angles and poses that are not a number
+        are missing: they are left out and counted.
         """
-        facts = dict(settings or {})
-        checks.check_pose(object_pose, len(time), name)
-        tension, tension_mask = present_readings(tension)
-        motor_angle, angle_mask = present_readings(motor_angle)
-        facts |= _missing(tension_mask, angle_mask, object_pose)
-        new = _angle_mask(time, motor_angle, float(facts.get("motor_angle_hold", 0.0)))
-        arrays = {
-            "position": position,
-            "position_mask": np.ones(np.shape(position)[:2], dtype=bool) if position_mask is None else position_mask,
-            "command": command,
-            "initial_command": np.zeros(len(cable_names)) if initial_command is None else initial_command,
-            "tension": tension,
-            "tension_mask": tension_mask,
-            "motor_angle": motor_angle,
-            "motor_angle_mask": angle_mask if new is None else (new if angle_mask is None else new & angle_mask),
-            "object_pose": None if object_pose is None else continuous_quaternions(object_pose),
-        }
-        dataset = _assemble(name, arrays, time, command_time, marker_names, cable_names)
-        dataset["command"].attrs["unit"] = command_unit
-        dataset.attrs = {
-            "schema": SCHEMA,
-            "name": name,
-            "robot": robot,
-            "format": format,
-            "provenance": provenance,
-            "frame": frame,
-            "sample_time": sample_time(np.asarray(time, dtype=float)) if len(time) > 1 else 0.0,
-            "synthetic": int(synthetic),
-            "settings": json.dumps(facts, sort_keys=True),
-        }
-        return cls(dataset)
+        return cls(assembled(Recorded(origin, sent, measured)))
 
     @classmethod
-    def from_arrays(cls, **given: Any) -> Trajectory:
-        """A recording from arrays in any unit; see `in_memory.from_arrays`."""
-        from rfdropo_bayes.data.in_memory import from_arrays
+    def from_arrays(cls, *, initial_command: Any = None, **given: Any) -> Trajectory:
+        """A recording from arrays in any unit.
 
-        return from_arrays(**given)
+        Args:
+            initial_command: in force before the first one, in the unit of the others: "first" (that one was already),
+                "zero", or one value per channel; recognised from motor angles or the first rows by default, as in files
+                (`first_command`).
+            given: arrays, their names and units; see `in_memory.from_arrays`.
+
+        Raises:
+            InputError: an unknown unit, what is not a number, shapes that do not fit, times that do not increase, or
+                lengths that cannot be in the unit that was given.
+        """
+        recording = cls.build(*in_memory.from_arrays(**given))
+        if not (initial_command is None or isinstance(initial_command, str)):
+            unit, channels = given.get("command_unit", "m"), len(recording.cable_names)
+            value = in_memory.initial_command(initial_command, unit, channels, recording.name)
+            return recording.with_initial_command(value, {"rule": "given", "why": "initial_command"})
+        return begun_from(recording, in_memory.beginning(initial_command, recording.name))
 
     @classmethod
-    def from_pandas(cls, frame: Any, columns: Any, name: str = "recording", **options: Any) -> Trajectory:
-        """A recording from a table whose columns are named; see `in_memory.from_pandas`."""
-        from rfdropo_bayes.data.in_memory import from_pandas
+    def from_pandas(
+        cls,
+        frame: pd.DataFrame,
+        columns: CsvColumns | Mapping[str, Any],
+        name: str = "recording",
+        *,
+        mask_missing: bool = True,
+    ) -> Trajectory:
+        """A recording from a table.
 
-        return from_pandas(frame, columns, name, **options)
+        Args:
+            frame: one row per observation.
+            columns: what each column is, as in an experiment file's [data.columns]; see `CsvColumns`. The index is a
+                column under its name, or "index".
+            name: of the recording.
+            mask_missing: leave out and count positions that are not a number; else they are an error.
+
+        Raises:
+            InputError: a column that is not there or is no number, or columns that do not fit together.
+        """
+        return begun_from(cls.build(*in_memory.from_pandas(frame, columns, name, mask_missing)), None)
 
     @classmethod
-    def from_xarray(cls, dataset: xr.Dataset, name: str = "recording", **options: Any) -> Trajectory:
-        """A recording from a labelled data set; see `in_memory.from_xarray`."""
-        from rfdropo_bayes.data.in_memory import from_xarray
+    def from_xarray(cls, dataset: xr.Dataset, name: str = "recording", *, robot: str = "") -> Trajectory:
+        """A recording from a data set with ``position(time, marker, axis)`` and ``command(time, channel)``.
 
-        return from_xarray(dataset, name, **options)
+        Dimensions may be in any order; ``command`` may have a clock of its own, ``command_time``. Markers and channels
+        are named by their coordinates, units stand in the variables' attribute ``units`` ("m" where it is missing, and
+        "s" of ``time``, which may hold dates). Further variables are ``initial_command``, ``tension``, ``motor_angle``
+        and ``object_pose``.
+
+        Raises:
+            InputError: a variable, dimension or coordinate that is missing, or see `from_arrays`.
+        """
+        if "schema" in dataset.attrs:  # one of ours
+            return cls(dataset)
+        return cls.from_arrays(name=name, robot=robot, **in_memory.labelled_arrays(dataset, name))
 
     @property
     def name(self) -> str:
@@ -419,57 +411,6 @@ def open_netcdf(path: Path) -> xr.Dataset:
 
 FINEST = 100.0  # rows of a new grid for one that was recorded: more are another unit of time
 _INSTANT = 1e-9  # [s]: times that differ by less are the same instant
-
-
-def _assemble(
-    name: str,
-    arrays: Mapping[str, Any],
-    time: np.ndarray,
-    command_time: np.ndarray,
-    marker_names: Sequence[str],
-    cable_names: Sequence[str],
-) -> xr.Dataset:
-    origin = time[0] if len(time) else 0.0
-    coords = {
-        "time": np.asarray(time, dtype=float) - origin,
-        "command_time": np.asarray(command_time, dtype=float) - origin,
-        "marker": list(marker_names),
-        "cable": list(cable_names),
-        "axis": list(AXES),
-    } | ({} if arrays["object_pose"] is None else {"pose": list(POSE)})
-    try:
-        data = {key: (checks.DIMS[key], np.array(value)) for key, value in arrays.items() if value is not None}
-        return xr.Dataset(data, coords=coords)
-    except ValueError as error:
-        raise InputError(
-            f"recording and commands do not fit together ({error})", where=name, remedy="check their lengths"
-        ) from None
-
-
-def _angle_mask(time: np.ndarray, angle: np.ndarray | None, hold: float) -> Bool[np.ndarray, "time cable"] | None:
-    fits = angle is not None and len(np.shape(angle)) == 2 and len(angle) == len(time) > 1  # else checked later
-    return new_readings(np.asarray(time), np.asarray(angle), hold) if hold > 0.0 and fits else None
-
-
-def _missing(
-    tension_mask: np.ndarray | None, angle_mask: np.ndarray | None, pose: np.ndarray | None
-) -> dict[str, dict[str, int]]:
-    counts = {
-        "tensions": 0 if tension_mask is None else int((~tension_mask).sum()),
-        "motor angles": 0 if angle_mask is None else int((~angle_mask).sum()),
-        "poses of the object": 0 if pose is None else int((~np.isfinite(pose).all(axis=-1)).sum()),
-    }
-    found = {kind: count for kind, count in counts.items() if count}
-    return {MISSING: found} if found else {}
-
-
-def continuous_quaternions(pose: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time 7"]:
-    """Poses whose quaternion keeps its sign from row to row, the first with w >= 0 (q and -q are the same rotation)."""
-    pose = np.array(pose, dtype=float)
-    turn = np.where((pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0.0, -1.0, 1.0)
-    first = -1.0 if pose.size and pose[0, 6] < 0.0 else 1.0
-    pose[:, 3:] *= first * np.concatenate([[1.0], np.cumprod(turn)])[:, None][: len(pose)]
-    return pose
 
 
 def _brackets(time: Float[np.ndarray, " rows"], grid: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ import xarray as xr
 from rfdropo_bayes.data.asl_csv import read_asl_start
 from rfdropo_bayes.data.first_command import MEASURED, UNTOLD, angle_at_first, begun_from
 from rfdropo_bayes.data.mapped_formats import FOLDERS, observed_table, recognised_format
-from rfdropo_bayes.data.plain_csv import FORMAT as CSV
+from rfdropo_bayes.data.named_columns import FORMAT as CSV
 from rfdropo_bayes.data.plain_csv import holds_commands_alone, read_csv_start
 from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, load_recordings
 from rfdropo_bayes.data.trajectory import Trajectory

@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Bool, Float, Shaped
 
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.deployment.bus import FrameLog
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
@@ -215,22 +215,28 @@ def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> T
     radius = np.array([motor.drum_radius_m for motor in robot.motors])
     before = np.concatenate([before, rows["command"][: first[0]]])[-1]
     trajectory = Trajectory.build(
-        name=Path(folder).name,
-        robot=robot.name,
-        format=FORMAT,
-        time=rows["time"],
-        position=position,
-        position_mask=seen,
-        command_time=rows["time"][first],
-        command=rows["command"][first],
-        initial_command=before,
-        command_unit=robot.command_unit,
-        marker_names=robot.marker_names,
-        cable_names=robot.channel_names,
-        tension=np.where(rows["fresh"], rows["tension"], np.nan),
-        motor_angle=rows["length"] / radius,
-        provenance=f"session of {time.strftime('%Y-%m-%d %H:%M:%S', time.gmtime(header['wall_time']))} UTC",
-        settings=header["facts"] | ({} if seen.any() else {"unseen": True}),
+        Origin(
+            name=Path(folder).name,
+            robot=robot.name,
+            format=FORMAT,
+            provenance=f"session of {time.strftime('%Y-%m-%d %H:%M:%S', time.gmtime(header['wall_time']))} UTC",
+            settings=header["facts"] | ({} if seen.any() else {"unseen": True}),
+        ),
+        SentCommands(
+            command_time=rows["time"][first],
+            command=rows["command"][first],
+            command_unit=robot.command_unit,
+            cable_names=robot.channel_names,
+            initial_command=before,
+        ),
+        Measured(
+            time=rows["time"],
+            position=position,
+            marker_names=robot.marker_names,
+            position_mask=seen,
+            tension=np.where(rows["fresh"], rows["tension"], np.nan),
+            motor_angle=rows["length"] / radius,
+        ),
     )
     cycle, command = ("time", "cable"), ("command_time", "cable")
     beside = {

@@ -34,7 +34,7 @@ from rfdropo_bayes.deployment.sensors import MarkerSensor, MarkerView, Simulated
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, load_deployment
 from rfdropo_bayes.deployment.vendors import LEFT_OUT
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import Motor, Robot, load_robot
+from rfdropo_bayes.robots import Motor, Robot
 
 
 class Mode(StrEnum):
@@ -82,13 +82,12 @@ def deploy(
     out: Path,
     *,
     simulated: bool = False,
-    recording: Path | None = None,
+    commands: CommandSource | Path | str | None = None,
     hooks: tuple[Hook, ...] = (),
     show: bool = False,
     keyboard: bool = False,
     bus: can.BusABC | None = None,
     sensor: MarkerSensor | None = None,
-    source: CommandSource | None = None,
 ) -> Outcome:
     """Run one session.
 
@@ -97,11 +96,12 @@ def deploy(
         mode: see `Mode`.
         out: folder for log, frames, recording and summary.
         simulated: use simulated drives whatever the mode; a dry run always does.
-        recording: of `Mode.REPLAY`: a session's folder, or a trajectory of ours.
+        commands: what `Mode.REPLAY` sends, a session's folder or a trajectory of ours; or a source of commands in the
+            place of the policy.
         hooks: each returns True while its emergency button is pressed.
         show: live view in the terminal.
         keyboard: keys of the terminal stop the drives.
-        bus, sensor, source: instead of those that the settings describe.
+        bus, sensor: instead of those that the settings describe.
 
     Raises:
         InputError: if anything does not fit: a drive's identity, data sheet or mapping, units, rates, the policy's card
@@ -109,7 +109,7 @@ def deploy(
     """
     settings = load_deployment(Path(settings)) if isinstance(settings, Path | str) else settings
     mode = Mode(mode)
-    robot = load_robot(settings.robot)
+    robot = Robot.load(settings.robot)
     if not robot.motors:
         raise InputError("has no motors", where=f"robot {robot.name}", remedy="add [[motors]], one per channel")
     with contextlib.ExitStack() as stack:
@@ -118,7 +118,7 @@ def deploy(
         session = _Session(settings, mode, robot, Path(out), simulated or mode is Mode.DRY_RUN, stack)
         try:
             session.open(bus, sensor)
-            session.prepare(source, recording)
+            session.prepare(commands)
             return session.run(hooks, show, keyboard)
         except (InputError, can.CanError) as error:
             session.log.event("refused", str(error))
@@ -217,14 +217,14 @@ class _Session:
         with contextlib.suppress(can.CanError, OSError):
             self.network.disconnect()
 
-    def prepare(self, source: CommandSource | None, recording: Path | None) -> None:
+    def prepare(self, commands: CommandSource | Path | str | None) -> None:
         """Find the source of commands, and configure the drives unless they are only checked."""
-        if source is not None:
-            self.source = source
+        if commands is not None and not isinstance(commands, Path | str):
+            self.source = commands
         elif self.mode is Mode.REPLAY:
-            if recording is None:
+            if commands is None:
                 raise InputError("names no recording", where="replay", remedy="give one with --recording")
-            path = Path(recording)
+            path = Path(commands)
             trajectory = session_trajectory(path, (Phase.RUNNING,)) if path.is_dir() else Trajectory.load(path)
             self.source = RecordedCommands(trajectory, self.robot, _rate_of(trajectory, self.settings.rate_hz))
         if self.source is None and self.mode not in (Mode.CHECK, Mode.HOME):

@@ -102,7 +102,6 @@ def simulate(
     displacement: Float[Array, "rows substeps cables"],
     time_step: Scalar,
     points: PointMap,
-    external_force: Float[Array, "nodes 3"] | float = 0.0,
     scene: PushGeometry | None = None,
     cube: Cube | None = None,
     horizon: Int[Array, ""] | int | None = None,
@@ -110,12 +109,12 @@ def simulate(
 ) -> Rollout:
     """Rollout from ``state`` through the commanded cable displacements [m] of every step, recorded after every row.
 
-    ``time_step`` [s] is that of one substep; ``external_force`` [N] is constant. With a ``scene`` and a ``cube`` the
-    body pushes it; ``state.cube`` is where it starts. ``horizon`` as for `roll`. Where a step has several stages,
-    ``state.commanded`` are the displacements before the first step, zero where that is None.
+    ``time_step`` [s] is that of one substep. With a ``scene`` and a ``cube`` the body pushes it; ``state.cube``
+    is where it starts. ``horizon`` as for `roll`. Where a step has several stages, ``state.commanded`` are the
+    displacements before the first step, zero where that is None.
     """
 
     def take(before: State, commanded: Float[Array, " cables"]) -> tuple[State, StepInfo]:
-        return step(system, prepared, before, commanded, time_step, external_force, scene, cube, integrator)
+        return step(system, prepared, before, commanded, time_step, scene=scene, cube=cube, integrator=integrator)
 
     return roll(take, remembering(system, prepared, state, scene, integrator), displacement, points, horizon)

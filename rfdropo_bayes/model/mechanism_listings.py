@@ -8,7 +8,7 @@ from typing import Any
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.mechanisms.registry import REGISTRY
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import BODIES, ENGINES, Mechanism, bodies_of, engines_of
 
 Row = dict[str, str]
@@ -18,7 +18,7 @@ EXAMPLE_ROBOT = "smooth_arm"
 
 def mechanism_rows() -> list[Row]:
     """The mechanisms of the library, in the order of the physics."""
-    robot = load_robot(EXAMPLE_ROBOT)
+    robot = Robot.load(EXAMPLE_ROBOT)
     return [
         {"mechanism": m.name, "stage": m.stage, "runs on": where_it_runs(m), "cause": m.cause}
         for m in mechanisms_named(REGISTRY, robot)
@@ -31,7 +31,7 @@ def mechanism_facts(name: str, robot: str = EXAMPLE_ROBOT) -> tuple[Row, list[Ro
     Raises:
         InputError: no such mechanism, or no such robot.
     """
-    made_for = load_robot(robot)
+    made_for = Robot.load(robot)
     (mechanism,) = mechanisms_named([name], made_for, where="mechanisms")
     facts = {
         "mechanism": mechanism.name,

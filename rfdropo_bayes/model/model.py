@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import pandas as pd
 
@@ -34,6 +34,18 @@ from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.tables import parse_table
 
 
+class ExperimentFile(NamedTuple):
+    """The file that a model was read from.
+
+    Attributes:
+        path: of the file.
+        tables: as they were read, with the overrides in place.
+    """
+
+    path: Path
+    tables: Mapping[str, Any]
+
+
 class Model:
     """Robot or black box, with mechanisms, priors and noise.
 
@@ -49,16 +61,20 @@ class Model:
         fixed: values of parameters that are not inferred.
         simulator: body, engine and discretisation: the keys of an experiment file's [simulator].
         folder: that paths are relative to.
+        title: heading of reports; the robot's name by default.
         more: further keys of an experiment file's [model], such as ``tension = True`` or ``per_recording``.
 
     Attributes:
         spec: what it means, as objects.
         settings: what its experiment says beside the model.
+        file: that it was read from, if any; a changed model has none.
 
     Raises:
         InputError: an unknown robot, key or mechanism, or a distribution that cannot be a prior. What is wrong with a
             prior's numbers is said when recordings are there.
     """
+
+    file: ExperimentFile | None = None
 
     def __init__(
         self,
@@ -70,6 +86,7 @@ class Model:
         fixed: Mapping[str, float] | None = None,
         simulator: Mapping[str, Any] | None = None,
         folder: Path | str = Path(),
+        title: str = "",
         **more: Any,
     ) -> None:
         fixed = dict(fixed or {})
@@ -86,7 +103,7 @@ class Model:
             tables["simulator"] = dict(simulator)
         experiment = parse_table(Experiment, tables, where="Model")
         self.spec = spec_of(experiment, Path(folder), made, mechanisms)
-        self.settings = RunSettings()
+        self.settings = RunSettings(title=title)
 
     @classmethod
     def of(cls, spec: ModelSpec, settings: RunSettings | None = None) -> Model:
@@ -101,10 +118,26 @@ class Model:
         return cls.of(spec_of(experiment, folder), RunSettings.of(experiment))
 
     @classmethod
-    def read(cls, path: Path, overrides: Sequence[str] = ()) -> tuple[Model, dict[str, Any]]:
-        """The model of an experiment file, and the file's tables with the overrides in place, for the record."""
-        experiment, tables = load_experiment(path, overrides)
-        return cls.of_experiment(experiment, Path(path).resolve().parent), tables
+    def read(cls, path: Path | str, overrides: Sequence[str] | None = None) -> Model:
+        """The model of an experiment file, with what the file says beside it: recordings, method, seed.
+
+        Args:
+            path: the file.
+            overrides: assignments that replace entries of the file, as with ``--set``.
+
+        Raises:
+            InputError: no such file, an unknown key, or a bad value.
+        """
+        path = Path(path)
+        experiment, tables = load_experiment(path, overrides or ())
+        model = cls.of_experiment(experiment, path.resolve().parent)
+        model.file = ExperimentFile(path, tables)
+        return model
+
+    @property
+    def title(self) -> str:
+        """Heading of reports: as the experiment says, or else its file's name, or else the robot's."""
+        return self.settings.title or (self.name if self.file is None else self.file.path.stem)
 
     def recordings(self, role: Literal["fit", "test"]) -> list[Trajectory]:
         """The recordings that its experiment file names."""
@@ -167,8 +200,28 @@ class Model:
         """The posterior given these recordings, as the inference methods see it."""
         return build_problem(self.numpyro(runs), earlier)
 
+    def runs(
+        self, fit: Sequence[Trajectory] | None, test: Sequence[Trajectory] | None = None
+    ) -> tuple[Sequence[Trajectory], Sequence[Trajectory]]:
+        """Recordings to fit and to test that a call gives, or else those that the experiment file names."""
+        if fit is None:
+            return self.recordings("fit"), self.recordings("test") if test is None else test
+        return fit, test or ()
+
+    def record(self, meant: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+        """Tables for the record of a run, as an experiment file has them.
+
+        Args:
+            meant: keys that a file would need to mean the run; what the model was read from says them already.
+            given: those that a call gave in their place; None where it did not.
+        """
+        stated = {name: value for name, value in given.items() if value is not None}
+        return {**self.tables(), **(meant if self.file is None else {}), **stated}
+
     def tables(self) -> dict[str, Any]:
-        """The tables of an experiment file that says the same, as far as a file can."""
+        """The tables of the file it was read from, or of one that says the same, as far as a file can."""
+        if self.file is not None:
+            return dict(self.file.tables)
         robot = ROBOT_COPY if self.texts() else self.spec.named or self.name
         return {"robot": robot, **self.settings.tables(), **self.spec.tables()}
 

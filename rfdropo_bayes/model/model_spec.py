@@ -30,7 +30,7 @@ from rfdropo_bayes.model.experiment import (
     SimulatorTable,
 )
 from rfdropo_bayes.policies.training_config import TrainingTable
-from rfdropo_bayes.robots import DriveTravel, Robot, load_robot
+from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.tables import nearest
 
@@ -223,4 +223,4 @@ def find_robot(name: str, folder: Path) -> Robot:
         InputError: no such robot.
     """
     beside = folder / name
-    return load_robot(beside if beside.suffix == ".toml" and beside.is_file() else name)
+    return Robot.load(beside if beside.suffix == ".toml" and beside.is_file() else name)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rfdropo_bayes.data.formats import FORMATS
-from rfdropo_bayes.robots import Robot, find_robot_file, known_robots, load_robot
+from rfdropo_bayes.robots import Robot, find_robot_file, known_robots
 
 Row = dict[str, str]
 
@@ -12,7 +12,7 @@ def robot_rows() -> list[Row]:
     """The robots that come with the package."""
     rows = []
     for name in known_robots():
-        robot = load_robot(name)
+        robot = Robot.load(name)
         rows.append(
             {
                 "robot": name,
@@ -27,7 +27,7 @@ def robot_rows() -> list[Row]:
 
 def named_robot_facts(name: str) -> Row:
     """What one robot is, and where its file is: of the package, or a path."""
-    return {"file": str(find_robot_file(name)), **robot_facts(load_robot(name))}
+    return {"file": str(find_robot_file(name)), **robot_facts(Robot.load(name))}
 
 
 def robot_facts(robot: Robot) -> Row:

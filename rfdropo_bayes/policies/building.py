@@ -11,7 +11,7 @@ from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.policies.episodes import Episodes, Settings
 from rfdropo_bayes.policies.randomisation import Point, Randomisation
 from rfdropo_bayes.policies.tasks import task_named
-from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.engine import Backend, Engine, Integrator
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
@@ -22,7 +22,7 @@ def trunk_simulator(
     *,
     push: bool = False,
     mechanisms: Sequence[str] = (),
-    precision: Literal["float32", "float64"] = "float32",
+    precision: Literal["float32", "float64"] = "float64",
     threads: int | None = None,
     time_step: float | None = None,
     integrator: Integrator = "euler",
@@ -33,7 +33,8 @@ def trunk_simulator(
     Args:
         push: put the robot's cube and plate before it.
         mechanisms: extensions by name, or of a file relative to ``folder``.
-        precision: of the body's motion; single precision is twice as fast and moves the tip by 0.01 mm.
+        precision: of the body's motion, as in an experiment file; single precision is up to twice as fast and moves the
+            tip by 0.01 mm.
         threads: that the engine may use; all processors by default.
         time_step: [s]; the robot's own by default.
         integrator: how a time step is taken.
@@ -57,7 +58,7 @@ def make_episodes(
     mechanisms: Sequence[str] = (),
     parameters: Mapping[str, float] | None = None,
     randomisation: Randomisation | None = None,
-    precision: Literal["float32", "float64"] = "float32",
+    precision: Literal["float32", "float64"] = "float64",
     threads: int | None = None,
     **settings: Any,
 ) -> Episodes:
@@ -78,7 +79,7 @@ def make_episodes(
     """
     chosen = task_named(task)
     if simulator is None:
-        described = robot if isinstance(robot, Robot) else load_robot(robot or chosen.robot)
+        described = robot if isinstance(robot, Robot) else Robot.load(robot or chosen.robot)
         simulator = trunk_simulator(
             described, push=chosen.push, mechanisms=mechanisms, precision=precision, threads=threads
         )

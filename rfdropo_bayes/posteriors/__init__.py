@@ -9,7 +9,8 @@ from rfdropo_bayes.posteriors.inference_data import (
     summarise,
     to_inference_data,
 )
-from rfdropo_bayes.posteriors.record import SPREAD, InferenceData, ParameterInfo, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors.parameter_info import SPREAD, ParameterInfo
+from rfdropo_bayes.posteriors.record import InferenceData, PosteriorRecord, RecordingPrediction
 
 __all__ = [
     "SPREAD",

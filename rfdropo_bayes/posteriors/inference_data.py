@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole
+from rfdropo_bayes.posteriors.parameter_info import ParameterInfo
 
 with warnings.catch_warnings():  # 0.23 announces its successor on import; pyproject.toml keeps us on the old one
     warnings.simplefilter("ignore", FutureWarning)
@@ -33,10 +34,7 @@ def to_inference_data(
     observed_data: xr.Dataset | None = None,
     sample_stats: xr.Dataset | None = None,
     log_likelihood: Float[np.ndarray, "chain draw row"] | None = None,
-    units: Mapping[str, str] | None = None,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    priors: Mapping[str, Mapping[str, Any]] | None = None,
-    descriptions: Mapping[str, str] | None = None,
+    parameters: Sequence[ParameterInfo] = (),
     attrs: Mapping[str, Any] | None = None,
 ) -> arviz.InferenceData:
     """Put draws and what belongs to them into ArviZ's layout.
@@ -46,7 +44,7 @@ def to_inference_data(
         prior: prior draws of each parameter.
         posterior_predictive, prior_predictive, observed_data, sample_stats: groups as they shall be stored.
         log_likelihood: of every data row at every draw.
-        units, bounds, priors, descriptions: kept as attributes of the variable; a prior is its table.
+        parameters: what is known of them, kept as attributes of the variables.
         attrs: attributes of the whole, numbers, strings or JSON-able objects (data hash, seed, versions, ...).
 
     Raises:
@@ -59,17 +57,19 @@ def to_inference_data(
         if not np.isfinite(values).all():
             raise InputError(f"draws of {name} are not finite", where="posterior", remedy="report this as an error")
 
+    known = {info.name: info for info in parameters}
+
     def described(values: Mapping[str, np.ndarray]) -> xr.Dataset:
         dataset = _draws_dataset(values)
         for name in values:
-            low, high = (bounds or {}).get(name, (-np.inf, np.inf))
+            info = known.get(name, ParameterInfo(name, ""))
             dataset[variable_key(name)].attrs = {
                 "name": name,
-                "unit": (units or {}).get(name, ""),
-                "low": float(low),
-                "high": float(high),
-                "prior": json.dumps(dict((priors or {}).get(name, {}))),
-                "description": (descriptions or {}).get(name, ""),
+                "unit": info.unit,
+                "low": float(info.low),
+                "high": float(info.high),
+                "prior": json.dumps(dict(info.prior)),
+                "description": info.description,
             }
         return dataset
 

@@ -22,46 +22,9 @@ from rfdropo_bayes.posteriors.inference_data import (
     to_inference_data,
     variable_key,
 )
+from rfdropo_bayes.posteriors.parameter_info import ParameterInfo
 
 AXES = ("x", "y", "z")
-
-SPREAD = "_spread"  # ends the name of a standard deviation between groups
-
-
-@dataclass(frozen=True)
-class ParameterInfo:
-    """What is known of a parameter beside its draws.
-
-    Attributes:
-        name: as in the experiment file; ``name@recording`` for one that belongs to a recording.
-        unit: SI unit, "-" if it has none.
-        low, high: hard bounds, infinite where there is none.
-        prior: table of its prior, ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``; empty if derived.
-        description: one line on its physical meaning.
-    """
-
-    name: str
-    unit: str
-    low: float = -np.inf
-    high: float = np.inf
-    prior: Mapping[str, Any] = field(default_factory=dict)
-    description: str = ""
-
-    @property
-    def logarithmic(self) -> bool:
-        """True where the prior is one of the logarithm."""
-        return str(self.prior.get("distribution", "")).startswith("Log")
-
-    @property
-    def ends(self) -> tuple[float, float]:
-        """Where its prior ends: on the hard bounds or between them; infinite where there is neither.
-
-        A spread between groups that is zero is no end of anything: the groups do not differ.
-        """
-        if self.name.endswith(SPREAD):
-            return -np.inf, min(self.high, self.prior.get("high", np.inf))
-        low = 0.0 if self.prior.get("distribution") == "HalfNormal" else self.prior.get("low", -np.inf)
-        return max(self.low, low), min(self.high, self.prior.get("high", np.inf))
 
 
 @dataclass(frozen=True)
@@ -173,7 +136,6 @@ class PosteriorRecord:
 
     def inference_data(self) -> InferenceData:
         """The same in ArviZ's layout."""
-        infos = {info.name: info for info in self.parameters}
         products = [
             {"name": p.name, "unit": p.unit, "powers": dict(p.powers), "description": p.description}
             for p in self.derived
@@ -186,10 +148,7 @@ class PosteriorRecord:
             observed_data=_observations(self.recordings),
             sample_stats=_stages(self.trace, self.block_scores),
             log_likelihood=self.log_likelihood,
-            units={name: info.unit for name, info in infos.items()},
-            bounds={name: (info.low, info.high) for name, info in infos.items()},
-            priors={name: info.prior for name, info in infos.items()},
-            descriptions={name: info.description for name, info in infos.items()},
+            parameters=self.parameters,
             attrs={"attributes": dict(self.attrs), "derived": products, "names": list(self.posterior)},
         )
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json, write_text
 from rfdropo_bayes.model.experiment import Experiment
@@ -41,6 +42,7 @@ class Audit:
         base: folder that paths in the tables are relative to.
         folder: that it was written to, if any.
         shown: what its figures show; None where it was read from files.
+        answer: with its fits; None where it was read from files.
     """
 
     content: Mapping[str, Any]
@@ -50,6 +52,7 @@ class Audit:
     base: Path
     folder: Path | None = None
     shown: Shown | None = None
+    answer: Answer | None = None
 
     @property
     def verdict(self) -> str:

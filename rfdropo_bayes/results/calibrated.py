@@ -22,6 +22,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.report import render_page, write_run
 from rfdropo_bayes.report.posterior_figures import draw_before_and_after, draw_pairs, pair_figure, paired_names
+from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.report.trajectory_figures import AXES, draw_band
 from rfdropo_bayes.tables import nearest
 
@@ -53,6 +54,15 @@ class Calibration:
     config: str
     model: Model | None = None
     folder: Path | None = None
+
+    @classmethod
+    def of_posterior(cls, folder: Path, model: Model) -> Calibration:
+        """The posterior in a folder with the model that was fitted, and nothing else said of it.
+
+        Raises:
+            InputError: no posterior there, or a damaged one.
+        """
+        return cls(PosteriorRecord.load(folder / POSTERIOR), {"title": model.title}, "", model, folder)
 
     @cached_property
     def posterior(self) -> InferenceData:

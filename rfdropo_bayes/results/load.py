@@ -42,7 +42,7 @@ def load(folder: Path | str, model: Model | None = None) -> Calibration | Audit:
 
 def _model(config: Path) -> Model | None:
     try:
-        return Model.read(config)[0]
+        return Model.read(config)
     except InputError:  # of something that no file describes
         return None
 

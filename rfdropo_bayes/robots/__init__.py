@@ -2,7 +2,7 @@
 
 from rfdropo_bayes.robots.body import Body, PointMass
 from rfdropo_bayes.robots.cable import Cable, Channels
-from rfdropo_bayes.robots.catalogue import find_robot_file, known_robots, load_robot
+from rfdropo_bayes.robots.catalogue import find_robot_file, known_robots
 from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in
 from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.parameter import Parameter
@@ -30,7 +30,6 @@ __all__ = [
     "Tube",
     "find_robot_file",
     "known_robots",
-    "load_robot",
     "robot_shape",
     "section_profile",
     "travel_in",

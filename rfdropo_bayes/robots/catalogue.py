@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots.robot import Robot
 from rfdropo_bayes.robots.sections import body_tables
-from rfdropo_bayes.tables import parse_table
 
 PACKAGE = Path(__file__).resolve().parents[1]
 FOLDERS = (PACKAGE / "models" / "robots", PACKAGE.parent / "models" / "robots")
@@ -22,24 +20,16 @@ def known_robots() -> dict[str, Path]:
     return {path.stem: path for folder in reversed(FOLDERS) for path in sorted(folder.glob("*.toml"))}
 
 
-def load_robot(name_or_path: str | Path) -> Robot:
-    """Read and validate a robot description.
-
-    Its body is a section profile, or shapes that make one up (`sections`). A file with a key ``base`` describes a
-    variant of that robot: its tables replace the base's of the same name.
-
-    Args:
-        name_or_path: name of a robot that comes with the package, or path of a TOML file.
+def robot_tables(path: Path) -> dict[str, Any]:
+    """Tables of a robot file, with those of the robots it is based on, and its body as a section profile.
 
     Raises:
-        InputError: an unknown robot (the known ones are listed), an unreadable file, or a description that does not
-            hold together.
+        InputError: an unreadable file, an unknown base, or shapes that make no body.
     """
-    path = find_robot_file(name_or_path)
     tables = _read(path)
     if isinstance(tables.get("body"), dict):
         tables["body"] = body_tables(tables["body"], str(path))
-    return parse_table(Robot, tables, where=str(path))
+    return tables
 
 
 def _read(path: Path, derived: tuple[Path, ...] = ()) -> dict[str, Any]:

@@ -10,9 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots.robot import Robot
 from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, body_tables, section_profile
-from rfdropo_bayes.tables import parse_table
 
 SILICONE = 1070.0
 """Density [kg/m3] where no mass is given: that of most silicone rubbers."""
@@ -129,15 +127,10 @@ def robot_text(outline: RobotOutline) -> str:
     )
 
 
-def outlined_robot(**answers: Any) -> Robot:
-    """The robot that a `RobotOutline` with these answers describes.
-
-    Raises:
-        InputError: answers that make no robot.
-    """
-    tables = tomllib.loads(robot_text(RobotOutline(**answers)))
-    tables["body"] = body_tables(tables["body"], "outline")
-    return parse_table(Robot, tables, where="outline")
+def outlined_tables(outline: RobotOutline) -> dict[str, Any]:
+    """The tables of a robot file that these answers make, its body as a section profile."""
+    tables = tomllib.loads(robot_text(outline))
+    return tables | {"body": body_tables(tables["body"], "outline")}
 
 
 def _head(o: RobotOutline) -> list[str]:

@@ -14,11 +14,13 @@ from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.groups import Patterns, group_of, whole
 from rfdropo_bayes.robots.body import Body
 from rfdropo_bayes.robots.cable import Cable, Channels
+from rfdropo_bayes.robots.catalogue import find_robot_file, robot_tables
 from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in, unstated_travel
 from rfdropo_bayes.robots.motor import Motor
+from rfdropo_bayes.robots.outline import RobotOutline, outlined_tables
 from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.table import Name, Positive, RobotTable, Vector
-from rfdropo_bayes.tables import changed, nearest
+from rfdropo_bayes.tables import changed, nearest, parse_table
 
 REQUIRED = (
     "young_modulus",
@@ -151,17 +153,29 @@ class Robot(RobotTable):
 
     @classmethod
     def load(cls, name_or_path: str | Path) -> Robot:
-        """A robot that comes with the package, by name, or one from a file; see `load_robot`."""
-        from rfdropo_bayes.robots.catalogue import load_robot
+        """Read and validate a robot description.
 
-        return load_robot(name_or_path)
+        Its body is a section profile, or shapes that make one up (`sections`). A file with a key ``base`` describes a
+        variant of that robot: its tables replace the base's of the same name.
+
+        Args:
+            name_or_path: name of a robot that comes with the package, or path of a TOML file.
+
+        Raises:
+            InputError: an unknown robot (the known ones are listed), an unreadable file, or a description that does not
+                hold together.
+        """
+        path = find_robot_file(name_or_path)
+        return parse_table(cls, robot_tables(path), where=str(path))
 
     @classmethod
     def outline(cls, **answers: Any) -> Robot:
-        """A robot from a few answers, such as its length, radius, cables and markers; see `RobotOutline`."""
-        from rfdropo_bayes.robots.outline import outlined_robot
+        """A robot from a few answers, such as its length, radius, cables and markers; see `RobotOutline`.
 
-        return outlined_robot(**answers)
+        Raises:
+            InputError: answers that make no robot.
+        """
+        return parse_table(cls, outlined_tables(RobotOutline(**answers)), where="outline")
 
     def without_command_timing(self) -> Robot:
         """The same robot, carrying every command out at once: no ramp, no dead time."""

@@ -24,9 +24,10 @@ from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.interrupts import running
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import CommandsTable
+from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.studies.fits import Job, run_fits
 from rfdropo_bayes.studies.hidden_effects import Hidden, Setting, hide
-from rfdropo_bayes.verbs.audit import JOURNAL, Workshop, run_audit
+from rfdropo_bayes.verbs.audit import JOURNAL, Workshop, audit
 
 RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
 NEAR = 1.3  # times the error of the model that knows what is hidden
@@ -187,21 +188,21 @@ def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path)
     number = int(np.random.SeedSequence([job["seed"], index, CONDITIONS.index(condition)]).generate_state(1)[0])
     turn = _turn(library, condition.effects, [job["seed"], CONDITIONS.index(condition)], index)
     hidden, names, unreached = _hidden(condition, turn, number, library, exclude, place, _WORKSHOP)
-    answers: list[Answer] = []
     given = [] if condition.repeats else [ONCE]
-    content = run_audit(
-        hidden.experiment, place / "audit", workshop=_WORKSHOP, overrides=given, inspect=answers.append, overwrite=True
-    )
-    prior = answers[0].problem.coordinates.prior_deviations
+    found = audit(Model.read(hidden.experiment, given), out=place / "audit", workshop=_WORKSHOP, overwrite=True)
+    content, answer = found.content, found.answer
+    assert answer is not None
+    prior = answer.problem.coordinates.prior_deviations
     judged = {
         **judge(content, names, hidden, prior),
-        "error_over_oracle": error_over_oracle(answers[0], names, hidden),
+        "error_over_oracle": error_over_oracle(answer, names, hidden),
     }
     if condition.removed:
         # What the base model does is the same in both.
         shutil.copytree(place / "audit" / JOURNAL, place / "removed" / JOURNAL, dirs_exist_ok=True)
         less = [_without(content, names, exclude)]
-        content = run_audit(hidden.experiment, place / "removed", workshop=_WORKSHOP, overrides=less, resume=True)
+        model = Model.read(hidden.experiment, less)
+        content = audit(model, out=place / "removed", workshop=_WORKSHOP, resume=True).content
         judged = {**judge(content, names, hidden, prior), "error_over_oracle": None, WHOLE: judged}
     return {
         "hidden": names,

@@ -26,7 +26,7 @@ from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import AuditTable, CommandsTable, Experiment, SimulatorTable
@@ -191,18 +191,19 @@ def _blank_recordings(setting: Setting, rng: np.random.Generator) -> list[Trajec
     time = table.sample_time * np.arange(round(table.duration / table.sample_time) + 1)
     return [
         Trajectory.build(
-            name=name,
-            robot=robot.name,
-            format="netcdf",
-            time=time,
-            position=np.tile(robot.marker_points(), (len(time), 1, 1)),
-            command_time=sequences[k][0],
-            command=sequences[k][1],
-            command_unit=robot.command_unit,
-            marker_names=robot.marker_names,
-            cable_names=robot.channel_names,
-            tension=np.ones((len(time), len(robot.channel_names))) if setting.tension else None,
-            synthetic=True,
+            Origin(name=name, robot=robot.name, format="netcdf", synthetic=True),
+            SentCommands(
+                command_time=sequences[k][0],
+                command=sequences[k][1],
+                command_unit=robot.command_unit,
+                cable_names=robot.channel_names,
+            ),
+            Measured(
+                time=time,
+                position=np.tile(robot.marker_points(), (len(time), 1, 1)),
+                marker_names=robot.marker_names,
+                tension=np.ones((len(time), len(robot.channel_names))) if setting.tension else None,
+            ),
         )
         for name, k in zip(names, order, strict=True)
     ]

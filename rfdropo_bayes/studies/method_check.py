@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +25,11 @@ MOST_FAILURES = 100
 
 
 def run_check(
-    path: Path,
+    model: Model,
     out: Path,
     check: str,
     *,
     datasets: int = 200,
-    overrides: Sequence[str] = (),
     resume: bool = False,
     overwrite: bool = False,
 ) -> dict[str, Any]:
@@ -47,12 +45,11 @@ def run_check(
     """
     if check not in CHECKS:
         raise InputError(f"unknown check {check!r}", where="--check", remedy=f"one of {', '.join(CHECKS)}")
-    model, tables = Model.read(path, overrides)
     chosen, fitted = model.settings, model.recordings("fit")
     problem = model.problem(fitted)
     options = inference_options(chosen.inference)
     make_config(chosen.inference.method, options)
-    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(fitted)}
+    settings: dict[str, Any] = {"tables": model.tables(), "folder": model.folder, "data": hashes(fitted)}
     settings["options"] = {"check": check}
     with run_folder(out, "check", **settings, resume=resume, overwrite=overwrite) as out:
         with Progress("sbc", show=None, log=out / LOG) as progress:

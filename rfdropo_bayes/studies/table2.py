@@ -28,13 +28,15 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.model.experiment_file import describe, read_tables, self_contained
+from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, LOG, run_ended, run_folder
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.style import CYCLE, WIDTH, styled
 from rfdropo_bayes.results.audited import AUDIT, EXTENDED
-from rfdropo_bayes.verbs.audit import run_audit
-from rfdropo_bayes.verbs.calibrate import run_calibration
-from rfdropo_bayes.verbs.train import CSV, POLICY, run_evaluation, run_training
+from rfdropo_bayes.verbs.audit import audit
+from rfdropo_bayes.verbs.calibrate import calibrate
+from rfdropo_bayes.verbs.evaluate import CSV, evaluate
+from rfdropo_bayes.verbs.train import POLICY, train
 
 THRESHOLDS = (0.01525, 0.02157, 0.030)  # m, those of the paper's Table II
 PAPER = {"15.25": 0.32, "21.57": 0.56, "30": 0.60}  # RF-DROPO, TrunkPush on hardware
@@ -232,7 +234,7 @@ def _do(study: Study, task: str, row: str, seed: int) -> None:
     out = _place(study, task, "evaluations", row, seed)
     tables = _on_target(study, _tables(study, task))
     path = _written(tables, study.out / task / "experiments" / "target.toml")
-    run_evaluation(path, [policy], out, episodes=study.size.episodes, film=False, overwrite=True)
+    evaluate(Model.read(path), [policy], out, episodes=study.size.episodes, film=False, overwrite=True)
     made = {"sha256": _digest(policy / POLICY), **_learning(policy), **_judged_on(study, row)}
     write_json(out / "policy.json", made)
 
@@ -257,7 +259,7 @@ def _trained(study: Study, task: str, row: str, seed: int) -> Path:
     path = _written(tables, study.out / task / "experiments" / f"{_slug(row)}_{seed}.toml")
     out, asked = _place(study, task, "policies", row, seed), path.read_text(encoding="utf-8")
     if not _ran(out, asked):
-        run_training(path, out, resume=(out / CHECKPOINTS).exists())
+        train(Model.read(path), out, resume=(out / CHECKPOINTS).exists())
         write_text(out / ASKED, asked)
     return out
 
@@ -278,7 +280,7 @@ def _fitted(study: Study, task: str, row: str, seed: int | None) -> tuple[Path, 
     path = _written(tables, study.out / task / "experiments" / f"fit_{out.name}.toml")
     asked = path.read_text(encoding="utf-8")
     if not _ran(out, asked):
-        run_calibration(path, out, resume=(out / CHECKPOINTS).exists())
+        calibrate(Model.read(path), out=out, resume=(out / CHECKPOINTS).exists())
         write_text(out / ASKED, asked)
     return out, tables
 
@@ -288,7 +290,7 @@ def _with_causes(study: Study, tables: dict[str, Any]) -> dict[str, Any]:
     out, minutes = study.out / "audit", f"audit.minutes={study.size.minutes}"
     asked = f"# {minutes}\n{study.audit.read_text(encoding='utf-8')}"
     if not _ran(out, asked):
-        run_audit(study.audit, out, overrides=[minutes], resume=(out / CHECKPOINTS).exists())
+        audit(Model.read(study.audit, [minutes]), out=out, resume=(out / CHECKPOINTS).exists())
         write_text(out / ASKED, asked)
     found = json.loads((out / AUDIT).read_text(encoding="utf-8"))
     if found["verdict"] == NO_VERDICT:

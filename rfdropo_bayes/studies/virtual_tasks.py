@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.model.assembly import build_model, build_problem, build_robot_simulator
 from rfdropo_bayes.model.experiment import CommandsTable, SimulatorTable
 from rfdropo_bayes.model.model_spec import DataChannels, ModelSpec
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.verbs.random_commands import random_walk
 
@@ -121,7 +121,7 @@ def _spec(task: InferenceTask, tension: bool) -> ModelSpec:
     }
     sizes = {name: {"distribution": "LogNormal", "median": size, "sigma": 0.5} for name, size in noise.items()}
     return ModelSpec(
-        load_robot(task.robot),
+        Robot.load(task.robot),
         named=task.robot,
         simulator=SimulatorTable(push=bool(task.cube)),
         noise="ar1",
@@ -144,7 +144,7 @@ def _commands(task: str, actions: int, held_out: bool, seed: int) -> Commands:
         sample_time=SAMPLE_TIME,
         recordings=["data"],
     )
-    channels = len(load_robot(chosen.robot).channels.names)
+    channels = len(Robot.load(chosen.robot).channels.names)
     walks = [random_walk(table, channels, rng) for _ in range(WALKS if chosen.cube else 1)]
     if len(walks) == 1:
         return walks[0]
@@ -173,17 +173,18 @@ def _blank(
         start = [next(s.nominal for s in simulator.parameters if s.name == f"cube_{axis}") for axis in "xyz"]
         pose = np.tile([*start, 0.0, 0.0, 0.0, 1.0], (len(time), 1))
     return Trajectory.build(
-        name=name,
-        robot=simulator.robot.name,
-        format="netcdf",
-        time=time,
-        position=np.tile(simulator.robot.marker_points(), (len(time), 1, 1)),
-        command_time=command_time,
-        command=command,
-        command_unit=simulator.robot.command_unit,
-        marker_names=simulator.marker_names,
-        cable_names=simulator.channel_names,
-        tension=np.ones((len(time), len(simulator.channel_names))) if tension else None,
-        object_pose=pose,
-        synthetic=True,
+        Origin(name=name, robot=simulator.robot.name, format="netcdf", synthetic=True),
+        SentCommands(
+            command_time=command_time,
+            command=command,
+            command_unit=simulator.robot.command_unit,
+            cable_names=simulator.channel_names,
+        ),
+        Measured(
+            time=time,
+            position=np.tile(simulator.robot.marker_points(), (len(time), 1, 1)),
+            marker_names=simulator.marker_names,
+            tension=np.ones((len(time), len(simulator.channel_names))) if tension else None,
+            object_pose=pose,
+        ),
     )

@@ -69,7 +69,6 @@ def adapt(
     draws: int = DRAWS,
     seed: int = 0,
     out: Path | str | None = None,
-    entry: RecordingEntry | None = None,
     overwrite: bool = False,
     show: bool | None = None,
 ) -> Calibration:
@@ -90,7 +89,6 @@ def adapt(
         draws: of the posterior.
         seed: of all that is random.
         out: folder that gets what a calibration writes; None writes nothing.
-        entry: the recording's files, for the record.
         overwrite: start anew whatever ``out`` holds.
         show: whether to show progress, see `Progress`.
 
@@ -101,7 +99,7 @@ def adapt(
     head, rest = _parted(recording, seconds)
     day = group_of(recording.name, model.spec.groups) if group is None else group
     left = model_error_of(fit.record)
-    moved = _adapted(model, left, recording, group, entry)
+    moved = _adapted(model, left, recording, group)
     space = day_space(fitted_parts(fit)[1], moved, [head.name], day, fit.record.attrs[FITTED])
     own = _own_of_day(fit.record, space, recording.name, day)
     settings: dict[str, Any] = {"tables": moved.tables(), "folder": model.folder, "texts": moved.texts()}
@@ -208,14 +206,13 @@ def _own_of_day(fit: PosteriorRecord, space: ParameterSpace, recording: str, day
 
 def run_adaptation(
     run: Path,
+    model: Model,
     recording: str,
     out: Path,
     *,
     commands: str | None = None,
     seconds: float | None = None,
     group: str | None = None,
-    experiment: Path | None = None,
-    overrides: Sequence[str] = (),
     seed: int | None = None,
     overwrite: bool = False,
     show: bool | None = None,
@@ -224,30 +221,38 @@ def run_adaptation(
 
     Args:
         run: folder of a calibration, or of an earlier adaptation.
+        model: that was fitted, with the [data] of its experiment, see `fitted_model`.
         recording: file of observations; ``commands``: that of the commands, where the format has one of its own.
         out, seconds, group, seed, overwrite, show: see `adapt`.
-        experiment: the experiment file, where the folder holds a posterior alone.
-        overrides: assignments that replace entries of the experiment file.
 
     Raises:
         InputError: bad input.
     """
-    path = run / CONFIG if experiment is None else experiment
-    if not path.is_file():
-        raise InputError(f"{run} holds no {CONFIG}", where="RUN", remedy="name the experiment file with --experiment")
-    model, _ = Model.read(path, overrides)
     read = model.settings
     if read.data is None:
-        raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format recordings are")
+        where = model.name if model.file is None else str(model.file.path)
+        raise InputError("the experiment has no [data]", where=where, remedy="say in which format recordings are")
     entry = RecordingEntry(observations=recording, commands=commands)
     found = load_recordings(_alone(read.data, entry), model.folder)
     if len(found) > 1:
         raise InputError(f"names {len(found)} files", where=recording, remedy="adapt to one at a time")
-    record = PosteriorRecord.load(run / POSTERIOR)
-    fit = Calibration(record, {"title": read.title or path.stem}, "", model, run)
+    fit = Calibration.of_posterior(run, model)
+    fit = replace(fit, model=Model.of(model.spec, replace(read, data=_alone(read.data, entry))))
     chosen = read.seed if seed is None else seed
     options: dict[str, Any] = {"seconds": seconds, "group": group, "seed": chosen, "overwrite": overwrite, "show": show}
-    return adapt(fit, found[0], out=out, entry=entry, **options)
+    return adapt(fit, found[0], out=out, **options)
+
+
+def fitted_model(run: Path, experiment: Path | None = None, overrides: Sequence[str] | None = None) -> Model:
+    """The model of a run's folder, or of the experiment file where the folder holds a posterior alone.
+
+    Raises:
+        InputError: no file says which model.
+    """
+    path = run / CONFIG if experiment is None else experiment
+    if not path.is_file():
+        raise InputError(f"{run} holds no {CONFIG}", where="RUN", remedy="name the experiment file with --experiment")
+    return Model.read(path, overrides)
 
 
 def _parted(recording: Trajectory, seconds: float | None) -> tuple[Trajectory, Trajectory | None]:
@@ -288,18 +293,13 @@ def model_error_of(record: PosteriorRecord) -> ModelError:
     return found
 
 
-def _adapted(
-    model: Model, left: ModelError, recording: Trajectory, group: str | None, entry: RecordingEntry | None
-) -> Model:
+def _adapted(model: Model, left: ModelError, recording: Trajectory, group: str | None) -> Model:
     """The model of the adapted run: its noise is known, and its group and its recording are named."""
     groups = model.spec.groups if group is None else in_group(recording.name, group, model.spec.groups)
     noise = NoiseTable(
         standard_deviation=float(np.sqrt(np.mean(np.square(left.scale)))), correlation_time=left.correlation_time
     )
-    settings = model.settings
-    if entry is not None and settings.data is not None:
-        settings = replace(settings, data=_alone(settings.data, entry))
-    return Model.of(replace(model.spec, noise=STATED, stated=noise, groups=groups), settings)
+    return Model.of(replace(model.spec, noise=STATED, stated=noise, groups=groups), model.settings)
 
 
 def _alone(data: DataSpec, entry: RecordingEntry) -> DataSpec:

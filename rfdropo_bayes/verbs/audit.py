@@ -1,4 +1,4 @@
-"""What a simulator lacks, by name: ``audit``, and ``rfdropo audit`` for an experiment file."""
+"""What a simulator lacks, by name: ``audit``."""
 
 from __future__ import annotations
 
@@ -70,41 +70,36 @@ FINER = 2
 
 def audit(
     model: Model,
-    runs: Sequence[Trajectory],
+    runs: Sequence[Trajectory] | None = None,
     *,
-    test: Sequence[Trajectory] = (),
-    seed: int = 0,
+    test: Sequence[Trajectory] | None = None,
+    seed: int | None = None,
     base: Calibration | Path | None = None,
     noise: Mapping[str, float] | None = None,
     out: Path | str | None = None,
-    title: str = "",
     resume: bool = False,
     overwrite: bool = False,
     workshop: Workshop | None = None,
     report: Callable[[str], None] = lambda line: None,
-    inspect: Callable[[Answer], None] = lambda answer: None,
-    tables: Mapping[str, Any] | None = None,
     between: Between | None = None,
     **options: Any,
 ) -> Audit:
-    """Say what a model lacks, by name, and measure what it gains with that.
+    """Say what a model lacks, by name, and measure what it gains with that. What is not given is as the experiment file
+    of the model has it.
 
     Args:
         model: what is simulated and inferred.
         runs: recordings that are fitted and screened.
         test: unseen recordings, which measure the gain.
-        seed: of all that is random. The same seed gives the same answer.
+        seed: of all that is random, 0 where no file says. The same seed gives the same answer.
         base: an earlier calibration, or its folder, from whose posterior means the base model starts.
         noise: ``{"standard_deviation": m}`` of the positions, perhaps with a ``correlation_time`` [s]; it counts where
             nothing was repeated.
         out: folder that gets audit.json, extended.toml and report.html; None writes nothing.
-        title: heading of the report; the robot's name by default.
         resume: go on from what an interrupted audit has left in ``out``.
         overwrite: start anew whatever ``out`` holds.
         workshop: see `build_problem`.
         report: called with a line of words now and then.
-        inspect: called with the answer.
-        tables: of the experiment file that the model was read from, for the record.
         between: two groups of recordings to compare: which parameters or mechanisms differ, all else being shared.
             Two names of [model.groups], or ``{name: recordings}``, these as names, wildcards or `Trajectory` objects.
             What both lack is named, too.
@@ -115,26 +110,26 @@ def audit(
         InputError: bad input, before anything long has started.
     """
     model = _asked(model, noise, options)
-    spec, table, title = model.spec, model.settings.audit, title or model.name
+    runs, test = model.runs(runs, test)
+    chosen, spec, table = model.settings.seed if seed is None else seed, model.spec, model.settings.audit
     deadline = Deadline(table.minutes)
     groups = None
     if between is not None:
         groups, runs, test = find_groups(between, spec.groups, runs, test)
     start = start_values(base)
-    problem = build_problem(spec, table, runs, test, seed, start=start, workshop=workshop, groups=groups)
-    tables = {**model.tables(), "title": title, "seed": seed} if tables is None else tables
+    problem = build_problem(spec, table, runs, test, chosen, start=start, workshop=workshop, groups=groups)
+    tables = model.record({"title": model.title, "seed": chosen}, {})
 
     def found(out: Path | None) -> Audit:
         journal = None if out is None else Journal(out / JOURNAL, resume=resume)
         answer = ask(problem, report, journal, deadline)
-        inspect(answer)
         data = combined_hash([trajectory.sha256 for trajectory in [*runs, *test]])
-        return _audited(answer, model, tables, title, data, out)
+        return _audited(answer, model, tables, data, out)
 
     if out is None:
         return found(None)
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes([*runs, *test])}
-    given: dict[str, Any] = {"base": base.folder if isinstance(base, Calibration) else base, "seed": seed}
+    given: dict[str, Any] = {"base": base.folder if isinstance(base, Calibration) else base, "seed": chosen}
     given |= {} if groups is None else {"between": {name: list(own) for name, own in groups.members.items()}}
     settings |= {"options": given, "texts": model.texts()}
     with run_folder(Path(out), "audit", **settings, resume=resume, overwrite=overwrite) as place:
@@ -143,21 +138,21 @@ def audit(
     return answered
 
 
-def _audited(
-    answer: Answer, model: Model, tables: Mapping[str, Any], title: str, data_sha256: str, out: Path | None
-) -> Audit:
+def _audited(answer: Answer, model: Model, tables: Mapping[str, Any], data_sha256: str, out: Path | None) -> Audit:
     """What an audit found as an object, with its page."""
     versions, following = software_versions(), next_experiment(answer)
     content = record(answer, versions=versions, data_sha256=data_sha256, next_experiment=following)
     seen, shape = shown(answer), robot_shape(model.robot) if isinstance(model.robot, Robot) else None
-    page = render_audit(seen, content, title, describe(tables), shape)
+    page = render_audit(seen, content, model.title, describe(tables), shape)
     extended = extended_tables(dict(tables), answer, model.folder, out)
     made = None if model.spec.named else model.robot
-    return Audit(content, extended, page, made, out or model.folder, out, seen)
+    return Audit(content, extended, page, made, out or model.folder, out, seen, answer)
 
 
 def _asked(model: Model, noise: Mapping[str, float] | None, options: Mapping[str, Any]) -> Model:
     """The model with the tables [audit] and [noise] of a call."""
+    if not options and noise is None:
+        return model
     spec, settings = model.spec, model.settings
     if options:
         chosen = {**settings.audit.model_dump(exclude_unset=True), **options}
@@ -167,32 +162,6 @@ def _asked(model: Model, noise: Mapping[str, float] | None, options: Mapping[str
     if noise is not None:
         spec = replace(spec, stated=parse_table(NoiseTable, noise, where="audit, noise"))
     return Model.of(spec, settings)
-
-
-def run_audit(
-    path: Path, out: Path, *, overrides: Sequence[str] = (), seed: int | None = None, **options: Any
-) -> dict[str, Any]:
-    """`audit` what an experiment file says; return the content of audit.json.
-
-    Args:
-        path: the experiment file.
-        out: folder to write to.
-        overrides: assignments that replace entries of the file.
-        seed: of the audit; that of the file by default.
-        options: further arguments of `audit`.
-    """
-    model, tables = Model.read(path, overrides)
-    found = audit(
-        model,
-        model.recordings("fit"),
-        test=model.recordings("test"),
-        seed=model.settings.seed if seed is None else seed,
-        out=out,
-        title=model.settings.title or path.stem,
-        tables=tables,
-        **options,
-    )
-    return dict(found.content)
 
 
 def build_problem(

@@ -1,9 +1,9 @@
-"""Recordings and a model in, a posterior out: ``calibrate``, and ``rfdropo calibrate`` for an experiment file."""
+"""Recordings and a model in, a posterior out: ``calibrate``."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -58,50 +58,50 @@ CLIMBING = ("laplace", "bridge", "smc")  # smc where it starts at the optima
 
 def calibrate(
     model: Model,
-    runs: Sequence[Trajectory],
+    runs: Sequence[Trajectory] | None = None,
     method: Any = None,
     *,
-    test: Sequence[Trajectory] = (),
-    seed: int = 0,
+    test: Sequence[Trajectory] | None = None,
+    seed: int | None = None,
     out: Path | str | None = None,
     start: Calibration | Path | None = None,
-    title: str = "",
     resume: bool = False,
     overwrite: bool = False,
     show: bool | None = None,
-    tables: Mapping[str, Any] | None = None,
 ) -> Calibration:
-    """Fit a model to recordings.
+    """Fit a model to recordings. What is not given is as the experiment file of the model has it.
 
     Args:
         model: what is simulated, inferred and measured.
         runs: recordings that are fitted.
-        method: options of a method, such as ``SMC(rollouts=5000)``; SMC with 20000 rollouts by default.
+        method: options of a method, such as ``SMC(rollouts=5000)``; SMC with 20000 rollouts where no file says.
         test: recordings that no fit sees; the report says how well they are predicted.
-        seed: of all that is random. The same seed gives the same draws.
+        seed: of all that is random, 0 where no file says. The same seed gives the same draws.
         out: folder that gets posterior.nc, summary.json, report.html and checkpoints; None writes nothing.
         start: an earlier calibration of the same robot, or its folder, perhaps with fewer mechanisms or other
             recordings: climbs start from its optimum and draws. What is inferred, and from which data, does not change.
-        title: heading of the report; the robot's name by default.
         resume: go on from the checkpoint of an interrupted run of the same experiment in ``out``.
         overwrite: start anew whatever ``out`` holds.
         show: whether to show progress, see `Progress`.
-        tables: of the experiment file that the model was read from, for the record.
 
     Raises:
         InputError: bad input, before anything long has started.
     """
-    config = make_config("smc", {"rollouts": InferenceTable().rollouts}) if method is None else method
-    name = method_of(config)
+    runs, test = model.runs(runs, test)
+    table = model.settings.inference
+    config = make_config(table.method, inference_options(table)) if method is None else method
+    name, chosen = method_of(config), model.settings.seed if seed is None else seed
     problem = model.problem(runs, earlier_draws(start, name))
-    recordings, title = [*runs, *test], title or model.name
-    if tables is None:
-        options = {key: value for key, value in dataclasses.asdict(config).items() if value is not None}
-        tables = {**model.tables(), "title": title, "seed": seed, "inference": {"method": name, **options}}
-    fit = partial(_fit, Fitting(model, problem, config, runs, test, seed, title))
+    options = {key: value for key, value in dataclasses.asdict(config).items() if value is not None}
+    said = {"method": name, **options}
+    tables = model.record(
+        {"title": model.title, "seed": chosen, "inference": said},
+        {"seed": seed, "inference": None if method is None else said},
+    )
+    fit = partial(_fit, Fitting(model, problem, config, runs, test, chosen))
     if out is None:
         return fit(None, describe(tables), resume=False, show=show)
-    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(recordings)}
+    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes([*runs, *test])}
     settings |= {"options": {"from": start.folder if isinstance(start, Calibration) else start}, "texts": model.texts()}
     with run_folder(Path(out), "calibrate", **settings, resume=resume, overwrite=overwrite) as folder:
         found = fit(folder, (folder / CONFIG).read_text(encoding="utf-8"), resume=resume, show=show)
@@ -118,12 +118,11 @@ class Fitting(NamedTuple):
     runs: Sequence[Trajectory]
     test: Sequence[Trajectory]
     seed: int
-    title: str
 
 
 def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: bool | None) -> Calibration:
     """Run the method; ``text`` is the experiment as TOML, ``out`` the folder for log and checkpoints."""
-    model, problem, config, runs, test, seed, title = asked
+    model, problem, config, runs, test, seed = asked
     method = method_of(config)
     key, predicting = jax.random.split(jax.random.key(seed))
     log, kept = (None, None) if out is None else (out / LOG, out / CHECKPOINTS)
@@ -133,37 +132,8 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
     problem = problem.holding(result.held)
     attributes = {**_attributes(model.name, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
     record, unmatched = record_posterior(problem, result, test, predicting, attributes, model.spec.groups)
-    facts = gather_facts(title, seed, problem, result, runs, test, record, unmatched)
+    facts = gather_facts(model.title, seed, problem, result, runs, test, record, unmatched)
     return Calibration(record, build_summary(record, facts), text, model, out)
-
-
-def run_calibration(
-    path: Path,
-    out: Path,
-    *,
-    overrides: Sequence[str] = (),
-    resume: bool = False,
-    overwrite: bool = False,
-    start: Path | None = None,
-    show: bool | None = None,
-) -> Calibration:
-    """`calibrate` what an experiment file says; ``overrides`` are assignments that replace entries of the file."""
-    model, tables = Model.read(path, overrides)
-    settings = model.settings
-    return calibrate(
-        model,
-        model.recordings("fit"),
-        make_config(settings.inference.method, inference_options(settings.inference)),
-        test=model.recordings("test"),
-        seed=settings.seed,
-        out=out,
-        start=start,
-        title=settings.title or path.stem,
-        resume=resume,
-        overwrite=overwrite,
-        show=show,
-        tables=tables,
-    )
 
 
 def earlier_draws(start: Calibration | Path | None, method: str) -> Batch | None:

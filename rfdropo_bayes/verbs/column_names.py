@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from rfdropo_bayes.data import lerobot, motive_csv, plain_csv, rosbag
+from rfdropo_bayes.data import lerobot, motive_csv, named_columns, rosbag
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.mapped_formats import recognised_format
 from rfdropo_bayes.data.sample_times import pace
@@ -84,7 +84,7 @@ class Guess(NamedTuple):
     tensions: list[str]
     motor_angles: list[str]
     left: list[str]
-    format: str = plain_csv.FORMAT
+    format: str = named_columns.FORMAT
     command_time: str | None = None
     command_time_unit: str = "s"
 
@@ -115,7 +115,7 @@ def guess_columns(path: Path, sent: Path | None = None) -> Guess:
         source, clock = sending.numeric().head(LOOKED_AT), _clock_of(sending)
         commands = _commands([str(name) for name in source.columns if name != clock], any_name=True)
     else:
-        commands = _commands(free, any_name=format == plain_csv.FORMAT)
+        commands = _commands(free, any_name=format == named_columns.FORMAT)
     for what, found in (("positions (columns in x, y and z)", positions), ("commands", commands)):
         if not found:
             raise InputError(
@@ -132,7 +132,7 @@ def guess_columns(path: Path, sent: Path | None = None) -> Guess:
         _command_unit(source, commands),
         positions,
         unit or _written_unit(names_of(positions)) or _length_unit(table[names_of(positions)]),
-        _marker_names(list(triples), None if format == plain_csv.FORMAT else STRUCTURE),
+        _marker_names(list(triples), None if format == named_columns.FORMAT else STRUCTURE),
         tensions if len(tensions) == len(commands) else [],
         angles if len(angles) == len(commands) else [],
         [name for name in free if name not in commands],

@@ -1,4 +1,4 @@
-"""The next command sequence, and what it will decide: ``design``, and ``rfdropo design``."""
+"""The next command sequence, and what it will decide: ``design``."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -92,11 +93,13 @@ class Design:
 
 def design(
     model: Model,
-    runs: Sequence[Trajectory],
+    runs: Sequence[Trajectory] | None = None,
     *,
     base: Calibration | Path | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     minutes: float | None = None,
+    out: Path | str | None = None,
+    overwrite: bool = False,
     report: Callable[[str], None] = lambda line: None,
 ) -> Design:
     """Propose the commands that best separate the leading explanations of what a model lacks.
@@ -108,15 +111,44 @@ def design(
 
     Args:
         model: what is simulated and inferred.
-        runs: recordings.
+        runs: recordings; those of the model's experiment by default.
         base: an earlier calibration, or its folder, from whose posterior means the base model starts.
-        seed: of all that is random.
+        seed: of all that is random; that of the model's experiment by default.
         minutes: bound of the whole run; that of the model's experiment, 10 by default.
+        out: folder that gets design.json and next_commands.csv; None writes nothing.
+        overwrite: start anew whatever ``out`` holds.
         report: called with a line of words now and then.
 
     Raises:
         InputError: bad input, or a base model that was not fitted in the time.
     """
+    runs, chosen = model.runs(runs, ())[0], model.settings.seed if seed is None else seed
+    work = partial(_design, model, runs, base, chosen, minutes, report)
+    if out is None:
+        return work()
+    options = {"base": base.folder if isinstance(base, Calibration) else base, "seed": chosen}
+    settings: dict[str, Any] = {
+        "tables": model.tables(),
+        "folder": model.folder,
+        "data": hashes(runs),
+        "options": options,
+        "texts": model.texts(),
+    }
+    with run_folder(Path(out), "design", **settings, overwrite=overwrite) as folder:
+        found = work()
+        found.save(folder)
+    return found
+
+
+def _design(
+    model: Model,
+    runs: Sequence[Trajectory],
+    base: Calibration | Path | None,
+    seed: int,
+    minutes: float | None,
+    report: Callable[[str], None],
+) -> Design:
+    """See `design`."""
     settings = model.settings
     problem = build_problem(model.spec, settings.audit, runs, [], seed, start=start_values(base))
     clock = Clock(settings.design.minutes if minutes is None else minutes)
@@ -152,27 +184,6 @@ def design(
         "schema_version": 1,
     }
     return Design(content, command_table(settings.data, runs[0], times, value, float(runs[0].time[-1])))
-
-
-def run_design(
-    path: Path,
-    out: Path,
-    *,
-    overrides: Sequence[str] = (),
-    base: Path | None = None,
-    seed: int | None = None,
-    overwrite: bool = False,
-    report: Callable[[str], None] = lambda line: None,
-) -> dict[str, Any]:
-    """`design` what an experiment file says, and write design.json and next_commands.csv; return the former."""
-    model, tables = Model.read(path, overrides)
-    fitted = model.recordings("fit")
-    chosen = model.settings.seed if seed is None else seed
-    options = {"base": base, "seed": chosen}
-    settings = {"tables": tables, "folder": model.folder, "data": hashes(fitted), "options": options}
-    with run_folder(out, "design", **settings, overwrite=overwrite) as out:
-        found = design(model, fitted, base=base, seed=chosen, report=report)
-        return {**found.content, "commands": str(found.save(out))}
 
 
 def _hypotheses(search: ExtensionSearch, base: Fit, clock: Clock, report: Callable[[str], None]) -> list[Hypothesis]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,17 +16,15 @@ from rfdropo_bayes.bayes.channels.markers import noise_of_markers
 from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.data import Trajectory, actions
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, actions
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, group_of, whole
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
-from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.prediction.day import physical_of_normal
 from rfdropo_bayes.prediction.own_fit import STEP
 from rfdropo_bayes.prediction.predictive import FITTED, Batch
-from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.tables import nearest
 from rfdropo_bayes.verbs.adapt import day_space, model_error_of
@@ -58,11 +57,13 @@ class DayOutlook(NamedTuple):
 
 def design_day(
     fit: Calibration,
-    runs: Sequence[Trajectory],
+    runs: Sequence[Trajectory] | None = None,
     *,
     seconds: float = LONGEST,
     group: str | None = None,
-    seed: int = 0,
+    seed: int | None = None,
+    out: Path | str | None = None,
+    overwrite: bool = False,
     report: Callable[[str], None] = lambda line: None,
 ) -> Design:
     """Propose the shortest commands whose recording determines what a day changes.
@@ -75,15 +76,40 @@ def design_day(
 
     Args:
         fit: a calibration, with its model.
-        runs: recordings at hand.
+        runs: recordings at hand; those of the model's experiment by default.
         seconds: no proposal is longer.
         group: among the recordings at hand, whose drives and commands the day is to have; that of the last by default.
-        seed: of the proposals.
+        seed: of the proposals; that of the model's experiment by default.
+        out: folder that gets design.json and next_commands.csv; None writes nothing.
+        overwrite: start anew whatever ``out`` holds.
         report: called with a line of words now and then.
 
     Raises:
         InputError: nothing of the model differs between days, or no recording is of the group.
     """
+    model = model_of(fit)
+    runs, chosen = model.runs(runs, ())[0], model.settings.seed if seed is None else seed
+    work = partial(_design_day, fit, runs, seconds, group, chosen, report)
+    if out is None:
+        return work()
+    options = {"base": fit.folder, "seed": chosen, "adapt": True, "seconds": seconds, "group": group}
+    settings: dict[str, Any] = {"tables": model.tables(), "folder": model.folder, "data": hashes(runs)}
+    settings |= {"texts": model.texts()}
+    with run_folder(Path(out), "design", **settings, options=options, overwrite=overwrite) as folder:
+        found = work()
+        found.save(folder)
+    return found
+
+
+def _design_day(
+    fit: Calibration,
+    runs: Sequence[Trajectory],
+    seconds: float,
+    group: str | None,
+    seed: int,
+    report: Callable[[str], None],
+) -> Design:
+    """See `design_day`."""
     model, left = model_of(fit), model_error_of(fit.record)
     day, known = _of_group(runs, model.spec.groups, group)
     begun = _begun_like(known[0], seconds)
@@ -130,30 +156,6 @@ def design_day(
     if PER_ACTION in known[0].settings:
         table["action"] = actions.actions_of(value[kept], begun.initial_command)
     return Design(content, table)
-
-
-def run_day_design(
-    path: Path,
-    base: Path,
-    out: Path,
-    *,
-    seconds: float = LONGEST,
-    group: str | None = None,
-    overrides: Sequence[str] = (),
-    seed: int | None = None,
-    overwrite: bool = False,
-    report: Callable[[str], None] = lambda line: None,
-) -> dict[str, Any]:
-    """`design_day` for a calibration's folder, and write design.json and next_commands.csv; return the former."""
-    model, tables = Model.read(path, overrides)
-    runs = model.recordings("fit")
-    fit = Calibration(PosteriorRecord.load(base / POSTERIOR), {}, "", model, base)
-    chosen = model.settings.seed if seed is None else seed
-    options = {"base": base, "seed": chosen, "adapt": True, "seconds": seconds, "group": group}
-    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(runs), "options": options}
-    with run_folder(out, "design", **settings, overwrite=overwrite) as out:
-        found = design_day(fit, runs, seconds=seconds, group=group, seed=chosen, report=report)
-        return {**found.content, "commands": str(found.save(out))}
 
 
 def _problem(fit: Calibration, runs: Sequence[Trajectory]) -> tuple[CalibrationProblem, list[str], Batch]:
@@ -261,18 +263,17 @@ def _as_recording(
     """Commands as a recording that begins as another one and is observed when that was, by all of its markers."""
     observed = like.time if seen is None else seen
     return Trajectory.build(
-        name=name,
-        robot=like.robot,
-        format="memory",
-        time=observed,
-        position=np.tile(like.position[:1], (len(observed), 1, 1)),
-        marker_names=like.marker_names,
-        command_time=time,
-        command=value,
-        command_unit=like.command_unit,
-        initial_command=like.initial_command,
-        cable_names=like.cable_names,
-        settings={"unseen": True},
+        Origin(name=name, robot=like.robot, format="memory", settings={"unseen": True}),
+        SentCommands(
+            command_time=time,
+            command=value,
+            command_unit=like.command_unit,
+            cable_names=like.cable_names,
+            initial_command=like.initial_command,
+        ),
+        Measured(
+            time=observed, position=np.tile(like.position[:1], (len(observed), 1, 1)), marker_names=like.marker_names
+        ),
     )
 
 

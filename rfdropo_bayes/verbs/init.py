@@ -11,7 +11,7 @@ from rfdropo_bayes.data.mapped_formats import recognised_format
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import matching_files, output_folder
 from rfdropo_bayes.model.experiment import load_experiment
-from rfdropo_bayes.robots.catalogue import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.outline import RobotOutline, robot_text
 from rfdropo_bayes.verbs.column_names import Guess, guess_columns
 
@@ -96,7 +96,7 @@ def write_first_files(
         if path.exists():
             raise InputError("is there already", where=str(path), remedy="choose another folder, or move the file away")
     robot.write_text(robot_text(outline), encoding="utf-8")
-    load_robot(robot)
+    Robot.load(robot)
     data = _random_commands(outline) if guess is None else _data(folder, outline, recordings, commands, guess)
     experiment.write_text("\n".join([*_head(outline.name), *data, *_model(outline, guess)]), encoding="utf-8")
     load_experiment(experiment)

@@ -22,7 +22,15 @@ from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution
-from rfdropo_bayes.data import Trajectory, commands_alone, first_row_only, load_unseen, start_is_known
+from rfdropo_bayes.data import (
+    Origin,
+    SentCommands,
+    Trajectory,
+    commands_alone,
+    first_row_only,
+    load_unseen,
+    start_is_known,
+)
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_json
@@ -179,7 +187,7 @@ def model_of(fit: Calibration) -> Model:
     why = "no config.toml says which"
     if fit.folder is not None and (fit.folder / CONFIG).is_file():
         try:
-            return Model.read(fit.folder / CONFIG)[0]
+            return Model.read(fit.folder / CONFIG)
         except InputError as error:
             why = error.what
     raise InputError(
@@ -198,28 +206,24 @@ def fitted_parts(fit: Calibration) -> tuple[dict[str, float], ParameterSpace]:
 
 def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
     """Commands as a recording whose measurements are unknown, but for the start pose."""
+    simulator = model.simulator
+    times, values = np.asarray(time, dtype=float), np.asarray(command, dtype=float)
     return commands_alone(
-        np.asarray(time, dtype=float),
-        np.asarray(command, dtype=float),
-        model.simulator.marker_names,
+        Origin("commands", model.name, "memory"),
+        SentCommands(times, values, simulator.command_unit, simulator.channel_names),
+        simulator.marker_names,
         start=None if start is None else np.asarray(start, dtype=float)[None],
-        name="commands",
-        robot=model.name,
-        format="memory",
-        command_unit=model.simulator.command_unit,
-        cable_names=model.simulator.channel_names,
     )
 
 
 def run_prediction(
-    path: Path,
+    model: Model,
     posterior: Path,
     commands: str,
     out: Path,
     *,
     start: str | None = None,
     rows: tuple[int, int] | None = None,
-    overrides: Sequence[str] = (),
     seed: int | None = None,
     group: str | None = None,
     overwrite: bool = False,
@@ -231,12 +235,11 @@ def run_prediction(
     an object, it starts from its measured pose; its centre is in both files, every draw of its pose in the first.
 
     Args:
-        path: the experiment file that was calibrated.
+        model: of the experiment file that was calibrated.
         posterior: folder of its calibration.
         commands, start: see `data.load_unseen`.
         out: folder to write to.
         rows: predict observation rows first to last only; the pose of the first is then that of row ``first``.
-        overrides: assignments that replace entries of the experiment file.
         seed: of the draws; that of the experiment by default.
         group: see `predict`.
         overwrite: write whatever ``out`` holds.
@@ -244,21 +247,26 @@ def run_prediction(
     Raises:
         InputError: bad input, or a posterior that does not belong to the experiment.
     """
-    model, tables = Model.read(path, overrides)
     read, folder = model.settings, model.folder
+    path = model.name if model.file is None else str(model.file.path)
     if read.data is None:
-        raise InputError("the experiment has no [data]", where=str(path), remedy="say in which format the commands are")
+        raise InputError("the experiment has no [data]", where=path, remedy="say in which format the commands are")
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
     unseen = load_unseen(read.data, folder, commands, start, rows, record.attrs.get(BEGUN))
     fit = Calibration(record, {}, "", model)
     found = predict(fit, unseen, seed=read.seed if seed is None else seed, group=group)
     options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
     options["group"] = group
-    settings: dict[str, Any] = {"tables": tables, "folder": folder, "options": options, "data": hashes([unseen])}
+    settings: dict[str, Any] = {
+        "tables": model.tables(),
+        "folder": folder,
+        "options": options,
+        "data": hashes([unseen]),
+    }
     with run_folder(out, "predict", **settings, overwrite=overwrite) as out:
         facts = {
             "schema_version": SCHEMA_VERSION,
-            "experiment": str(path),
+            "experiment": path,
             "posterior": str(posterior),
             "commands": commands,
             "start_pose_known": start_is_known(unseen),

@@ -26,11 +26,10 @@ DRAWS = 1000
 MILLIMETRES = 1e3
 
 
-def run_separation(
-    path: Path,
+def separate_mechanisms(
+    model: Model,
     out: Path,
     *,
-    overrides: Sequence[str] = (),
     base: Path | None = None,
     seed: int | None = None,
     resume: bool = False,
@@ -40,9 +39,8 @@ def run_separation(
     """Fit the experiment's base model with and without the mechanisms of its table [separation].
 
     Args:
-        path: the experiment file; its ``fit`` recordings are used.
+        model: of an experiment file, whose ``fit`` recordings are used.
         out: folder to write to.
-        overrides: assignments that replace entries of the file.
         base: folder of an earlier calibration, from whose posterior means the model without mechanisms starts.
         seed: of the intervals of sizes; that of the file by default.
         resume: go on from what an interrupted run has left in ``out``.
@@ -55,11 +53,14 @@ def run_separation(
     Raises:
         InputError: bad input, before anything long has started.
     """
-    model, tables = Model.read(path, overrides)
     settings = model.settings
     table = settings.separation
     if table is None:
-        raise InputError("has no [separation]", where=str(path), remedy="name the mechanisms to tell apart")
+        raise InputError(
+            "has no [separation]",
+            where=model.title if model.file is None else str(model.file.path),
+            remedy="name the mechanisms to tell apart",
+        )
     both = [name for name in table.mechanisms if name in model.spec.sources]
     if both:
         raise InputError(
@@ -69,7 +70,7 @@ def run_separation(
     start, seed = start_values(base), settings.seed if seed is None else seed
     names = table.mechanisms
     problem = build_problem(model.spec, settings.audit, fitted, [], seed, start=start, names=names)
-    given: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes(fitted)}
+    given: dict[str, Any] = {"tables": model.tables(), "folder": model.folder, "data": hashes(fitted)}
     given["options"] = {"base": base, "seed": seed}
     with run_folder(out, "separate", **given, resume=resume, overwrite=overwrite) as out:
         coordinates = problem.coordinates

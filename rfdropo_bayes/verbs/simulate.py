@@ -1,4 +1,4 @@
-"""The motion that commands produce: ``simulate``, and ``rfdropo simulate`` with its distance to the recordings."""
+"""The motion that commands produce, ``simulate``, and its distance to the recordings, ``simulate_all``."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.recordings import commands_of
-from rfdropo_bayes.data import Trajectory, shared_markers
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, shared_markers
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import output_folder, whole, write_json
+from rfdropo_bayes.files import whole, write_json
 from rfdropo_bayes.model.assembly import AnySimulator, physical_values, robot_of
 from rfdropo_bayes.model.experiment import CommandsTable, NoiseTable
 from rfdropo_bayes.model.model import Model
@@ -101,22 +101,8 @@ def _rollouts(
         yield Simulated(source, markers, np.asarray(observation.position)[:, chosen], pose, result, commands)
 
 
-def run_simulation(
-    path: Path, out: Path, *, overrides: Sequence[str] = (), balance: bool = False, overwrite: bool = False
-) -> dict[str, Any]:
-    """Simulate the recordings or commands of an experiment file into a folder of its own; see `simulate_all`.
-
-    Raises:
-        InputError: bad input, a folder that holds a run, or a rollout that did not end well.
-    """
-    model, tables = Model.read(path, overrides)
-    settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "options": {"balance": balance}}
-    with run_folder(out, "simulate", **settings, overwrite=overwrite) as out:
-        return simulate_all(model, out, balance)
-
-
-def simulate_all(model: Model, out: Path, balance: bool = False) -> dict[str, Any]:
-    """Simulate every recording of a model's experiment, or the command sequences of its [commands] table.
+def simulate_all(model: Model, out: Path, *, balance: bool = False, overwrite: bool = False) -> dict[str, Any]:
+    """Simulate into a folder each recording of a model's experiment, or the command sequences of its [commands] table.
 
     Writes, per recording, ``<name>.nc`` (`Trajectory`) and ``<name>.csv`` (time in s, markers in mm, in the source's
     column names), called ``trajectory`` where there is only one recording. With ``balance``, forces and energies follow
@@ -127,14 +113,21 @@ def simulate_all(model: Model, out: Path, balance: bool = False) -> dict[str, An
         Where a cube is simulated, also how far its centre is from the measured one [mm] and its orientation [deg].
 
     Raises:
-        InputError: bad input, or a rollout that did not end well.
+        InputError: bad input, a folder that holds a run, or a rollout that did not end well.
     """
+    settings: dict[str, Any] = {"tables": model.tables(), "folder": model.folder, "options": {"balance": balance}}
+    settings |= {"texts": model.texts()}
+    with run_folder(Path(out), "simulate", **settings, overwrite=overwrite) as out:
+        return _simulate_into(out, model, balance)
+
+
+def _simulate_into(out: Path, model: Model, balance: bool) -> dict[str, Any]:
+    """See `simulate_all`."""
     robot_of(model.spec)
     simulator, measured = model.simulator, model.settings.data is not None
     assert isinstance(simulator, RobotSimulator)
     values = physical_values(model.spec, simulator)
     sources = _sources(model)
-    out = output_folder(out)
     report: dict[str, Any] = {"simulator": simulator.description, "parameters": values, "recordings": {}}
     distances = []
     for index, found in enumerate(_rollouts(simulator, values, sources)):
@@ -180,17 +173,14 @@ def _generated(table: CommandsTable, name: str, simulator: AnySimulator, rng: np
     markers = _known_markers(table.markers or simulator.marker_names, simulator)
     places = simulator.marker_points()[[simulator.marker_names.index(name) for name in markers]]
     return Trajectory.build(
-        name=name,
-        robot=simulator.robot.name,
-        format="netcdf",
-        time=time,
-        position=np.tile(places, (len(time), 1, 1)),
-        command_time=command_time,
-        command=command,
-        command_unit=simulator.command_unit,
-        marker_names=markers,
-        cable_names=simulator.channel_names,
-        synthetic=True,
+        Origin(name=name, robot=simulator.robot.name, format="netcdf", synthetic=True),
+        SentCommands(
+            command_time=command_time,
+            command=command,
+            command_unit=simulator.command_unit,
+            cable_names=simulator.channel_names,
+        ),
+        Measured(time=time, position=np.tile(places, (len(time), 1, 1)), marker_names=markers),
     )
 
 
@@ -209,30 +199,31 @@ def _as_trajectory(found: Simulated, model: Model, values: Mapping[str, float], 
     if noise is not None:
         key = jax.random.fold_in(jax.random.key(seed), index)
         position = position + _noise(noise, key, source.time, position.shape[1])
-    settings: dict[str, Any] | None = {
+    settings: dict[str, Any] = {
         "simulator": simulator.description,
         "parameters": {spec.name: values.get(spec.name, spec.nominal) for spec in simulator.parameters},
         "noise": None if noise is None else noise.model_dump(),
         "seed": seed,
     }
     if model.settings.commands is not None and model.settings.commands.blind:
-        settings = None
+        settings = {}
     return Trajectory.build(
-        name=source.name,
-        robot=simulator.robot.name,
-        format="netcdf",
-        time=source.time,
-        position=position,
-        object_pose=found.pose,
-        command_time=source.command_time,
-        command=source.command,
-        command_unit=source.command_unit,
-        initial_command=source.initial_command,
-        marker_names=found.markers,
-        cable_names=source.cable_names,
-        synthetic=True,
-        provenance="synthetic: made by rfdropo simulate",
-        settings=settings,
+        Origin(
+            name=source.name,
+            robot=simulator.robot.name,
+            format="netcdf",
+            synthetic=True,
+            provenance="synthetic: made by rfdropo simulate",
+            settings=settings,
+        ),
+        SentCommands(
+            command_time=source.command_time,
+            command=source.command,
+            command_unit=source.command_unit,
+            cable_names=source.cable_names,
+            initial_command=source.initial_command,
+        ),
+        Measured(time=source.time, position=position, marker_names=found.markers, object_pose=found.pose),
     )
 
 

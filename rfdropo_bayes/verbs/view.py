@@ -17,7 +17,7 @@ from rfdropo_bayes.model.experiment_file import ROBOT_COPY
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.report.motion import DrawnMotion, cube_corners, save_frames, save_vtk, smooth_line, upright
 from rfdropo_bayes.report.motion_figures import save_animation, save_still
-from rfdropo_bayes.robots import Robot, known_robots, load_robot
+from rfdropo_bayes.robots import Robot, known_robots
 from rfdropo_bayes.verbs.predict import OBJECT
 from rfdropo_bayes.verbs.simulate import simulate
 
@@ -78,7 +78,7 @@ def _robot_of(path: Path, name: str, given: Path | None) -> Robot:
             where=str(path),
             remedy="give the robot's file with --robot",
         )
-    return load_robot(given or (beside if beside.is_file() else name))
+    return Robot.load(given or (beside if beside.is_file() else name))
 
 
 def _predicted(dataset: xr.Dataset, robot: Robot) -> DrawnMotion:
@@ -95,7 +95,7 @@ def _predicted(dataset: xr.Dataset, robot: Robot) -> DrawnMotion:
 
 def _from_experiment(path: Path, overrides: list[str], recording: str | None) -> DrawnMotion:
     """Simulate one recording of an experiment."""
-    model, _ = Model.read(path, overrides)
+    model = Model.read(path, overrides)
     table, runs = model.settings.commands, {}
     if table is None:
         runs = {run.name: run for role in ("fit", "test") for run in model.recordings(role)}

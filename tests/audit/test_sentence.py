@@ -12,7 +12,7 @@ from rfdropo_bayes.audit.fixed_quantities import with_fixed_quantities
 from rfdropo_bayes.audit.omnibus import BLOCK
 from rfdropo_bayes.audit.pipeline import Answer, audit
 from rfdropo_bayes.bayes.space import ParameterSpace
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.parameters import specs_of
 
 from .toys import NOISE, problem
@@ -57,7 +57,7 @@ def test_the_next_step_is_about_the_largest_share(answer):
 
 
 def test_what_is_held_at_nominal_values_says_what_to_do_at_the_robot():
-    specs = specs_of(load_robot("asl_trunk").parameter_table())
+    specs = specs_of(Robot.load("asl_trunk").parameter_table())
     _, candidates = with_fixed_quantities(ParameterSpace(()), specs, ())
     remedies = {candidate.name: candidate.mechanism.remedy for candidate in candidates}
     assert "turn each until its cable just begins to move the body" in remedies["initial_displacement"]

@@ -19,7 +19,7 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.repeat_noise import mean_of, spread
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.simulators.commands import commands_on_grid
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
@@ -162,17 +162,16 @@ def recordings(truth: dict, seed: int, toy: Toy | None = None) -> list[Trajector
         read = np.asarray(shown.tension) * (1.0 + 0.02 * pulls.standard_normal((ROWS, 2)))
         found.append(
             Trajectory.build(
-                name=f"r{index}",
-                robot="toy",
-                format="netcdf",
-                time=time,
-                position=position,
-                command_time=clock,
-                command=sequences[k],
-                command_unit="rad",
-                marker_names=toy.marker_names,
-                cable_names=toy.channel_names,
-                tension=read if isinstance(toy, Pulling) else None,
+                Origin(name=f"r{index}", robot="toy", format="netcdf"),
+                SentCommands(
+                    command_time=clock, command=sequences[k], command_unit="rad", cable_names=toy.channel_names
+                ),
+                Measured(
+                    time=time,
+                    position=position,
+                    marker_names=toy.marker_names,
+                    tension=read if isinstance(toy, Pulling) else None,
+                ),
             )
         )
     return found

@@ -20,16 +20,15 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import CsvColumns, Measured, Origin, SentCommands, Trajectory, read_plain_csv
 from rfdropo_bayes.data.held_readings import hold_time
-from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.mechanisms.registry import REGISTRY, mechanisms_named
 from rfdropo_bayes.model.assembly import build_model, build_simulator, measurement_specs
 from rfdropo_bayes.model.experiment import Experiment
 from rfdropo_bayes.model.model_spec import spec_of
-from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
 from rfdropo_bayes.simulators.mechanisms import Mechanism, inside_drive
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -77,19 +76,16 @@ def recording(rows: int = 200, hold: int = 1, unit: str = "rad", angles: bool = 
     clean = simulator.rollout(TRUTH, simulator.commands(time, command, command[0], time))
     fresh = np.asarray(clean.motor_angle) + READ * rng.normal(size=(rows, 2))
     return Trajectory.build(
-        name="r",
-        robot="servo and body",
-        format="netcdf",
-        time=time,
-        position=np.asarray(clean.position) + SENT * rng.normal(size=(rows, 1, 3)),
-        command_time=time,
-        command=command,
-        initial_command=command[0],
-        command_unit=unit,
-        marker_names=("tip",),
-        cable_names=("a", "b"),
-        motor_angle=fresh[hold * (np.arange(rows) // hold)] if angles else None,
-        settings={"motor_angle_hold": hold * STEP},
+        Origin(name="r", robot="servo and body", format="netcdf", settings={"motor_angle_hold": hold * STEP}),
+        SentCommands(
+            command_time=time, command=command, command_unit=unit, cable_names=("a", "b"), initial_command=command[0]
+        ),
+        Measured(
+            time=time,
+            position=np.asarray(clean.position) + SENT * rng.normal(size=(rows, 1, 3)),
+            marker_names=("tip",),
+            motor_angle=fresh[hold * (np.arange(rows) // hold)] if angles else None,
+        ),
     )
 
 
@@ -201,7 +197,7 @@ class Drives(RobotSimulator):
 
 
 def test_the_encoder_shows_what_happens_inside_the_drive_in_the_order_given():
-    robot = load_robot("asl_trunk")
+    robot = Robot.load("asl_trunk")
     time = STEP * np.arange(30)
     command = 0.3 * np.sin(5.0 * time)[:, None] * np.ones(6)
     commands = commands_on_grid(time, command, command[0], time, time_step=STEP)
@@ -223,7 +219,7 @@ def test_the_encoder_shows_what_happens_inside_the_drive_in_the_order_given():
 def test_gains_scale_the_whole_command_and_what_was_in_force_before_the_first_row():
     """A command u that was held for ever: drives stand at (1 + g) u, cables at (1 + g) (1 + e) u radii, from row 0 on,
     whatever lags behind. Half of a command is lost, so that nothing but the whole of it can be scaled."""
-    robot = load_robot("asl_trunk")
+    robot = Robot.load("asl_trunk")
     time, held = STEP * np.arange(5), 0.1 * np.arange(1, 7)
     commands = commands_on_grid(time, np.tile(held, (5, 1)), held, time, time_step=STEP)
     errors = np.linspace(-0.5, 0.5, 6)
@@ -263,17 +259,16 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
     commands = simulator.commands(time, command, command[0], time)
     np.testing.assert_array_equal(sample(np.vstack([commands.initial, commands.step]), commands)[7:], command[7:])
     trunk = Trajectory.build(
-        name="r",
-        robot="asl_trunk",
-        format="netcdf",
-        time=time,
-        position=np.tile(simulator.robot.marker_points(), (20, 1, 1)),
-        command_time=time,
-        command=command,
-        command_unit="rad",
-        marker_names=simulator.marker_names,
-        cable_names=[f"motor{k}" for k in range(1, 7)],
-        motor_angle=command,
+        Origin(name="r", robot="asl_trunk", format="netcdf"),
+        SentCommands(
+            command_time=time, command=command, command_unit="rad", cable_names=[f"motor{k}" for k in range(1, 7)]
+        ),
+        Measured(
+            time=time,
+            position=np.tile(simulator.robot.marker_points(), (20, 1, 1)),
+            marker_names=simulator.marker_names,
+            motor_angle=command,
+        ),
     )
     model = build_model(spec, simulator, [trunk])
     assert model.measured["motor_angle"].shape == (1, 20, 6)

@@ -20,7 +20,7 @@ from rfdropo_bayes.bayes.repeat_noise import group_recordings, with_noise_of_rep
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
@@ -62,20 +62,18 @@ def recording(seed: int, noise: np.ndarray | None = None) -> Trajectory:
     pose = np.concatenate([position + 1e-3 * rng.normal(size=(ROWS, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (ROWS, 1))], 1)
     own = 2e-3 * rng.normal(size=(ROWS, 3)) if noise is None else noise
     return Trajectory.build(
-        name=f"r{seed}",
-        robot="puller",
-        format="netcdf",
-        time=time,
-        position=(position + own)[:, None],
-        command_time=time,
-        command=command,
-        initial_command=command[0],
-        command_unit="rad",
-        marker_names=("tip",),
-        cable_names=("a",),
-        tension=(5.0 + sent)[:, None] * (1.0 + 0.05 * rng.normal(size=(ROWS, 1))),
-        motor_angle=sent[:, None] + 0.01 * rng.normal(size=(ROWS, 1)),
-        object_pose=pose,
+        Origin(name=f"r{seed}", robot="puller", format="netcdf"),
+        SentCommands(
+            command_time=time, command=command, command_unit="rad", cable_names=("a",), initial_command=command[0]
+        ),
+        Measured(
+            time=time,
+            position=(position + own)[:, None],
+            marker_names=("tip",),
+            tension=(5.0 + sent)[:, None] * (1.0 + 0.05 * rng.normal(size=(ROWS, 1))),
+            motor_angle=sent[:, None] + 0.01 * rng.normal(size=(ROWS, 1)),
+            object_pose=pose,
+        ),
     )
 
 

@@ -18,7 +18,7 @@ from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.simulators.commands import commands_on_grid
@@ -58,18 +58,16 @@ def recording(tension: bool = True) -> Trajectory:
     simulator = HangingMass()
     clean = simulator.rollout(TRUTH, simulator.commands(time, command, command[0], time))
     return Trajectory.build(
-        name="r",
-        robot="hanging mass",
-        format="netcdf",
-        time=time,
-        position=np.asarray(clean.position) + 1e-4 * rng.normal(size=(15, 1, 3)),
-        command_time=time,
-        command=command,
-        initial_command=command[0],
-        command_unit="m",
-        marker_names=("tip",),
-        cable_names=("pull",),
-        tension=np.asarray(clean.tension) * (1.0 + 0.01 * rng.normal(size=(15, 1))) if tension else None,
+        Origin(name="r", robot="hanging mass", format="netcdf"),
+        SentCommands(
+            command_time=time, command=command, command_unit="m", cable_names=("pull",), initial_command=command[0]
+        ),
+        Measured(
+            time=time,
+            position=np.asarray(clean.position) + 1e-4 * rng.normal(size=(15, 1, 3)),
+            marker_names=("tip",),
+            tension=np.asarray(clean.tension) * (1.0 + 0.01 * rng.normal(size=(15, 1))) if tension else None,
+        ),
     )
 
 

@@ -16,7 +16,7 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Code
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.posteriors import central_interval
@@ -60,17 +60,14 @@ def problem(noise: str) -> CalibrationProblem:
     mask = np.ones((ROWS, 2), dtype=bool)
     mask[rng.choice(ROWS, ROWS // 10, replace=False), 1] = False
     trajectory = Trajectory.build(
-        name="r",
-        robot="lagging arm",
-        format="netcdf",
-        time=time,
-        position=0.1 * rng.normal(size=(ROWS, 2, 3)),  # replaced below
-        position_mask=mask,
-        command_time=time,
-        command=command,
-        command_unit="rad",
-        marker_names=LaggingArm.marker_names,
-        cable_names=("a", "b"),
+        Origin(name="r", robot="lagging arm", format="netcdf"),
+        SentCommands(command_time=time, command=command, command_unit="rad", cable_names=("a", "b")),
+        Measured(
+            time=time,
+            position=0.1 * rng.normal(size=(ROWS, 2, 3)),
+            marker_names=LaggingArm.marker_names,
+            position_mask=mask,
+        ),
     )
     simulator = LaggingArm()
     specs = simulator.parameters + noise_specs(noise)

@@ -18,7 +18,7 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import SWITCHED
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
@@ -81,18 +81,16 @@ def recording(*, pose: bool = True) -> Trajectory:
     body = (turn * Rotation.from_euler("y", 90, degrees=True)).as_quat()
     centre = START + (TRUTH["slip"] * way)[:, None] * [1.0, 0.0, 0.0]
     return Trajectory.build(
-        name="r",
-        robot="finger",
-        format="netcdf",
-        time=time,
-        position=(way[:, None] * [1.0, 0.0, 0.0] + [SHIFT, 0.0, 0.0] + 1e-3 * rng.normal(size=(30, 3)))[:, None],
-        command_time=time,
-        command=command,
-        initial_command=command[0],
-        command_unit="m",
-        marker_names=("tip",),
-        cable_names=("a",),
-        object_pose=np.concatenate([centre, body], axis=1) if pose else None,
+        Origin(name="r", robot="finger", format="netcdf"),
+        SentCommands(
+            command_time=time, command=command, command_unit="m", cable_names=("a",), initial_command=command[0]
+        ),
+        Measured(
+            time=time,
+            position=(way[:, None] * [1.0, 0.0, 0.0] + [SHIFT, 0.0, 0.0] + 1e-3 * rng.normal(size=(30, 3)))[:, None],
+            marker_names=("tip",),
+            object_pose=np.concatenate([centre, body], axis=1) if pose else None,
+        ),
     )
 
 

@@ -6,28 +6,28 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 
 
 @pytest.mark.parametrize(("unit", "message"), [("m", None), ("rad", "commands are in rad, the robot's in m")])
 def test_commands_in_another_unit_than_the_robots_are_refused(unit: str, message: str | None) -> None:
-    simulator = build_simulator(ModelSpec(load_robot("smooth_arm")))
+    simulator = build_simulator(ModelSpec(Robot.load("smooth_arm")))
     channels, time = len(simulator.channel_names), 0.05 * np.arange(6)
     trajectory = Trajectory.build(
-        name="r",
-        robot="smooth_arm",
-        format="csv",
-        time=time,
-        position=np.tile(simulator.robot.marker_points(), (6, 1, 1)),
-        command_time=time,
-        command=np.zeros((6, channels)),
-        command_unit=unit,
-        marker_names=simulator.marker_names,
-        cable_names=[f"u{k}" for k in range(channels)],
+        Origin(name="r", robot="smooth_arm", format="csv"),
+        SentCommands(
+            command_time=time,
+            command=np.zeros((6, channels)),
+            command_unit=unit,
+            cable_names=[f"u{k}" for k in range(channels)],
+        ),
+        Measured(
+            time=time, position=np.tile(simulator.robot.marker_points(), (6, 1, 1)), marker_names=simulator.marker_names
+        ),
     )
     if message is None:
         assert gather_recordings(simulator, [trajectory]).names == ("r",)

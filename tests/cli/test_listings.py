@@ -12,7 +12,7 @@ from rfdropo_bayes.data.formats import FORMATS
 from rfdropo_bayes.data.spec import Format
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.mechanisms.registry import REGISTRY
-from rfdropo_bayes.robots import known_robots, load_robot
+from rfdropo_bayes.robots import Robot, known_robots
 
 
 def told(monkeypatch, capsys, *words: str) -> str:
@@ -39,7 +39,7 @@ def test_formats_are_those_that_are_read():
 
 def test_a_robot_says_what_it_is(monkeypatch, capsys):
     text = told(monkeypatch, capsys, "robots", "asl_trunk")
-    robot = load_robot("asl_trunk")
+    robot = Robot.load("asl_trunk")
     assert str(known_robots()["asl_trunk"]) in text
     for name in (*robot.cable_names, *robot.channel_names, *robot.marker_names, *robot.parameters):
         assert name in text
@@ -48,4 +48,4 @@ def test_a_robot_says_what_it_is(monkeypatch, capsys):
 def test_a_mechanism_says_its_cause_and_the_parameters_of_a_robot(monkeypatch, capsys):
     text = told(monkeypatch, capsys, "mechanisms", "cable_gain", "--robot", "asl_trunk")
     assert REGISTRY["cable_gain"].cause in text
-    assert all(f"cable_gain_error_{channel}" in text for channel in load_robot("asl_trunk").channel_names)
+    assert all(f"cable_gain_error_{channel}" in text for channel in Robot.load("asl_trunk").channel_names)

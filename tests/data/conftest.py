@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import gzip
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
+
+KINDS = (Origin, SentCommands, Measured)
 
 
 def _recording(rows: int = 11, **changes: object) -> Trajectory:
@@ -29,7 +32,11 @@ def _recording(rows: int = 11, **changes: object) -> Trajectory:
         "marker_names": ["m1", "m2"],
         "cable_names": ["a", "b"],
     }
-    return Trajectory.build(**(content | changes))  # type: ignore[arg-type]
+    content |= changes
+    parts = ({f.name: content.pop(f.name) for f in fields(kind) if f.name in content} for kind in KINDS)
+    recording = Trajectory.build(*(kind(**part) for kind, part in zip(KINDS, parts, strict=True)))
+    assert not content, f"no part of a recording: {content}"
+    return recording
 
 
 @pytest.fixture

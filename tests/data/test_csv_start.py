@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rfdropo_bayes.data import DataSpec, common_beginning, load_unseen, start_is_known
-from rfdropo_bayes.data.plain_csv import CsvColumns, command_columns
+from rfdropo_bayes.data import CsvColumns, DataSpec, common_beginning, load_unseen, start_is_known
+from rfdropo_bayes.data.plain_csv import command_columns
 from rfdropo_bayes.errors import InputError
 
 COLUMNS = {

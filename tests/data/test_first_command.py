@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rfdropo_bayes.data import DataSpec, Trajectory, load_recordings, load_unseen, read_asl_csv
+from rfdropo_bayes.data import (
+    DataSpec,
+    Measured,
+    Origin,
+    SentCommands,
+    Trajectory,
+    load_recordings,
+    load_unseen,
+    read_asl_csv,
+)
 from rfdropo_bayes.data.first_command import recognised
 from rfdropo_bayes.errors import InputError
 
@@ -34,9 +43,12 @@ def recording(command: np.ndarray, initial: np.ndarray, seed: int = 0) -> Trajec
     time = PERIOD * np.arange(len(position))
     names = [f"c{k}" for k in range(CHANNELS)]
     return Trajectory.build(
-        name="made", robot="", format="csv", time=time, position=position, command_time=time[:-1], command=command,
-        command_unit="m", initial_command=command[0], marker_names=["a", "b"], cable_names=names,
-    )  # fmt: skip
+        Origin(name="made", robot="", format="csv"),
+        SentCommands(
+            command_time=time[:-1], command=command, command_unit="m", cable_names=names, initial_command=command[0]
+        ),
+        Measured(time=time, position=position, marker_names=["a", "b"]),
+    )
 
 
 def walk(rows: int, hold: int, rng: np.random.Generator) -> np.ndarray:

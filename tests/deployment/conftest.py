@@ -16,7 +16,7 @@ from rfdropo_bayes.deployment.bench.plant import PlantHere, SpringCables
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulatedDrives, SimulationTable
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork
 from rfdropo_bayes.deployment.drives import Drive, Drives, Guards
-from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.robots import Robot
 
 ROBOT = "motor_arm"
 
@@ -58,7 +58,7 @@ class Rig:
 @pytest.fixture(scope="session")
 def robot() -> Robot:
     """A robot with four motors."""
-    return load_robot(ROBOT)
+    return Robot.load(ROBOT)
 
 
 @contextlib.contextmanager

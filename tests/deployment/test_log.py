@@ -22,8 +22,8 @@ WRITER = """
 import sys, time
 from pathlib import Path
 from rfdropo_bayes.deployment.log import SessionLog
-from rfdropo_bayes.robots import load_robot
-log = SessionLog(Path(sys.argv[1]), load_robot("motor_arm"), {})
+from rfdropo_bayes.robots import Robot
+log = SessionLog(Path(sys.argv[1]), Robot.load("motor_arm"), {})
 for number in range(10**6):
     log.record["time"] = number
     log.write()

@@ -41,14 +41,14 @@ from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.deployment.bus import BusTable, LoggedNetwork, open_bus
 from rfdropo_bayes.deployment.drives import Drive
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # here: a fork before it would copy what JAX holds
 plant, own_process = sys.argv[1], sys.argv[2] == "own"
 hub = BusTable(interface="hub", channel="127.0.0.1:0")
 with simulated_drives(SimulationTable("motor_arm", hub, plant, own_process=own_process)) as found:
     network = LoggedNetwork(open_bus(found))
-    drive = Drive(network, load_robot("motor_arm").motors[0], str(objects.SIMULATED_EDS), 0.0, 10.0)
+    drive = Drive(network, Robot.load("motor_arm").motors[0], str(objects.SIMULATED_EDS), 0.0, 10.0)
     print("type", drive.read(objects.Object.DEVICE_TYPE), flush=True)
     network.disconnect()
     for process in psutil.Process().children(recursive=True):  # as a task manager does

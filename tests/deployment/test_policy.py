@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.deployment.causes import Cause, Stop
 from rfdropo_bayes.deployment.policy import OnnxPolicy, PolicyScene, RecordedCommands
 from rfdropo_bayes.errors import InputError
@@ -127,14 +128,13 @@ def test_files_that_are_no_policies_are_refused(robot: Robot, tmp_path: Path) ->
         OnnxPolicy(path, robot, {})
 
 
-def recording(robot: Robot, **changes: object) -> Trajectory:
+def recording(robot: Robot, cables: Sequence[str] | None = None) -> Trajectory:
     time = np.arange(11) * 0.1
-    table = {
-        "name": "r", "robot": robot.name, "format": "test", "time": time, "marker_names": robot.marker_names,
-        "position": np.broadcast_to(robot.marker_points(), (11, 4, 3)), "command_time": time[:-1],
-        "command": 1e-3 * np.arange(40).reshape(10, 4), "command_unit": "m", "cable_names": robot.channel_names,
-    }  # fmt: skip
-    return Trajectory.build(**(table | changes))
+    return Trajectory.build(
+        Origin("r", robot.name, "test"),
+        SentCommands(time[:-1], 1e-3 * np.arange(40).reshape(10, 4), "m", cables or robot.channel_names),
+        Measured(time, np.broadcast_to(robot.marker_points(), (11, 4, 3)), robot.marker_names),
+    )
 
 
 def test_a_recording_is_replayed_command_by_command_and_ends(robot: Robot) -> None:
@@ -146,4 +146,4 @@ def test_a_recording_is_replayed_command_by_command_and_ends(robot: Robot) -> No
 
 def test_a_recording_of_another_robot_is_refused(robot: Robot) -> None:
     with pytest.raises(InputError, match="drives a, b, c, d"):
-        RecordedCommands(recording(robot, cable_names=["a", "b", "c", "d"]), robot, 10.0)
+        RecordedCommands(recording(robot, ["a", "b", "c", "d"]), robot, 10.0)

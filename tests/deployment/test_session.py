@@ -31,7 +31,7 @@ from rfdropo_bayes.deployment.settings import (
     load_deployment,
 )
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.robots import Robot
 
 from .policies import linear_policy
 
@@ -55,7 +55,7 @@ def turning(path: Path, robot: Robot, gain: float = 0.004) -> Path:
 def dry_run(tmp_path_factory) -> tuple[Path, Deployment]:
     """A dry run of two seconds."""
     folder = tmp_path_factory.mktemp("dry")
-    policy = turning(folder / "policy.onnx", load_robot("motor_arm"))
+    policy = turning(folder / "policy.onnx", Robot.load("motor_arm"))
     settings = Deployment(
         robot="motor_arm", duration_s=2.0, policy=PolicyTable(file=str(policy)), drives=SLOW, safety=PATIENT,
         simulation=SimulationSettings(settings={"stiffness": 300.0, "pretension": 3.0}),
@@ -121,7 +121,7 @@ def test_a_session_is_recovered_from_its_journal(dry_run) -> None:
 
 def test_a_session_is_replayed(dry_run, tmp_path: Path) -> None:
     folder, settings = dry_run
-    outcome = deploy(settings, "replay", tmp_path / "again", simulated=True, recording=folder)
+    outcome = deploy(settings, "replay", tmp_path / "again", simulated=True, commands=folder)
     assert outcome.cause is Cause.FINISHED, outcome.detail
     first, second = (Trajectory.load(path / "session.nc") for path in (folder, tmp_path / "again"))
     rows = min(len(first.command), len(second.command)) - 2
@@ -153,7 +153,7 @@ def test_a_check_writes_nothing(dry_run, tmp_path: Path) -> None:
 def test_homing_finds_the_tension_and_keeps_it(tmp_path: Path) -> None:
     """Encoders start anywhere; length zero is where each spring carries its homing tension."""
     homing = HomingTable(file=str(tmp_path / "home.json"), rate_m_s=0.01, rounds=1)
-    robot = load_robot("motor_arm")
+    robot = Robot.load("motor_arm")
     sensor = SimulatedMarkers(len(robot.marker_names))
     bus = BusTable(interface="hub", channel="127.0.0.1:0")
     table = SimulationTable(

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rfdropo_bayes.deployment.setpoints import SetPoints
-from rfdropo_bayes.robots import Motor, Robot, load_robot
+from rfdropo_bayes.robots import Motor, Robot
 
 PERIOD = 0.01
 
@@ -21,7 +21,7 @@ def points(robot: Robot, length: float = 0.0) -> SetPoints:
 @given(goals=st.lists(st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4), min_size=1, max_size=8), data=st.data())
 def test_limits_hold_for_any_goals(goals: list[list[float]], data: st.DataObject) -> None:
     """Goals change at any moment, ramps lead anywhere; length, rate and acceleration stay within the limits."""
-    robot = load_robot("motor_arm")
+    robot = Robot.load("motor_arm")
     made = points(robot)
     lengths, rates, ramp = [made.length], [made.rate], None
     for goal in goals:
@@ -77,14 +77,14 @@ def test_a_motor_found_beyond_its_limit_may_come_back_but_go_no_further(robot: R
 
 def test_counts_of_a_published_drive() -> None:
     """HUMASoft (UC3M): 2048 counts a turn, gear 24: 841 counts/mm on a drum of 9.3 mm, 1043 on one of 7.5 mm."""
-    table = load_robot("motor_arm").motors[0].model_dump()
+    table = Robot.load("motor_arm").motors[0].model_dump()
     assert Motor(**table).counts_per_metre / 1e3 == pytest.approx(841, abs=0.5)
     assert Motor(**(table | {"drum_radius_m": 0.0075})).counts_per_metre / 1e3 == pytest.approx(1043, abs=0.5)
 
 
 @given(length=st.floats(-0.03, 0.03), offset=st.integers(-(2**20), 2**20), sign=st.sampled_from([-1, 1]))
 def test_length_and_counts_are_inverse(length: float, offset: int, sign: int) -> None:
-    motor = load_robot("motor_arm").motors[0].model_copy(update={"sign": sign})
+    motor = Robot.load("motor_arm").motors[0].model_copy(update={"sign": sign})
     counts = motor.counts(length, offset)
     assert motor.length(counts, offset) == pytest.approx(length, abs=0.51 / motor.counts_per_metre)
     assert np.sign(counts - offset) in (0, sign * np.sign(length))

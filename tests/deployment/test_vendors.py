@@ -21,7 +21,7 @@ from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import Deployment, DrivesTable, HomingTable, SafetyTable, load_deployment
 from rfdropo_bayes.deployment.vendors import STANDARD, WITHOUT, Units, told_counts
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import Motor, load_robot
+from rfdropo_bayes.robots import Motor, Robot
 
 from .conftest import Rig
 
@@ -76,7 +76,7 @@ def rigs(hub: str) -> Iterator[Callable[..., Rig]]:
     made: list[Rig] = []
 
     def make(**table: object) -> Rig:
-        made.append(Rig(hub, load_robot("motor_arm"), **table))
+        made.append(Rig(hub, Robot.load("motor_arm"), **table))
         return made[-1]
 
     yield make
@@ -132,7 +132,7 @@ def test_a_wrong_rated_torque_is_another_unit_or_another_motor(rigs, found: int,
 
 def test_a_robot_file_with_a_torque_in_millinewton_metres_is_refused() -> None:
     """The torque limit would be next to nothing, and every tension a thousand times too large."""
-    motor = load_robot("motor_arm").motors[0]
+    motor = Robot.load("motor_arm").motors[0]
     with pytest.raises(ValueError, match=r"0.81 per mille of the rated torque: write rated_torque_n_m in N m"):
         Motor.model_validate(motor.model_dump() | {"rated_torque_n_m": 12.0})
 
@@ -283,7 +283,7 @@ def test_the_example_of_the_documentation_drives_an_epos4(sheet: Write, tmp_path
     (tmp_path / "drive.eds").write_text(Path(eds).read_text())
     (tmp_path / "arm.toml").write_text('robot = "motor_arm"\n[drives]\n' + block)
     drives = load_deployment(tmp_path / "arm.toml").drives.model_copy(update={"answer_s": 2.0})
-    sensor = SimulatedMarkers(len(load_robot("motor_arm").marker_names))
+    sensor = SimulatedMarkers(len(Robot.load("motor_arm").marker_names))
     hub = Deployment(robot="motor_arm").bus.model_copy(update={"interface": "hub", "channel": "127.0.0.1:0"})
     with simulated_drives(SimulationTable("motor_arm", hub, values={(0x6076, 0): TORQUE}, eds=eds)) as found:
         homing = HomingTable(rate_m_s=0.02, rounds=1)

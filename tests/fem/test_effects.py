@@ -12,7 +12,9 @@ import pytest
 from rfdropo_bayes import fem
 from rfdropo_bayes.fem.cable_friction import wrap_angles
 from rfdropo_bayes.fem.cables import guide_matrix, segments
+from rfdropo_bayes.fem.dynamics import remembering
 from rfdropo_bayes.fem.effects import BodyEffects
+from rfdropo_bayes.fem.rollouts import roll
 from rfdropo_bayes.fem.surroundings import WALL_SOFTNESS, drag_areas, section_load
 
 LENGTH, HALF, LAYERS = 0.4, 0.004, 8
@@ -58,9 +60,12 @@ def settled(material, displacement, force):
 def moved(material, state, displacement, time_step, force):
     """The body held at its base through 100 steps: positions of the tip, tensions, last state."""
     tip = fem.attach(bar().body, np.array([[0.0, 0.0, LENGTH]]))
-    rollout = fem.simulate(
-        bar(), fem.prepare(bar(), material), state, displacement[:, None, :], time_step, tip, external_force=force
-    )
+    prepared = fem.prepare(bar(), material)
+
+    def take(before, commanded):
+        return fem.step(bar(), prepared, before, commanded, time_step, force)
+
+    rollout = roll(take, remembering(bar(), prepared, state), displacement[:, None, :], tip)
     return rollout.position[:, 0], rollout.tension, rollout.state, rollout.diverged
 
 

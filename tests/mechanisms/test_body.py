@@ -9,7 +9,7 @@ import pytest
 
 from rfdropo_bayes.fem import Material
 from rfdropo_bayes.mechanisms import REGISTRY
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
@@ -22,7 +22,7 @@ STEP = {"coulomb_friction": 1e-7, "cable_compliance": 1e-9}  # of a difference; 
 
 
 def simulator(*names: str) -> TrunkSimulator:
-    robot = load_robot("smooth_arm")
+    robot = Robot.load("smooth_arm")
     discretisation = Discretisation(0.02)
     assembly = assemble(robot, discretisation)
     engine = Engine(assembly, 0.02, Backend("jax"), from_equilibrium=True)
@@ -71,7 +71,7 @@ def test_parameters_state_their_null_value(name):
 
 @pytest.mark.parametrize(("robot", "axes"), [("smooth_arm", "xz"), ("asl_trunk", "xy")])
 def test_a_base_tilts_about_the_axes_across_gravity(robot, axes):
-    described = load_robot(robot)
+    described = Robot.load(robot)
     tilt = REGISTRY["base_tilt"].for_robot(described)
     assert [spec.name for spec in tilt.parameters] == [f"base_tilt_{axis}" for axis in axes]
     gravity = jnp.asarray(described.gravity)

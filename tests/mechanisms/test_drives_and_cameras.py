@@ -14,7 +14,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import commands_on_grid
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -120,7 +120,7 @@ def test_a_rate_limit_slows():
 def test_each_cable_has_its_own_gain_and_a_wrong_one_leaves_the_others_alone():
     errors = {f"cable_gain_error_{k + 1}": jnp.asarray(v) for k, v in enumerate((0.3, 0.1))}
     np.testing.assert_allclose(applied("cable_gain", errors), COMMAND * jnp.array([1.3, 1.1]), atol=1e-15)
-    (mechanism,) = mechanisms_named(["cable_gain"], load_robot("smooth_arm"))
+    (mechanism,) = mechanisms_named(["cable_gain"], Robot.load("smooth_arm"))
     assert [spec.name for spec in mechanism.parameters] == [
         f"cable_gain_error_{channel}" for channel in ("up", "left", "down", "right")
     ]
@@ -204,7 +204,7 @@ def test_a_users_file_may_hold_dataclasses_and_have_any_name(tmp_path):
 
 def test_the_code_of_a_mechanism_is_part_of_what_a_simulator_is(tmp_path):
     """A checkpoint made with other code, or with another robot of the same name, must not be taken up."""
-    robot = load_robot("smooth_arm")
+    robot = Robot.load("smooth_arm")
     stiffer = robot.model_copy(update={"description": "the same name, other content"})
 
     def content(robot, share):
@@ -256,7 +256,7 @@ def test_markers_beside_their_places_turn_with_the_body():
 def test_sizes_of_commands_are_in_the_unit_that_the_robot_is_commanded_in():
     """Half a millimetre of play is 25 mrad of a motor with a spool of 20 mm; a limit of 1/m becomes one of 0.02/rad."""
     names = ["backlash", "cable_slack", "end_stop", "travel_stop", "spool_growth", "drive_drift", "rate_limit"]
-    cables, motors = (mechanisms_named(names, load_robot(robot)) for robot in ("smooth_arm", "asl_trunk"))
+    cables, motors = (mechanisms_named(names, Robot.load(robot)) for robot in ("smooth_arm", "asl_trunk"))
     units = [spec.unit for mechanism in motors for spec in mechanism.parameters]
     assert units == ["rad", "rad", "1/rad", "1/rad", "1/rad", "1/rad", "rad/s", "s/rad"]
     play, turned = cables[0].parameters[0], motors[0].parameters[0]

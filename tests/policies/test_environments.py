@@ -20,7 +20,7 @@ from rfdropo_bayes.policies.randomisation import Draws, Phi, Point, Uniform, fit
 from rfdropo_bayes.policies.tasks import FLOOR, TASKS, command_limits, layout_of, potential, reward, tracked_markers
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Result
 
@@ -59,7 +59,7 @@ def test_reward_is_the_papers() -> None:
 
 
 def test_observations_have_the_papers_size_and_goals_its_boxes() -> None:
-    robot = load_robot("trunk_sofa")
+    robot = Robot.load("trunk_sofa")
     assert layout_of(TASKS[REACH], robot, "discrete", "paper").size == 66
     assert layout_of(TASKS["TrunkPush-v0"], robot, "discrete", "paper").size == 73
     assert len(layout_of(TASKS[REACH], robot, "discrete", "paper").moves) == 16
@@ -160,7 +160,7 @@ def test_rewards_stay_finite_for_episodes_that_begin_at_the_goal() -> None:
 
 @pytest.mark.parametrize("action", [-1, 16, 3.0])
 def test_a_discrete_action_that_is_none_is_refused(action) -> None:
-    layout = layout_of(TASKS[REACH], load_robot("trunk_sofa"), "discrete", "paper")
+    layout = layout_of(TASKS[REACH], Robot.load("trunk_sofa"), "discrete", "paper")
     with pytest.raises(InputError, match="no action"):
         layout.change(np.array([0, action]))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.cautions import Caution, Code
-from rfdropo_bayes.data import Trajectory, group_repeats, noise_floor
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, group_repeats, noise_floor
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
 from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, software_versions
 
@@ -50,18 +50,9 @@ def recording(
     mask[rng.choice(np.arange(5, rows), faults, replace=False), 1] = False
     time = STEP * np.arange(rows)
     return Trajectory.build(
-        name=name,
-        robot="toy",
-        format="csv",
-        time=time,
-        position=position,
-        position_mask=mask,
-        command_time=time,
-        command=command,
-        command_unit="m",
-        marker_names=MARKERS,
-        cable_names=("a", "b"),
-        synthetic=True,
+        Origin(name=name, robot="toy", format="csv", synthetic=True),
+        SentCommands(command_time=time, command=command, command_unit="m", cable_names=("a", "b")),
+        Measured(time=time, position=position, marker_names=MARKERS, position_mask=mask),
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rfdropo_bayes.data import DataSpec, Trajectory, load_recordings
+from rfdropo_bayes.data import DataSpec, Measured, Origin, SentCommands, Trajectory, load_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report import BaselineErrors, baseline_errors
 from rfdropo_bayes.report.baselines import copied_mean, held_initial_pose, mean_pose
@@ -40,16 +40,9 @@ def linear(toy: SimpleNamespace, name: str, rows: int, rng: np.random.Generator)
     weights = np.random.default_rng(9).normal(size=(3, 2, 2, 3))
     position = np.einsum("ltc,lcma->tma", history, weights) + np.array([0.0, 0.0, 0.1])
     return Trajectory.build(
-        name=name,
-        robot="toy",
-        format="csv",
-        time=time,
-        position=position,
-        command_time=time,
-        command=command,
-        command_unit="m",
-        marker_names=toy.MARKERS,
-        cable_names=("a", "b"),
+        Origin(name=name, robot="toy", format="csv"),
+        SentCommands(command_time=time, command=command, command_unit="m", cable_names=("a", "b")),
+        Measured(time=time, position=position, marker_names=toy.MARKERS),
     )
 
 

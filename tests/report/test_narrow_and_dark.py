@@ -13,7 +13,7 @@ from rfdropo_bayes.report import build_summary, render_page
 from rfdropo_bayes.report import page as page_module
 from rfdropo_bayes.report.robot_figure import robot_figure
 from rfdropo_bayes.report.style import Panel, embed
-from rfdropo_bayes.robots import known_robots, load_robot, robot_shape
+from rfdropo_bayes.robots import Robot, known_robots, robot_shape
 
 
 def grid(rows: int, columns: int, *, legend: bool = False) -> Figure:
@@ -72,7 +72,7 @@ def test_the_page_shows_through_a_picture():
 
 @pytest.mark.parametrize("name", sorted(known_robots()))
 def test_every_robot_has_a_picture(name):
-    robot = load_robot(name)
+    robot = Robot.load(name)
     shape = robot_shape(robot)
     assert list(shape["cables"]) == list(robot.cable_names)
     assert list(shape["markers"]) == list(robot.marker_names)

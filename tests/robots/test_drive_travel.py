@@ -10,12 +10,12 @@ import pytest
 
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.cautions import Code
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import group_of, in_group
 from rfdropo_bayes.model.assembly import with_groups
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.robots import DriveTravel, Robot, load_robot, travel_in
+from rfdropo_bayes.robots import DriveTravel, Robot, travel_in
 from rfdropo_bayes.robots.drive_travel import unstated_travel
 
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
@@ -122,22 +122,22 @@ def recording(name: str, robot: Robot) -> Trajectory:
     """Two seconds in which every cable is pulled by 5 mm four times, and released three times."""
     time = 0.25 * np.arange(9)
     return Trajectory.build(
-        name=name,
-        robot=robot.name,
-        format="memory",
-        time=time,
-        position=np.tile(robot.marker_points(), (len(time), 1, 1)),
-        command_time=time[:7],
-        command=UP_AND_BACK[:, :1] * np.ones(len(robot.channel_names)),
-        command_unit="m",
-        marker_names=robot.marker_names,
-        cable_names=robot.channel_names,
+        Origin(name=name, robot=robot.name, format="memory"),
+        SentCommands(
+            command_time=time[:7],
+            command=UP_AND_BACK[:, :1] * np.ones(len(robot.channel_names)),
+            command_unit="m",
+            cable_names=robot.channel_names,
+        ),
+        Measured(
+            time=time, position=np.tile(robot.marker_points(), (len(time), 1, 1)), marker_names=robot.marker_names
+        ),
     )
 
 
 def test_a_model_drives_a_recording_as_its_group_does():
     """Groups of the experiment, wildcards of the robot; a session's drives are those of the recording it names."""
-    robot = load_robot("smooth_arm")
+    robot = Robot.load("smooth_arm")
     first = robot.channel_names[0]
     robot = robot.with_changes(drives=(table(recordings="tuesday_*", beyond="clipped"),))
     stated = [{"cables": [first], "recordings": "mondays", "high": 0.012, "beyond": "lost"}]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.outline import SILICONE, RobotOutline, robot_text
 
 ARM = {"name": "arm", "length": 0.3, "radius": 0.015, "markers": {"low": 0.15, "tip": 0.3}}
@@ -15,7 +15,7 @@ ARM = {"name": "arm", "length": 0.3, "radius": 0.015, "markers": {"low": 0.15, "
 def written(tmp_path, **answers):
     path = tmp_path / "arm.toml"
     path.write_text(robot_text(RobotOutline(**ARM | answers)))
-    return load_robot(path)
+    return Robot.load(path)
 
 
 @pytest.mark.parametrize(

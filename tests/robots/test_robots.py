@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import known_robots, load_robot
+from rfdropo_bayes.robots import Robot, known_robots
 
 TRUNKS = ("trunk_sofa", "trunk_physical")
 ROBOTS = (*TRUNKS, "asl_trunk")
@@ -26,16 +26,16 @@ def edited(tmp_path: Path, old: str, new: str, robot: str = "trunk_sofa") -> Pat
 
 def test_the_three_robots_come_with_the_package():
     assert set(ROBOTS) <= set(known_robots())
-    assert all(load_robot(name).name == name for name in known_robots())
+    assert all(Robot.load(name).name == name for name in known_robots())
 
 
 def test_a_path_serves_as_well_as_a_name():
-    assert load_robot(known_robots()["asl_trunk"]) == load_robot("asl_trunk")
+    assert Robot.load(known_robots()["asl_trunk"]) == Robot.load("asl_trunk")
 
 
 def test_unknown_robot_lists_the_known_ones():
     with pytest.raises(InputError, match=r"unknown robot 'trunk_soft'.*asl_trunk, .*trunk_physical, trunk_sofa"):
-        load_robot("trunk_soft")
+        Robot.load("trunk_soft")
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_unknown_robot_lists_the_known_ones():
 )
 def test_a_mistake_is_named(tmp_path, old, new, message):
     with pytest.raises(InputError, match=message) as caught:
-        load_robot(edited(tmp_path, old, new))
+        Robot.load(edited(tmp_path, old, new))
     assert "edited.toml" in str(caught.value)
     assert ": :" not in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -76,26 +76,26 @@ def test_a_mistake_is_named(tmp_path, old, new, message):
 
 def test_a_point_mass_sits_at_a_station(tmp_path):
     with pytest.raises(InputError, match="not at a station"):
-        load_robot(edited(tmp_path, "z_m = 0.201", "z_m = 0.2", robot="asl_trunk"))
+        Robot.load(edited(tmp_path, "z_m = 0.201", "z_m = 0.2", robot="asl_trunk"))
 
 
 def test_an_unreadable_file_is_refused(tmp_path):
     path = tmp_path / "binary.toml"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="cannot be read"):
-        load_robot(path)
+        Robot.load(path)
 
 
 @pytest.mark.parametrize("name", TRUNKS)
 def test_trunk_has_the_volume_of_the_mesh(name):
-    body = load_robot(name).body
+    body = Robot.load(name).body
     assert body.layer_volume() == pytest.approx(38.9e-6, rel=0.01)
-    assert load_robot(name).density(0.42) == pytest.approx(0.42 / 38.9e-6, rel=1e-3)
+    assert Robot.load(name).density(0.42) == pytest.approx(0.42 / 38.9e-6, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_arrays_fit_the_finite_element_body(name):
-    arrays = load_robot(name).layered_arrays()
+    arrays = Robot.load(name).layered_arrays()
     layers = len(arrays["station"]) - 1
     assert np.all(np.diff(arrays["station"]) > 0)
     assert arrays["station"][0] == 0.0
@@ -111,7 +111,7 @@ def test_arrays_fit_the_finite_element_body(name):
 
 @pytest.mark.parametrize("name", TRUNKS)
 def test_necks_are_softer_than_their_vertebrae(name):
-    bending = np.array(load_robot(name).body.bending_moment_area_m4).mean(1)
+    bending = np.array(Robot.load(name).body.bending_moment_area_m4).mean(1)
     necks, vertebrae = bending[1:-1:2], bending[2::2]
     assert len(necks) == len(vertebrae) == 10
     assert np.all(necks < vertebrae / 3)
@@ -119,13 +119,13 @@ def test_necks_are_softer_than_their_vertebrae(name):
 
 def test_sofas_mesh_is_far_stiffer_than_the_converged_solid():
     """Linear tetrahedra lock in the necks: that is a finding about the scene, not about silicone."""
-    sofa, solid = (np.array(load_robot(name).body.bending_moment_area_m4)[1:-1:2].mean() for name in TRUNKS)
+    sofa, solid = (np.array(Robot.load(name).body.bending_moment_area_m4)[1:-1:2].mean() for name in TRUNKS)
     assert sofa > 4 * solid
 
 
 @pytest.mark.parametrize("name", TRUNKS)
 def test_guides_lie_on_stations_and_turn_by_quarters(name):
-    robot = load_robot(name)
+    robot = Robot.load(name)
     tolerance = {"trunk_sofa": np.deg2rad(0.14), "trunk_physical": 1e-12}[name]  # the scene turns by 1.57 rad
     for index, guides in enumerate(robot.guides()):
         distance = np.abs(guides[:, 2, None] - np.array(robot.body.station_m)).min(1)
@@ -140,7 +140,7 @@ def test_guides_lie_on_stations_and_turn_by_quarters(name):
 
 
 def test_trunk_sofa_is_the_scene_of_the_paper():
-    robot = load_robot("trunk_sofa")
+    robot = Robot.load("trunk_sofa")
     nominal = robot.nominal()
     assert nominal["young_modulus"] == 4.5e6
     assert nominal["poisson_ratio"] == 0.45
@@ -158,11 +158,11 @@ def test_trunk_sofas_markers_are_where_the_recording_starts(datasets):
     path = datasets / "sofa_trunk" / "reach_1.csv"
     row = np.loadtxt(path, delimiter=",", skiprows=1, max_rows=1, usecols=range(1, 64))
     recorded = 1e-3 * row.reshape(21, 3)
-    assert np.abs(load_robot("trunk_sofa").marker_points() - recorded).max() < 1e-5
+    assert np.abs(Robot.load("trunk_sofa").marker_points() - recorded).max() < 1e-5
 
 
 def test_each_parameter_given_per_cable_is_written_out():
-    robot = load_robot("trunk_physical")
+    robot = Robot.load("trunk_physical")
     table = robot.parameter_table()
     assert set(robot.initial_displacement_names) <= set(table)
     assert "initial_displacement" not in table
@@ -172,13 +172,13 @@ def test_each_parameter_given_per_cable_is_written_out():
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_bounds_enclose_nominal_values(name):
-    table = load_robot(name).parameter_table()
+    table = Robot.load(name).parameter_table()
     assert all(p.low <= p.nominal <= p.high for p in table.values())
     assert table["poisson_ratio"].high <= 0.499
 
 
 def test_asl_motors_pull_one_tendon_and_release_the_opposite():
-    robot = load_robot("asl_trunk")
+    robot = Robot.load("asl_trunk")
     matrix = robot.channel_matrix({"pulley_radius": 0.02})
     assert matrix.shape == (12, 6)
     np.testing.assert_allclose(matrix.sum(axis=0), 0.0)
@@ -200,7 +200,7 @@ def test_asl_tendons_lie_where_the_motors_move_the_disks(datasets):
     folder = datasets / "asl_trunk"
     observed = pandas.read_csv(folder / "observations_controlled_1.csv.gz")
     angles = observed[[f"phi{k}" for k in range(1, 7)]].to_numpy()
-    robot = load_robot("asl_trunk")
+    robot = Robot.load("asl_trunk")
     disk = {0.106: 1, 0.201: 2, 0.316: 3}
     for motor in range(6):
         guide = robot.guides()[2 * motor][-1]
@@ -212,18 +212,18 @@ def test_asl_tendons_lie_where_the_motors_move_the_disks(datasets):
 
 
 def test_point_masses_are_lumped_at_their_stations_and_traceable():
-    robot = load_robot("asl_trunk")
+    robot = Robot.load("asl_trunk")
     masses = robot.point_masses({"disk_mass_tip": 0.1})
     assert masses.sum() == pytest.approx(0.03 + 0.03 + 0.1)
     assert masses[-1] == 0.1
     slope = jax.grad(lambda mass: robot.point_masses({"disk_mass_tip": mass})[-1])(0.1)
     assert slope == 1.0
-    assert np.all(load_robot("trunk_sofa").point_masses({}) == 0.0)
+    assert np.all(Robot.load("trunk_sofa").point_masses({}) == 0.0)
 
 
 @pytest.mark.parametrize("name", TRUNKS)
 def test_stiffness_grows_with_poissons_ratio(name):
-    robot = load_robot(name)
+    robot = Robot.load(name)
     np.testing.assert_allclose(robot.stiffness_scale(0.45), 1.0)
     necks = np.array([robot.stiffness_scale(ratio)[1:-1:2] for ratio in (0.4, 0.43, 0.45, 0.47, 0.49)])
     assert np.all(np.diff(necks, axis=0) > 0)
@@ -231,7 +231,7 @@ def test_stiffness_grows_with_poissons_ratio(name):
 
 
 def test_a_variant_replaces_tables_of_its_base(tmp_path):
-    variant, base = load_robot("trunk_sofa_mesh"), load_robot("trunk_sofa")
+    variant, base = Robot.load("trunk_sofa_mesh"), Robot.load("trunk_sofa")
     assert variant.body == base.body
     assert variant.markers == base.markers
     assert variant.cables != base.cables
@@ -240,4 +240,4 @@ def test_a_variant_replaces_tables_of_its_base(tmp_path):
     path = tmp_path / "circle.toml"
     path.write_text(f'base = "{path}"\n')
     with pytest.raises(InputError, match="is its own base"):
-        load_robot(path)
+        Robot.load(path)

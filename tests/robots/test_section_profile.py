@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 
 pytest.importorskip("skfem", reason="needs scikit-fem")
 pytest.importorskip("pypardiso", reason="needs pypardiso")
@@ -67,7 +67,7 @@ def test_the_chain_of_beams_is_a_cantilever():
 @pytest.mark.slow
 def test_trunk_sofa_answers_as_sofas_mesh_does(mesh):
     """Profile within its printed digits; sag and two modes within 5 %; SOFA's first mode is the documented 0.81 Hz."""
-    body = load_robot("trunk_sofa").body
+    body = Robot.load("trunk_sofa").body
     station = np.array(body.station_m)
     solid = section_profile.Discretisation("P1", equal_node_masses=True).solid(mesh, station, RATIO)
     profile = section_profile.derive_profile(solid, station, equal_node_masses=True)
@@ -85,7 +85,7 @@ def test_trunk_sofa_answers_as_sofas_mesh_does(mesh):
 def test_trunk_physical_lies_where_refinement_leads(mesh):
     """Bending stiffness falls under refinement, and the file's extrapolated profile lies below both meshes, near them
     where there is no notch."""
-    body = load_robot("trunk_physical").body
+    body = Robot.load("trunk_physical").body
     station, bending = np.array(body.station_m), np.array(body.bending_moment_area_m4).mean(1)
     coarse, finer = (
         section_profile.effective_sections(

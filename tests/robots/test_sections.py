@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import Cone, Cylinder, Disks, Tube, known_robots, load_robot, section_profile
+from rfdropo_bayes.robots import Cone, Cylinder, Disks, Robot, Tube, known_robots, section_profile
 
 L, R, TIP = 0.2, 0.014, 0.009
 
@@ -104,7 +104,7 @@ def _robot(tmp_path, section: str):
     head, _, rest = text.partition("[body]")
     path = tmp_path / "own.toml"
     path.write_text(head + section + rest[rest.index("[[markers]]") :], encoding="utf-8")
-    return load_robot(path)
+    return Robot.load(path)
 
 
 CONE = '[[body.section]]\nshape = "cone"\nlength_m = 0.2\nlayers = 10\nradius_m = [0.014, 0.009]\n\n'
@@ -112,7 +112,7 @@ CONE = '[[body.section]]\nshape = "cone"\nlength_m = 0.2\nlayers = 10\nradius_m 
 
 def test_a_robot_file_may_state_shapes(tmp_path):
     """The bundled arm's areas are those in the middle of each layer: a cone's to second order in its taper."""
-    own, bundled = _robot(tmp_path, CONE), load_robot("smooth_arm")
+    own, bundled = _robot(tmp_path, CONE), Robot.load("smooth_arm")
     np.testing.assert_allclose(own.body.axial_area_m2, bundled.body.axial_area_m2, rtol=2e-3)
     np.testing.assert_allclose(own.body.torsion_constant_m4, bundled.body.torsion_constant_m4, rtol=5e-3)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, TetrahedraTable, assemble_mesh
@@ -18,7 +18,7 @@ from rfdropo_bayes.simulators.robot_simulator import every_node
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
 TIME_STEP, PLATE = 0.01, -0.075
-SOFA = load_robot("trunk_sofa_mesh")
+SOFA = Robot.load("trunk_sofa_mesh")
 ROBOT = SOFA.model_copy(update={"push": SOFA.push.model_copy(update={"plate_height_m": PLATE})})
 SOFT = {"young_modulus": jnp.asarray(2e5), "rayleigh_mass": jnp.asarray(0.3)}
 
@@ -83,7 +83,7 @@ def test_what_the_cube_is_pushed_by_pushes_the_trunk_back(trunk):
 
 @pytest.mark.slow
 def test_both_engines_balance_alike():
-    robot, discretisation = load_robot("smooth_arm"), Discretisation(TIME_STEP)
+    robot, discretisation = Robot.load("smooth_arm"), Discretisation(TIME_STEP)
     assembly = assemble(robot, discretisation)
     fast = TrunkSimulator(robot, Engine(assembly, TIME_STEP, from_equilibrium=True), assembly, discretisation)
     slow = replace(fast, engine=replace(fast.engine, backend=Backend("jax")))

@@ -11,7 +11,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators import Result, Simulator
 from rfdropo_bayes.simulators.commands import animated_on_grid
@@ -22,7 +22,7 @@ from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, TetrahedraTab
 TIME_STEP = 0.01
 SOFA = {"frames": "edges", "masses": "equal", "drives": "sofa", "drive_rate": 1e-3}
 LONG = ("long_0", "long_1", "long_2", "long_3")
-ROBOT = load_robot("trunk_sofa_mesh")
+ROBOT = Robot.load("trunk_sofa_mesh")
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +169,7 @@ def test_options_that_do_not_fit_are_refused(mesh):
         with pytest.raises(InputError, match=message):
             assemble_mesh(ROBOT, mesh, table(**options))
     with pytest.raises(InputError, match="starts in equilibrium"):
-        assemble_mesh(load_robot("trunk_physical"), mesh, table())
+        assemble_mesh(Robot.load("trunk_physical"), mesh, table())
 
 
 def test_animated_commands_follow_their_own_clock():

@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.fem import corotational
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
@@ -33,7 +33,7 @@ def dense(matrix, free: int) -> np.ndarray:
 
 @pytest.mark.parametrize("refine", [1, 2])
 def test_sag_and_modes_are_those_of_the_solid(refine):
-    robot, discretisation = load_robot("trunk_sofa"), Discretisation(0.01, refine=refine)
+    robot, discretisation = Robot.load("trunk_sofa"), Discretisation(0.01, refine=refine)
     assembly = assemble(robot, discretisation)
     trunk = TrunkSimulator(robot, Engine(assembly, 0.01, Backend("jax")), assembly, discretisation)
     system = assembly.system

@@ -9,7 +9,7 @@ import pytest
 
 from rfdropo_bayes.model.assembly import build_robot_simulator
 from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.control_session import Session
 from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.protocol import Result
@@ -18,7 +18,7 @@ from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assem
 
 def test_a_notched_trunk_between_opposed_cables_stays_whole():
     """Eight random walks of up to 40 mm, each cable on its own, on light and heavy, soft and stiff trunks."""
-    robot, discretisation = load_robot("trunk_sofa"), Discretisation(0.01)
+    robot, discretisation = Robot.load("trunk_sofa"), Discretisation(0.01)
     assembly = assemble(robot, discretisation)
     trunk = TrunkSimulator(robot, Engine(assembly, 0.01, Backend(threads=1)), assembly, discretisation)
     clock = np.arange(0.0, 3.0, 0.05)
@@ -41,7 +41,7 @@ def test_a_notched_trunk_between_opposed_cables_stays_whole():
 def squeezed(stiffness: np.ndarray, periods: int, held: int, seed: int = 2) -> np.ndarray:
     """Markers (period, lane, marker, 3) of trunks of some moduli [Pa] whose cables go by 5 mm at random, each on its
     own, then hold. Steps of a period are odd in number: a swing of two steps shows."""
-    simulator = build_robot_simulator(ModelSpec(load_robot("virtual_trunk")))
+    simulator = build_robot_simulator(ModelSpec(Robot.load("virtual_trunk")))
     session = Session(simulator, len(stiffness), 0.05)
     fixed = {"poisson_ratio": 0.43, "trunk_mass": 0.4, "rayleigh_mass": 0.3, "rayleigh_stiffness": 0.05}
     session.reset(np.arange(len(stiffness)), {"young_modulus": stiffness, **fixed})
@@ -67,7 +67,7 @@ def test_a_squeezed_trunk_moves_smoothly_with_its_modulus_and_comes_to_rest():
 @pytest.mark.slow
 def test_a_notched_trunk_settles_between_opposed_cables():
     """Taut cables hold its necks against twist; an iteration that does not know this swings in twist for ever."""
-    simulator = build_robot_simulator(ModelSpec(load_robot("trunk_physical")))
+    simulator = build_robot_simulator(ModelSpec(Robot.load("trunk_physical")))
     commands = simulator.commands(np.zeros(1), np.zeros((1, 8)), np.zeros(8), np.array([0.0, 0.01]))
     rng = np.random.default_rng(0)
     batch = 24

@@ -16,7 +16,7 @@ from rfdropo_bayes.fem.pushing import find_contacts, trunk_rows
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.model.engines import backend
 from rfdropo_bayes.model.experiment import SimulatorTable
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators import Result, Simulator
 from rfdropo_bayes.simulators.cube import push_table
@@ -26,7 +26,7 @@ from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
 TIME_STEP, HALF = 0.01, 0.0175
-SOFA = load_robot("trunk_sofa_mesh")
+SOFA = Robot.load("trunk_sofa_mesh")
 PLATE = -0.075
 """[m] The bar bends less than SOFA's trunk: a plate that it reaches."""
 ROBOT = SOFA.model_copy(update={"push": SOFA.push.model_copy(update={"plate_height_m": PLATE})})
@@ -277,7 +277,7 @@ def test_the_engine_is_the_one_that_was_asked_for(trunk):
 
 def test_a_robot_without_a_cube_is_refused():
     with pytest.raises(InputError, match="no cube to push"):
-        push_table(load_robot("smooth_arm"))
+        push_table(Robot.load("smooth_arm"))
 
 
 def test_a_cube_that_was_measured_stands_on_the_plate(beside):

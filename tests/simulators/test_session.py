@@ -10,7 +10,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
-from rfdropo_bayes.robots import DriveTravel, load_robot
+from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.simulators.control_session import Session
 from rfdropo_bayes.simulators.engine import Backend, Engine, Integrator
 from rfdropo_bayes.simulators.protocol import Result
@@ -37,7 +37,7 @@ def simulator(
     integrator: Integrator = "euler",
 ):
     """The paper's trunk; its drives ramp every command over two periods, and here answer late, as far as they reach."""
-    robot = load_robot("trunk_sofa")
+    robot = Robot.load("trunk_sofa")
     names, kinds = robot.channel_names, ("lost", "clipped", "kept")
     drives = tuple(DriveTravel(cables=names[k:6:3], low=-0.004, high=0.018, beyond=kinds[k]) for k in range(3))
     timing = robot.command.model_copy(update={"dead_time_s": 0.013})

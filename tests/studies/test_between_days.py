@@ -10,6 +10,7 @@ import pytest
 import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.data import Measured, Origin, SentCommands
 from rfdropo_bayes.model.experiment import CommandsTable
 from rfdropo_bayes.verbs.random_commands import random_walk
 
@@ -34,17 +35,18 @@ def days(mechanisms: list[str], change: dict[str, float], seed: int) -> list[rb.
     sequences = [random_walk(table, 4, rng) for _ in range(2)]
     blank = [
         rb.Trajectory.build(
-            name=f"{day}_{name}",
-            robot="smooth_arm",
-            format="netcdf",
-            time=time,
-            position=np.tile(model.robot.marker_points(), (ROWS, 1, 1)),
-            command_time=sequences[k][0],
-            command=sequences[k][1],
-            command_unit="m",
-            marker_names=model.robot.marker_names,
-            cable_names=model.robot.channel_names,
-            synthetic=True,
+            Origin(name=f"{day}_{name}", robot="smooth_arm", format="netcdf", synthetic=True),
+            SentCommands(
+                command_time=sequences[k][0],
+                command=sequences[k][1],
+                command_unit="m",
+                cable_names=model.robot.channel_names,
+            ),
+            Measured(
+                time=time,
+                position=np.tile(model.robot.marker_points(), (ROWS, 1, 1)),
+                marker_names=model.robot.marker_names,
+            ),
         )
         for day in ("january", "april")
         for name, k in (("a1", 0), ("a2", 0), ("b", 1))

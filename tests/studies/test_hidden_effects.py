@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.model.experiment import load_experiment
+from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.studies.hidden_effects import Setting, hide
-from rfdropo_bayes.verbs.audit import run_audit
+from rfdropo_bayes.verbs.audit import audit
 
 # Friction runs on the slower engine; it has its own test.
 FRICTION = ("coulomb_friction", "capstan_friction")
@@ -28,8 +29,8 @@ def hidden(tmp_path, mechanisms, rho, seed, exclude=FRICTION):
     return found
 
 
-def audited(found, out, **options):
-    return run_audit(found.experiment, out, workshop=SHOP, **options)
+def audited(found, out, overrides=()):
+    return audit(Model.read(found.experiment, overrides), out=out, workshop=SHOP).content
 
 
 @pytest.mark.slow

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.studies.hidden_effects import Setting, hide
-from rfdropo_bayes.verbs.audit import run_audit
+from rfdropo_bayes.verbs.audit import audit
 
 SHOP: dict = {}
 COARSE = {"refine": 1, "time_step": 0.01}
@@ -54,5 +55,5 @@ def test_what_the_library_lacks_is_never_explained(tmp_path, what):
     found = hide(SETTING, [], 0.0, 11, tmp_path, workshop=SHOP)
     assert found is not None
     change(tmp_path, what)
-    content = run_audit(found.experiment, tmp_path / "audit", workshop=SHOP)
+    content = audit(Model.read(found.experiment), out=tmp_path / "audit", workshop=SHOP).content
     assert content["verdict"] in ("unexplained", "partly_explained"), content["sentence"]

@@ -261,7 +261,7 @@ def test_lost_markers_are_left_out(known, tmp_path, monkeypatch):
     monkeypatch.setattr(adaptation, "load_recordings", read)
     (tmp_path / "config.toml").write_text('robot = "smooth_arm"\n[data]\nformat = "netcdf"\nfit = ["a.nc"]\n')
     with pytest.raises(rb.InputError, match="read"):
-        adaptation.run_adaptation(tmp_path, "b.nc", tmp_path / "out")
+        adaptation.run_adaptation(tmp_path, adaptation.fitted_model(tmp_path), "b.nc", tmp_path / "out")
     assert asked["missing"] == "mask"
 
 

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import Experiment
 from rfdropo_bayes.model.model_spec import spec_of
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import bodies_of
 from rfdropo_bayes.verbs.audit import build_problem
 
-ROBOT = load_robot("trunk_sofa_mesh")
+ROBOT = Robot.load("trunk_sofa_mesh")
 OWN = """
 import jax.numpy as jnp
 
@@ -57,16 +57,9 @@ def recording(rows: int = 12) -> Trajectory:
     command = np.zeros((rows, 8))
     command[2:, 1] = 5e-3
     return Trajectory.build(
-        name="bar",
-        robot=ROBOT.name,
-        format="netcdf",
-        time=time,
-        position=np.tile(ROBOT.marker_points(), (rows, 1, 1)),
-        command_time=time,
-        command=command,
-        command_unit="m",
-        marker_names=ROBOT.marker_names,
-        cable_names=ROBOT.channel_names,
+        Origin(name="bar", robot=ROBOT.name, format="netcdf"),
+        SentCommands(command_time=time, command=command, command_unit="m", cable_names=ROBOT.channel_names),
+        Measured(time=time, position=np.tile(ROBOT.marker_points(), (rows, 1, 1)), marker_names=ROBOT.marker_names),
     )
 
 

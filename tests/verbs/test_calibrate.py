@@ -16,9 +16,10 @@ import pytest
 
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, load_posterior
 from rfdropo_bayes.results.calibrated import Calibration
-from rfdropo_bayes.verbs.calibrate import earlier_draws, run_calibration
+from rfdropo_bayes.verbs.calibrate import calibrate, earlier_draws
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEMO = REPOSITORY / "experiments" / "demo.toml"
@@ -35,7 +36,7 @@ SHORT = [
 @pytest.mark.slow
 def test_a_calibration_writes_what_it_promises(tmp_path):
     stated = 'model.drives=[{recordings="demo_1", high=1.0, beyond="lost"}]'
-    found = run_calibration(DEMO, tmp_path, overrides=[*SHORT, stated])
+    found = calibrate(Model.read(DEMO, [*SHORT, stated]), out=tmp_path)
     assert Code.DRIVES_UNSTATED in [caution.code for caution in found.cautions]  # of the test recording
     assert found.verdict in ("safe", "with care", "unsafe")
     assert (tmp_path / "report.html").read_text().startswith("<!DOCTYPE html>")
@@ -56,7 +57,7 @@ def test_two_runs_of_the_same_data_are_compared_by_what_they_predict_of_each_row
     runs = {}
     for noise in ("white", "auto"):
         overrides = [*SHORT, "inference.rollouts=4000", "inference.replicates=2", f'model.noise="{noise}"']
-        run_calibration(DEMO, tmp_path / noise, overrides=overrides)
+        calibrate(Model.read(DEMO, overrides), out=tmp_path / noise)
         runs[noise] = load_posterior(tmp_path / noise / "posterior.nc")
         summary = json.loads((tmp_path / noise / "summary.json").read_text())
         rows = [row for row in summary["parameters"].values() if not row.get("derived")]

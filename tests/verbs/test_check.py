@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.check import Check, run_check
 from rfdropo_bayes.verbs.placement import placement_hints
 
@@ -101,7 +101,7 @@ def moved(change) -> tuple[list[str], Trajectory]:
     demo = Trajectory.load(DEMO)
     dataset = demo.dataset.copy(deep=True)
     dataset["position"] = dataset["position"].copy(data=change(demo.position))
-    return placement_hints(load_robot("smooth_arm"), Trajectory(dataset)), demo
+    return placement_hints(Robot.load("smooth_arm"), Trajectory(dataset)), demo
 
 
 def test_a_recording_in_place_needs_no_hint():

@@ -13,7 +13,7 @@ from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.data import Trajectory, first_row_only
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, first_row_only
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.prediction.predictive import with_measured_starts
@@ -26,7 +26,7 @@ YAW, SHIFT = 0.2, np.array([0.003, -0.002, 0.004])
 
 @pytest.fixture(scope="module")
 def simulator():
-    return Model.read(EXPERIMENTS / "sim2real_trunk.toml", ["simulator.push=true"])[0].simulator
+    return Model.read(EXPERIMENTS / "sim2real_trunk.toml", ["simulator.push=true"]).simulator
 
 
 def recording(simulator, rows: int = 4) -> Trajectory:
@@ -36,17 +36,16 @@ def recording(simulator, rows: int = 4) -> Trajectory:
     pose[1:, 0] += 1.0  # what came after must not be seen
     time = 0.1 * np.arange(rows)
     return Trajectory.build(
-        name="pushed",
-        robot="trunk_physical",
-        format="netcdf",
-        time=time,
-        position=np.broadcast_to(np.linspace([0.0, 0.0, 0.04], [0.0, 0.0, 0.18], 4), (rows, 4, 3)).copy(),
-        object_pose=pose,
-        command_time=time,
-        command=np.zeros((rows, 8)),
-        command_unit="m",
-        marker_names=simulator.marker_names,
-        cable_names=simulator.channel_names,
+        Origin(name="pushed", robot="trunk_physical", format="netcdf"),
+        SentCommands(
+            command_time=time, command=np.zeros((rows, 8)), command_unit="m", cable_names=simulator.channel_names
+        ),
+        Measured(
+            time=time,
+            position=np.broadcast_to(np.linspace([0.0, 0.0, 0.04], [0.0, 0.0, 0.18], 4), (rows, 4, 3)).copy(),
+            marker_names=simulator.marker_names,
+            object_pose=pose,
+        ),
     )
 
 
@@ -87,11 +86,10 @@ def test_a_prediction_holds_every_draw_of_the_cube_in_the_measuring_frame(simula
     PosteriorRecord(tuple(infos), draws).save(tmp_path / "posterior.nc")
     changes = ["simulator.push=true", "simulator.time_step=0.02", "data.format='netcdf'"]
     run_prediction(
-        EXPERIMENTS / "sim2real_trunk.toml",
+        Model.read(EXPERIMENTS / "sim2real_trunk.toml", changes),
         tmp_path,
         str(tmp_path / "commands.nc"),
         tmp_path / "out",
-        overrides=changes,
     )
     with xr.open_dataset(tmp_path / "out" / "prediction.nc") as opened:
         assert opened["object"].shape == (8, 4, 7)

@@ -18,7 +18,7 @@ DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo.toml"
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_every_draw_of_the_demos_prior_ends_well(precision) -> None:
     """Of 600 draws 43 were lost where single precision was asked for more than its rounding allows."""
-    model, _ = Model.read(DEMO, [f"simulator.precision={precision}"])
+    model = Model.read(DEMO, [f"simulator.precision={precision}"])
     problem = model.problem(model.recordings("fit"))
     drawn = problem.sample_prior(jax.random.key(3), 300)
     status = np.ravel(problem.observe({name: np.asarray(value) for name, value in drawn.items()}).status)

@@ -12,7 +12,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms.actuation import Backlash
 from rfdropo_bayes.model.experiment import Experiment, SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec, RunSettings, spec_of
-from rfdropo_bayes.robots import DriveTravel, load_robot
+from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.tables import changed, parse_table
 
 TABLES = {
@@ -48,7 +48,7 @@ def test_a_model_written_as_a_file_and_read_again_is_the_same():
 
 
 def test_mechanisms_and_robots_made_in_python_stay_the_objects_that_they_are():
-    robot, lost = load_robot("smooth_arm"), Backlash.for_robot(load_robot("smooth_arm"))
+    robot, lost = Robot.load("smooth_arm"), Backlash.for_robot(Robot.load("smooth_arm"))
     model = rb.Model(robot, mechanisms=[lost]).with_mechanisms("command_delay")
     assert model.robot is robot
     assert model.spec.mechanisms[0].made_for(robot) is lost
@@ -60,17 +60,17 @@ def test_mechanisms_and_robots_made_in_python_stay_the_objects_that_they_are():
     ("change", "said"),
     [
         (lambda: rb.Model("smooth_arm", mechanisms=["backlsh"]), "did you mean 'backlash'"),
-        (lambda: replace(ModelSpec(load_robot("smooth_arm")), noise="pink"), "unknown noise 'pink'"),
+        (lambda: replace(ModelSpec(Robot.load("smooth_arm")), noise="pink"), "unknown noise 'pink'"),
         (
             lambda: replace(
-                ModelSpec(load_robot("smooth_arm")), drives=(DriveTravel(beyond="lost", low=0.0, cables=("nine",)),)
+                ModelSpec(Robot.load("smooth_arm")), drives=(DriveTravel(beyond="lost", low=0.0, cables=("nine",)),)
             ),
             "nine",
         ),
         (lambda: ModelSpec("smooth_arm"), "str is no robot"),
         (lambda: changed(SimulatorTable(), where="[simulator]", refine=99), "refine = 99"),
         (lambda: changed(SimulatorTable(), where="[simulator]", refin=2), "did you mean 'refine'"),
-        (lambda: load_robot("smooth_arm").with_changes(initial_state="asleep"), "initial_state"),
+        (lambda: Robot.load("smooth_arm").with_changes(initial_state="asleep"), "initial_state"),
     ],
 )
 def test_a_change_is_checked_as_what_is_read(change, said):
@@ -80,6 +80,6 @@ def test_a_change_is_checked_as_what_is_read(change, said):
 
 
 def test_a_changed_robot_keeps_the_groups_of_its_drives():
-    robot = load_robot("smooth_arm").grouped({"monday": "one"})
+    robot = Robot.load("smooth_arm").grouped({"monday": "one"})
     for found in (robot.without_command_timing(), robot.with_changes(initial_state="rest")):
         assert found._groups == {"monday": "one"}

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.bus import BusTable, open_bus
 from rfdropo_bayes.deployment.causes import Cause
@@ -16,11 +16,12 @@ from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import Deployment, SafetyTable
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import CommandsTable
+from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.posteriors import PosteriorRecord
-from rfdropo_bayes.robots import Robot, load_robot
-from rfdropo_bayes.verbs.audit import run_audit
-from rfdropo_bayes.verbs.calibrate import run_calibration
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.audit import audit
+from rfdropo_bayes.verbs.calibrate import calibrate
 from rfdropo_bayes.verbs.random_commands import random_walk
 from rfdropo_bayes.verbs.simulated_plant import trunk
 
@@ -58,17 +59,11 @@ def walk(robot: Robot, name: str, seed: int) -> Trajectory:
     command_time, command = random_walk(table, len(robot.channel_names), np.random.default_rng(seed))
     time = np.array([0.0, table.duration])
     return Trajectory.build(
-        name=name,
-        robot=robot.name,
-        format="netcdf",
-        time=time,
-        position=np.tile(robot.marker_points(), (2, 1, 1)),
-        command_time=command_time,
-        command=command,
-        command_unit=robot.command_unit,
-        marker_names=robot.marker_names,
-        cable_names=robot.channel_names,
-        synthetic=True,
+        Origin(name=name, robot=robot.name, format="netcdf", synthetic=True),
+        SentCommands(
+            command_time=command_time, command=command, command_unit=robot.command_unit, cable_names=robot.channel_names
+        ),
+        Measured(time=time, position=np.tile(robot.marker_points(), (2, 1, 1)), marker_names=robot.marker_names),
     )
 
 
@@ -89,7 +84,7 @@ def record(folder: Path, names: dict[str, int], hidden: str = "") -> None:
     """
     values = [f"model.fixed.{name} = {value}" for name, value in TRUTH.items()]
     (folder / "truth.toml").write_text("\n".join(['robot = "motor_arm"', *values, hidden, ""]))
-    robot = load_robot("motor_arm")
+    robot = Robot.load("motor_arm")
     sensor = KeptOpen(len(robot.marker_names))
     settings = {"marker_noise": NOISE, "experiment": str(folder / "truth.toml")}
     hub = BusTable(interface="hub", channel="127.0.0.1:0")
@@ -103,7 +98,7 @@ def record(folder: Path, names: dict[str, int], hidden: str = "") -> None:
             walk(robot, name, seed).save(folder / f"{name}_commands.nc")
             outcome = deploy(
                 Deployment(robot="motor_arm", safety=patient), "replay", folder / name, simulated=True,
-                recording=folder / f"{name}_commands.nc", bus=open_bus(found), sensor=sensor,
+                commands=folder / f"{name}_commands.nc", bus=open_bus(found), sensor=sensor,
             )  # fmt: skip
             assert outcome.cause is Cause.FINISHED, outcome.detail
             (folder / f"{name}.nc").write_bytes((folder / name / "session.nc").read_bytes())
@@ -122,7 +117,7 @@ def experiment(folder: Path, fit: list[str], test: list[str]) -> Path:
 @pytest.mark.slow
 def test_the_plant_moves_as_a_rollout_of_the_same_commands() -> None:
     """Drums that follow the ramps of a rollout, asked 8 to 12 ms at a time: at the end all is where the rollout is."""
-    robot = load_robot("motor_arm")
+    robot = Robot.load("motor_arm")
     robot = robot.model_copy(update={"command": robot.command.model_copy(update={"dead_time_s": 0.0})})
     command = np.array([[0.006, 0.0, 0.0, -0.002], [0.002, 0.004, 0.0, 0.001]])
     simulator = build_simulator(ModelSpec(robot))
@@ -146,7 +141,7 @@ def test_torques_in_the_log_break_the_scale_and_the_truth_is_recovered(tmp_path:
     path = experiment(tmp_path, ["one"], ["two"])
     deviations = {}
     for tension in ("true", "false"):
-        run_calibration(path, tmp_path / tension, overrides=[f"model.tension={tension}"])
+        calibrate(Model.read(path, [f"model.tension={tension}"]), out=tmp_path / tension)
         found = PosteriorRecord.load(tmp_path / tension / "posterior.nc")
         deviations[tension] = np.std(np.log(found.flat("young_modulus")))
         for name, true in TRUTH.items() if tension == "true" else ():
@@ -161,7 +156,8 @@ def test_torques_in_the_log_break_the_scale_and_the_truth_is_recovered(tmp_path:
 def test_the_audit_of_the_log_names_what_is_hidden_in_the_robot(tmp_path: Path) -> None:
     names = {"one": 1, "again": 1, "two": 2, "three": 3, "four": 4}
     record(tmp_path, names, f'model.mechanisms = ["backlash"]\nmodel.fixed.backlash = {PLAY}')
-    content = run_audit(experiment(tmp_path, ["one", "again", "two"], ["three", "four"]), tmp_path / "out")
+    model = Model.read(experiment(tmp_path, ["one", "again", "two"], ["three", "four"]))
+    content = audit(model, out=tmp_path / "out").content
     # Where in its play a drive stands when a session begins depends on the session before, which no log tells: the
     # verdict may be that something remains.
     assert content["verdict"] in ("explained", "equivalent", "partly_explained")

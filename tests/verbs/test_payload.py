@@ -51,7 +51,7 @@ def documented() -> list[str]:
 def test_an_unknown_payload_is_free_beside_the_one_that_was_weighed(datasets, monkeypatch):
     monkeypatch.setenv("RFDROPO_DATA", str(datasets))
     for overrides, payloads in (([], {KNOWN}), (documented(), {KNOWN, UNKNOWN})):
-        model, _ = Model.read(EXPERIMENT, overrides)
+        model = Model.read(EXPERIMENT, overrides)
         built = model.numpyro(load_recordings(model.settings.data, model.folder))
         (weighed,) = [channel for channel in built.channels if isinstance(channel, WeighedParts)]
         assert weighed.entries == (Weighed((KNOWN,), 0.1, 0.001),)

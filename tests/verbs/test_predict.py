@@ -29,7 +29,7 @@ from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPr
 from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError
 from rfdropo_bayes.prediction.predictive import NOISE, _for_new_recordings
-from rfdropo_bayes.robots import load_robot
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.verbs.predict import run_prediction
 from rfdropo_bayes.verbs.simulate import simulate_all
@@ -64,7 +64,7 @@ def prior_of(median: float) -> dict[str, object]:
 
 
 def predict(posterior: Path, commands: str, out: Path, rows: tuple[int, int] = (0, 30), **options) -> xr.Dataset:
-    run_prediction(EXPERIMENTS / "demo.toml", posterior, commands, out, rows=rows, overrides=COARSE, **options)
+    run_prediction(Model.read(EXPERIMENTS / "demo.toml", COARSE), posterior, commands, out, rows=rows, **options)
     with xr.open_dataset(out / "prediction.nc") as opened:
         return opened.load()
 
@@ -172,9 +172,8 @@ def test_the_chosen_group_says_what_the_drives_follow(posterior, tmp_path):
     moved, said = {}, {}
     for group in (None, "april"):
         out = tmp_path / str(group)
-        facts = run_prediction(
-            EXPERIMENTS / "demo.toml", posterior, COMMANDS, out, rows=(0, 30), overrides=overrides, group=group
-        )
+        model = Model.read(EXPERIMENTS / "demo.toml", overrides)
+        facts = run_prediction(model, posterior, COMMANDS, out, rows=(0, 30), group=group)
         moved[group] = np.ptp(pd.read_csv(out / "prediction.csv")["m4_x_mean"])
         said[group] = [caution["code"] for caution in facts["cautions"]]
     assert said == {None: ["drives_unstated"], "april": []}
@@ -308,7 +307,7 @@ def test_a_first_row_far_from_the_model_s_is_found_by_the_model_s_own_error():
 
 def test_noise_is_not_pooled():
     """It is the same for all recordings: a deviation of it would be drawn and never used."""
-    spec = ModelSpec(load_robot("smooth_arm"), per_group={"observation_noise": 1e-3})
+    spec = ModelSpec(Robot.load("smooth_arm"), per_group={"observation_noise": 1e-3})
     with pytest.raises(InputError, match="unknown parameter 'observation_noise'"):
         pooling(spec, (ParameterSpec("mass", "kg", 0.0, 1.0, 0.1, {}, ""),), ["a"])
 
@@ -338,7 +337,7 @@ def test_a_simulated_recording_is_predicted_from_its_first_row(name, sign, tmp_p
         "simulator": {"time_step": 0.005},
         "model": {"noise": "white", "mechanisms": [name], "priors": {"offset": {}}, "per_recording": {"offset": "all"}},
     }
-    specs = [spec for mechanism in mechanisms_named([name], load_robot("smooth_arm")) for spec in mechanism.parameters]
+    specs = [spec for mechanism in mechanisms_named([name], Robot.load("smooth_arm")) for spec in mechanism.parameters]
     values = {spec.name: beyond_null(spec, sign) for spec in specs}
     commands = {"duration": 0.8, "interval": 0.05, "step": 0.004, "low": 0, "high": 0.02, "sample_time": 0.05}
     made = experiment | {
@@ -355,7 +354,7 @@ def test_a_simulated_recording_is_predicted_from_its_first_row(name, sign, tmp_p
     infos += [ParameterInfo(n, "m", -0.5, 0.5, {"distribution": "Normal", "loc": 0.0, "scale": 0.01}) for n in offset]
     draws = {n: np.full((1, 4), v) for n, v in fixed.items()} | offset
     PosteriorRecord(tuple(infos), draws).save(tmp_path / "posterior.nc")
-    run_prediction(tmp_path / "own.toml", tmp_path, "trajectory.nc", tmp_path / "out")
+    run_prediction(Model.read(tmp_path / "own.toml"), tmp_path, "trajectory.nc", tmp_path / "out")
     with xr.open_dataset(tmp_path / "out" / "prediction.nc") as opened:
         predicted = opened["mean"].values
     measured = Trajectory.load(tmp_path / "trajectory.nc").position

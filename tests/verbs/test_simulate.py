@@ -190,7 +190,7 @@ def test_a_simulated_recording_is_found_again(bar, tmp_path, monkeypatch, capsys
 def test_the_mesh_is_looked_for_beside_the_experiment(bar, bar_mesh, tmp_path, monkeypatch):
     monkeypatch.delenv(DATA_VARIABLE, raising=False)
     text = bar.read_text().replace(str(bar_mesh), "mine.vtk") + COMMANDS
-    model, _ = Model.read(write(tmp_path / "mine.toml", text))
+    model = Model.read(write(tmp_path / "mine.toml", text))
     with pytest.raises(InputError, match=r"mine\.vtk: no such file"):
         simulate_all(model, tmp_path / "out")
     (tmp_path / "mine.vtk").write_bytes(bar_mesh.read_bytes())

@@ -14,7 +14,6 @@ import rfdropo_bayes as rb
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy
-from rfdropo_bayes.verbs.train import run_evaluation, run_training
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REACH = REPOSITORY / "experiments" / "reach_policy.toml"
@@ -58,7 +57,7 @@ def test_a_policy_is_trained_exported_and_evaluated(tmp_path, task) -> None:
 @pytest.mark.slow
 def test_the_committed_policy_reaches_its_goals(tmp_path) -> None:
     """200 of 200 episodes ended within 5 mm. At 99 % a sample of 60 has fewer than 57 once in 300."""
-    found = run_evaluation(REACH, [COMMITTED], tmp_path, episodes=60, lanes=30, seed=5)
+    found = rb.evaluate(rb.Model.read(REACH), [COMMITTED], tmp_path, episodes=60, lanes=30, seed=5)
     row = found["policies"]["reach"]
     assert row["success_mm"]["5"]["share"] >= 57 / 60
     assert row["median_mm"] < 2.0
@@ -78,12 +77,12 @@ def test_the_committed_policy_reaches_its_goals(tmp_path) -> None:
 )
 def test_settings_that_cannot_be_are_refused(tmp_path, overrides, words) -> None:
     with pytest.raises(InputError, match=words):
-        run_training(REACH, tmp_path / "policy", overrides=[*QUICK, *overrides])
+        rb.train(rb.Model.read(REACH, [*QUICK, *overrides]), tmp_path / "policy")
 
 
 def test_an_experiment_without_training_is_refused(tmp_path) -> None:
     with pytest.raises(InputError, match=r"no table \[training\]"):
-        run_training(REPOSITORY / "experiments" / "sofa_reach_layered.toml", tmp_path)
+        rb.train(rb.Model.read(REPOSITORY / "experiments" / "sofa_reach_layered.toml"), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +94,7 @@ def test_an_experiment_without_training_is_refused(tmp_path) -> None:
 )
 def test_a_policy_for_another_task_or_period_is_refused(tmp_path, override, words) -> None:
     with pytest.raises(InputError, match=f"the policy's {words}"):
-        run_evaluation(REACH, [COMMITTED], tmp_path / "test", overrides=[override], episodes=2)
+        rb.evaluate(rb.Model.read(REACH, [override]), [COMMITTED], tmp_path / "test", episodes=2)
 
 
 def test_the_model_in_memory_makes_environments() -> None:
@@ -109,6 +108,16 @@ def test_the_model_in_memory_makes_environments() -> None:
     assert np.isfinite(venv.step(np.zeros((3, 8)))[1]).all()
     with pytest.raises(rb.InputError, match="TrunkReach-v0"):
         rb.make_vec("TrunkReech-v0", model)
+
+
+def test_a_posterior_beside_another_randomisation_is_refused(tmp_path) -> None:
+    """It would take the place of the ranges without a word."""
+    model = rb.Model("trunk_sofa", simulator=SINGLE)
+    ranges = {"randomisation": "uniform", "ranges": {"young_modulus": [4e6, 5e6]}}
+    with pytest.raises(InputError, match="a posterior was given, and randomisation = 'uniform'"):
+        rb.make_vec("TrunkReach-v0", model, posterior=tmp_path, **ranges)
+    with pytest.raises(InputError, match="posterior.nc"):  # which is looked for where the two agree
+        rb.make_vec("TrunkReach-v0", model, posterior=tmp_path, randomisation="posterior")
 
 
 @pytest.mark.slow
@@ -133,7 +142,7 @@ def test_policies_whose_folders_are_called_the_same_are_told_apart(tmp_path) -> 
         (tmp_path / day / "reach").mkdir(parents=True)
         (tmp_path / day / "reach" / "policy.onnx").write_bytes((COMMITTED / "policy.onnx").read_bytes())
     policies = [tmp_path / "monday" / "reach", tmp_path / "tuesday" / "reach" / "policy.onnx"]
-    found = run_evaluation(REACH, policies, tmp_path / "test", episodes=2, lanes=2, film=False)
+    found = rb.evaluate(rb.Model.read(REACH), policies, tmp_path / "test", episodes=2, lanes=2, film=False)
     assert set(found["policies"]) == {"monday_reach", "tuesday_reach"}
     with pytest.raises(InputError, match="given twice"):
-        run_evaluation(REACH, [COMMITTED, COMMITTED], tmp_path / "twice", episodes=2)
+        rb.evaluate(rb.Model.read(REACH), [COMMITTED, COMMITTED], tmp_path / "twice", episodes=2)

@@ -12,10 +12,10 @@ import xarray as xr
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.motion import AROUND, cube_corners, silhouette, smooth_line, tube, tube_faces, upright
-from rfdropo_bayes.robots import known_robots, load_robot
+from rfdropo_bayes.robots import Robot, known_robots
 from rfdropo_bayes.verbs.view import run_view
 
 ROWS = 6
@@ -24,25 +24,23 @@ ROWS = 6
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
     """A trunk that bends sideways while a cube slides along and turns."""
-    robot = load_robot("trunk_sofa_mesh")
+    robot = Robot.load("trunk_sofa_mesh")
     rest, share = robot.marker_points(), np.linspace(0.0, 1.0, ROWS)
     position = np.tile(rest, (ROWS, 1, 1))
     position[:, :, 0] += 4.0 * share[:, None] * rest[:, 2] ** 2
     centre = np.array([0.02, -0.0828, 0.1]) + share[:, None] * [0.05, 0.0, -0.02]
     turn = Rotation.from_rotvec(share[:, None] * [0.0, 0.6, 0.0]).as_quat()
     trajectory = Trajectory.build(
-        name="bend",
-        robot=robot.name,
-        format="netcdf",
-        time=0.05 * np.arange(ROWS),
-        position=position,
-        object_pose=np.concatenate([centre, turn], axis=1),
-        command_time=np.zeros(1),
-        command=np.zeros((1, 8)),
-        command_unit="m",
-        marker_names=list(robot.marker_names),
-        cable_names=list(robot.channel_names),
-        synthetic=True,
+        Origin(name="bend", robot=robot.name, format="netcdf", synthetic=True),
+        SentCommands(
+            command_time=np.zeros(1), command=np.zeros((1, 8)), command_unit="m", cable_names=list(robot.channel_names)
+        ),
+        Measured(
+            time=0.05 * np.arange(ROWS),
+            position=position,
+            marker_names=list(robot.marker_names),
+            object_pose=np.concatenate([centre, turn], axis=1),
+        ),
     )
     path = tmp_path_factory.mktemp("view") / "bend.nc"
     trajectory.save(path)
@@ -146,7 +144,7 @@ def own_robot(folder: Path) -> Path:
 
 def prediction(folder: Path) -> Path:
     """What predict writes of the bundled arm, as far as it is drawn."""
-    position = np.tile(load_robot("smooth_arm").marker_points(), (ROWS, 1, 1))
+    position = np.tile(Robot.load("smooth_arm").marker_points(), (ROWS, 1, 1))
     position[:, 2:, 0] += [0.005, -0.005]
     data = dict.fromkeys(("mean", "q05", "q95"), (("time", "marker", "axis"), position))
     coords = {"time": 0.05 * np.arange(ROWS), "marker": ["m1", "m2", "m3", "m4"], "axis": list("xyz")}

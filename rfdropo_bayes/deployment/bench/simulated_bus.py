@@ -30,7 +30,7 @@ from rfdropo_bayes.deployment.bus import BusTable, open_bus
 from rfdropo_bayes.deployment.clock import real_time, steady_interpreter
 from rfdropo_bayes.deployment.objects import Object
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import Robot, load_robot
+from rfdropo_bayes.robots import Robot
 
 TICK = 0.002  # [s]: drives check their guards and move between frames
 PLANT_PERIOD = 0.01  # [s]: how often plant and markers are brought up to date where no SYNC comes
@@ -186,7 +186,7 @@ def serve(table: SimulationTable, ready: Path | None = None) -> None:
             bus_table = stack.enter_context(_hub_process(table.bus))
         bus = open_bus(bus_table)
         stack.callback(bus.shutdown)
-        robot = load_robot(table.robot)
+        robot = Robot.load(table.robot)
         if table.own_process:
             process = PlantProcess(table.plant, robot, table.settings)
             stack.callback(process.close)

@@ -117,11 +117,13 @@ class TetrahedralEngine:
             inputs = self._samples({name: np.asarray(value)[lane] for name, value in parameters.items()})
             displacement, work = self._lanes_last(commands[lane]), self._work()
             sizes = (rows, points, 3, self.lanes), (rows, commands.shape[2], self.lanes)
-            output = kernels.Output(self._nodes, self._weights, *(aligned_zeros(size, self.dtype) for size in sizes))
+            output = kernels.TetrahedralOutput(
+                self._nodes, self._weights, *(aligned_zeros(size, self.dtype) for size in sizes)
+            )
             single = self.dtype.itemsize == 4
             numbers = SETTLED[self.dtype.name], SOFTNESS[self.dtype.name]
             stages = timed_stages(self.integrator, time_step)
-            schedule = kernels.Schedule(float(time_step), stride, *numbers, self._reach, single, *stages)
+            schedule = kernels.TetrahedralSchedule(float(time_step), stride, *numbers, self._reach, single, *stages)
             self._kernel(
                 self._pattern, self._mesh, self._cables, self._scene, self._rest, displacement, cubes, inputs, work,
                 *self._constraints(), schedule, output, poses, first, samples, lane_token(self.lanes),

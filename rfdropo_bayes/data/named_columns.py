@@ -1,0 +1,300 @@
+"""The table [data.columns]: which column of a table is what, and the recording that is read by it.
+
+Timing. The command in row k is in force from the time of row k until that of row k + 1, as a loop that measures, then
+commands, writes it; what was in force before row 0 is another matter (`first_command`). Commands may stand in a
+table of their own, with as many rows as the observations or one fewer; or with their own times and any number of rows.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from scipy.spatial.transform import Rotation
+
+from rfdropo_bayes.data.csv_table import CsvTable
+from rfdropo_bayes.data.faults import fill_missing, find_faults
+from rfdropo_bayes.data.held_readings import hold_time
+from rfdropo_bayes.data.recorded import Measured, Origin, Recorded, SentCommands
+from rfdropo_bayes.data.sample_times import TimeUnit
+from rfdropo_bayes.errors import InputError
+
+FORMAT = "csv"
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
+    "rad": ("rad", 1.0),
+    "deg": ("rad", np.pi / 180.0),
+}
+
+
+def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
+    matrix = axes_matrix(axes)
+    if not np.isclose(np.linalg.det(matrix), 1.0):
+        raise ValueError("axes must name x, y and z once each, with signs that make a right-handed frame")
+    return axes
+
+
+_ORIENTATION = re.compile("orient|quat|euler|rot|imu|acc|gyro|magnet|angular|inert", re.IGNORECASE)
+_POSITIONS_ONLY = (
+    "a marker is a position: leave orientations and inertial readings out (columns that are not named are not read). "
+    "From a rigid body's pose, a second point on the body can be computed and named as a marker; object_pose is the "
+    "pose of a pushed body"
+)
+
+
+class CsvColumns(BaseModel):
+    """The table [data.columns]: which column is what, in which unit. Columns that are not named are not read.
+
+    Times come from the column ``time`` or from a constant ``sample_time``.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    time: str | None = Field(
+        default=None,
+        description="column of the times: numbers in time_unit, or dates (ISO 8601); or give sample_time; for "
+        '"rosbag": "header", stamps where messages have them, or "log", the recorder\'s times',
+    )
+    time_unit: TimeUnit = Field(default="s", description="unit of the times; dates and durations need none")
+    sample_time: float | None = Field(
+        default=None,
+        gt=0,
+        description="time between rows [s], where no column holds times, or one holds those of arrival",
+    )
+    commands: list[str] = Field(
+        min_length=1,
+        description="columns of the commands as they were sent, one for each of the robot's channels, in its order",
+    )
+    command_unit: Literal["m", "cm", "mm", "rad", "deg"] = Field(
+        description="unit of the commands: a length of cable, or an angle of a motor"
+    )
+    command_time: str | None = Field(
+        default=None,
+        description="column of the commands' own times, in their file; by default command k is sent in row k of the "
+        "observations",
+    )
+    command_time_unit: TimeUnit | None = Field(
+        default=None, description="unit of command_time; that of time by default"
+    )
+    command_offset: float = Field(
+        default=0.0,
+        description="added to the commands' own times [s]: what the clock of the observations shows when that of the "
+        "commands shows zero",
+    )
+    positions: list[tuple[str, str, str]] = Field(
+        min_length=1, description="columns of x, y and z of each marker, base to tip"
+    )
+    position_unit: Literal["m", "cm", "mm"] = Field(
+        description='unit of the positions; the header of a "motive-csv" file comes first'
+    )
+    axes: Annotated[tuple[str, str, str], AfterValidator(_right_handed)] = Field(
+        ("x", "y", "z"),
+        description="the base frame's x, y, z in terms of the file's axes, e.g. "
+        '["x", "z", "-y"] for a trunk that hangs in a frame with y up',
+    )
+    markers: list[str] | None = Field(
+        default=None, description="the robot's name of each marker in positions; m1, m2, ... by default"
+    )
+    cables: list[str] | None = Field(
+        default=None, description="name of each channel in commands; those of the columns by default"
+    )
+    tensions: list[str] | None = Field(
+        default=None, description="columns of the cable tensions [N], one for each command; empty cells are left out"
+    )
+    motor_angles: list[str] | None = Field(
+        default=None, description="columns of the measured motor angles, one for each command; empty cells are left out"
+    )
+    motor_angle_unit: Literal["rad", "deg"] = Field(default="rad", description="unit of the motor angles")
+    object_pose: list[str] | None = Field(
+        default=None,
+        min_length=7,
+        max_length=7,
+        description="columns of the pushed body's centre x, y, z and unit quaternion x, y, z, w; empty rows are left "
+        "out",
+    )
+    robot: str = Field("", description="name of the robot that was recorded")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _positions_only(cls, table: Any) -> Any:
+        if isinstance(table, dict):
+            unknown = set(table) - set(cls.model_fields)
+            for key in unknown:
+                if _ORIENTATION.search(str(key)):
+                    raise InputError(f"unknown key {key!r}", where="[data.columns]", remedy=_POSITIONS_ONLY)
+            if "positions" not in table and not unknown:
+                remedy = f'add positions = [["x1", "y1", "z1"], ...]; {_POSITIONS_ONLY}'
+                raise InputError("no positions of markers", where="[data.columns]", remedy=remedy)
+            points = table.get("positions")
+            for point in points if isinstance(points, list) else []:
+                if isinstance(point, list) and len(point) != 3:
+                    raise InputError(
+                        f"the marker {', '.join(str(name) for name in point)} has {len(point)} columns, not x, y and z",
+                        where="[data.columns] positions",
+                        remedy=_POSITIONS_ONLY if len(point) > 3 else "name its three columns",
+                    )
+        return table
+
+    @model_validator(mode="after")
+    def _fits(self) -> CsvColumns:
+        if (self.time is None) == (self.sample_time is None):
+            raise ValueError("give either time (a column) or sample_time (seconds)")
+        for key, names, count in (
+            ("markers", self.markers, len(self.positions)),
+            ("cables", self.cables, len(self.commands)),
+            ("tensions", self.tensions, len(self.commands)),
+            ("motor_angles", self.motor_angles, len(self.commands)),
+        ):
+            if names is not None and len(names) != count:
+                what = "marker in positions" if key == "markers" else "channel in commands"
+                raise ValueError(f"{key} has {len(names)} entries where {count} are needed, one for each {what}")
+        return self
+
+
+def axes_matrix(axes: tuple[str, str, str]) -> Float[np.ndarray, "3 3"]:
+    """Rotation from the file's frame to the base frame, from names such as ("x", "z", "-y")."""
+    matrix = np.zeros((3, 3))
+    for row, name in enumerate(axes):
+        sign, letter = (-1.0, name[1:]) if name.startswith("-") else (1.0, name.lstrip("+"))
+        if letter in ("x", "y", "z"):
+            matrix[row, "xyz".index(letter)] = sign
+    return matrix
+
+
+def read_frame(frame: pd.DataFrame, columns: CsvColumns, name: str, *, mask_missing: bool = False) -> Recorded:
+    """One recording from a table in memory."""
+    table = CsvTable.of_frame(frame, name, coordinates(columns))
+    return read_tables(table, table, columns, mask_missing=mask_missing)
+
+
+def coordinates(columns: CsvColumns) -> list[str]:
+    """The columns of the positions."""
+    return [name for point in columns.positions for name in point]
+
+
+def read_tables(
+    table: CsvTable, source: CsvTable, columns: CsvColumns, *, mask_missing: bool = False, origin: Origin | None = None
+) -> Recorded:
+    """The recording in a table, whose commands are in ``source``, which may be the same.
+
+    ``origin`` is that of a CSV by default.
+    """
+    position, time = points(table, columns, mask_missing=mask_missing), _times(table, columns)
+    markers = marker_names(columns)
+    faults = find_faults(time, position, where=str(table.path), names=markers)
+    command = _commands(table, source, columns)
+    sent = time[: len(command)] if columns.command_time is None else _command_times(table, source, columns)
+    angle = None
+    if columns.motor_angles is not None:
+        degree = np.pi / 180.0 if columns.motor_angle_unit == "deg" else 1.0
+        angle = degree * table.numbers(columns.motor_angles, allow_missing=True)
+    settings = faults.settings | ({} if angle is None else {"motor_angle_hold": hold_time(time, angle)})
+    return Recorded(
+        replace(origin or origin_of(table, columns), settings=settings),
+        SentCommands(sent, command, *_channels(columns), command[0]),
+        Measured(
+            time=time,
+            position=fill_missing(time, position),
+            marker_names=markers,
+            position_mask=faults.mask,
+            tension=None if columns.tensions is None else table.numbers(columns.tensions, allow_missing=True),
+            motor_angle=angle,
+            object_pose=_pose(table, columns),
+        ),
+    )
+
+
+def read_commands(table: CsvTable, columns: CsvColumns) -> SentCommands:
+    """The commands in a table that may hold nothing else; their times count from the first one."""
+    clock, unit = command_clock(columns)
+    time = _times(table, columns) if clock is None else _from_first(table, clock, unit)
+    return SentCommands(time, _commands(table, table, columns), *_channels(columns))
+
+
+def origin_of(table: CsvTable, columns: CsvColumns) -> Origin:
+    """What a recording in a CSV is called."""
+    file = table.path.name
+    return Origin(file.removesuffix(".gz").removesuffix(".csv"), columns.robot, FORMAT, provenance=file)
+
+
+def marker_names(columns: CsvColumns) -> list[str]:
+    """Names of the markers, as they are given, or m1, m2, ..."""
+    return columns.markers or [f"m{marker}" for marker in range(1, len(columns.positions) + 1)]
+
+
+def _channels(columns: CsvColumns) -> tuple[str, list[str]]:
+    """Unit of the commands in a recording, and the names of their channels."""
+    return COMMAND_UNITS[columns.command_unit][0], columns.cables or columns.commands
+
+
+def points(table: CsvTable, columns: CsvColumns, *, mask_missing: bool) -> Float[np.ndarray, "rows marker 3"]:
+    """Positions of the markers [m] in the base frame."""
+    place = table.points(coordinates(columns), allow_missing=mask_missing)
+    return METRES[columns.position_unit] * place @ axes_matrix(columns.axes).T
+
+
+def _times(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " rows"]:
+    if columns.time is None:
+        return float(columns.sample_time or 0.0) * np.arange(len(table))
+    return _from_first(table, columns.time, columns.time_unit)
+
+
+def _from_first(table: CsvTable, clock: str, unit: TimeUnit) -> Float[np.ndarray, " rows"]:
+    stamps = table.stamps(clock, unit)
+    return stamps.since(stamps, str(table.path))
+
+
+def command_clock(columns: CsvColumns) -> tuple[str | None, TimeUnit]:
+    """Column of times in a file of commands, and its unit."""
+    return columns.command_time or columns.time, columns.command_time_unit or columns.time_unit
+
+
+def _command_times(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " command"]:
+    """The commands' own times [s] from the first observation on.
+
+    Raises:
+        InputError: commands that were sent at other times than the recording.
+    """
+    clock, unit = command_clock(columns)
+    stamps, where = source.stamps(str(clock), unit), f"{table.path} with {source.path}"
+    if columns.time is None:
+        sent = stamps.ticks / stamps.per_second
+    else:
+        sent = stamps.since(table.stamps(columns.time, columns.time_unit), where)
+    sent, last = sent + columns.command_offset, float(_times(table, columns)[-1])
+    if sent[0] > last or sent[-1] < -last:  # a command long before may hold throughout, but is likelier another clock's
+        raise InputError(
+            f"commands were sent from {sent[0]:.6g} to {sent[-1]:.6g} s, and {last:.6g} s were recorded from 0 s on",
+            where=where,
+            remedy="correct command_offset, or pair what was recorded together; for a bag whose stamps are of several "
+            'clocks write time = "log"',
+        )
+    return sent
+
+
+def _commands(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows cable"]:
+    values = COMMAND_UNITS[columns.command_unit][1] * source.numbers(columns.commands)
+    if columns.command_time is None and len(values) not in (len(table), len(table) - 1):
+        raise InputError(
+            f"{len(table)} observations do not fit {len(values)} commands: give as many, or one fewer",
+            where=f"{table.path} with {source.path}",
+            remedy="pair the files that were recorded together, or name the commands' own times: command_time",
+        )
+    return values
+
+
+def _pose(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows 7"] | None:
+    if columns.object_pose is None:
+        return None
+    pose = table.numbers(columns.object_pose, allow_missing=True) * np.array(
+        [METRES[columns.position_unit]] * 3 + [1.0] * 4
+    )
+    rotation, known = axes_matrix(columns.axes), np.isfinite(pose).all(axis=1)
+    turned = np.full((len(pose), 4), np.nan)
+    turned[known] = (Rotation.from_matrix(rotation) * Rotation.from_quat(pose[known, 3:])).as_quat()
+    return np.hstack([pose[:, :3] @ rotation.T, turned])

@@ -1,0 +1,184 @@
+"""What a reader found in a file or a program held, in SI units: the parts that a `Trajectory` is built of."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from jaxtyping import Bool, Float
+
+from rfdropo_bayes.data import checks
+from rfdropo_bayes.data.held_readings import new_readings, present_readings
+from rfdropo_bayes.data.sample_times import sample_time
+from rfdropo_bayes.errors import InputError
+
+AXES = ("x", "y", "z")
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+SCHEMA = "rfdropo_bayes.trajectory/1"
+FIRST_COMMAND = "first_command"  # among the settings: which command was in force before the first row
+MISSING = "missing_readings"  # among the settings: how many tensions, motor angles and poses a recording lacks
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a recording comes from.
+
+    Attributes:
+        name: of the recording, in reports.
+        robot: name of the robot description; empty where the file does not say.
+        format: of the file, as in an experiment's [data].
+        synthetic: whether a simulator made it.
+        provenance: the file, or how it was made, in words.
+        frame: of the positions, in words.
+        settings: facts about the recording that a model may need (JSON); of motor angles with a ``motor_angle_hold``
+            [s] among them only new readings are to be used (`held_readings`).
+    """
+
+    name: str
+    robot: str
+    format: str
+    synthetic: bool = False
+    provenance: str = ""
+    frame: str = "robot base: x, y across, z along the axis away from the base"
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SentCommands:
+    """Commands as they were sent, cumulative, pull > 0, each in force until the next.
+
+    Attributes:
+        command_time: from when each is in force [s], on the clock of the observations.
+        command: values, unclipped.
+        command_unit: "m" of cable or "rad" of a motor.
+        cable_names: of the channels.
+        initial_command: in force before the first; zero by default.
+    """
+
+    command_time: Float[np.ndarray, " command_time"]
+    command: Float[np.ndarray, "command_time cable"]
+    command_unit: str
+    cable_names: Sequence[str]
+    initial_command: Float[np.ndarray, " cable"] | None = None
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was observed; tensions, motor angles and poses that are not a number are missing.
+
+    Attributes:
+        time: of the observations [s]; the first one becomes 0.
+        position: of the markers in the robot's base frame [m].
+        marker_names: base to tip.
+        position_mask: False where a position is a recording fault; all True by default.
+        tension: of the cables [N].
+        motor_angle: [rad].
+        object_pose: centre [m] and unit quaternion x, y, z, w of a pushed body.
+    """
+
+    time: Float[np.ndarray, " time"]
+    position: Float[np.ndarray, "time marker 3"]
+    marker_names: Sequence[str]
+    position_mask: Bool[np.ndarray, "time marker"] | None = None
+    tension: Float[np.ndarray, "time cable"] | None = None
+    motor_angle: Float[np.ndarray, "time cable"] | None = None
+    object_pose: Float[np.ndarray, "time 7"] | None = None
+
+
+class Recorded(NamedTuple):
+    """All of a recording, before it is checked: ``Trajectory.build(*recorded)`` checks it."""
+
+    origin: Origin
+    sent: SentCommands
+    measured: Measured
+
+
+def assembled(recorded: Recorded) -> xr.Dataset:
+    """A recording as a data set with its attributes; readings that are missing are left out and counted.
+
+    Raises:
+        InputError: lengths that do not fit together.
+    """
+    origin, sent, measured = recorded
+    facts = dict(origin.settings)
+    checks.check_pose(measured.object_pose, len(measured.time), origin.name)
+    tension, tension_mask = present_readings(measured.tension)
+    motor_angle, angle_mask = present_readings(measured.motor_angle)
+    facts |= _missing(tension_mask, angle_mask, measured.object_pose)
+    new = _angle_mask(measured.time, motor_angle, float(facts.get("motor_angle_hold", 0.0)))
+    pose, mask, initial = measured.object_pose, measured.position_mask, sent.initial_command
+    arrays = {
+        "position": measured.position,
+        "position_mask": np.ones(np.shape(measured.position)[:2], dtype=bool) if mask is None else mask,
+        "command": sent.command,
+        "initial_command": np.zeros(len(sent.cable_names)) if initial is None else initial,
+        "tension": tension,
+        "tension_mask": tension_mask,
+        "motor_angle": motor_angle,
+        "motor_angle_mask": angle_mask if new is None else (new if angle_mask is None else new & angle_mask),
+        "object_pose": None if pose is None else continuous_quaternions(pose),
+    }
+    dataset = _dataset(recorded, arrays)
+    dataset["command"].attrs["unit"] = sent.command_unit
+    time = measured.time
+    dataset.attrs = {
+        "schema": SCHEMA,
+        "name": origin.name,
+        "robot": origin.robot,
+        "format": origin.format,
+        "provenance": origin.provenance,
+        "frame": origin.frame,
+        "sample_time": sample_time(np.asarray(time, dtype=float)) if len(time) > 1 else 0.0,
+        "synthetic": int(origin.synthetic),
+        "settings": json.dumps(facts, sort_keys=True),
+    }
+    return dataset
+
+
+def _dataset(recorded: Recorded, arrays: Mapping[str, Any]) -> xr.Dataset:
+    origin, sent, measured = recorded
+    start = measured.time[0] if len(measured.time) else 0.0
+    coords = {
+        "time": np.asarray(measured.time, dtype=float) - start,
+        "command_time": np.asarray(sent.command_time, dtype=float) - start,
+        "marker": list(measured.marker_names),
+        "cable": list(sent.cable_names),
+        "axis": list(AXES),
+    } | ({} if arrays["object_pose"] is None else {"pose": list(POSE)})
+    try:
+        data = {key: (checks.DIMS[key], np.array(value)) for key, value in arrays.items() if value is not None}
+        return xr.Dataset(data, coords=coords)
+    except ValueError as error:
+        raise InputError(
+            f"recording and commands do not fit together ({error})", where=origin.name, remedy="check their lengths"
+        ) from None
+
+
+def _angle_mask(time: np.ndarray, angle: np.ndarray | None, hold: float) -> Bool[np.ndarray, "time cable"] | None:
+    fits = angle is not None and len(np.shape(angle)) == 2 and len(angle) == len(time) > 1  # else checked later
+    return new_readings(np.asarray(time), np.asarray(angle), hold) if hold > 0.0 and fits else None
+
+
+def _missing(
+    tension_mask: np.ndarray | None, angle_mask: np.ndarray | None, pose: np.ndarray | None
+) -> dict[str, dict[str, int]]:
+    counts = {
+        "tensions": 0 if tension_mask is None else int((~tension_mask).sum()),
+        "motor angles": 0 if angle_mask is None else int((~angle_mask).sum()),
+        "poses of the object": 0 if pose is None else int((~np.isfinite(pose).all(axis=-1)).sum()),
+    }
+    found = {kind: count for kind, count in counts.items() if count}
+    return {MISSING: found} if found else {}
+
+
+def continuous_quaternions(pose: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time 7"]:
+    """Poses whose quaternion keeps its sign from row to row, the first with w >= 0 (q and -q are the same rotation)."""
+    pose = np.array(pose, dtype=float)
+    turn = np.where((pose[1:, 3:] * pose[:-1, 3:]).sum(axis=1) < 0.0, -1.0, 1.0)
+    first = -1.0 if pose.size and pose[0, 6] < 0.0 else 1.0
+    pose[:, 3:] *= first * np.concatenate([[1.0], np.cumprod(turn)])[:, None][: len(pose)]
+    return pose

@@ -1,0 +1,203 @@
+"""Policies on the same episodes: ``evaluate``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import whole, write_json, write_text
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.run_folder import run_folder
+from rfdropo_bayes.policies.episodes import Episodes, Settings
+from rfdropo_bayes.policies.evaluation import (
+    Case,
+    Episode,
+    draw_cases,
+    episode_table,
+    interquartile_mean,
+    median_episode,
+    play,
+    success,
+)
+from rfdropo_bayes.policies.onnx_export import ExportedPolicy
+from rfdropo_bayes.policies.policy_figures import save_animation, success_figure
+from rfdropo_bayes.policies.randomisation import (
+    Randomisation,
+)
+from rfdropo_bayes.policies.rendering import picture
+from rfdropo_bayes.policies.tasks import Task, observed_of
+from rfdropo_bayes.policies.training_config import TrainingTable
+from rfdropo_bayes.policies.vec_env import TrunkVecEnv
+from rfdropo_bayes.results.calibrated import Calibration
+from rfdropo_bayes.robots.policy_layout import PolicyLayout
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of, with_training
+from rfdropo_bayes.verbs.train import POLICY
+
+EVALUATION, TABLE, CSV, FIGURE = "evaluation.json", "evaluation.md", "episodes.csv", "success.png"
+THRESHOLDS = (0.005, 0.01, 0.01525, 0.02157, 0.030)  # m; the last three are the paper's
+EVALUATION_SEED = 2_000_003  # none of the seeds that training or its evaluations use
+SCHEMA_VERSION = 1
+
+
+def evaluate(
+    model: Model,
+    policies: Sequence[Path],
+    out: Path | str,
+    *,
+    posterior: Calibration | Path | None = None,
+    episodes: int = 200,
+    lanes: int = 64,
+    seed: int = 0,
+    film: bool = True,
+    overwrite: bool = False,
+    **options: Any,
+) -> dict[str, Any]:
+    """Play exported policies on the same episodes of a model.
+
+    Args:
+        model: that is simulated.
+        posterior: whose draws the episodes' parameters are, or its folder.
+        policies: policy.onnx, or folders that hold one; named after their folders, with those above
+            where two folders are called the same.
+        out: folder to write to: evaluation.json, evaluation.md, episodes.csv, success.png, and a GIF of each policy's
+            median episode.
+        episodes: of each policy.
+        lanes: episodes that are simulated at once.
+        seed: of the cases.
+        film: whether to draw the animations.
+        overwrite: start anew whatever ``out`` holds.
+        options: keys of an experiment file's [training], such as the task.
+
+    Returns:
+        the content of evaluation.json.
+
+    Raises:
+        InputError: bad input, a policy for another layout, or one that is given twice.
+    """
+    model = with_training(model, options)
+    table, task, simulator = training_of(model)
+    randomisation = randomisation_of(table, model.spec, simulator, posterior)
+    opened = [ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies]
+    loaded = dict(zip(_names(policies), opened, strict=True))
+    chosen = {"episodes": episodes, "seed": seed}
+    record: dict[str, Any] = {
+        "tables": model.tables(),
+        "folder": model.folder,
+        "options": chosen,
+        "texts": model.texts(),
+    }
+    with run_folder(Path(out), "evaluate", **record, overwrite=overwrite) as out:
+        cases: list[Case] = []
+        found: dict[str, list[Episode]] = {}
+        for name, policy in loaded.items():
+            batch = _episodes_for(policy.layout, simulator, task, min(lanes, episodes), randomisation, table, name)
+            venv = TrunkVecEnv(batch)
+            cases = cases or draw_cases(venv, episodes, EVALUATION_SEED + seed)
+            found[name] = play(policy.act, venv, cases, seed)
+            if film:
+                _film(batch, found[name], cases, out / f"{name}.gif")
+        content = _judged(found, cases, seed)
+        with whole(out / CSV) as partial:
+            episode_table(found, cases).to_csv(partial, index=False)
+        success_figure(found, THRESHOLDS).savefig(out / FIGURE, dpi=150)
+        write_text(out / TABLE, evaluation_table(content))
+        write_json(out / EVALUATION, content, finite=True)
+    return content
+
+
+def _episodes_for(
+    layout: PolicyLayout,
+    simulator: RobotSimulator,
+    task: Task,
+    lanes: int,
+    randomisation: Randomisation,
+    table: TrainingTable,
+    name: str,
+) -> Episodes:
+    """Lanes that show a policy what it was trained to see."""
+    settings = Settings(
+        actions=layout.kind,
+        observed=observed_of(layout),
+        period=table.period,
+        step=float(np.max(layout.moves)),
+        noise=table.noise,
+    )
+    batch = Episodes(simulator, task, lanes, randomisation, settings)
+    batch.layout.require(layout, where=name)
+    return batch
+
+
+def _names(policies: Sequence[Path]) -> list[str]:
+    """Names of policies: of their folders, with as many folders above as it takes to tell them apart."""
+    places = [p if p.is_dir() else (p.parent if p.stem == "policy" else p.with_suffix("")) for p in policies]
+    parts = [place.resolve().parts for place in places]
+    if len(set(parts)) < len(parts):
+        raise InputError("a policy is given twice", where="--policy", remedy="name each once")
+    depth = next(d for d in range(1, 1 + max(map(len, parts))) if len({own[-d:] for own in parts}) == len(parts))
+    return ["_".join(part.strip("/") for part in own[-depth:]) for own in parts]
+
+
+def _film(batch: Episodes, episodes: Sequence[Episode], cases: Sequence[Case], path: Path) -> None:
+    """The median episode again, as an animation."""
+    episode = median_episode(episodes)
+    case = cases[episode.case]
+    option = {"parameters": dict(case.parameters), "goal": list(case.goal)}
+    batch.reset(np.arange(batch.lanes), [option] * batch.lanes)
+    frames = [picture(batch, 0)]
+    for action in episode.actions:
+        batch.act(np.repeat(np.asarray(action)[None], batch.lanes, axis=0))
+        frames.append(picture(batch, 0))
+    save_animation(frames, path, batch.layout.period_s)
+
+
+def _judged(found: Mapping[str, Sequence[Episode]], cases: Sequence[Case], seed: int) -> dict[str, Any]:
+    policies = {}
+    for name, episodes in found.items():
+        middle = interquartile_mean([episodes], seed)
+        rates = {f"{1e3 * t:g}": success(episodes, t) for t in THRESHOLDS}
+        policies[name] = {
+            "success_mm": {key: {"share": s, "low": low, "high": high} for key, (s, low, high) in rates.items()},
+            "interquartile_mean_mm": dict(zip(("value", "low", "high"), map(_millimetres, middle), strict=True)),
+            "median_mm": _millimetres(float(np.median([episode.distance for episode in episodes]))),
+            "diverged": int(np.sum([episode.diverged for episode in episodes])),
+        }
+    return {"episodes": len(cases), "policies": policies, "seed": seed, "schema_version": SCHEMA_VERSION}
+
+
+def _millimetres(distance: float) -> float | None:
+    """None where simulations failed, which is no distance."""
+    return 1e3 * distance if np.isfinite(distance) else None
+
+
+def _shown(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def evaluation_table(content: Mapping[str, Any]) -> str:
+    """Success of every policy within each distance, with 95 % Wilson intervals, as Markdown."""
+    names = next(iter(content["policies"].values()))["success_mm"]
+    lines = [
+        f"Share of {content['episodes']} episodes, the same for all policies, that end within a distance of the goal,",
+        "with 95 % Wilson intervals; median and interquartile mean of the final distance.",
+        "",
+        f"| policy | {' | '.join(f'{name} mm' for name in names)} | median [mm] | IQM [mm] | diverged |",
+        f"|{'---|' * (len(names) + 4)}",
+    ]
+    for name, row in content["policies"].items():
+        cells = [
+            f"{100 * r['share']:.0f} % [{100 * r['low']:.0f}, {100 * r['high']:.0f}]"
+            for r in row["success_mm"].values()
+        ]
+        middle = row["interquartile_mean_mm"]
+        cells += [
+            _shown(row["median_mm"]),
+            f"{_shown(middle['value'])} [{_shown(middle['low'])}, {_shown(middle['high'])}]",
+            str(row["diverged"]),
+        ]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,133 @@
+"""The tasks of an experiment as environments: ``make_vec``, and what training and evaluation set up alike."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.assembly import build_robot_simulator, physical_values
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.model_spec import ModelSpec
+from rfdropo_bayes.policies.episodes import Episodes, Settings
+from rfdropo_bayes.policies.randomisation import (
+    Layers,
+    Point,
+    Randomisation,
+    Uniform,
+    drawn_rows,
+    read_phi,
+    read_posterior,
+)
+from rfdropo_bayes.policies.tasks import Task, task_named
+from rfdropo_bayes.policies.training_config import TrainingTable
+from rfdropo_bayes.policies.vec_env import TrunkVecEnv
+from rfdropo_bayes.results.calibrated import Calibration
+from rfdropo_bayes.robots import OBJECT
+from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.tables import changed, parse_table
+
+
+def make_vec(
+    task: str, model: Model, *, posterior: Calibration | Path | None = None, n: int = 64, **options: Any
+) -> TrunkVecEnv:
+    """Environments of a task, side by side, for Stable-Baselines3.
+
+    Args:
+        task: "TrunkReach-v0" or "TrunkPush-v0".
+        model: that is simulated; its fixed values hold.
+        posterior: whose draws the episodes' parameters are, or its folder; nominal values without.
+        n: how many environments.
+        options: further keys of an experiment file's [training], such as ``observation`` or ``period``.
+
+    Raises:
+        InputError: an unknown task or key, or a posterior of another robot.
+    """
+    model = with_training(model, {"task": task, **options})
+    table, chosen, simulator = training_of(model)
+    randomisation = randomisation_of(table, model.spec, simulator, posterior)
+    return TrunkVecEnv(Episodes(simulator, chosen, n, randomisation, episode_settings(table)))
+
+
+def with_training(model: Model, options: Mapping[str, Any]) -> Model:
+    """The model with further keys of [training]."""
+    if not options:
+        return model
+    own = model.settings.training
+    known = {} if own is None else own.model_dump(exclude_unset=True)
+    table = parse_table(TrainingTable, {**known, **options}, where="training")
+    return Model.of(model.spec, replace(model.settings, training=table))
+
+
+def training_of(model: Model) -> tuple[TrainingTable, Task, RobotSimulator]:
+    table = model.settings.training
+    if table is None:
+        raise InputError(
+            "the experiment has no table [training]", where="training", remedy='add it, with task = "TrunkReach-v0"'
+        )
+    task = task_named(table.task)
+    if table.goals is not None:
+        task = replace(task, goal_low=table.goals[0], goal_high=table.goals[1])
+    pushing = changed(model.spec.simulator, where="[simulator]", push=task.push)
+    return table, task, build_robot_simulator(replace(model.spec, simulator=pushing))
+
+
+def episode_settings(table: TrainingTable) -> Settings:
+    return Settings(actions=table.actions, observed=table.observation, period=table.period, noise=table.noise)
+
+
+def randomisation_of(
+    table: TrainingTable,
+    spec: ModelSpec,
+    simulator: RobotSimulator,
+    posterior: Calibration | Path | None = None,
+) -> Randomisation:
+    """Where parameters come from: values that are held, what is randomised, and what differs between episodes.
+
+    A task without a cube has no use for what the experiment says of one.
+
+    Raises:
+        InputError: a posterior beside another ``randomisation`` of [training]: one of the two is not meant.
+    """
+    stated = table.randomisation if "randomisation" in table.model_fields_set else None
+    if posterior is not None and stated not in (None, "posterior"):
+        raise InputError(
+            f"a posterior was given, and randomisation = {stated!r}",
+            where="[training]",
+            remedy='leave one of them out, or set randomisation = "posterior"',
+        )
+    absent = () if "cube_mass" in {spec.name for spec in simulator.parameters} else OBJECT
+    held = replace(spec, fixed={name: value for name, value in spec.fixed.items() if name not in absent})
+    parts: list[Randomisation] = [Point(physical_values(held, simulator))]
+    if isinstance(posterior, Calibration):
+        parts.append(drawn_rows(posterior.record, simulator.parameters, robot=simulator.robot))
+    elif posterior is not None:
+        parts.append(read_posterior(Path(posterior), simulator.parameters, simulator.robot))
+    elif table.randomisation != "none":
+        parts.append(_randomised(table, simulator, spec.folder))
+    kind = parts[-1].kind
+    start = {name: ends for name, ends in table.start.items() if name not in absent}
+    return Layers((*parts, Uniform(start)), kind) if start or len(parts) > 1 else parts[0]
+
+
+def _randomised(table: TrainingTable, simulator: RobotSimulator, folder: Path) -> Randomisation:
+    """What [training] randomises over."""
+    if table.randomisation == "uniform":
+        if not table.ranges:
+            raise InputError(
+                "no ranges", where="[training.ranges]", remedy="give name = [low, high] for each parameter"
+            )
+        return Uniform(table.ranges)
+    if table.source is None:
+        raise InputError(
+            f"randomisation = {table.randomisation!r} without a source",
+            where="[training]",
+            remedy="name the folder of a calibration: source = ...",
+        )
+    beside = folder / table.source
+    source = beside if beside.exists() else Path(table.source)
+    if table.randomisation == "phi":
+        return read_phi(source, simulator.parameters, simulator.robot)
+    return read_posterior(source, simulator.parameters, simulator.robot)
