@@ -109,11 +109,9 @@ def test_links_inside_the_repository_lead_somewhere(document: Path) -> None:
 
 
 def test_what_contributing_points_to_is_there() -> None:
-    """Modules in the second column of "Where things are", tests in the third; a name without a folder shares the last."""
-    text = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    rows = [
-        line.split("|")[1:-1] for line in text.split("## Where things are")[1].splitlines() if line.startswith("| ")
-    ]
+    """Modules in the second column of "Where things are", tests in the last; a bare name is beside the last."""
+    lines = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8").split("## Where things are")[1].splitlines()
+    rows = [line.split("|")[1:-1] for line in lines if line.startswith("| ")]
     missing = []
     for row in rows:
         for cell, base in ((row[1], REPOSITORY / "rfdropo_bayes"), (row[-1], REPOSITORY / "tests")):
