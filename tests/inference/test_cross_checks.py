@@ -14,7 +14,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.plain.plain_problem import problem_from_numpyro
 
-from .plain.test_problem import SCHOOLS, schools, schools_by_quadrature
+from .plain.test_plain_problem import SCHOOLS, schools, schools_by_quadrature
 from .toys import Decay
 
 KEY = jax.random.key(41)
