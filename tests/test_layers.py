@@ -14,7 +14,8 @@ PACKAGE = REPOSITORY / "rfdropo_bayes"
 # Modules at the bottom, open to every room.
 FOUNDATION = {"cautions", "errors", "files", "groups", "interrupts", "runtime", "tables"}
 
-# From the ground up; docs/architecture.md says why. A room may import these, the foundation and the standard library.
+# In the order of docs/architecture.md, which says why: a room imports from rooms above it, of these from those
+# named here; from the foundation and the standard library, too.
 MAY_IMPORT: dict[str, set[str]] = {
     "data": set(),
     "posteriors": set(),
@@ -104,11 +105,11 @@ def forbidden_rooms(room: str, imported: set[str]) -> set[str]:
     return rooms - MAY_IMPORT.get(room, set()) - FOUNDATION - {room, "__version__"}
 
 
-def test_the_table_goes_downwards_only() -> None:
-    """Every room's permissions are rooms listed before it, so the imports cannot form a circle."""
+def test_rooms_import_from_rooms_above_them_in_the_table_only() -> None:
+    """Every room's permissions are rooms listed above it, so the imports cannot form a circle."""
     seen: set[str] = set()
     for room, allowed in MAY_IMPORT.items():
-        assert allowed <= seen, f"{room} may import {sorted(allowed - seen)}, which come after it"
+        assert allowed <= seen, f"{room} may import {sorted(allowed - seen)}, which stand below it"
         seen.add(room)
 
 
@@ -126,10 +127,10 @@ def test_the_parser_sees_every_way_to_import() -> None:
     assert forbidden_rooms("robots", imported) == {"fem", "audit", "data", "report", "cli"}
 
 
-def test_imports_go_downwards() -> None:
-    above = {relative(path): forbidden_rooms(room_of(path), imports_of(path)) for path in MODULES}
-    wrong = {name: sorted(rooms) for name, rooms in above.items() if rooms}
-    assert not wrong, f"imports from rooms above; see the table in docs/architecture.md: {wrong}"
+def test_imports_come_from_above() -> None:
+    below = {relative(path): forbidden_rooms(room_of(path), imports_of(path)) for path in MODULES}
+    wrong = {name: sorted(rooms) for name, rooms in below.items() if rooms}
+    assert not wrong, f"imports from rooms below; see the table in docs/architecture.md: {wrong}"
 
 
 def test_rooms_that_touch_hardware_and_files_do_not_import_jax() -> None:

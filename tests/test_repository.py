@@ -108,6 +108,22 @@ def test_links_inside_the_repository_lead_somewhere(document: Path) -> None:
     assert not [target for target in targets if not (document.parent / target).exists()]
 
 
+def test_what_contributing_points_to_is_there() -> None:
+    """Modules in the second column of "Where things are", tests in the last; a bare name is beside the last."""
+    lines = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8").split("## Where things are")[1].splitlines()
+    rows = [line.split("|")[1:-1] for line in lines if line.startswith("| ")]
+    missing = []
+    for row in rows:
+        for cell, base in ((row[1], REPOSITORY / "rfdropo_bayes"), (row[-1], REPOSITORY / "tests")):
+            folder = base
+            for name in re.findall(r"`([a-z_0-9/]+(?:\.py|/))`", cell):
+                path = base / name.removeprefix("rfdropo_bayes/").removeprefix("tests/")
+                folder = path.parent if "/" in name.rstrip("/") else folder
+                missing += [] if path.exists() or (folder / name).exists() else [name]
+    assert len(rows) > 20
+    assert not missing
+
+
 def test_the_version_is_the_same_everywhere() -> None:
     version = rfdropo_bayes.__version__
     assert f"\nversion: {version}\n" in (REPOSITORY / "CITATION.cff").read_text()

@@ -104,7 +104,7 @@ def design(
     folder = folder_for("design", experiment, out, overrides, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.results.calibrated import Calibration
-    from rfdropo_bayes.verbs.design import COMMANDS
+    from rfdropo_bayes.results.designed import COMMANDS
     from rfdropo_bayes.verbs.design import design as propose
     from rfdropo_bayes.verbs.design_day import design_day
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +23,13 @@ from rfdropo_bayes.bayes.recordings import commands_after
 from rfdropo_bayes.data import DataSpec, Trajectory, asl_csv
 from rfdropo_bayes.data.asl_csv import FORMAT as ASL
 from rfdropo_bayes.data.plain_csv import command_columns
-from rfdropo_bayes.files import whole, write_json
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.results.calibrated import Calibration
+from rfdropo_bayes.results.designed import COMMANDS, Design
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.verbs.audit import build_problem, start_values
 
-COMMANDS, DESIGN = "next_commands.csv", "design.json"
 SEQUENCES, HYPOTHESES, KINDS = 24, 4, 4
 SCREENED_BY, REFITTED_BY = 0.7, 0.85  # shares of the time by which these parts have to end
 SCREENING = "screening of the candidates"
@@ -59,36 +56,6 @@ class Clock(Deadline):
             self.missed.append(words)
         finally:
             self.share = math.inf
-
-
-@dataclass(frozen=True)
-class Design:
-    """The commands to record next, and what they will decide.
-
-    Attributes:
-        content: of design.json.
-        commands: the proposal, a column for the time and one for each channel, as the recordings have them.
-    """
-
-    content: Mapping[str, Any]
-    commands: pd.DataFrame
-
-    @property
-    def sentence(self) -> str:
-        """What to record, and what it will tell."""
-        return str(self.content["sentence"])
-
-    def save(self, folder: Path | str) -> Path:
-        """Write next_commands.csv and design.json; return the path of the commands."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        with whole(folder / COMMANDS) as partial:
-            self.commands.to_csv(partial, index=False, float_format="%.6f")
-        write_json(folder / DESIGN, {**self.content, "commands": str(folder / COMMANDS)})
-        return folder / COMMANDS
-
-    def _repr_html_(self) -> str:
-        return f"<p>{escape(self.sentence)}</p>{self.commands.head().to_html()}"
 
 
 def design(

@@ -26,9 +26,10 @@ from rfdropo_bayes.prediction.day import physical_of_normal
 from rfdropo_bayes.prediction.own_fit import STEP
 from rfdropo_bayes.prediction.predictive import FITTED, Batch
 from rfdropo_bayes.results.calibrated import Calibration
+from rfdropo_bayes.results.designed import COMMANDS, Design
 from rfdropo_bayes.tables import nearest
 from rfdropo_bayes.verbs.adapt import day_space, model_error_of
-from rfdropo_bayes.verbs.design import COMMANDS, Design, command_table, proposals, units_said
+from rfdropo_bayes.verbs.design import command_table, proposals, units_said
 from rfdropo_bayes.verbs.predict import fitted_parts, model_of
 
 LONGEST = 10.0  # [s] of a proposal, unless more is asked for

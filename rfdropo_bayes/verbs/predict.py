@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
-import pandas as pd
 import xarray as xr
 from jaxtyping import Float
 
@@ -21,7 +20,6 @@ from rfdropo_bayes.bayes.pooling import DEVIATION, Pooled
 from rfdropo_bayes.bayes.recordings import RecordingSet, gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, ParameterSpace, build_space
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import (
     Origin,
     SentCommands,
@@ -33,7 +31,7 @@ from rfdropo_bayes.data import (
 )
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import whole, write_json
+from rfdropo_bayes.files import write_json
 from rfdropo_bayes.groups import group_of, in_group
 from rfdropo_bayes.model.assembly import KNOWN, fixed_values, model_specs, with_groups
 from rfdropo_bayes.model.model import Model
@@ -52,65 +50,14 @@ from rfdropo_bayes.prediction.predictive import (
     thin,
 )
 from rfdropo_bayes.report.run_files import CONFIG, POSTERIOR
-from rfdropo_bayes.report.trajectory_figures import draw_band
-from rfdropo_bayes.results.calibrated import Calibration, axes_or_new
+from rfdropo_bayes.results.calibrated import Calibration
+from rfdropo_bayes.results.predicted import LEVELS, OBJECT, Prediction
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 DRAWS = 200
-LEVELS = {"q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
 SCHEMA_VERSION = 1
-OBJECT, POSE_UNITS = "object", "m, m, m, and unit quaternion x, y, z, w"
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """What a calibrated simulator expects of commands that were never run.
-
-    Attributes:
-        bands: mean and 5, 25, 75 and 95 % quantiles [m] of what would be measured, (time, marker, axis).
-        drawn: the same as draws.
-        group: that the commands were taken to belong to.
-        group_fitted: whether the posterior has values of it; None where nothing differs between groups.
-        cautions: what speaks against the prediction.
-    """
-
-    bands: xr.Dataset
-    drawn: RecordingPrediction
-    group: str = ""
-    group_fitted: bool | None = None
-    cautions: list[Caution] = field(default_factory=list)
-
-    @property
-    def frame(self) -> pd.DataFrame:
-        """One row per time [s]; columns ``<marker>_<axis>_<statistic>`` [m]."""
-        return _columns(self.bands)
-
-    def plot(self, marker: str | int = -1, axis: str = "x", ax: Axes | None = None) -> Axes:
-        """Draw one coordinate of one marker over time, with its 50 % and 90 % bands."""
-        names = self.drawn.marker_names
-        index = names.index(marker) if isinstance(marker, str) else range(len(names))[marker]
-        axes = axes_or_new(ax)
-        draw_band(axes, self.drawn, index, "xyz".index(axis))
-        axes.set_xlabel("time [s]")
-        axes.legend()
-        return axes
-
-    def save(self, folder: Path | str) -> list[Path]:
-        """Write prediction.nc and prediction.csv; return their paths."""
-        files = [Path(folder) / "prediction.nc", Path(folder) / "prediction.csv"]
-        files[0].parent.mkdir(parents=True, exist_ok=True)
-        with whole(files[0]) as partial:
-            self.bands.to_netcdf(partial, engine="h5netcdf")
-        with whole(files[1]) as partial:
-            self.frame.to_csv(partial, index=False, float_format="%.6f")
-        return files
-
-    def _repr_html_(self) -> str:
-        return self.bands._repr_html_()
+POSE_UNITS = "m, m, m, and unit quaternion x, y, z, w"
 
 
 def predict(
@@ -379,16 +326,3 @@ def _object(pose: Float[np.ndarray, "draw time 7"]) -> dict[str, xr.Variable]:
     for name, value in (("mean", centre.mean(axis=0)), *zip(LEVELS, quantiles, strict=True)):
         found[f"{OBJECT}_{name}"] = xr.Variable(("time", "axis"), value, {"units": "m"})
     return found
-
-
-def _columns(table: xr.Dataset) -> pd.DataFrame:
-    """One row per time [s]; columns ``<marker>_<axis>_<statistic>`` [m]."""
-    columns: dict[str, Float[np.ndarray, " time"]] = {"time": table["time"].values}
-    for name in ("mean", *LEVELS):
-        for i, marker in enumerate(table["marker"].values):
-            for j, axis in enumerate("xyz"):
-                columns[f"{marker}_{axis}_{name}"] = table[name].values[:, i, j]
-        if OBJECT in table:
-            for j, axis in enumerate("xyz"):
-                columns[f"{OBJECT}_{axis}_{name}"] = table[f"{OBJECT}_{name}"].values[:, j]
-    return pd.DataFrame(columns)

@@ -17,8 +17,8 @@ from rfdropo_bayes.model.experiment_file import ROBOT_COPY
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.report.motion import DrawnMotion, cube_corners, save_frames, save_vtk, smooth_line, upright
 from rfdropo_bayes.report.motion_figures import save_animation, save_still
+from rfdropo_bayes.results.predicted import OBJECT
 from rfdropo_bayes.robots import Robot, known_robots
-from rfdropo_bayes.verbs.predict import OBJECT
 from rfdropo_bayes.verbs.simulate import simulate
 
 PREDICTED = "mean"  # variable of a prediction's file

@@ -17,7 +17,7 @@ from rfdropo_bayes.inference.plain.plain_problem import CentredProblem, centred,
 from rfdropo_bayes.inference.plain.refinement import _clusters
 from rfdropo_bayes.inference.smc.bridge import ModeMixture
 
-from .test_problem import SCHOOLS, schools_by_quadrature
+from .test_plain_problem import SCHOOLS, schools_by_quadrature
 
 KEY = jax.random.key(8)
 SD, NOISE = 100.0, 0.5

@@ -1,0 +1,45 @@
+"""The commands to record next, as an object that shows itself and writes its files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from rfdropo_bayes.files import whole, write_json
+
+COMMANDS, DESIGN = "next_commands.csv", "design.json"
+
+
+@dataclass(frozen=True)
+class Design:
+    """The commands to record next, and what they will decide.
+
+    Attributes:
+        content: of design.json.
+        commands: the proposal, a column for the time and one for each channel, as the recordings have them.
+    """
+
+    content: Mapping[str, Any]
+    commands: pd.DataFrame
+
+    @property
+    def sentence(self) -> str:
+        """What to record, and what it will tell."""
+        return str(self.content["sentence"])
+
+    def save(self, folder: Path | str) -> Path:
+        """Write next_commands.csv and design.json; return the path of the commands."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        with whole(folder / COMMANDS) as partial:
+            self.commands.to_csv(partial, index=False, float_format="%.6f")
+        write_json(folder / DESIGN, {**self.content, "commands": str(folder / COMMANDS)})
+        return folder / COMMANDS
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(self.sentence)}</p>{self.commands.head().to_html()}"

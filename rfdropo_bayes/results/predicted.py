@@ -1,0 +1,84 @@
+"""What a prediction says, as an object that shows itself, draws its bands and writes its files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from jaxtyping import Float
+
+from rfdropo_bayes.cautions import Caution
+from rfdropo_bayes.files import whole
+from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.report.trajectory_figures import draw_band
+from rfdropo_bayes.results.calibrated import axes_or_new
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+LEVELS = {"q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
+OBJECT = "object"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a calibrated simulator expects of commands that were never run.
+
+    Attributes:
+        bands: mean and 5, 25, 75 and 95 % quantiles [m] of what would be measured, (time, marker, axis).
+        drawn: the same as draws.
+        group: that the commands were taken to belong to.
+        group_fitted: whether the posterior has values of it; None where nothing differs between groups.
+        cautions: what speaks against the prediction.
+    """
+
+    bands: xr.Dataset
+    drawn: RecordingPrediction
+    group: str = ""
+    group_fitted: bool | None = None
+    cautions: list[Caution] = field(default_factory=list)
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """One row per time [s]; columns ``<marker>_<axis>_<statistic>`` [m]."""
+        return _columns(self.bands)
+
+    def plot(self, marker: str | int = -1, axis: str = "x", ax: Axes | None = None) -> Axes:
+        """Draw one coordinate of one marker over time, with its 50 % and 90 % bands."""
+        names = self.drawn.marker_names
+        index = names.index(marker) if isinstance(marker, str) else range(len(names))[marker]
+        axes = axes_or_new(ax)
+        draw_band(axes, self.drawn, index, "xyz".index(axis))
+        axes.set_xlabel("time [s]")
+        axes.legend()
+        return axes
+
+    def save(self, folder: Path | str) -> list[Path]:
+        """Write prediction.nc and prediction.csv; return their paths."""
+        files = [Path(folder) / "prediction.nc", Path(folder) / "prediction.csv"]
+        files[0].parent.mkdir(parents=True, exist_ok=True)
+        with whole(files[0]) as partial:
+            self.bands.to_netcdf(partial, engine="h5netcdf")
+        with whole(files[1]) as partial:
+            self.frame.to_csv(partial, index=False, float_format="%.6f")
+        return files
+
+    def _repr_html_(self) -> str:
+        return self.bands._repr_html_()
+
+
+def _columns(table: xr.Dataset) -> pd.DataFrame:
+    """One row per time [s]; columns ``<marker>_<axis>_<statistic>`` [m]."""
+    columns: dict[str, Float[np.ndarray, " time"]] = {"time": table["time"].values}
+    for name in ("mean", *LEVELS):
+        for i, marker in enumerate(table["marker"].values):
+            for j, axis in enumerate("xyz"):
+                columns[f"{marker}_{axis}_{name}"] = table[name].values[:, i, j]
+        if OBJECT in table:
+            for j, axis in enumerate("xyz"):
+                columns[f"{OBJECT}_{axis}_{name}"] = table[f"{OBJECT}_{name}"].values[:, j]
+    return pd.DataFrame(columns)
