@@ -34,6 +34,7 @@ _HOMES = {
     "Disks": "robots.sections",
     "InputError": "errors",
     "Model": "model.model",
+    "MuJoCo": "simulators.adapters.mujoco_model",
     "Parameter": "robots.parameter",
     "ParameterSpec": "simulators.parameters",
     "Prediction": "verbs.predict",

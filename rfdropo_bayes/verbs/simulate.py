@@ -129,9 +129,9 @@ def simulate_all(model: Model, out: Path, balance: bool = False) -> dict[str, An
     Raises:
         InputError: bad input, or a rollout that did not end well.
     """
-    robot_of(model.spec)
     simulator, measured = model.simulator, model.settings.data is not None
-    assert isinstance(simulator, RobotSimulator)
+    if balance:
+        robot_of(model.spec)
     values = physical_values(model.spec, simulator)
     sources = _sources(model)
     out = output_folder(out)
@@ -150,7 +150,7 @@ def simulate_all(model: Model, out: Path, balance: bool = False) -> dict[str, An
             "files": [str(out / f"{stem}.nc"), str(out / f"{stem}.csv")],
             "error_mm": _errors([distances[-1]]) if measured else None,
         }
-        if balance:
+        if isinstance(simulator, RobotSimulator) and balance:
             written = append_balance(simulator, values, found.commands, source.time, out / f"{stem}.nc")
             report["recordings"][source.name]["balance"] = written
         if pose is not None and source.object_pose is not None:
