@@ -44,6 +44,7 @@ _HOMES = {
     "adapt": "verbs.adapt",
     "audit": "verbs.audit",
     "calibrate": "verbs.calibrate",
+    "check": "verbs.check",
     "deploy": "deployment.session",
     "design": "verbs.design",
     "design_day": "verbs.design_day",

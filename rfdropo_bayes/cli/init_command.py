@@ -86,7 +86,7 @@ def init(
         Path,
         typer.Argument(
             metavar="FOLDER",
-            help="folder to write to, whose name the robot takes; or a MuJoCo model (.xml, .urdf), whose experiment goes "
+            help="folder to write to, whose name the robot takes; or a MuJoCo model (.xml, .urdf): the experiment goes "
             "into a folder of its name",
         ),
     ],

@@ -155,7 +155,9 @@ class BlackBox:
         an attribute ``digest``."""
         try:
             source = getattr(self.function, "digest", None)
-            source = source or inspect.getsource(self.function) if callable(self.function) else repr(tuple(self.function))
+            source = (
+                source or inspect.getsource(self.function) if callable(self.function) else repr(tuple(self.function))
+            )
         except (OSError, TypeError):
             source = repr(getattr(self.function, "__qualname__", type(self.function).__qualname__))
         return hashlib.sha256(repr((source, self.specs, self.time_step)).encode()).hexdigest()

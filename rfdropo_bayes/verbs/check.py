@@ -21,10 +21,11 @@ from rfdropo_bayes.data import (
 from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import output_folder
+from rfdropo_bayes.files import output_folder, write_json
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.model.assembly import build_model, build_simulator, with_drives
 from rfdropo_bayes.model.experiment import Experiment, load_experiment
+from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import Workpiece, find_robot, spec_of
 from rfdropo_bayes.model.robot_listings import robot_facts, simulator_facts
 from rfdropo_bayes.report.trajectory_figures import save_recording
@@ -32,6 +33,7 @@ from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.calibrate import inference_options
 from rfdropo_bayes.verbs.placement import far_from_rest, placement_hints
+from rfdropo_bayes.verbs.preflight import Preflight, preflight
 
 MILLIMETRES = 1e3
 IRREGULAR = 1.5
@@ -50,21 +52,39 @@ class Check:
         notes: what is allowed, and perhaps not meant.
         problems: what keeps the experiment from running.
         files: pictures, one per recording.
+        ahead: what a fit could determine; None where that was not asked, or nothing can be fitted.
     """
 
     lines: list[tuple[str, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
+    ahead: Preflight | None = None
 
 
-def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
+def check(model: Model, runs: Sequence[Trajectory], *, seed: int = 0) -> Preflight:
+    """Say before a fit which combinations of parameters recordings cannot determine, what else would have to be
+    measured, whether commands excite what is asked, and what the fit costs; see `preflight`.
+
+    Args:
+        model: what would be fitted.
+        runs: recordings.
+        seed: of the draws of the prior at which derivatives are taken.
+
+    Raises:
+        InputError: bad input, or a model that cannot be simulated.
+    """
+    return preflight(model, runs, seed=seed)
+
+
+def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bool = False) -> Check:
     """Read everything that an experiment names, and say what was read.
 
     Args:
         path: the experiment file.
-        out: folder for the pictures, ``NAME.png`` for each recording.
+        out: folder for the pictures, ``NAME.png`` for each recording, and check.json.
         overrides: assignments that replace entries of the file.
+        ahead: also say what a fit could determine, see `check`.
 
     Raises:
         InputError: the experiment file or the robot cannot be read; whatever else is wrong is among the problems.
@@ -85,6 +105,8 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
         found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
     _say_repeats(found, [*recordings["fit"], *recordings["test"]])
     _say_model(found, experiment, folder, recordings["fit"])
+    if ahead and recordings["fit"] and not found.problems:
+        _say_ahead(found, experiment, folder, recordings["fit"])
     if any(recordings.values()):
         out = output_folder(out)
     rest = robot_shape(robot) if isinstance(robot, Robot) else None
@@ -92,7 +114,21 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
         file = out / f"{trajectory.name.replace('/', '_')}.png"
         save_recording(trajectory, rest, file)
         found.files.append(file)
+    if found.files:
+        content = {key: getattr(found, key) for key in ("lines", "notes", "problems")}
+        told = None if found.ahead is None else found.ahead.as_dict()
+        write_json(out / "check.json", {**content, "preflight": told})
     return found
+
+
+def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
+    """What a fit could determine; a model that cannot be simulated is no problem of its description."""
+    try:
+        found.ahead = check(Model.of_experiment(experiment, folder), runs, seed=experiment.seed)
+    except InputError as error:
+        found.notes.append(str(error))
+        return
+    found.lines += found.ahead.lines()
 
 
 def _try(found: Check, action: Callable[[], Result]) -> Result | None:

@@ -91,11 +91,15 @@ def _first_seen(guess: Guess, recordings: list[Path], commands: list[Path]) -> d
 
 def _adapter(tables: dict[str, Any], assumed: list[str]) -> list[str]:
     """The table [adapter] and its tables."""
-    lines = ["[adapter]", 'start = "rest"           # or "settled" under the first command, or the name of a keyframe', ""]
+    lines = [
+        "[adapter]",
+        'start = "rest"           # or "settled" under the first command, or the name of a keyframe',
+        "",
+    ]
     said = {
         "markers": "# What each marker is: site/NAME, body/NAME or geom/NAME.",
         "channels": "# The actuator of each command, by name, or by number from 0.",
-        "parameters": "# What may be inferred: kind/name/attribute, or * for a factor on all; docs/your_simulator.md has all.",
+        "parameters": "# What may be inferred: kind/name/attribute, or * for a factor on all.",
     }
     for key, words in said.items():
         lines += [words, f"[adapter.{key}]"]

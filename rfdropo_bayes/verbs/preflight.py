@@ -19,6 +19,7 @@ import pandas as pd
 from jaxtyping import Float
 from scipy.linalg import solve_triangular
 
+from rfdropo_bayes.bayes.batches import chunk_sizes
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.noise import LASTING_NOISE, NOISE_CORRELATION_TIME, OBSERVATION_NOISE
 from rfdropo_bayes.data import Trajectory, noise_floor
@@ -26,11 +27,12 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.report.identifiability import DETERMINED, FREE, NEGLIGIBLE, WELL_AWAY
 from rfdropo_bayes.simulators.black_box import BlackBox
-from rfdropo_bayes.simulators.protocol import Result
+from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.tables import changed
 
 STEP = 0.05  # of a derivative, in prior standard deviations: motion bends little over it
-SETS = 192  # parameter sets that are rolled out in all, about
+SETS = 128  # parameter sets that are rolled out in all, about
+PATIENCE = 10.0  # [s]: no more rollouts are begun after these
 FEWEST, MOST = 4, 16  # draws of the prior
 PRIOR_DRAWS = 2000
 KNOWN = 0.01  # relative error with which a part is weighed, or a parameter measured by itself
@@ -91,13 +93,19 @@ class Preflight:
         found = [direction.sentence for direction in self.directions] or ["every combination, more or less"]
         rows = [("undetermined" if self.directions else "determined", found[0]), *(("", text) for text in found[1:])]
         rows += [("" if index else "excited", text) for index, text in enumerate(self._excitation())]
-        cost = f"{self.method}: {self.rollouts} rollouts of {1e3 * self.rollout_seconds:.3g} ms, {minutes(self.minutes)}"
+        cost = (
+            f"{self.method}: {self.rollouts} rollouts of {1e3 * self.rollout_seconds:.3g} ms, {minutes(self.minutes)}"
+        )
         rows += [("cost", cost), ("assumed", self.noise)]
         return rows
 
     def _excitation(self) -> list[str]:
         blind = [name for name, row in self.parameters.iterrows() if row["alone"] > FREE]
-        words = [f"{', '.join(map(str, blind))}: the motion hardly depends on it, even were all else known"] if blind else []
+        words = (
+            [f"{', '.join(map(str, blind))}: the motion hardly depends on it, even were all else known"]
+            if blind
+            else []
+        )
         words += [f"{run}: {', '.join(names)} never changes" for run, names in self.channels.items() if names]
         return words or ["all parameters change the motion by more than the noise, and all channels move"]
 
@@ -148,7 +156,9 @@ class _Noise(NamedTuple):
     words: str
 
 
-def preflight(model: Model, runs: Sequence[Trajectory], *, method: str = "", rollouts: int = 0, seed: int = 0) -> Preflight:
+def preflight(
+    model: Model, runs: Sequence[Trajectory], *, method: str = "", rollouts: int = 0, seed: int = 0
+) -> Preflight:
     """Say what a fit of these recordings can determine, in seconds.
 
     Args:
@@ -190,7 +200,7 @@ def preflight(model: Model, runs: Sequence[Trajectory], *, method: str = "", rol
         _shares(coordinates, known),
         {run.name: _held(run) for run in runs},
         noise.words,
-        count,
+        len(good),
         int(np.sum(~good)),
         per_set,
         budget,
@@ -212,14 +222,14 @@ def _coordinates(problem: CalibrationProblem, drawn: Mapping[str, np.ndarray]) -
     names = tuple(name for name in problem.physical_names if np.ptp(drawn[name]) > 0.0)
     logarithmic = np.array([_has_scale(problem, name, drawn[name]) for name in names], dtype=bool)
     columns = [np.log(drawn[n]) if log else drawn[n] for n, log in zip(names, logarithmic, strict=True)]
-    return _Coordinates(
-        names, logarithmic, np.array([c.mean() for c in columns]), np.array([c.std() for c in columns])
-    )
+    return _Coordinates(names, logarithmic, np.array([c.mean() for c in columns]), np.array([c.std() for c in columns]))
 
 
 def _has_scale(problem: CalibrationProblem, name: str, draws: np.ndarray) -> bool:
     family = (problem.model.space[name].table or {}).get("distribution")
-    return bool(np.all(draws > 0.0) and (family in ("LogNormal", "LogUniform") or draws.std() < WELL_AWAY * draws.mean()))
+    return bool(
+        np.all(draws > 0.0) and (family in ("LogNormal", "LogUniform") or draws.std() < WELL_AWAY * draws.mean())
+    )
 
 
 def _noise(
@@ -257,7 +267,7 @@ def _slopes(
     """Derivatives at draws of the prior, which draws ended well, seconds of a parameter set, and the worst result."""
     dimension, count = len(coordinates.names), len(start)
     rows = [
-        (np.log(drawn[n][start]) if log else drawn[n][start] - 0.0)
+        np.log(drawn[n][start]) if log else drawn[n][start]
         for n, log in zip(coordinates.names, coordinates.logarithmic, strict=True)
     ]
     x = (np.stack(rows, axis=1) - coordinates.mean) / coordinates.sd
@@ -268,23 +278,44 @@ def _slopes(
         low, high = problem.bounds[name]
         values[name] = np.clip(own, low, high)
     rest = {n: np.repeat(drawn[n][start], 2 * dimension) for n in problem.names if n not in values}
-    every = {**rest, **values}
-    first = {name: column[: 2 * dimension] for name, column in every.items()}
-    _ = problem.observe(first)  # compiled before it is timed
-    begun = clock.perf_counter()
-    seen = problem.observe(every)
-    per_set = (clock.perf_counter() - begun) / len(moved)
+    seen, per_set = _observed(problem, {**rest, **values}, 2 * dimension)
+    count = len(seen.status) // (2 * dimension)
     status = np.asarray(seen.status).reshape(count, -1)
     ended = (status == Result.OK).all(axis=1) & np.isfinite(np.asarray(seen.position)).all(axis=(1, 2, 3, 4)).reshape(
         count, -1
     ).all(axis=1)
 
-    def slope(part: np.ndarray) -> np.ndarray:
+    def slope(part: Any) -> np.ndarray:
         both = np.asarray(part).reshape(count, 2, dimension, *part.shape[1:])
         return (both[:, 0] - both[:, 1]) / (2.0 * STEP)
 
     level = np.asarray(seen.tension).reshape(count, 2 * dimension, *seen.tension.shape[1:])[:, 0]
     return _Slopes(slope(seen.position), slope(seen.tension), level), ended, per_set, Result(int(status.max()))
+
+
+def _observed(problem: CalibrationProblem, every: Mapping[str, np.ndarray], whole: int) -> tuple[Observation, float]:
+    """What parameter sets show, and seconds of one, in batches of one size, as each size takes a compilation.
+
+    When `PATIENCE` is up, what is left is not simulated; what is there is a multiple of ``whole`` sets.
+    """
+    count = len(next(iter(every.values())))
+    size = max(each for each in chunk_sizes(problem.chunk) if each <= max(count, min(chunk_sizes(problem.chunk))))
+    parts: list[Observation] = []
+    seconds: list[float] = []
+    for first in range(0, count, size):
+        if sum(seconds) > PATIENCE and first >= whole:
+            count = first // whole * whole
+            break
+        rows = np.arange(first, first + size) % count
+        begun = clock.perf_counter()
+        parts.append(problem.observe({name: column[rows] for name, column in every.items()}))
+        seconds.append(clock.perf_counter() - begun)
+    if len(parts) == 1:
+        begun = clock.perf_counter()
+        problem.observe({name: column[:size] for name, column in every.items()})
+        seconds.append(clock.perf_counter() - begun)
+    seen = jax.tree.map(lambda *each: np.concatenate(each)[:count], *parts)
+    return seen, float(np.min(seconds[1:])) / size
 
 
 class _Whitening:
@@ -351,9 +382,7 @@ def _further(model: Model, coordinates: _Coordinates, tension: np.ndarray) -> di
     return found
 
 
-def _directions(
-    coordinates: _Coordinates, information: np.ndarray, more: Mapping[str, np.ndarray]
-) -> list[Direction]:
+def _directions(coordinates: _Coordinates, information: np.ndarray, more: Mapping[str, np.ndarray]) -> list[Direction]:
     """What keeps most of its prior standard deviation."""
     values, vectors = np.linalg.eigh(information)
     loose = vectors[:, 1.0 / np.sqrt(1.0 + np.maximum(values, 0.0)) > FREE]
@@ -417,5 +446,3 @@ def _held(run: Trajectory) -> list[str]:
     """Channels whose command never changes."""
     sent = np.concatenate([np.asarray(run.initial_command)[None], np.asarray(run.command)])
     return [name for name, spread in zip(run.cable_names, np.ptp(sent, axis=0), strict=True) if spread == 0.0]
-
-

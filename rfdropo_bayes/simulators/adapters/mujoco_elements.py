@@ -70,7 +70,9 @@ ATTRIBUTES: dict[str, dict[str, Attribute]] = {
         "damping": _plain("dof_damping", PER["damping"], 0.7, (1.0, 0.1), "damping"),
         "armature": _plain("dof_armature", ("kg", "kg m2"), 0.5, (0.1, 0.01), "inertia of the rotor"),
         "frictionloss": _plain("dof_frictionloss", PER["force"], 0.7, (1.0, 0.1), "dry friction"),
-        "springref": Attribute((("qpos_spring", None, 1.0),), ("m", "rad"), True, 0.0, (0.005, 0.1), "rest of the spring"),
+        "springref": Attribute(
+            (("qpos_spring", None, 1.0),), ("m", "rad"), True, 0.0, (0.005, 0.1), "rest of the spring"
+        ),
     },
     "tendon": {
         "stiffness": _plain("tendon_stiffness", "N/m", 0.5, 100.0, "stiffness"),
@@ -95,11 +97,18 @@ ATTRIBUTES: dict[str, dict[str, Attribute]] = {
         "kv": Attribute((("actuator_biasprm", 2, -1.0),), "-", False, 0.5, 1.0, "gain of velocity"),
         "gear": Attribute((("actuator_gear", 0, 1.0),), "-", True, 0.0, 0.1, "gear ratio"),
         "offset": Attribute((("actuator_biasprm", 0, 1.0),), "-", True, 0.0, 0.1, "force at no command"),
-        "time_constant": Attribute((("actuator_dynprm", 0, 1.0),), "s", False, 0.5, 0.05, "time constant of activation"),
+        "time_constant": Attribute(
+            (("actuator_dynprm", 0, 1.0),), "s", False, 0.5, 0.05, "time constant of activation"
+        ),
     },
     "flex": {
         "stiffness": Attribute(
-            (("flex_stiffness", None, 1.0), ("flex_bending", None, 1.0)), "-", False, 0.5, 1.0, "factor on Young's modulus"
+            (("flex_stiffness", None, 1.0), ("flex_bending", None, 1.0)),
+            "-",
+            False,
+            0.5,
+            1.0,
+            "factor on Young's modulus",
         ),
         "damping": _plain("flex_damping", "s", 0.7, 0.01, "damping"),
         "edgestiffness": _plain("flex_edgestiffness", "N/m", 0.5, 100.0, "stiffness of edges"),
@@ -131,7 +140,7 @@ class Place(NamedTuple):
     """Entries of a field of MjModel."""
 
     field: str
-    index: tuple[Any, ...]
+    entries: tuple[Any, ...]
     sign: float
 
 
@@ -152,16 +161,16 @@ class Edit(NamedTuple):
 
     def apply(self, model: Any, value: float) -> None:
         """Change a model in place that other parameters may have changed before."""
-        for field, index, sign in self.places:
+        for field, entries, sign in self.places:
             array = field_of(model, field)
             if self.form == "offset":
-                array[index] += sign * value
+                array[entries] += sign * value
             elif self.form == "factor":
-                array[index] *= value
+                array[entries] *= value
             elif self.nominal != 0.0:
-                array[index] *= value / self.nominal
+                array[entries] *= value / self.nominal
             else:
-                array[index] = sign * value
+                array[entries] = sign * value
 
 
 def field_of(model: Any, name: str) -> Any:
@@ -252,13 +261,13 @@ def edit_of(model: Any, address: str, *, form: str | None = None) -> tuple[Edit,
 
 def _values(model: Any, kind: str, number: int, attribute: Attribute) -> np.ndarray:
     place = places_of(model, kind, number, attribute)[0]
-    return np.asarray(field_of(model, place.field)[place.index])
+    return np.asarray(field_of(model, place.field)[place.entries])
 
 
 def _nominal(model: Any, places: Sequence[Place], where: str) -> float:
     """Value of the first of some places."""
-    field, index, sign = places[0]
-    values = np.unique(np.asarray(field_of(model, field)[index]))
+    field, entries, sign = places[0]
+    values = np.unique(np.asarray(field_of(model, field)[entries]))
     if len(values) == 0:
         raise InputError("has nothing of that kind", where=where, remedy="choose another attribute")
     return float(sign * values[-1])
@@ -316,7 +325,11 @@ def parameter_of(edit: Edit, attribute: Attribute, unit: str, words: str, given:
     prior: dict[str, Any]
     if edit.form == "offset" or attribute.signed:
         reach = 20.0 * max(typical, abs(nominal))
-        low, high, prior = nominal - reach, nominal + reach, {"distribution": "Normal", "loc": nominal, "scale": typical}
+        low, high, prior = (
+            nominal - reach,
+            nominal + reach,
+            {"distribution": "Normal", "loc": nominal, "scale": typical},
+        )
     elif nominal == 0.0:
         low, high, prior = 0.0, RANGE * typical, {"distribution": "HalfNormal", "scale": typical}
     else:
@@ -350,7 +363,7 @@ def searched(
                 if (kind, number, attribute) in taken or not _matters(model, kind, number, attribute, trees):
                     continue
                 place = places_of(model, kind, number, ATTRIBUTES[kind][attribute])[0]
-                form = "value" if not np.any(field_of(model, place.field)[place.index]) else "factor"
+                form = "value" if not np.any(field_of(model, place.field)[place.entries]) else "factor"
                 address = f"option/{attribute}" if kind == "option" else f"{kind}/{number}/{attribute}"
                 edit, known, unit = edit_of(model, address, form="offset" if kind == "option" else form)
                 words = known.words if kind == "option" else f"{kind} {name}: {known.words}"

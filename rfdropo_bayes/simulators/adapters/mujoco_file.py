@@ -33,7 +33,9 @@ def model_text(rollouts: Any, model: Any, path: Path, remarks: Sequence[str]) ->
         written = _edited(text, model, elements, path.parent, remarks)
         if written is not None and _same(rollouts, model, written):
             return written
-    raise InputError("its file cannot say what was calibrated", where=str(path), remedy="export --phi, and set it there")
+    raise InputError(
+        "its file cannot say what was calibrated", where=str(path), remedy="export --phi, and set it there"
+    )
 
 
 def _texts(spec: Any, path: Path) -> Iterator[str]:
@@ -65,9 +67,7 @@ def _edited(
     for kind, number, attribute in elements:
         if kind == "option":
             _write_option(root, model, attribute)
-        elif kind == "flex":
-            return None
-        elif len(known[kind]) != counts[kind]:
+        elif kind == "flex" or len(known[kind]) != counts[kind]:
             return None
         else:
             _write(root, known[kind][number], model, kind, number, attribute)
@@ -239,4 +239,3 @@ def _moved(model: Any) -> np.ndarray:
         mujoco.mj_step(model, data)
         places.append(np.array(data.xpos))
     return np.stack(places)
-

@@ -47,7 +47,7 @@ MARKED = ("site", "body", "geom")
 """Elements that may be markers, in the order in which a bare name is looked up."""
 
 
-def MuJoCo(  # noqa: N802 - it stands where a class does: rb.MuJoCo beside rb.BlackBox
+def MuJoCo(
     path: str | Path,
     *,
     markers: Mapping[str, str] | Sequence[str] | None = None,
@@ -432,4 +432,3 @@ def _unheard() -> Iterator[None]:
         yield
     finally:
         mujoco.set_mju_user_warning(kept)
-

@@ -50,7 +50,7 @@ def adapter_tables(
     for kind, attribute in INFERRED:
         numbers = range(len(element_names(model, kind)))
         places = [places_of(model, kind, k, ATTRIBUTES[kind][attribute])[0] for k in numbers]
-        if any(np.any(field_of(model, place.field)[place.index]) for place in places):
+        if any(np.any(field_of(model, place.field)[place.entries]) for place in places):
             found["parameters"][f"{kind}_{attribute}"] = f"{kind}/*/{attribute}"
     return found, assumed + more
 
@@ -86,7 +86,9 @@ def _markers(model: Any, markers: Mapping[str, np.ndarray | None]) -> tuple[dict
         for row, column in zip(*linear_sum_assignment(far), strict=True):
             kind, name = chosen[column]
             found[left[row]] = f"{kind}/{name}"
-            assumed.append(f"marker {left[row]} is the {kind} {name}, {1e3 * far[row, column]:.3g} mm from its first row")
+            assumed.append(
+                f"marker {left[row]} is the {kind} {name}, {1e3 * far[row, column]:.3g} mm from its first row"
+            )
     return {marker: found[marker] for marker in markers}, assumed
 
 
