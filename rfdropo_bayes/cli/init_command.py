@@ -78,18 +78,19 @@ Modulus = Annotated[float | None, typer.Option("--modulus-mpa", help="Young's mo
 Markers = Annotated[
     str | None, typer.Option(help='heights in mm, in the order of the columns: "low=66,middle=133,tip=200"')
 ]
+Target = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FOLDER",
+        help="folder to write to, whose name the robot takes; or a MuJoCo model (.xml, .urdf): the experiment goes "
+        "into a folder of its name",
+    ),
+]
 Defaults = Annotated[bool, typer.Option("--defaults", help="ask nothing: take defaults, and mark them")]
 
 
 def init(
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FOLDER",
-            help="folder to write to, whose name the robot takes; or a MuJoCo model (.xml, .urdf): the experiment goes "
-            "into a folder of its name",
-        ),
-    ],
+    folder: Target,
     recording: Recordings = None,
     commands: Commands = None,
     shape: Shape = None,

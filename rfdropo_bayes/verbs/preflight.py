@@ -30,7 +30,7 @@ from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.tables import changed
 
-STEP = 0.05  # of a derivative, in prior standard deviations: motion bends little over it
+STEP = 2e-3  # of a derivative, in prior standard deviations: error of second order, beside information of up to 1e6
 SETS = 128  # parameter sets that are rolled out in all, about
 PATIENCE = 10.0  # [s]: no more rollouts are begun after these
 FEWEST, MOST = 4, 16  # draws of the prior

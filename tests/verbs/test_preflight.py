@@ -110,11 +110,11 @@ def test_an_arm_of_mujoco_with_stiff_drives_leaves_a_common_scale(tmp_path):
     path = tmp_path / "arm.xml"
     path.write_text("""
 <mujoco><option timestep="0.005" gravity="0 0 0" integrator="implicitfast"/><worldbody><body name="hand">
-  <joint name="base" axis="0 1 0" armature="100"/><geom size="0.01" mass="1e-3"/>
+  <joint name="base" axis="0 1 0" armature="1"/><geom size="0.01" mass="1e-3"/>
   <body name="rod" pos="0 0 -0.02"><joint name="bend" axis="0 1 0" stiffness="0.05" damping="0.002"/>
     <geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.2" mass="0.05"/><site name="tip" pos="0 0 -0.2"/>
   </body></body></worldbody>
-  <actuator><position name="drive" joint="base" kp="500000" kv="14000"/></actuator></mujoco>""")
+  <actuator><position name="drive" joint="base" kp="5000" kv="140"/></actuator></mujoco>""")
     given = {"mass": "body/rod/mass", "stiffness": "joint/bend/stiffness", "damping": "joint/bend/damping"}
     box = rb.MuJoCo(path, parameters=given)
     assert box.command_unit == "rad"
