@@ -1,0 +1,73 @@
+"""Simulators of others by name: the example of the document, a process, and PyElastica's rod."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rfdropo_bayes as rb
+from rfdropo_bayes.model.experiment_file import self_contained
+from rfdropo_bayes.simulators.adapters import adapted
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+DOCUMENT = (REPOSITORY / "docs" / "your_simulator.md").read_text()
+LINES = 40
+WALK = {"duration": 1.0, "interval": 0.2, "step": 0.01, "low": -0.03, "high": 0.03, "sample_time": 0.02}
+PROGRAM = """
+import json, sys
+for line in sys.stdin:
+    asked = json.loads(line)
+    k = asked["parameters"]["stiffness"]
+    print(json.dumps({"position": [[[k * row[0], 0.0, 0.1]] for row in asked["command"]]}), flush=True)
+"""
+
+
+def block(language: str, containing: str) -> str:
+    """A block of code of the document."""
+    found = [code for code in re.findall(rf"```{language}\n(.*?)```", DOCUMENT, re.DOTALL) if containing in code]
+    assert len(found) == 1
+    return found[0]
+
+
+def test_the_example_of_the_document_is_a_simulator_of_forty_lines(tmp_path):
+    code = block("python", "rb.BlackBox")
+    assert code.count("\n") <= LINES
+    (tmp_path / "engine.py").write_text(code)
+    (tmp_path / "experiment.toml").write_text(block("toml", "engine.py"))
+    model, tables = rb.Model.read(tmp_path / "experiment.toml")
+    assert model.parameters.loc["stiffness", "prior"] is not None
+    assert {spec.name: spec.nominal for spec in model.simulator.parameters}["stiffness"] == 30.0
+    (run,) = rb.simulate(model, {**WALK, "recordings": ["a"]})
+    assert np.ptp(run.position[:, 0, 0]) > 0.005
+    (tmp_path / "run").mkdir()
+    placed = self_contained(tables, tmp_path, tmp_path / "run")
+    assert (placed["robot"], (tmp_path / "run" / "engine.py").read_text()) == ("engine.py:arm", code)
+    assert model.tables()["adapter"] == {"stiffness": 30.0}
+
+
+def test_a_process_is_named_by_an_experiment(tmp_path):
+    (tmp_path / "simulate.py").write_text(PROGRAM)
+    text = block("toml", "black_box:BlackBox").replace(
+        '["./simulate", "--quiet"]', f'["{sys.executable}", "{tmp_path / "simulate.py"}"]'
+    )
+    (tmp_path / "experiment.toml").write_text(text)
+    model, _ = rb.Model.read(tmp_path / "experiment.toml")
+    (run,) = rb.simulate(model, {**WALK, "recordings": ["a"]}, parameters={"stiffness": 3.0})
+    level = run.command[np.searchsorted(run.command_time, run.time[1:] - 1e-9) - 1, 0]
+    np.testing.assert_allclose(run.position[1:, 0, 0], 3.0 * level, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_rod_of_pyelastica_bends_as_a_beam_does():
+    pytest.importorskip("elastica")
+
+    box = adapted("pyelastica_rod.py:rod", REPOSITORY / "examples", {})
+    stiff = {"young_modulus": 1e7, "density": 500.0, "damping": 30.0}
+    force = 0.05
+    place = box.function(stiff, np.full((151, 1), force))
+    beam = force * 0.3**3 / (3.0 * 1e7 * np.pi * 0.01**4 / 4.0)
+    assert place[-1, 0, 0] == pytest.approx(beam, rel=0.08)  # gravity stretches it a little
