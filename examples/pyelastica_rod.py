@@ -13,7 +13,7 @@ import numpy as np
 import rfdropo_bayes as rb
 
 LENGTH, RADIUS = 0.3, 0.01  # [m]
-STEP = 2e-4  # [s]: what the rod's waves ask for
+STEP = 1e-4  # [s]: the stiffest and lightest rod lets a wave pass half an element in it
 
 
 class _Scene(elastica.BaseSystemCollection, elastica.Constraints, elastica.Forcing, elastica.Damping):
@@ -69,8 +69,8 @@ def rod(elements: int = 20, time_step: float = 0.01) -> rb.BlackBox:
         return {"unit": unit, "low": low, "high": high, "nominal": median, "prior": prior}
 
     parameters = {
-        "young_modulus": table("Pa", 1e5, 1e6, 1e7),
-        "density": table("kg/m3", 500.0, 1100.0, 3000.0),
+        "young_modulus": table("Pa", 1e5, 1e6, 3e6),
+        "density": table("kg/m3", 800.0, 1100.0, 3000.0),
         "damping": table("1/s", 0.01, 2.0, 50.0),
     }
     names = {"markers": ["tip"], "channels": ["force"], "command_unit": "N"}
