@@ -46,7 +46,9 @@ def draw(time: np.ndarray, seen: np.ndarray, found: list[np.ndarray], rest: np.n
     every = 1e3 * np.concatenate([seen.reshape(-1, 3), *(path.reshape(-1, 3) for path in found), np.zeros((1, 3))])
     low, high = np.nanmin(every, axis=0), np.nanmax(every, axis=0)
     rows = np.linspace(0, len(time) - 1, min(FRAMES, len(time))).round().astype(int)
-    lines = [smooth_line(np.concatenate([np.zeros((len(path), 1, 3)), path], axis=1), np.r_[0.0, rest])[0] for path in found]
+    lines = [
+        smooth_line(np.concatenate([np.zeros((len(path), 1, 3)), path], axis=1), np.r_[0.0, rest])[0] for path in found
+    ]
     artists = []
     for axes, words, colour in zip(panels, ("before the audit", "after the audit"), (TEST, POSTERIOR), strict=True):
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
@@ -67,7 +69,9 @@ def draw(time: np.ndarray, seen: np.ndarray, found: list[np.ndarray], rest: np.n
             body.set_data_3d(*(1e3 * line[row].T))
             trail.set_data_3d(*(1e3 * seen[: row + 1, -1].T))
             dots.set_data_3d(*(1e3 * seen[row].T))
-        caption.set_text(f"dots: measured by motion capture; body: predicted from the commands alone; {time[row] - time[0]:.1f} s")
+        caption.set_text(
+            f"dots: measured by motion capture; body: predicted from the commands alone; {time[row] - time[0]:.1f} s"
+        )
         return []
 
     out.parent.mkdir(parents=True, exist_ok=True)
