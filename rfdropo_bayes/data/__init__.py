@@ -7,7 +7,7 @@ from rfdropo_bayes.data.first_command import common_beginning
 from rfdropo_bayes.data.matching import check_channels, shared_markers
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
 from rfdropo_bayes.data.plain_csv import CsvColumns, read_plain_csv
-from rfdropo_bayes.data.repeats import group_repeats, noise_floor
+from rfdropo_bayes.data.repeats import command_openings, group_repeats, noise_floor, same_opening
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, load_recordings
 from rfdropo_bayes.data.trajectory import Trajectory
@@ -27,7 +27,9 @@ __all__ = [
     "find_data_file",
     "find_faults",
     "first_row_only",
+    "command_openings",
     "group_repeats",
+    "same_opening",
     "load_recordings",
     "load_unseen",
     "noise_floor",
