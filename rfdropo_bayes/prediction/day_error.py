@@ -184,9 +184,7 @@ def _tip_error(predictions: Sequence[RecordingPrediction]) -> float:
     return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
-def _held(
-    prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]], squares: Mapping[str, float]
-) -> float:
+def _held(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]], squares: Mapping[str, float]) -> float:
     """Share of the coordinates of days left out in 90 % bands that know of the other days alone."""
     inside = []
     for number, (group, found) in enumerate(days.items()):

@@ -168,7 +168,9 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
         details={**_details(found, asked.name, asked.own), "checks": checks, "compared": check_sentences(checks)},
     )
     prior = _prior(asked.space, asked.own, adapted.body, seed)
-    record = _record(asked, adapted, result, {p.name: d for p, d in zip(asked.own, prior, strict=True)} | adapted.body, seed)
+    record = _record(
+        asked, adapted, result, {p.name: d for p, d in zip(asked.own, prior, strict=True)} | adapted.body, seed
+    )
     facts = gather_facts(
         f"{asked.fit.content.get('title', asked.model.name)}: {asked.name}",
         seed,
@@ -528,7 +530,9 @@ def check_sentences(checks: Mapping[str, Mapping[str, Mapping[str, float]]]) -> 
     """Before and after an adaptation in the same words, of each recording that it did not look at."""
     found = []
     for name, check in checks.items():
-        words = [f"{row['error_mm']:.3g} mm off, its 90 % bands held {100.0 * row['held']:.0f} %" for row in check.values()]
+        words = [
+            f"{row['error_mm']:.3g} mm off, its 90 % bands held {100.0 * row['held']:.0f} %" for row in check.values()
+        ]
         found.append(f"{name}, as far as it was not shown: from the first row {words[0]}; adapted {words[1]}.")
     return found
 

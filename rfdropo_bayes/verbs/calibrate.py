@@ -26,7 +26,7 @@ from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
-from rfdropo_bayes.prediction.day_error import DAY_ERROR, DayError
+from rfdropo_bayes.prediction.day_error import DAY_ERROR, DayError, left_out_sentence, recorded_day_error
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError, model_error
 from rfdropo_bayes.prediction.predictive import (
     BEGUN,
@@ -41,6 +41,7 @@ from rfdropo_bayes.prediction.predictive import (
     thin,
 )
 from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, build_summary, software_versions
+from rfdropo_bayes.report.baselines import with_fitted_commands
 from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
@@ -342,6 +343,7 @@ def gather_facts(
     added: Any = description.get("mechanisms", ())
     checks = check_fit(problem, record, problem.model.markers.name in result.details.get("lasting", {}))
     floor = noise_floor([*fitted, *tested])
+    slow = recorded_day_error(record) if record.attrs.get(DAY_ERROR) else None
     undriven = [] if robot is None else robot.unstated(run.name for run in (*fitted, *tested))
     return RunFacts(
         title=title,
@@ -369,11 +371,13 @@ def gather_facts(
             **{key: str(value) for key, value in description.items() if key not in ("mechanisms", "robot")},
         },
         baselines=baseline_errors(list(fitted), list(tested)),
+        fitted_commands=with_fitted_commands(fitted, tested),
         noise_floor=floor,
         phi=result.phi,
         optimum=result.optimum,
         objects=score_objects(unseen, [*fitted, *tested]),
         versions=software_versions(),
+        unseen_days={} if slow is None else {**slow.as_dict(), "sentence": left_out_sentence(slow)},
         details=result.details,
         outline=None if robot is None else robot_shape(robot),
     )
