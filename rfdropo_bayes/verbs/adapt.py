@@ -492,7 +492,9 @@ def _record(
         ParameterInfo(p.name, p.spec.unit, p.spec.low, p.spec.high, dict(p.table or {}), p.spec.description)
         for p in problem.model.space.parameters
     )
-    known = {NOISE: STATED, KNOWN_NOISE: {"markers": list(recordings.markers), **noise.as_dict()}} if noise else {}
+    known: dict[str, Any] = (
+        {NOISE: STATED, KNOWN_NOISE: {"markers": list(recordings.markers), **noise.as_dict()}} if noise else {}
+    )
     known |= {DAY_ERROR: None if adapted.slow is None else adapted.slow.as_dict()}
     attributes = {**attrs, **known, FITTED: list(recordings.names), ADAPTED_TO: asked.name, "seed": seed}
     record = PosteriorRecord(infos, result.draws, dict(prior), tuple(adapted.predictions), attrs=attributes)
@@ -540,7 +542,7 @@ def check_sentences(checks: Mapping[str, Mapping[str, Mapping[str, float]]]) -> 
 def _kept_caution(check: Mapping[str, Mapping[str, float]]) -> Caution:
     before, after = check["from_first_row"]["error_mm"], check["adapted"]["error_mm"]
     sentence = (
-        f"what was shown of the day makes the rest of the recording worse: {after:.3g} mm off, from the first row alone "
-        f"{before:.3g} mm; the day has what its first rows say of it, and the rest has served to see that"
+        f"what was shown of the day makes the rest of the recording worse: {after:.3g} mm off, from the first row "
+        f"alone {before:.3g} mm; the day has what its first rows say of it, and the rest has served to see that"
     )
     return Caution(Code.DAY_UNMATCHED, sentence)

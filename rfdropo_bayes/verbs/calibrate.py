@@ -232,7 +232,9 @@ def record_posterior(
         days, openings = list(gather_groups(fitted, model.spec.groups)), openings_of(asked.runs)
         unseen = [] if slow is None else of_unseen_days(tested, model.spec.groups, days, openings)
         known: dict[str, Any] = {"fitted": fitted, "left": left, "groups": model.spec.groups, "chunk": problem.chunk}
-        found = predict_new(problem.model, tested, values, test_key, **known, slow=dict.fromkeys(unseen, slow))
+        found = predict_new(
+            problem.model, tested, values, test_key, **known, slow={} if slow is None else dict.fromkeys(unseen, slow)
+        )
         predictions += found.recordings
         cautions = match_cautions(found)
     record = PosteriorRecord(
