@@ -4,8 +4,8 @@
 
 Three joints with gravity, markers at elbow and tip with 1 mm of white noise, two seconds of torques; the damping of
 each joint and the mass of the last link are unknown. One table: error, share of the 90 % intervals that hold the truth,
-their width, and seconds. mujoco.sysid needs ``pip install "mujoco[sysid]"`` and is left out without it. The seconds of each
-method are those of a whole fit, compilation included, after one fit that is not counted.
+their width, and seconds. mujoco.sysid needs ``pip install "mujoco[sysid]"`` and is left out without it. The seconds of
+each method are those of a whole fit, compilation included, after one fit that is not counted.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ def test_a_process_is_named_by_an_experiment(tmp_path):
         '["./simulate", "--quiet"]', f'["{sys.executable}", "{tmp_path / "simulate.py"}"]'
     )
     (tmp_path / "experiment.toml").write_text(text)
-    model, _ = rb.Model.read(tmp_path / "experiment.toml")
+    model = rb.Model.read(tmp_path / "experiment.toml")
     (run,) = rb.simulate(model, {**WALK, "recordings": ["a"]}, parameters={"stiffness": 3.0})
     level = run.command[np.searchsorted(run.command_time, run.time[1:] - 1e-9) - 1, 0]
     np.testing.assert_allclose(run.position[1:, 0, 0], 3.0 * level, atol=1e-12)

@@ -64,7 +64,7 @@ def test_init_finds_the_elements_and_says_what_it_assumed(place):
     recorded(place, 0.0)
     told = rfdropo("init", "reacher.xml", "--recording", "run_*.csv")
     assert "assumed: marker elbow is the body body1" in told
-    model, _ = rb.Model.read(place / "reacher" / "experiment.toml")
+    model = rb.Model.read(place / "reacher" / "experiment.toml")
     assert model.robot.function.channels == {"motor1": 0, "motor2": 1}
     inferred = model.parameters[[prior is not None for prior in model.parameters["prior"]]]
     assert {"body_mass", "joint_damping"} <= set(inferred.index)
@@ -93,7 +93,7 @@ def test_a_model_of_others_is_calibrated_drawn_predicted_and_written_back(place)
     written = mujoco.MjModel.from_xml_path("calibrated/calibrated.xml")
     np.testing.assert_allclose(written.dof_damping[:2], row["mean"], rtol=1e-6)
     again = rb.MuJoCo("calibrated/calibrated.xml", markers={"tip": "fingertip"})
-    model, _ = rb.Model.read(Path("fit/config.toml"))
+    model = rb.Model.read(Path("fit/config.toml"))
     means = {
         name: float(row["mean"]) for name, row in json.loads(Path("fit/summary.json").read_text())["parameters"].items()
     }
