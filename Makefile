@@ -12,12 +12,13 @@ PYTEST  = $(BIN)/python -m pytest
 CORE    = $(VENV)/core.stamp
 DEV     = $(VENV)/dev.stamp
 ALL     = $(VENV)/all.stamp
+SITE    = $(VENV)/site.stamp
 
 # Two BLAS threads that fight over small blocks make a solve fifty times slower.
 export OPENBLAS_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-portable test-compiler test-all matrix lint format bench validate notebooks notebook-outputs reference demo-data clean
+.PHONY: help demo test test-portable test-compiler test-all matrix lint format bench validate notebooks notebook-outputs reference site demo-data clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-20s%s\n", $$1, $$2 }'
@@ -61,6 +62,9 @@ validate: $(CORE) ## references and other simulators with ours beside them, in r
 notebooks: $(DEV) ## run every notebook from top to bottom
 	$(PYTEST) -m notebook
 
+site: $(SITE) ## the documentation as pages, in site/; needs no network
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
+
 reference: $(CORE) ## write docs/reference from the code
 	$(BIN)/python tools/reference.py
 
@@ -91,3 +95,7 @@ $(DEV): pyproject.toml constraints.txt | $(BIN)/python
 $(ALL): pyproject.toml constraints.txt | $(BIN)/python
 	$(PIP) --editable '.[dev,sbi,cluster]'
 	@touch $(CORE) $(DEV) $@
+
+$(SITE): pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) --editable '.[site]'
+	@touch $(CORE) $@

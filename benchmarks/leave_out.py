@@ -1,24 +1,32 @@
 """Leave recordings out in turn, fit the others, and predict those left out from their commands and first rows.
 
-    python benchmarks/leave_out.py EXPERIMENT PATTERN [PATTERN ...] [--adapt SECONDS] [--out DIR] [--set ASSIGNMENT ...]
+    python benchmarks/leave_out.py [SETTINGS.toml] [--out DIR]
 
-Every pattern stands for recordings that are left out together, such as those of a day. They are predicted whole, also
-where the experiment fits some rows of them. The table says how far the last marker is off [mm], and which share of the
-measured coordinates lies in the 90 % bands: of all markers, of the last, and of rows whose last marker is inside in all
-three. With --adapt each fit is then adapted to the first seconds of the first recording that was left out; further rows
-of the table are of the rest of it, and of the others. Fits that are done are read again.
+The settings name experiments, patterns of recordings that are left out together, such as those of a day, and the
+seconds of the first of them that each fit is then adapted to. Recordings are predicted whole, also where the experiment
+fits some rows of them; after an adaptation the first one as far as it was not shown.
+
+Every figure is a line of DIR/ledger.jsonl: how far the last marker is off [mm], and which share of the measured
+coordinates lies in the 90 % bands: of all markers, of the last, and of rows whose last marker is inside in all three.
+Lines that are there are not computed again, fits that are done are read again, and so an interrupted run goes on. A fit
+of the paper's trunk takes 2 to 10 minutes of two shared cores, one of the ASL trunk 7 minutes or more, an adaptation 1.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import tomllib
+from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.data import RecordingEntry
+from rfdropo_bayes.files import append_line
 from rfdropo_bayes.groups import whole
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.model.assembly import load_data
@@ -27,7 +35,19 @@ from rfdropo_bayes.report.coverage import predictive_bands
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.calibrate import calibrate, inference_options
 
-HEAD = ("left out", "recording", "start held [mm]", "error [mm]", "coordinates in", "of the tip", "tips in")
+SETTINGS = Path(__file__).with_suffix(".toml")
+
+HEAD = (
+    "left out",
+    "shown [s]",
+    "recording",
+    "start held [mm]",
+    "error [mm]",
+    "coordinates in",
+    "of the tip",
+    "tips in",
+)
+FIGURES = ("held_mm", "error_mm", "coordinates", "tip_coordinates", "tips")
 
 
 def whole_recordings(model: rb.Model, pattern: str) -> list[rb.Trajectory]:
@@ -61,7 +81,7 @@ def tested(found: rb.Calibration) -> list[RecordingPrediction]:
     return [prediction for prediction in found.record.recordings if prediction.split == "test"]
 
 
-def figures(prediction: RecordingPrediction) -> tuple[float, ...]:
+def figures(prediction: RecordingPrediction) -> dict[str, float]:
     """Errors of the last marker [mm], and shares in the 90 % bands."""
     bands, seen = predictive_bands(prediction.predicted), prediction.mask
     inside = (prediction.observed >= bands.low90) & (prediction.observed <= bands.high90)
@@ -69,31 +89,47 @@ def figures(prediction: RecordingPrediction) -> tuple[float, ...]:
     held = prediction.observed[tip, -1] - prediction.observed[tip, -1][0]
     off = prediction.central[tip, -1] - prediction.observed[tip, -1]
     errors = [1e3 * float(np.sqrt(np.mean(np.sum(each**2, axis=-1)))) for each in (held, off)]
-    return (*errors, inside[seen].mean(), inside[tip, -1].mean(), inside[tip, -1].all(axis=-1).mean())
+    shares = [inside[seen].mean(), inside[tip, -1].mean(), inside[tip, -1].all(axis=-1).mean()]
+    return dict(zip(FIGURES, [*errors, *map(float, shares)], strict=True))
+
+
+def cases(study: dict[str, Any], out: Path, known: set[tuple[str, str, float]]) -> Iterator[dict[str, Any]]:
+    """Lines of the ledger that are not known, each as soon as it is there; 0 seconds shown are the first row alone."""
+    experiment = Path(study["experiment"])
+    model = rb.Model.read(experiment)
+    for pattern in study["left_out"]:
+        waiting = [seconds for seconds in (0.0, *study["adapt"]) if (experiment.stem, pattern, seconds) not in known]
+        if not waiting:
+            continue
+        found = left_out(model, pattern, out / experiment.stem / pattern.replace("*", ""))
+        first, *others = whole_recordings(model, pattern)
+        for seconds in waiting:
+            fit = found
+            if seconds:
+                fit = rb.adapt(found, first, seconds=seconds, test=others, group="the day left out")
+            rows = {prediction.name: figures(prediction) for prediction in tested(fit)}
+            yield {"experiment": experiment.stem, "left_out": pattern, "seconds": seconds, "recordings": rows}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("experiment", type=Path)
-    parser.add_argument("patterns", nargs="+")
-    parser.add_argument("--adapt", type=float, help="seconds of the first recording left out that are then looked at")
+    parser.add_argument("settings", type=Path, nargs="?", default=SETTINGS)
     parser.add_argument("--out", type=Path, default=Path("reports/leave_out"))
-    parser.add_argument("--set", action="append", default=[], dest="overrides")
     given = parser.parse_args()
-    model = rb.Model.read(given.experiment, given.overrides)
-    print("| " + " | ".join(HEAD) + " |\n" + "|---" * len(HEAD) + "|", flush=True)
-    for pattern in given.patterns:
-        out = given.out / pattern.replace("*", "")
-        found = left_out(model, pattern, out)
-        rows = [(pattern, prediction) for prediction in tested(found)]
-        if given.adapt is not None:
-            first, *others = whole_recordings(model, pattern)
-            adapted = rb.adapt(found, first, seconds=given.adapt, test=others, group="the day left out")
-            rows += [(f"{pattern}, adapted", prediction) for prediction in tested(adapted)]
-        for words, prediction in rows:
-            held, off, *shares = figures(prediction)
-            percent = " | ".join(f"{100 * share:.0f} %" for share in shares)
-            print(f"| {words} | {prediction.name} | {held:.1f} | {off:.1f} | {percent} |", flush=True)
+    ledger = given.out / "ledger.jsonl"
+    lines = [json.loads(line) for line in ledger.read_text().splitlines()] if ledger.exists() else []
+    known = {(line["experiment"], line["left_out"], line["seconds"]) for line in lines}
+    given.out.mkdir(parents=True, exist_ok=True)
+    for study in tomllib.loads(given.settings.read_text())["study"]:
+        for line in cases(study, given.out, known):
+            append_line(ledger, json.dumps(line))
+            lines.append(line)
+    print("| " + " | ".join(HEAD) + " |\n" + "|---" * len(HEAD) + "|")
+    for line in lines:
+        for name, row in line["recordings"].items():
+            percent = " | ".join(f"{100 * row[key]:.0f} %" for key in FIGURES[2:])
+            errors = f"{row['held_mm']:.1f} | {row['error_mm']:.1f}"
+            print(f"| {line['left_out']} | {line['seconds']:g} | {name} | {errors} | {percent} |")
 
 
 if __name__ == "__main__":

@@ -70,15 +70,19 @@ def _remedy(family: Sequence[ParameterSpec]) -> str:
 
 
 def families(specs: Sequence[ParameterSpec]) -> list[list[ParameterSpec]]:
-    """Parameters that are one quantity at several places (the zeros of all cables), by the start of their names."""
+    """Parameters that are one quantity at several places (the zeros of all cables), by the start of their names; or
+    by their family, where a simulator tells it."""
     alike: dict[str, list[ParameterSpec]] = {}
     for spec in specs:
-        alike.setdefault(repr((spec.unit, spec.low, spec.high, sorted(spec.prior.items()))), []).append(spec)
-    return [found for found in alike.values() if len(found) > 1 and stem(found)]
+        key = repr((spec.unit, spec.low, spec.high, sorted(spec.prior.items())))
+        alike.setdefault(spec.family or key, []).append(spec)
+    return [found for found in alike.values() if found[0].family or (len(found) > 1 and stem(found))]
 
 
 def stem(specs: Sequence[ParameterSpec]) -> str:
-    """What the names of several parameters begin with, in whole words."""
+    """Their family, or what the names of several parameters begin with, in whole words."""
+    if specs[0].family:
+        return specs[0].family
     words = zip(*(spec.name.split("_") for spec in specs), strict=False)
     shared = []
     for first, *others in words:

@@ -18,11 +18,15 @@ def check(
         Path | None, typer.Option("--out", help="folder of the pictures; reports/<experiment>-check by default")
     ] = None,
     overrides: Overrides = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="read only: do not simulate what a fit could determine")
+    ] = False,
 ) -> None:
-    """Say in words what was read (robot, markers, commands, units, rows, masks, model) and draw every recording."""
+    """Say in words what was read (robot, markers, commands, units, rows, masks, model), draw every recording, and say
+    what a fit could determine, and at what cost."""
     from rfdropo_bayes.verbs.check import run_check
 
-    found = run_check(experiment, out or Path("reports") / f"{experiment.stem}-check", overrides or [])
+    found = run_check(experiment, out or Path("reports") / f"{experiment.stem}-check", overrides or [], ahead=not quick)
     width = max(len(label) for label, _ in found.lines)
     for label, text in found.lines:
         typer.echo(f"{label:<{width}}  {text}")

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from rfdropo_bayes.robots.outline import RobotOutline
 
 UNITS = ("mm", "cm", "m", "deg", "rad")
+MODELS = (".xml", ".urdf")
+"""Suffixes of models of other simulators, see `simulators.adapters`."""
 MILLIMETRES = 1e-3
 LENGTHS = ("length", "radius", "tip_radius", "inner_radius", "disk_thickness", "cable_radius", "spool_radius")
 FACTORS = {**dict.fromkeys(LENGTHS, MILLIMETRES), "mass": 1e-3, "young_modulus": 1e6}
@@ -76,11 +78,19 @@ Modulus = Annotated[float | None, typer.Option("--modulus-mpa", help="Young's mo
 Markers = Annotated[
     str | None, typer.Option(help='heights in mm, in the order of the columns: "low=66,middle=133,tip=200"')
 ]
+Target = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FOLDER",
+        help="folder to write to, whose name the robot takes; or a MuJoCo model (.xml, .urdf): the experiment goes "
+        "into a folder of its name",
+    ),
+]
 Defaults = Annotated[bool, typer.Option("--defaults", help="ask nothing: take defaults, and mark them")]
 
 
 def init(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="folder to write to; the robot takes its name")],
+    folder: Target,
     recording: Recordings = None,
     commands: Commands = None,
     shape: Shape = None,
@@ -115,6 +125,9 @@ def init(
     files = matching_recordings(recording or [])
     sent = matching_commands(commands or [], files)
     guess = guess_units(files[0], sent[0] if sent else None, command_unit, position_unit) if files else None
+    if folder.suffix in MODELS:
+        _init_model(folder, files, sent, guess)
+        return
     unit = guess.command_unit if guess else ask.answer("command_unit", command_unit, "Commands in", "mm")
     if unit not in UNITS:
         raise InputError(f"commands in {unit!r}", where="--command-unit", remedy=f"use one of {', '.join(UNITS)}")
@@ -134,6 +147,17 @@ def init(
     if ask.assumed:
         typer.echo(f"assumed, and marked ASSUMED in the robot file: {', '.join(sorted(ask.assumed))}")
     typer.echo(f"next: rfdropo check {folder / 'experiment.toml'}")
+
+
+def _init_model(model: Path, files: list[Path], sent: list[Path], guess: Any) -> None:
+    """Write an experiment for a model of another simulator."""
+    from rfdropo_bayes.verbs.init_model import write_model_experiment
+
+    path, assumed = write_model_experiment(model, Path(model.stem), files, sent, guess)
+    typer.echo(f"wrote {path}")
+    for line in assumed:
+        typer.echo(f"assumed: {line}")
+    typer.echo(f"next: rfdropo check {path}")
 
 
 def _body(

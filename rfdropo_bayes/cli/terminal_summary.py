@@ -65,6 +65,8 @@ def show_calibration(found: Calibration, *, quiet: bool, as_json: bool) -> None:
         seen = next(run for run in summary["recordings"] if run["split"] == "fit")
         if seen["masked"]:
             console.print(f"left out: {seen['masked']} of {seen['positions']} positions", soft_wrap=True)
+        for sentence in summary["details"].get("compared", ()):
+            console.print(sentence, soft_wrap=True)
         console.print(f"next: rfdropo predict {folder} --commands FILE --out OUT", soft_wrap=True)
     console.print(f"report: {report}", soft_wrap=True)
 
@@ -115,6 +117,8 @@ def show_prediction(facts: Mapping[str, Any], *, quiet: bool, as_json: bool) -> 
     if facts["group_fitted"] is not None:
         values = "fitted" if facts["group_fitted"] else "not fitted: its values are drawn from the spread of groups"
         lines.append(f"group {facts['group']}, {values}")
+    if facts.get("unseen_day"):
+        lines.append(facts["unseen_day"])
     lines += [f"caution: {caution['sentence']}" for caution in facts["cautions"]]
     lines += ["mean, 50 and 90 % bands in m:", *(f"  {file}" for file in facts["files"])]
     say(facts, *lines, quiet=quiet, as_json=as_json)

@@ -9,7 +9,7 @@ from rfdropo_bayes.data.named_columns import CsvColumns
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
 from rfdropo_bayes.data.plain_csv import read_plain_csv
 from rfdropo_bayes.data.recorded import Measured, Origin, SentCommands
-from rfdropo_bayes.data.repeats import group_repeats, noise_floor
+from rfdropo_bayes.data.repeats import command_openings, group_repeats, noise_floor, same_opening
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, load_recordings
 from rfdropo_bayes.data.trajectory import Trajectory
@@ -27,6 +27,7 @@ __all__ = [
     "SentCommands",
     "Trajectory",
     "check_channels",
+    "command_openings",
     "commands_alone",
     "common_beginning",
     "find_data_file",
@@ -40,6 +41,7 @@ __all__ = [
     "read_optitrack_csv",
     "read_plain_csv",
     "read_sofa_csv",
+    "same_opening",
     "shared_markers",
     "start_is_known",
 ]

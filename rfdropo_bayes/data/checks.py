@@ -24,8 +24,9 @@ DIMS: dict[str, tuple[str, ...]] = {
 MASKS = frozenset({"position_mask", "tension_mask", "motor_angle_mask"})
 _LARGEST_EXTENT = 5.0  # [m]: no soft robot on a bench sweeps more; millimetres taken for metres always do
 _SMALLEST_EXTENT = 1e-3  # [m]: several markers on one robot are never this close; metres taken for millimetres are
-_LARGEST_COMMAND = {"m": 5.0, "rad": 20.0}  # unclipped cumulative commands stay below; other units exceed it
-_LARGEST_COMMAND_STEP = {"m": 0.5, "rad": 20.0}
+_UNLIMITED = {"N": np.inf, "N m": np.inf, "-": np.inf}
+_LARGEST_COMMAND = {"m": 5.0, "rad": 20.0} | _UNLIMITED  # unclipped cumulative commands stay below in the right unit
+_LARGEST_COMMAND_STEP = {"m": 0.5, "rad": 20.0} | _UNLIMITED
 
 
 def check_dataset(dataset: xr.Dataset) -> None:
@@ -112,7 +113,7 @@ def _check_lengths(dataset: xr.Dataset, name: str) -> None:
 def _check_commands(dataset: xr.Dataset, name: str) -> None:
     unit = dataset["command"].attrs.get("unit")
     if unit not in _LARGEST_COMMAND:
-        raise InputError(f"command unit {unit!r} is unknown", where=name, remedy="use 'm' or 'rad'")
+        raise InputError(f"command unit {unit!r} is unknown", where=name, remedy="use one of m, rad, N, N m, -")
     command = np.concatenate([dataset["initial_command"].values[None], dataset["command"].values])
     largest = float(np.abs(command).max())
     step = float(np.abs(np.diff(command, axis=0)).max())

@@ -48,7 +48,7 @@ def from_arrays(
             by default.
         time_unit: "s", "ms", "us" or "ns".
         position_unit: "m", "cm" or "mm"; also of ``object_pose``.
-        command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor.
+        command_unit: "m", "cm" or "mm" of cable, "rad" or "deg" of a motor, "N", "N m", or "-".
         tension: [N]; not a number where it is missing.
         motor_angle: [rad]; not a number where it is missing.
         object_pose: centre and unit quaternion x, y, z, w of a pushed body.

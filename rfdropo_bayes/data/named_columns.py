@@ -29,7 +29,11 @@ METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "rad": ("rad", 1.0),
     "deg": ("rad", np.pi / 180.0),
+    "N": ("N", 1.0),
+    "N m": ("N m", 1.0),
+    "-": ("-", 1.0),
 }
+CommandUnit = Literal["m", "cm", "mm", "rad", "deg", "N", "N m", "-"]
 
 
 def _right_handed(axes: tuple[str, str, str]) -> tuple[str, str, str]:
@@ -70,8 +74,9 @@ class CsvColumns(BaseModel):
         min_length=1,
         description="columns of the commands as they were sent, one for each of the robot's channels, in its order",
     )
-    command_unit: Literal["m", "cm", "mm", "rad", "deg"] = Field(
-        description="unit of the commands: a length of cable, or an angle of a motor"
+    command_unit: CommandUnit = Field(
+        description='unit of the commands: a length of cable, an angle of a motor, a force or torque; "-" for what a '
+        "simulator of one's own takes"
     )
     command_time: str | None = Field(
         default=None,

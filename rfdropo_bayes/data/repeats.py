@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -30,6 +31,26 @@ def group_repeats(trajectories: Sequence[Trajectory]) -> list[list[int]]:
         )
         groups.setdefault(key, []).append(index)
     return list(groups.values())
+
+
+FIRST_OPENING = 8  # commands
+
+
+def command_openings(trajectory: Trajectory) -> dict[str, str]:
+    """Hashes of the first 8, 16, 32 ... commands of a recording, and of all, by their number."""
+    command = np.round(np.concatenate([trajectory.initial_command[None], trajectory.command]), 9)
+    counts = {len(command)}
+    count = FIRST_OPENING
+    while count < len(command):
+        counts.add(count)
+        count *= 2
+    return {str(n): hashlib.sha256(command[:n].tobytes()).hexdigest()[:16] for n in sorted(counts)}
+
+
+def same_opening(one: Mapping[str, str], other: Mapping[str, str]) -> bool:
+    """Whether two recordings have the same commands, as far as both can be compared (`command_openings`)."""
+    shared = set(one) & set(other)
+    return bool(shared) and one[max(shared, key=int)] == other[max(shared, key=int)]
 
 
 def _squares(repeats: Sequence[Trajectory]) -> Float[np.ndarray, " marker"]:

@@ -166,7 +166,7 @@ class Trajectory:
 
     @property
     def command_unit(self) -> str:
-        """``"m"`` (cable displacement) or ``"rad"`` (motor angle)."""
+        """``"m"`` (cable displacement), ``"rad"`` (motor angle), ``"N"``, ``"N m"`` or ``"-"``."""
         return str(self.dataset["command"].attrs["unit"])
 
     @property

@@ -15,6 +15,7 @@ from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActu
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SPOOL = 0.02  # [m], a usual radius: a prior for metres of cable becomes one for radians of the motor that winds it
+STROKE = 0.03  # [m], a usual pull: what commands in units of their own are measured by
 POWERS = {"m": 1, "m/s": 1, "1/m": -1, "s/m": -1}  # of a length in each unit
 NUMBERED = tuple(str(k + 1) for k in range(8))
 REST = 1e-9  # m or rad per step: less is the rounding of a command that is held
@@ -26,26 +27,34 @@ class InCommandUnit:
     """Base of such mechanisms: a class gives its parameters for metres of cable.
 
     Args:
-        unit: of the commands, "m" or "rad".
+        unit: of the commands.
+        stroke: size of usual commands, where they are neither metres nor radians.
     """
 
     parameters: tuple[ParameterSpec, ...]
     in_metres: ClassVar[tuple[ParameterSpec, ...]]
 
-    def __init__(self, unit: str = "m") -> None:
-        self.parameters = self.in_metres if unit == "m" else tuple(turned(spec) for spec in self.in_metres)
+    def __init__(self, unit: str = "m", stroke: float | None = None) -> None:
+        per_metre = {"m": 1.0, "rad": 1.0 / SPOOL}.get(unit, (stroke or 1.0) / STROKE)
+        self.parameters = tuple(in_unit(spec, unit, per_metre) for spec in self.in_metres)
 
     @classmethod
     def for_robot(cls, robot: Robot) -> InCommandUnit:
         """With parameters in the unit that a robot is commanded in."""
-        return cls(robot.command_unit)
+        return cls(robot.command_unit, getattr(robot, "stroke", None))
 
 
-def turned(spec: ParameterSpec) -> ParameterSpec:
-    """A parameter given for metres of cable, for radians of a motor with a usual spool."""
-    factor = SPOOL ** -POWERS[spec.unit]
+def in_unit(spec: ParameterSpec, unit: str, per_metre: float) -> ParameterSpec:
+    """A parameter given for metres of cable, in another unit of commands, of which so many stand for a metre.
+
+    For radians that is a usual spool; for other units, what their usual commands are to those of cables.
+    """
+    if unit == "m":
+        return spec
+    factor = per_metre ** POWERS[spec.unit]
+    word = {"-": "1", "N m": "(N m)"}.get(unit, unit) if "/" in spec.unit else unit
     return spec._replace(
-        unit="rad".join(spec.unit.rsplit("m", 1)),
+        unit=word.join(spec.unit.rsplit("m", 1)),
         low=factor * spec.low,
         high=factor * spec.high,
         nominal=factor * spec.nominal,

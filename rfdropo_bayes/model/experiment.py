@@ -248,7 +248,13 @@ class Experiment(ExperimentTable):
     """An experiment as read from its file; see `load_experiment`."""
 
     robot: str = Field(
-        description="name of a robot that comes with the package, or path of a robot file, relative to this file",
+        description="name of a robot that comes with the package, or path of a robot file, relative to this file; the "
+        "path of a MuJoCo model (.xml, .urdf); or module:attribute or file.py:attribute of another simulator",
+    )
+    adapter: dict[str, Any] = Field(
+        default_factory=dict,
+        description="what a simulator of another kind is told: markers, channels, parameters and whatever else its "
+        "adapter takes; see docs/your_simulator.md",
     )
     seed: int = Field(default=0, description="of all that is random")
     title: str = Field(default="", description="heading of the report; the file's name by default")

@@ -16,6 +16,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import find_files, unwritten
 
 ROBOT_COPY = "robot.toml"
+MODEL_FILES = (".toml", ".xml", ".urdf")
 FILE_KEYS = ("observations", "commands")
 NO_COMMANDS = "none"  # stands for zero commands where a file of them could be named
 
@@ -86,7 +87,7 @@ def look_through(path: Path, overrides: Sequence[str] = ()) -> None:
         if assignment.split("=")[0].strip().startswith(("data.", "robot")):
             override(tables, assignment, {"robot"})
     robot = tables.get("robot")
-    if isinstance(robot, str) and robot.endswith(".toml") and not _robot_file(robot, folder).is_file():
+    if isinstance(robot, str) and robot.endswith(MODEL_FILES) and not _robot_file(robot, folder).is_file():
         raise InputError(
             "no such robot file", where=str(folder / robot), remedy="correct robot = ... in the experiment"
         )
@@ -124,6 +125,10 @@ def self_contained(tables: Mapping[str, Any], folder: Path, out: Path | None = N
     robot = _robot_file(str(placed.get("robot", "")), folder)
     if robot.suffix == ".toml" and robot.is_file():
         placed["robot"] = _brought(robot, out, ROBOT_COPY)
+    elif robot.suffix in MODEL_FILES and robot.is_file():  # which may name meshes beside it: it stays where it is
+        placed["robot"] = str(robot.resolve())
+    elif ".py:" in str(placed.get("robot", "")):
+        placed["robot"] = code_placed(str(placed["robot"]), folder, out)
     for table, key in (("model", "mechanisms"), ("audit", "candidates"), ("separation", "mechanisms")):
         if key in placed.get(table, {}):
             placed[table][key] = [code_placed(name, folder, out) for name in placed[table][key]]

@@ -50,10 +50,11 @@ class Model:
     """Robot or black box, with mechanisms, priors and noise.
 
     Args:
-        robot: name of a robot that comes with the package, path of a robot file, a `Robot`, or a `BlackBox`.
+        robot: name of a robot that comes with the package, path of a robot file or of a MuJoCo model, a `Robot`, or a
+            `BlackBox`.
         priors: what is inferred: {parameter: prior}. A prior is a numpyro distribution, a table such as
             ``{"distribution": "LogNormal", "median": 4.5e6, "sigma": 0.5}``, or ``{}`` for the parameter's default.
-            For a black box, all its parameters with their own priors by default.
+            For a black box, all its parameters with their own priors by default, less those of its `families`.
         mechanisms: effects on top of the base simulator: names of the library, ``"file.py:ClassName"``, or mechanisms
             of one's own, as classes or objects.
         noise: of the positions, by name as in an experiment file; or, where it is known,
@@ -90,8 +91,6 @@ class Model:
         **more: Any,
     ) -> None:
         fixed = dict(fixed or {})
-        if priors is None and isinstance(robot, BlackBox):
-            priors = {name: {} for name in robot.parameters if name not in fixed}
         given = {name: table_of(prior, where=f"priors, {name}") for name, prior in (priors or {}).items()}
         stated = dict(noise) if isinstance(noise, Mapping) else None
         described = {"priors": given, "noise": noise if stated is None else STATED, "fixed": fixed, **more}

@@ -31,6 +31,7 @@ from rfdropo_bayes.model.experiment import (
 )
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.robots import DriveTravel, Robot
+from rfdropo_bayes.simulators.adapters import adapted, is_adapted
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.tables import nearest
 
@@ -66,6 +67,7 @@ class ModelSpec:
         drives: what is known of the drives, beside what the robot says.
         channels: what is data beside the markers.
         weighed: sums of parameters that were measured.
+        adapter: what a file tells the adapter of a black box.
         folder: that the mesh of the body, and code of one's own, are relative to.
 
     Raises:
@@ -86,6 +88,7 @@ class ModelSpec:
     drives: tuple[DriveTravel, ...] = ()
     channels: DataChannels = field(default_factory=DataChannels)
     weighed: tuple[Weighed, ...] = ()
+    adapter: Mapping[str, Any] = field(default_factory=dict)
     folder: Path = Path()
 
     def __post_init__(self) -> None:
@@ -132,7 +135,8 @@ class ModelSpec:
         }
         model = {"noise": self.noise, **{key: value for key, value in given.items() if value}}
         rest = {"noise": self.stated, "simulator": self.simulator}
-        return {**_dumped(rest), "model": {**model, "mechanisms": list(self.sources)}}
+        told = {"adapter": dict(self.adapter)} if self.adapter else {}
+        return {**told, **_dumped(rest), "model": {**model, "mechanisms": list(self.sources)}}
 
 
 @dataclass(frozen=True)
@@ -197,12 +201,13 @@ def spec_of(
     """
     table = experiment.model
     asked = table.mechanisms if mechanisms is None else mechanisms
+    found = find_robot(experiment.robot, folder, experiment.adapter) if robot is None else robot
     return ModelSpec(
-        robot=find_robot(experiment.robot, folder) if robot is None else robot,
+        robot=found,
         named=experiment.robot if robot is None else "",
         mechanisms=choose_mechanisms(asked, folder=folder),
         simulator=experiment.simulator,
-        priors=table.priors,
+        priors=table.priors or _own_priors(found, table.fixed),
         fixed=table.fixed,
         noise=table.noise,
         stated=experiment.noise,
@@ -212,15 +217,28 @@ def spec_of(
         drives=tuple(table.drives),
         channels=DataChannels(table.tension, table.motor_angle, table.object_pose),
         weighed=tuple(Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed),
+        adapter=experiment.adapter,
         folder=folder,
     )
 
 
-def find_robot(name: str, folder: Path) -> Robot:
-    """The robot that an experiment file names: one that comes with the package, or a file relative to the experiment's.
+def _own_priors(robot: Workpiece, fixed: Mapping[str, float]) -> dict[str, dict[str, Any]]:
+    """What is inferred where nothing says so: the parameters of a black box, less those of its families."""
+    if not isinstance(robot, BlackBox):
+        return {}
+    return {name: {} for name in robot.parameters if name not in fixed and name not in robot.families}
+
+
+def find_robot(name: str, folder: Path, adapter: Mapping[str, Any] | None = None) -> Workpiece:
+    """The robot that an experiment file names: one that comes with the package, a file relative to the experiment's, or
+    another simulator, whose adapter gets the keys of ``adapter``.
 
     Raises:
-        InputError: no such robot.
+        InputError: no such robot, or an adapter where there is none.
     """
+    if is_adapted(name):
+        return adapted(name, folder, adapter or {})
+    if adapter:
+        raise InputError(f"the robot {name!r} has no adapter", where="[adapter]", remedy="remove the table")
     beside = folder / name
     return Robot.load(beside if beside.suffix == ".toml" and beside.is_file() else name)

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from rfdropo_bayes.data.formats import FORMATS
 from rfdropo_bayes.robots import Robot, find_robot_file, known_robots
+
+if TYPE_CHECKING:
+    from rfdropo_bayes.simulators.black_box import BlackBox
 
 Row = dict[str, str]
 
@@ -46,6 +51,18 @@ def robot_facts(robot: Robot) -> Row:
         "cables": ", ".join(robot.cable_names),
         "markers": ", ".join(f"{m.name} (z = {1e3 * m.point_m[2]:.4g} mm)" for m in robot.markers),
         "parameters": ", ".join(robot.parameters),
+    }
+
+
+def simulator_facts(box: BlackBox) -> Row:
+    """What a simulator of another kind is."""
+    return {
+        "robot": box.name,
+        "engine": f"{box.engine}, steps of {1e3 * box.time_step:.4g} ms",
+        "commands": f"{', '.join(box.channel_names)} ({box.command_unit})",
+        "markers": ", ".join(box.marker_names),
+        **({"cables": ", ".join(box.cable_names)} if box.cable_names else {}),
+        **({"candidates": ", ".join(sorted(set(box.families.values())))} if box.families else {}),
     }
 
 

@@ -14,6 +14,9 @@ from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 
 MODEL_ERROR = "model_error"  # among the attributes of a posterior
+MOST_LAGS = 100  # rows of memory, of noise that lasts: longer recordings forget its constant part over as many
+MOST_CONSTANT = 0.95
+CONSTANT_ROUNDS = 5  # until share and memory agree
 
 
 class ModelError(NamedTuple):
@@ -31,6 +34,7 @@ class ModelError(NamedTuple):
     scale: tuple[float, ...]
     correlation_time: float
     share: float = 1.0
+    constant: float = 0.0
 
     def of_marker(self, name: str) -> float:
         """How far [m] a marker is off, root mean square, where all coordinates of a row are taken for independent."""
@@ -40,6 +44,19 @@ class ModelError(NamedTuple):
     def every(self, step: float) -> Autoregression:
         """The same as noise of rows that are ``step`` seconds apart."""
         memory = np.array([1.0, np.exp(-step / self.correlation_time)])
+        return Autoregression(np.array(self.scale), memory, RESIDUALS, np.inf)
+
+    def lasting(self, step: float, rows: int) -> Autoregression:
+        """The same as noise of ``rows`` rows, with the part of it that lasts for all of them.
+
+        A first-order autoregression forgets that part, and takes a few seconds of a constant error for many
+        measurements of it.
+        """
+        if self.constant == 0.0:
+            return self.every(step)
+        fast = _memory(np.exp(-step / self.correlation_time), self.constant)
+        lags = np.arange(min(rows, MOST_LAGS))
+        memory = self.constant + (1.0 - self.constant) * fast**lags
         return Autoregression(np.array(self.scale), memory, RESIDUALS, np.inf)
 
 
@@ -73,7 +90,42 @@ def model_error(
     share = 1.0 if across is None else len(across) / float(np.sum(across**2))
     step = sample_time(*(p.time for p in fitted))
     memory = float(np.clip(noise.autocorrelation[1], 1e-3, 0.999))
-    return ModelError(tuple(markers), tuple((widened * noise.scale).tolist()), float(-step / np.log(memory)), share)
+    scale, lasts = tuple((widened * noise.scale).tolist()), float(-step / np.log(memory))
+    return ModelError(tuple(markers), scale, lasts, share, constant_share(fitted, memory))
+
+
+def constant_share(fitted: Sequence[RecordingPrediction], memory: float) -> float:
+    """Share of the squared error that is constant in each recording, beyond what one that is forgotten would show.
+
+    Args:
+        fitted: predictions, of which the mean errs.
+        memory: correlation of the errors of neighbouring rows.
+    """
+    means, total, expected = 0.0, 0.0, []
+    for p in fitted:
+        error, rows = np.where(p.mask[..., None], p.observed - p.central, 0.0), p.mask.sum(axis=0)
+        means += float(np.sum(np.sum(error, axis=0) ** 2 / np.maximum(rows, 1)[:, None]))
+        total += float(np.sum(error**2))
+        expected.append(len(p.time))
+    if total == 0.0:
+        return 0.0
+    found = 0.0
+    for _ in range(CONSTANT_ROUNDS):
+        fast = _memory(memory, found)
+        chance = float(np.mean([_mean_variance(fast, rows) for rows in expected]))
+        found = float(np.clip((means / total - chance) / (1.0 - chance), 0.0, min(MOST_CONSTANT, memory)))
+    return found
+
+
+def _memory(memory: float, constant: float) -> float:
+    """Correlation of neighbouring rows in the part of an error that is not constant."""
+    return max((memory - constant) / (1.0 - constant), 0.0)
+
+
+def _mean_variance(memory: float, rows: int) -> float:
+    """Variance of the mean of rows of a first-order autoregression, over that of one row."""
+    lags = np.arange(1, rows)
+    return float((1.0 + 2.0 * np.sum((1.0 - lags / rows) * memory**lags)) / rows)
 
 
 def recorded_model_error(record: PosteriorRecord) -> ModelError | None:
@@ -83,4 +135,8 @@ def recorded_model_error(record: PosteriorRecord) -> ModelError | None:
     if given is None:
         return model_error(record.recordings)
     lists = {name: tuple(given[name]) for name in ("markers", "scale")}
-    return ModelError(**{**given, **lists})
+    found, fitted = ModelError(**{**given, **lists}), [p for p in record.recordings if p.split == "fit"]
+    if "constant" in given or not fitted:
+        return found
+    step = sample_time(*(p.time for p in fitted))  # an earlier version did not say
+    return found._replace(constant=constant_share(fitted, float(np.exp(-step / found.correlation_time))))

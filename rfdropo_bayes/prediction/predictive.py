@@ -33,6 +33,7 @@ from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.posteriors import RecordingPrediction
+from rfdropo_bayes.prediction.day_error import DayError
 from rfdropo_bayes.prediction.first_row import far_first_rows, match_first_row, weighed_by_first_row
 from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -68,8 +69,8 @@ def match_cautions(found: NewPredictions) -> list[Caution]:
     cautions = []
     if found.unmatched:
         sentence = (
-            f"{found.unmatched} draws of a new group's parameters did not converge in matching its first row: they "
-            "count as they are, and the bands may be too wide"
+            f"{found.unmatched} draws of a new group's parameters did not converge in matching its first row, and "
+            "count as they are: the prediction may be farther off than its bands say; adapt to a recording of that day"
         )
         cautions.append(Caution(Code.FIRST_ROW_UNMATCHED, sentence))
     for name, times in found.far.items():
@@ -107,6 +108,7 @@ def predict_new(
     fitted: Sequence[str],
     left: ModelError | None = None,
     groups: Patterns | None = None,
+    slow: Mapping[str, DayError] | None = None,
 ) -> NewPredictions:
     """Predictions of recordings that no fit has seen, from their commands and at most their first row.
 
@@ -124,6 +126,7 @@ def predict_new(
         left: what the model left of the fitted recordings, which is its error in new ones where its noise is taken to
             be independent from row to row; without, all markers weigh the same in a first row.
         groups: which recordings belong together, by name or wildcard; each is a group of its own without.
+        slow: error of the day of each recording that no fit has seen, by its name.
     """
     names = [t.name for t in trajectories]
     own_key, row_key, noise_key = jax.random.split(key, 3)
@@ -145,7 +148,24 @@ def predict_new(
     matched = {member for p in drawn for member in p.members}
     unseen = [n for n in new if n not in matched]
     predictions = _predictions(problem, extended, noise_key, "test", unseen=unseen, left=left)
+    keys = jax.random.split(jax.random.fold_in(noise_key, 2), len(predictions))
+    predictions = [
+        with_day_error(p, slow[p.name], k) if slow and p.name in slow else p
+        for p, k in zip(predictions, keys, strict=True)
+    ]
     return NewPredictions(predictions, unmatched, far_first_rows(predictions, left))
+
+
+def with_day_error(prediction: RecordingPrediction, slow: DayError, key: PRNGKeyArray) -> RecordingPrediction:
+    """A prediction whose draws have the slow error of an unseen day; markers that no fit has seen stay as they are."""
+    known = [i for i, name in enumerate(prediction.marker_names) if name in slow.markers]
+    if not known:
+        return prediction
+    path = prediction.central[:, known]
+    unit = slow.unit(path, [prediction.marker_names[i] for i in known])
+    predicted = prediction.predicted.copy()
+    predicted[:, :, known] += slow.draw(key, len(predicted), prediction.time, unit).astype(predicted.dtype)
+    return replace(prediction, predicted=predicted, mean=prediction.central)
 
 
 def _for_new_recordings(

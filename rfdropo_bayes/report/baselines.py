@@ -1,4 +1,5 @@
-"""The predictors a sceptic would use instead of a simulator: a held pose, a copied mean, a regression on the commands.
+"""The predictors a sceptic would use instead of a simulator: a held pose, a copied mean, repeats, a regression on the
+commands.
 
 None of them knows anything of the robot. A calibrated simulator that does not beat them has not earned its keep.
 """
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.data import Trajectory, group_repeats
+from rfdropo_bayes.data import Trajectory, command_openings, group_repeats, same_opening
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.fir import FirRegression, fit_fir
@@ -83,6 +84,43 @@ def copied_mean(fit: Sequence[Trajectory]) -> Predictor:
     return predict
 
 
+def repeated_mean(fit: Sequence[Trajectory]) -> Predictor:
+    """The mean of the fitted repeats of the same commands at the same time; their last pose is held where they end.
+
+    Who has seen an experiment predicts its repeats so. The predictor raises InputError where no other fit recording has
+    the commands.
+    """
+    openings = [command_openings(source) for source in fit]
+
+    def predict(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
+        own = command_openings(recording)
+        repeats = [
+            source
+            for source, begun in zip(fit, openings, strict=True)
+            if same_opening(own, begun) and (source.sha256 != recording.sha256 or source.name != recording.name)
+        ]
+        if not repeats:
+            raise InputError("no other fit recording has its commands", where=recording.name)
+        total, count = np.zeros(recording.position.shape), np.zeros(recording.position.shape[1])
+        for source in repeats:
+            for marker in np.flatnonzero(source.position_mask.any(axis=0)):
+                usable = source.position_mask[:, marker]
+                path, time = source.position[usable, marker], source.time[usable]
+                total[:, marker] += np.stack([np.interp(recording.time, time, path[:, i]) for i in range(3)], axis=-1)
+                count[marker] += 1
+        if not count.all():
+            raise InputError("a marker was lost in all fit recordings of its commands", where=recording.name)
+        return total / count[:, None]
+
+    return predict
+
+
+def with_fitted_commands(fit: Sequence[Trajectory], test: Sequence[Trajectory]) -> list[str]:
+    """Names of the test recordings whose commands were fitted, too, in the same or another recording."""
+    openings = [command_openings(source) for source in fit]
+    return [t.name for t in test if any(same_opening(command_openings(t), begun) for begun in openings)]
+
+
 def _tolerance(recording: Trajectory) -> float:
     """Repeats end a little apart, with the jitter of their clocks."""
     return 2.0 * sample_time(recording.time)
@@ -109,6 +147,11 @@ def baseline_errors(
             "fit mean copied",
             f"mean of the fit recordings ({trained_on}) at the same time, whatever is commanded",
             copied_mean(fit),
+        ),
+        "repeated_mean": (
+            "mean of fitted repeats",
+            "mean of the fit recordings of the same commands at the same time",
+            repeated_mean(fit),
         ),
         "fir_linear": ("linear FIR", _describe(linear, trained_on), linear.predict),
         "fir_cubic": ("cubic FIR", _describe(cubic, trained_on), cubic.predict),

@@ -84,10 +84,13 @@ class RunFacts:
         model: label -> words, e.g. mechanisms, noise, fixed values, time step.
         residuals: from `check_residuals`; empty where the method has no likelihood.
         baselines: from `baseline_errors`; empty if not computed.
+        fitted_commands: test recordings whose commands were fitted, too.
         noise_floor: noise between repeats of each marker [m]; None without repeats.
         phi: distribution to randomise over, {name: {mean, std, low, high, unit}}; None without.
         optimum: posterior mode; None without.
         objects: how well the final position of a pushed object is predicted, by recording that was not fitted.
+        unseen_days: error on days that no fit has seen, with the key "sentence" for people; empty for a model without
+            days.
         limits: sentences on what this analysis cannot see, beside those that always hold.
         versions: of the software.
         details: further plain values of the method.
@@ -110,10 +113,12 @@ class RunFacts:
     model: Mapping[str, str] = field(default_factory=dict)
     residuals: Mapping[str, ResidualCheck] = field(default_factory=dict)
     baselines: Mapping[str, BaselineErrors] = field(default_factory=dict)
+    fitted_commands: Sequence[str] = ()
     noise_floor: Mapping[str, float] | None = None
     phi: Mapping[str, Mapping[str, Any]] | None = None
     optimum: Mapping[str, float] | None = None
     objects: Mapping[str, ObjectScore] = field(default_factory=dict)
+    unseen_days: Mapping[str, Any] = field(default_factory=dict)
     limits: Sequence[str] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)

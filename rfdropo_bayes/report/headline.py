@@ -14,6 +14,7 @@ def headline(summary: Mapping[str, Any]) -> list[str]:
             _fitted(summary),
             _errors(summary),
             _against(summary),
+            (summary.get("unseen_days") or {}).get("sentence", ""),
             _objects(summary),
             _bounds(summary),
             _excluded(summary),
@@ -43,11 +44,18 @@ def _errors(summary: Mapping[str, Any]) -> str:
                 split = ""
                 if figures["moving"] is not None:
                     split = f" (moving part {figures['moving']:.3g} mm, final pose {figures['final']:.3g} mm)"
-                parts.append(f"{value:.3g} mm {words}{split}")
+                parts.append(f"{value:.3g} mm {words}{_repeats(summary) if role == 'test' else ''}{split}")
     if not parts:
         return ""
     tail = "" if summary["rmse"]["test"] else " There are no test recordings: nothing here says how well it predicts."
     return f"In root mean square over time, its last marker ({marker}) is off by {', and by '.join(parts)}.{tail}"
+
+
+def _repeats(summary: Mapping[str, Any]) -> str:
+    """How many test recordings repeat commands that were fitted; empty where none does."""
+    repeated = len(summary.get("fitted_commands") or ())
+    tested = sum(recording["split"] == "test" for recording in summary["recordings"])
+    return f", of which {repeated} of {tested} repeat fitted commands" if repeated else ""
 
 
 def best_baseline(summary: Mapping[str, Any], role: str, marker: str | None = None) -> tuple[str, float] | None:

@@ -149,6 +149,11 @@ def _tiles(summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     tiles = []
     for role, words in (("test", "error on test recordings"), ("fit", "error where fitted")):
         values = list(summary["rmse"][role].values())
+        repeated = len(summary.get("fitted_commands") or ()) if role == "test" else 0
+        if repeated:
+            words += (
+                f" ({repeated} of {sum(r['split'] == 'test' for r in summary['recordings'])} repeat fitted commands)"
+            )
         if values and values[-1] is not None:
             tiles.append((number(values[-1]), "mm", words))
     best = best_baseline(summary, "test" if summary["rmse"]["test"] else "fit")

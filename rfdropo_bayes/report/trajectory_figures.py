@@ -180,13 +180,13 @@ def _memory(axes: Axes, time: np.ndarray, residual: Float[np.ndarray, "time 3"])
     axes.set_ylabel("autocorrelation")
 
 
-def save_recording(trajectory: Trajectory, rest: Mapping[str, Any], path: Path) -> None:
-    """Write the picture of a recording as PNG; ``rest`` is the robot's `robots.robot_shape`."""
+def save_recording(trajectory: Trajectory, rest: Mapping[str, Any] | None, path: Path) -> None:
+    """Write the picture of a recording as PNG; ``rest`` is the robot's `robots.robot_shape`, if it has one."""
     recording_figure(trajectory, rest).savefig(path)
 
 
 @style.styled
-def recording_figure(trajectory: Trajectory, rest: Mapping[str, Any]) -> Figure:
+def recording_figure(trajectory: Trajectory, rest: Mapping[str, Any] | None) -> Figure:
     """Left: coordinates of up to four markers over time, then the commands; right: the robot at rest from two sides."""
     markers = shown_markers(len(trajectory.marker_names))
     rows = len(markers) + 1
@@ -232,12 +232,13 @@ def _commands(axes: Axes, trajectory: Trajectory) -> None:
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def _rest(axes: Axes, trajectory: Trajectory, rest: Mapping[str, Any], across: int) -> None:
+def _rest(axes: Axes, trajectory: Trajectory, rest: Mapping[str, Any] | None, across: int) -> None:
     """The undeformed robot with its cables and markers, the first row, and the path of the last marker."""
-    draw_side(axes, rest, across, {})
+    if rest is not None:
+        draw_side(axes, rest, across, {})
     position = MILLIMETRES * np.where(trajectory.position_mask[..., None], trajectory.position, np.nan)
     axes.plot(position[:, -1, 2], position[:, -1, across], color=style.PRIOR, linewidth=0.8, label="last marker's path")
     axes.plot(position[0, :, 2], position[0, :, across], "x", color=style.POSTERIOR, label="first row")
-    axes.set_xlabel("z [mm], away from the clamp")
+    axes.set_xlabel("z [mm], away from the clamp" if rest is not None else "z [mm]")
     if across == 0:
         axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)

@@ -34,6 +34,7 @@ class Prediction:
         group: that the commands were taken to belong to.
         group_fitted: whether the posterior has values of it; None where nothing differs between groups.
         cautions: what speaks against the prediction.
+        unseen: what is known of the error on a day that no fit has seen; empty for other days.
     """
 
     bands: xr.Dataset
@@ -41,6 +42,7 @@ class Prediction:
     group: str = ""
     group_fitted: bool | None = None
     cautions: list[Caution] = field(default_factory=list)
+    unseen: str = ""
 
     @property
     def frame(self) -> pd.DataFrame:

@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +25,10 @@ from rfdropo_bayes.simulators.finite_differences import LENGTH, with_differences
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, Mechanism, Values, check_mechanisms, code_of, obstacle
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.protocol import Observation, Result
-from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.tables import nearest, parse_table
 
-ANGLE = 0.1  # [rad]: size that perturbations of a motor's command are relative to
+STROKES = {"m": LENGTH, "rad": 0.1, "N": 1.0, "N m": 1.0, "-": 1.0}
+"""Units of commands, and the size that perturbations of a command are relative to."""
 SMALLEST_SHARE = 1e-3  # of its range: least size that perturbations of a parameter are relative to
 PROBED_ROWS = 3
 
@@ -53,11 +54,14 @@ class BlackBox:
             ``nominal`` the middle and ``prior`` uniform between the bounds where they are left out.
         markers, channels, cables: names of the markers, of the command channels, and of the cables with a tension.
         time_step: between rows of the command [s].
-        command_unit: "m" of cable, or "rad" of a motor.
+        command_unit: "m" of cable, "rad" of a motor, "N", "N m", or "-" for a unit of its own.
         name: of the simulator, for reports.
         batched: whether the function takes many parameter sets at once.
         lanes: parameter sets that it is given at once.
         difference: relative step of derivatives; larger where the motion is rough on small scales.
+        stroke: size of usual commands, in their unit; those of cables and motors are known.
+        families: parameters that are not inferred unless they have a prior, and the quantity of which each is the value
+            at one place: an audit asks whether these differ from their nominal values.
 
     Raises:
         InputError: a parameter that is not described well, no marker or channel, or a time step that is not positive.
@@ -68,16 +72,21 @@ class BlackBox:
     markers: Sequence[str]
     channels: Sequence[str]
     time_step: float
-    command_unit: Literal["m", "rad"] = "m"
+    command_unit: str = "m"
     cables: Sequence[str] = ()
     name: str = "black box"
     batched: bool = False
     lanes: int = 64
     difference: float | None = None
+    stroke: float | None = None
+    families: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.markers or not self.channels or not self.time_step > 0.0:
             raise InputError("needs a marker, a channel and a positive time step", where=self.name)
+        if self.command_unit not in STROKES:
+            remedy = nearest(self.command_unit, STROKES)
+            raise InputError(f"commands in {self.command_unit!r}", where=self.name, remedy=remedy)
         tables = {name: _parameter(name, table) for name, table in self.parameters.items()}
         object.__setattr__(self, "parameters", tables)
 
@@ -104,7 +113,7 @@ class BlackBox:
     @property
     def specs(self) -> tuple[ParameterSpec, ...]:
         """Its parameters."""
-        return specs_of(self.parameters)
+        return tuple(spec._replace(family=self.families.get(spec.name, "")) for spec in specs_of(self.parameters))
 
     @cached_property
     def simulate(self) -> Callable[[Batch, np.ndarray], list[Any]]:
@@ -136,10 +145,19 @@ class BlackBox:
         return together if self.batched else one_by_one
 
     @property
+    def engine(self) -> str:
+        """What computes the motion: what a function says of itself in an attribute ``engine``."""
+        return getattr(self.function, "engine", "function") if callable(self.function) else "process"
+
+    @property
     def digest(self) -> str:
-        """Digest of the source, as far as it can be read, and of the parameters."""
+        """Digest of the source, as far as it can be read, and of the parameters; of what a function tells of itself in
+        an attribute ``digest``."""
         try:
-            source = inspect.getsource(self.function) if callable(self.function) else repr(tuple(self.function))
+            source = getattr(self.function, "digest", None)
+            source = (
+                source or inspect.getsource(self.function) if callable(self.function) else repr(tuple(self.function))
+            )
         except (OSError, TypeError):
             source = repr(getattr(self.function, "__qualname__", type(self.function).__qualname__))
         return hashlib.sha256(repr((source, self.specs, self.time_step)).encode()).hexdigest()
@@ -217,7 +235,7 @@ class BlackBoxSimulator(ExtendedSimulator):
     def description(self) -> dict[str, object]:
         """Engine, time step and mechanisms, with a digest of the source."""
         return {
-            "engine": "function" if callable(self.box.function) else "process",
+            "engine": self.box.engine,
             "precision": "float64",
             "robot": self.box.name,
             "time_step_s": self.time_step,
@@ -295,7 +313,7 @@ class BlackBoxSimulator(ExtendedSimulator):
             spec.name: SMALLEST_SHARE * (spec.high - spec.low) if np.isfinite(spec.high - spec.low) else 1e-12
             for spec in self.box.specs
         }
-        stroke = LENGTH if self.command_unit == "m" else ANGLE
+        stroke = self.box.stroke or STROKES[self.command_unit]
 
         def size(inputs: tuple[dict[str, Array], Array]) -> tuple[dict[str, Array], Array]:
             own, command = inputs

@@ -21,6 +21,8 @@ class ParameterSpec(NamedTuple):
         description: one line on its physical meaning.
         grid: values to try, for a mechanism's parameter that has no effect while the others are null (a time constant,
             the place of a wall): its derivative is zero there, so it cannot be screened. Empty for all others.
+        family: the quantity of which this is the value at one place, where a simulator asks for it to be a candidate of
+            audits; empty for all others.
     """
 
     name: str
@@ -31,6 +33,7 @@ class ParameterSpec(NamedTuple):
     prior: Mapping[str, Any]
     description: str
     grid: tuple[float, ...] = ()
+    family: str = ""
 
 
 def specs_of(table: Mapping[str, Any]) -> tuple[ParameterSpec, ...]:

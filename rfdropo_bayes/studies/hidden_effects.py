@@ -31,7 +31,8 @@ from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import AuditTable, CommandsTable, Experiment, SimulatorTable
 from rfdropo_bayes.model.experiment_file import describe
-from rfdropo_bayes.model.model_spec import find_robot, spec_of
+from rfdropo_bayes.model.model_spec import spec_of
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
 from rfdropo_bayes.verbs.random_commands import random_walk
@@ -183,7 +184,7 @@ def _experiment(setting: Setting, exclude: Sequence[str]) -> Experiment:
 
 def _blank_recordings(setting: Setting, rng: np.random.Generator) -> list[Trajectory]:
     """Commands and times of all recordings; their positions are still those at rest."""
-    robot = find_robot(setting.robot, Path())
+    robot = Robot.load(setting.robot)
     table = setting.commands
     sequences = [random_walk(table, len(robot.channel_names), rng) for _ in range(2 + UNTOUCHED)]
     names = [*(f"fit_{k + 1}" for k in range(REPEATS)), "screen", *(f"test_{k + 1}" for k in range(UNTOUCHED))]

@@ -35,6 +35,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.day import DayFit, fit_day
+from rfdropo_bayes.prediction.day_error import DAY_ERROR, DayError, reach_of, recorded_day_error
 from rfdropo_bayes.prediction.model_error import ModelError, recorded_model_error
 from rfdropo_bayes.prediction.own_fit import MOST_STEPS
 from rfdropo_bayes.prediction.predictive import (
@@ -49,6 +50,7 @@ from rfdropo_bayes.prediction.predictive import (
     thin,
 )
 from rfdropo_bayes.report import build_summary
+from rfdropo_bayes.report.coverage import predictive_bands
 from rfdropo_bayes.report.run_files import CONFIG, POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.tables import changed
@@ -56,6 +58,7 @@ from rfdropo_bayes.verbs.calibrate import gather_facts, with_ratios
 from rfdropo_bayes.verbs.predict import fitted_parts, model_of
 
 DRAWS = 100
+WORSE = 1.05  # times the error from the first row: two seeds differ by less
 MUCH_WORSE = 2.0**0.5  # from here on more than half of the squared error is not what the model left of the fitted days
 
 
@@ -105,7 +108,8 @@ def adapt(
     settings: dict[str, Any] = {"tables": moved.tables(), "folder": model.folder, "texts": moved.texts()}
     settings |= {"data": hashes([recording, *test]), "options": {"run": fit.folder, "seconds": seconds, "group": group}}
     tested = [*([] if rest is None else [rest]), *test]
-    run = partial(_adapt, Day(fit, moved, space, own, head, tested, day, left), draws, seed, show)
+    asked = Day(fit, moved, space, own, head, tested, "" if rest is None else rest.name, day, left)
+    run = partial(_adapt, asked, draws, seed, show)
     if out is None:
         return run(None, describe(moved.tables()))
     with run_folder(Path(out), "adapt", **settings, overwrite=overwrite) as folder:
@@ -121,6 +125,7 @@ class Day(NamedTuple):
         fit: the calibration; model: that of the adapted run.
         space: parameters of the body, the day and its recordings; own: those of the day.
         head: the recording, as far as it is looked at; tested: what is predicted.
+        rest: name of what is left of the recording, among those; empty without.
         name: of the day.
         left: what the model leaves of the recordings that were fitted.
     """
@@ -131,24 +136,84 @@ class Day(NamedTuple):
     own: Sequence[InferredParameter]
     head: Trajectory
     tested: Sequence[Trajectory]
+    rest: str
     name: str
     left: ModelError
 
 
 def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | None, text: str) -> Calibration:
     """Fit the day and predict its recording; ``text`` is the experiment as TOML."""
-    fit, model, space, own, head, tested, day, left = asked
-    began = time.monotonic()
-    simulator, key = model.simulator, jax.random.key(seed)
-    fixed, _ = fitted_parts(fit)
+    began, key = time.monotonic(), jax.random.key(seed)
+    before_key, fit_key = jax.random.split(key)
+    before = _from_first_rows(asked, draws, before_key)
+    adapted = _fitted(asked, draws, fit_key, show)
+    checks = _checks(before, adapted.predictions)
+    cautions = []
+    check = checks.get(asked.rest)
+    if check and check["adapted"]["error_mm"] > WORSE * check["from_first_row"]["error_mm"]:
+        cautions.append(_kept_caution(check))
+        head = asked.head.slice_rows(0, 1).with_attributes(name=asked.head.name)
+        adapted = _fitted(asked._replace(head=head), draws, fit_key, show)
+        checks = _checks(before, adapted.predictions)
+    found = adapted.found
+    result = InferenceResult(
+        method="adapt",
+        draws={name: column[None] for name, column in found.values.items()},
+        rollouts=adapted.rollouts,
+        evaluations=round(adapted.rollouts),
+        cautions=[*adapted.cautions, *cautions],
+        seconds=time.monotonic() - began,
+        details={**_details(found, asked.name, asked.own), "checks": checks, "compared": check_sentences(checks)},
+    )
+    prior = _prior(asked.space, asked.own, adapted.body, seed)
+    record = _record(
+        asked, adapted, result, {p.name: d for p, d in zip(asked.own, prior, strict=True)} | adapted.body, seed
+    )
+    facts = gather_facts(
+        f"{asked.fit.content.get('title', asked.model.name)}: {asked.name}",
+        seed,
+        adapted.problem,
+        result,
+        [asked.head],
+        asked.tested,
+        record,
+    )
+    return Calibration(record, build_summary(record, facts), text, asked.model, out)
+
+
+class Adapted(NamedTuple):
+    """A day as it was fitted.
+
+    Attributes:
+        found: draws of body and day; body: those of the body before.
+        problem: of the recording, under the noise that was found.
+        predictions: of the recording, and of what was not looked at.
+        cautions: what speaks against them.
+        rollouts: that it took.
+        slow: the error left on the day where it goes beyond what was shown.
+    """
+
+    found: DayFit
+    body: Batch
+    problem: CalibrationProblem
+    predictions: list[RecordingPrediction]
+    cautions: list[Caution]
+    rollouts: float
+    slow: DayError | None
+
+
+def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapted:
+    """Fit the day to as much of the recording as is looked at, and predict the rest."""
+    fit, _, space, own, head, _, _, day, left = asked
+    simulator, rows = asked.model.simulator, len(head.time)
     recordings = gather_recordings(simulator, [head])
-    noise = noise_of_markers(left.every(sample_time(head.time)), left.markers, recordings)
+    noise = noise_of_markers(left.lasting(sample_time(head.time), rows), left.markers, recordings)
     spread_key, fit_key, fitted_key, rest_key = jax.random.split(key, 4)
     posterior = fit.record.posterior
     body = thin({p.name: posterior[p.name] for p in space.parameters if p.name in posterior}, draws)
     body |= _drawn_spreads(space, body, spread_key)
     channel = Markers.gather(recordings, STATED, noise)
-    program = TrajectoryModel(simulator, space, fixed, recordings, (channel,))
+    program = TrajectoryModel(simulator, space, fitted_parts(fit)[0], recordings, (channel,))
     evaluations: list[float] = []
     problem = CalibrationProblem(program, chunk=simulator.lanes).telling(evaluations.append)
     with Progress("adapt", show=show) as progress:
@@ -160,26 +225,58 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
     problem = CalibrationProblem(replace(program, channels=(replace(channel, known=noise),)), chunk=simulator.lanes)
     predictions = predict_fitted(problem, found.values, fitted_key)
     cautions = _cautions(found)
-    if tested:
+    slow = _error_beyond(fit.record, predictions[0])
+    if asked.tested:
+        names = [run.name for run in asked.tested]
         known: dict[str, Any] = {"fitted": [head.name], "left": left}
-        known |= {"groups": {day: [head.name, *(run.name for run in tested)]}, "chunk": simulator.lanes}
-        new = predict_new(problem.model, tested, found.values, rest_key, **known)
+        known |= {"groups": {day: [head.name, *names]}, "chunk": simulator.lanes}
+        known |= {"slow": None if slow is None else dict.fromkeys(names, slow)}
+        new = predict_new(problem.model, asked.tested, found.values, rest_key, **known)
         predictions, cautions = predictions + new.recordings, cautions + match_cautions(new)
-    result = InferenceResult(
-        method="adapt",
-        draws={name: column[None] for name, column in found.values.items()},
-        rollouts=float(np.sum(evaluations)),
-        evaluations=round(float(np.sum(evaluations))),
-        cautions=cautions,
-        seconds=time.monotonic() - began,
-        details=_details(found, day, own),
-    )
-    before = {p.name: np.asarray(v) for p, v in zip(own, _prior(space, own, body, seed), strict=True)} | body
-    record = _record(fit.record, problem, result, before, predictions, noise.as_dict(), day, seed)
-    facts = gather_facts(
-        f"{fit.content.get('title', model.name)}: {day}", seed, problem, result, [head], tested, record
-    )
-    return Calibration(record, build_summary(record, facts), text, model, out)
+    return Adapted(found, body, problem, predictions, cautions, float(np.sum(evaluations)), slow)
+
+
+def _error_beyond(record: PosteriorRecord, shown: RecordingPrediction) -> DayError | None:
+    """The slow error of the day, where markers go farther than they did in the recording that was shown."""
+    slow = recorded_day_error(record)
+    if slow is None:
+        return None
+    far = dict(zip(shown.marker_names, reach_of(shown.central)[-1].tolist(), strict=True))
+    return slow._replace(shown=tuple(far.get(name, 0.0) for name in slow.markers))
+
+
+def _from_first_rows(asked: Day, draws: int, key: jax.Array) -> list[RecordingPrediction]:
+    """What the fit says of the recordings that are tested from their commands and first rows alone."""
+    record, model, names = asked.fit.record, model_of(asked.fit), [run.name for run in asked.tested]
+    if not names:
+        return []
+    rest = [run if run.position_mask[0].any() else _with_first_row(run, asked.head) for run in asked.tested]
+    fixed, space = fitted_parts(asked.fit)
+    recordings = gather_recordings(asked.model.simulator, rest)
+    noise = noise_of_markers(asked.left.every(sample_time(rest[0].time)), asked.left.markers, recordings)
+    channel = Markers.gather(recordings, STATED, noise)
+    slow = recorded_day_error(record)
+    values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
+    return predict_new(
+        TrajectoryModel(asked.model.simulator, space, fixed, recordings, (channel,)),
+        rest,
+        values,
+        key,
+        chunk=model.simulator.lanes,
+        fitted=record.attrs[FITTED],
+        left=asked.left,
+        groups={asked.name: names},
+        slow=None if slow is None else dict.fromkeys(names, slow._replace(shown=())),
+    ).recordings
+
+
+def _with_first_row(rest: Trajectory, head: Trajectory) -> Trajectory:
+    """The rest of a recording with the first row of what was looked at."""
+    mask = rest.position_mask.copy()
+    mask[0] = head.position_mask[0]
+    dataset = rest.dataset.copy()
+    dataset["position_mask"] = dataset["position_mask"].copy(data=mask)
+    return Trajectory(dataset)
 
 
 def _own_of_day(fit: PosteriorRecord, space: ParameterSpace, recording: str, day: str) -> list[InferredParameter]:
@@ -386,22 +483,66 @@ def _cautions(found: DayFit) -> list[Caution]:
 
 
 def _record(
-    fit: PosteriorRecord,
-    problem: CalibrationProblem,
-    result: InferenceResult,
-    prior: Mapping[str, np.ndarray],
-    predictions: Sequence[RecordingPrediction],
-    noise: dict[str, Any],
-    day: str,
-    seed: int,
+    asked: Day, adapted: Adapted, result: InferenceResult, prior: Mapping[str, np.ndarray], seed: int
 ) -> PosteriorRecord:
     """The draws, with what predictions of further recordings need."""
-    recordings = problem.model.recordings
+    problem, attrs = adapted.problem, asked.fit.record.attrs
+    recordings, noise = problem.model.recordings, problem.model.markers.known
     infos = tuple(
         ParameterInfo(p.name, p.spec.unit, p.spec.low, p.spec.high, dict(p.table or {}), p.spec.description)
         for p in problem.model.space.parameters
     )
-    known = {NOISE: STATED, KNOWN_NOISE: {"markers": list(recordings.markers), **noise}}
-    attributes = {**fit.attrs, **known, FITTED: list(recordings.names), ADAPTED_TO: day, "seed": seed}
-    record = PosteriorRecord(infos, result.draws, dict(prior), tuple(predictions), attrs=attributes)
+    known: dict[str, Any] = (
+        {NOISE: STATED, KNOWN_NOISE: {"markers": list(recordings.markers), **noise.as_dict()}} if noise else {}
+    )
+    known |= {DAY_ERROR: None if adapted.slow is None else adapted.slow.as_dict()}
+    attributes = {**attrs, **known, FITTED: list(recordings.names), ADAPTED_TO: asked.name, "seed": seed}
+    record = PosteriorRecord(infos, result.draws, dict(prior), tuple(adapted.predictions), attrs=attributes)
     return with_ratios(record, problem.names)
+
+
+def _checks(
+    before: Sequence[RecordingPrediction], after: Sequence[RecordingPrediction]
+) -> dict[str, dict[str, dict[str, float]]]:
+    """How well recordings that were not looked at are predicted before and after, by recording."""
+    adapted = {p.name: p for p in after if p.split == "test" and p.mask[:, -1].any()}
+    return {
+        p.name: {
+            "from_first_row": _fared(replace(p, mask=adapted[p.name].mask)),
+            "adapted": _fared(adapted[p.name]),
+        }
+        for p in before
+        if p.name in adapted
+    }
+
+
+def _fared(prediction: RecordingPrediction) -> dict[str, float]:
+    """Error of the last marker [mm], and shares of the measured coordinates in the 90 % bands."""
+    bands, mask = predictive_bands(prediction.predicted), prediction.mask
+    inside = (prediction.observed >= bands.low90) & (prediction.observed <= bands.high90)
+    tip = (prediction.central - prediction.observed)[mask[:, -1], -1]
+    return {
+        "error_mm": 1e3 * float(np.sqrt(np.mean(np.sum(tip**2, axis=-1)))),
+        "held": float(inside[mask].mean()),
+        "tip_held": float(inside[mask[:, -1], -1].mean()),
+    }
+
+
+def check_sentences(checks: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[str]:
+    """Before and after an adaptation in the same words, of each recording that it did not look at."""
+    found = []
+    for name, check in checks.items():
+        words = [
+            f"{row['error_mm']:.3g} mm off, its 90 % bands held {100.0 * row['held']:.0f} %" for row in check.values()
+        ]
+        found.append(f"{name}, as far as it was not shown: from the first row {words[0]}; adapted {words[1]}.")
+    return found
+
+
+def _kept_caution(check: Mapping[str, Mapping[str, float]]) -> Caution:
+    before, after = check["from_first_row"]["error_mm"], check["adapted"]["error_mm"]
+    sentence = (
+        f"what was shown of the day makes the rest of the recording worse: {after:.3g} mm off, from the first row "
+        f"alone {before:.3g} mm; the day has what its first rows say of it, and the rest has served to see that"
+    )
+    return Caution(Code.DAY_UNMATCHED, sentence)

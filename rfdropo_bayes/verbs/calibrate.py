@@ -17,7 +17,7 @@ from rfdropo_bayes.bayes.space import SEPARATOR
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory, common_beginning, noise_floor
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.groups import Patterns
+from rfdropo_bayes.groups import gather_groups
 from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
@@ -26,7 +26,8 @@ from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
-from rfdropo_bayes.prediction.model_error import MODEL_ERROR, model_error
+from rfdropo_bayes.prediction.day_error import DAY_ERROR, DayError, left_out_sentence, recorded_day_error
+from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError, model_error
 from rfdropo_bayes.prediction.predictive import (
     BEGUN,
     FITTED,
@@ -40,6 +41,7 @@ from rfdropo_bayes.prediction.predictive import (
     thin,
 )
 from rfdropo_bayes.report import RecordingFacts, RunFacts, baseline_errors, build_summary, software_versions
+from rfdropo_bayes.report.baselines import with_fitted_commands
 from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
@@ -47,6 +49,7 @@ from rfdropo_bayes.report.summary import read_summary
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import robot_shape
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.verbs.left_out_days import OPENINGS, Days, error_of_unseen_days, of_unseen_days, openings_of
 
 PREDICTIVE_DRAWS = 200
 PRIOR_DRAWS = 2000
@@ -131,7 +134,7 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
         result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
     problem = problem.holding(result.held)
     attributes = {**_attributes(model.name, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
-    record, unmatched = record_posterior(problem, result, test, predicting, attributes, model.spec.groups)
+    record, unmatched = record_posterior(asked, problem, result, predicting, attributes, show=show)
     facts = gather_facts(model.title, seed, problem, result, runs, test, record, unmatched)
     return Calibration(record, build_summary(record, facts), text, model, out)
 
@@ -173,15 +176,17 @@ def inference_options(table: InferenceTable) -> dict[str, Any]:
 
 
 def record_posterior(
+    asked: Fitting,
     problem: CalibrationProblem,
     result: InferenceResult,
-    tested: Sequence[Trajectory],
     key: jax.Array,
     attributes: dict[str, Any],
-    groups: Patterns,
+    *,
+    show: bool | None = None,
 ) -> tuple[PosteriorRecord, list[Caution]]:
     """Draws, prior draws and predictions of every recording, with the combinations of parameters that rollouts see, and
     what speaks against the predictions."""
+    model, tested = asked.model, asked.test
     prior_key, fit_key, test_key = jax.random.split(key, 3)
     rows = row_log_likelihood(problem, result)
     prior = {name: np.asarray(v) for name, v in problem.sample_prior(prior_key, PRIOR_DRAWS).items()}
@@ -191,10 +196,14 @@ def record_posterior(
     fitted = list(problem.model.recordings.names)
     lasting = result.details.get("lasting", {}).get(problem.model.markers.name)
     left = model_error(predictions, 1.0 if lasting is None else np.array(lasting["widened"]))
+    slow = _unseen_days(asked, result, predictions, left, jax.random.fold_in(key, 3), show=show)
     cautions: list[Caution] = []
     if tested:
+        days, openings = list(gather_groups(fitted, model.spec.groups)), openings_of(asked.runs)
+        unseen = [] if slow is None else of_unseen_days(tested, model.spec.groups, days, openings)
+        known: dict[str, Any] = {"fitted": fitted, "left": left, "groups": model.spec.groups, "chunk": problem.chunk}
         found = predict_new(
-            problem.model, tested, values, test_key, chunk=problem.chunk, fitted=fitted, left=left, groups=groups
+            problem.model, tested, values, test_key, **known, slow={} if slow is None else dict.fromkeys(unseen, slow)
         )
         predictions += found.recordings
         cautions = match_cautions(found)
@@ -215,10 +224,32 @@ def record_posterior(
             FITTED: fitted,
             HELD: result.held,
             MODEL_ERROR: None if left is None else left._asdict(),
+            DAY_ERROR: None if slow is None else slow.as_dict(),
+            OPENINGS: openings_of(asked.runs),
             **known_noise(problem),
         },
     )
     return with_ratios(record, problem.names), cautions
+
+
+def _unseen_days(
+    asked: Fitting,
+    result: InferenceResult,
+    predictions: Sequence[RecordingPrediction],
+    left: ModelError | None,
+    key: jax.Array,
+    *,
+    show: bool | None,
+) -> DayError | None:
+    """The error of a day that the fit has not seen; None for a model without days, and for draws that are no
+    posterior."""
+    if left is None or not method_named(result.method).posterior:
+        return None
+    draws = thin(result.draws, PREDICTIVE_DRAWS)
+    optimum = result.optimum or {}
+    if set(draws) <= set(optimum):
+        draws = {name: np.full(2, optimum[name]) for name in draws}
+    return error_of_unseen_days(Days(asked.model, asked.runs, draws, predictions, left), key, show=show)
 
 
 def row_log_likelihood(
@@ -284,6 +315,7 @@ def gather_facts(
     added: Any = description.get("mechanisms", ())
     checks = check_fit(problem, record, problem.model.markers.name in result.details.get("lasting", {}))
     floor = noise_floor([*fitted, *tested])
+    slow = recorded_day_error(record) if record.attrs.get(DAY_ERROR) else None
     undriven = [] if robot is None else robot.unstated(run.name for run in (*fitted, *tested))
     return RunFacts(
         title=title,
@@ -311,11 +343,13 @@ def gather_facts(
             **{key: str(value) for key, value in description.items() if key not in ("mechanisms", "robot")},
         },
         baselines=baseline_errors(list(fitted), list(tested)),
+        fitted_commands=with_fitted_commands(fitted, tested),
         noise_floor=floor,
         phi=result.phi,
         optimum=result.optimum,
         objects=score_objects(unseen, [*fitted, *tested]),
         versions=software_versions(),
+        unseen_days={} if slow is None else {**slow.as_dict(), "sentence": left_out_sentence(slow)},
         details=result.details,
         outline=None if robot is None else robot_shape(robot),
     )

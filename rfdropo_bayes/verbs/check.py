@@ -21,17 +21,19 @@ from rfdropo_bayes.data import (
 from rfdropo_bayes.data.repeats import group_repeats
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import output_folder
+from rfdropo_bayes.files import output_folder, write_json
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.model.assembly import build_model, build_simulator, with_drives
 from rfdropo_bayes.model.experiment import Experiment, load_experiment
-from rfdropo_bayes.model.model_spec import find_robot, spec_of
-from rfdropo_bayes.model.robot_listings import robot_facts
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.model_spec import Workpiece, find_robot, spec_of
+from rfdropo_bayes.model.robot_listings import robot_facts, simulator_facts
 from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.calibrate import inference_options
 from rfdropo_bayes.verbs.placement import far_from_rest, placement_hints
+from rfdropo_bayes.verbs.preflight import Preflight, preflight
 
 MILLIMETRES = 1e3
 IRREGULAR = 1.5
@@ -50,47 +52,83 @@ class Check:
         notes: what is allowed, and perhaps not meant.
         problems: what keeps the experiment from running.
         files: pictures, one per recording.
+        ahead: what a fit could determine; None where that was not asked, or nothing can be fitted.
     """
 
     lines: list[tuple[str, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
+    ahead: Preflight | None = None
 
 
-def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
+def check(model: Model, runs: Sequence[Trajectory], *, seed: int = 0) -> Preflight:
+    """Say before a fit which combinations of parameters recordings cannot determine, what else would have to be
+    measured, whether commands excite what is asked, and what the fit costs; see `preflight`.
+
+    Args:
+        model: what would be fitted.
+        runs: recordings.
+        seed: of the draws of the prior at which derivatives are taken.
+
+    Raises:
+        InputError: bad input, or a model that cannot be simulated.
+    """
+    return preflight(model, runs, seed=seed)
+
+
+def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bool = False) -> Check:
     """Read everything that an experiment names, and say what was read.
 
     Args:
         path: the experiment file.
-        out: folder for the pictures, ``NAME.png`` for each recording.
+        out: folder for the pictures, ``NAME.png`` for each recording, and check.json.
         overrides: assignments that replace entries of the file.
+        ahead: also say what a fit could determine, see `check`.
 
     Raises:
         InputError: the experiment file or the robot cannot be read; whatever else is wrong is among the problems.
     """
     experiment, _ = load_experiment(path, overrides)
     folder = Path(path).resolve().parent
-    robot = find_robot(experiment.robot, folder)
+    robot = find_robot(experiment.robot, folder, experiment.adapter)
     found = Check()
-    robot = _try(found, partial(with_drives, robot, experiment.model.drives, experiment.model.groups)) or robot
+    if isinstance(robot, Robot):
+        robot = _try(found, partial(with_drives, robot, experiment.model.drives, experiment.model.groups)) or robot
     _say_robot(found, robot)
     recordings = {role: list(_read(found, experiment, folder, role)) for role in ("fit", "test")}
     for role, trajectories in recordings.items():
         for trajectory in trajectories:
             _say_recording(found, trajectory, role, robot)
     named = [trajectory.name for trajectories in recordings.values() for trajectory in trajectories]
-    found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
+    if isinstance(robot, Robot):
+        found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
     _say_repeats(found, [*recordings["fit"], *recordings["test"]])
     _say_model(found, experiment, folder, recordings["fit"])
+    if ahead and recordings["fit"] and not found.problems:
+        _say_ahead(found, experiment, folder, recordings["fit"])
     if any(recordings.values()):
         out = output_folder(out)
-    rest = robot_shape(robot)
+    rest = robot_shape(robot) if isinstance(robot, Robot) else None
     for trajectory in (*recordings["fit"], *recordings["test"]):
         file = out / f"{trajectory.name.replace('/', '_')}.png"
         save_recording(trajectory, rest, file)
         found.files.append(file)
+    if found.files:
+        content = {key: getattr(found, key) for key in ("lines", "notes", "problems")}
+        told = None if found.ahead is None else found.ahead.as_dict()
+        write_json(out / "check.json", {**content, "preflight": told})
     return found
+
+
+def _say_ahead(found: Check, experiment: Experiment, folder: Path, runs: Sequence[Trajectory]) -> None:
+    """What a fit could determine; a model that cannot be simulated is no problem of its description."""
+    try:
+        found.ahead = check(Model.of_experiment(experiment, folder), runs, seed=experiment.seed)
+    except InputError as error:
+        found.notes.append(str(error))
+        return
+    found.lines += found.ahead.lines()
 
 
 def _try(found: Check, action: Callable[[], Result]) -> Result | None:
@@ -103,10 +141,11 @@ def _try(found: Check, action: Callable[[], Result]) -> Result | None:
         return None
 
 
-def _say_robot(found: Check, robot: Robot) -> None:
-    facts = robot_facts(robot)
-    for label in ("robot", "body", "gravity", "starts", "commands", "cables", "markers"):
-        found.lines.append((label, facts[label]))
+def _say_robot(found: Check, robot: Workpiece) -> None:
+    facts = robot_facts(robot) if isinstance(robot, Robot) else simulator_facts(robot)
+    for label in ("robot", "body", "gravity", "starts", "engine", "commands", "cables", "markers", "candidates"):
+        if label in facts:
+            found.lines.append((label, facts[label]))
 
 
 def _read(found: Check, experiment: Experiment, folder: Path, role: str) -> Iterator[Trajectory]:
@@ -123,7 +162,7 @@ def _read(found: Check, experiment: Experiment, folder: Path, role: str) -> Iter
     _try(found, lambda: load_recordings(spec, folder, role="fit" if role == "fit" else "test"))
 
 
-def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Robot) -> None:
+def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Workpiece) -> None:
     """Rows, markers, masks and commands of one recording, beside those of the robot."""
     gaps = np.diff(trajectory.time)
     step = sample_time(trajectory.time)
@@ -148,7 +187,7 @@ def _say_recording(found: Check, trajectory: Trajectory, role: str, robot: Robot
         found.lines.append(("", f"left out: {trajectory.missing}"))
 
 
-def _markers(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[str]:
+def _markers(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator[str]:
     shared = _try(found, lambda: shared_markers([trajectory], robot.marker_names))
     if shared is None:
         yield f"markers {_names(trajectory.marker_names)}: NONE is the robot's"
@@ -167,6 +206,8 @@ def _markers(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[str
         )
         yield f"positions in mm, in the robot's frame: {ranges}"
     yield _masks(trajectory)
+    if not isinstance(robot, Robot):
+        return
     place = far_from_rest(robot, trajectory)
     if place is None:
         yield "first row: every position is masked"
@@ -185,7 +226,7 @@ def _masks(trajectory: Trajectory) -> str:
     return f"{masked} of {every} positions are masked" + (f" (in the whole file: {kinds})" if kinds else "")
 
 
-def _commands(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[str]:
+def _commands(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator[str]:
     names, unit, command = trajectory.cable_names, trajectory.command_unit, trajectory.command
     yield f"{len(names)} commands in {unit}: {_names(names)}; from {command.min():.4g} to {command.max():.4g}"
     yield f"command before the first row: {trajectory.first_command}"
@@ -195,6 +236,8 @@ def _commands(found: Check, trajectory: Trajectory, robot: Robot) -> Iterator[st
         return
     if tuple(names) != robot.channel_names:
         yield f"the robot calls them {_names(robot.channel_names)}, in this order"
+    if not isinstance(robot, Robot):
+        return
     travel = _try(found, partial(robot.travel, trajectory.name, trajectory.initial_command))
     if travel is not None:
         yield from _travel(travel, robot)

@@ -12,9 +12,12 @@ import pandas as pd
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, whole, write_json
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.run_folder import CONFIG
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import read_summary
+from rfdropo_bayes.simulators.black_box import BlackBox
 
 TABLE, TABLE_JSON, DRAWS = "phi.csv", "phi.json", "phi_draws.csv"
 MOST_DRAWS = 2000
@@ -97,6 +100,40 @@ def export_posterior(folder: Path, out: Path | None, *, overwrite: bool = False)
     path = output_folder(out) / POSTERIOR
     _check_absent([path], overwrite)
     PosteriorRecord(record.parameters, draws, derived=record.derived, attrs=record.attrs).save(path)
+    return path
+
+
+def export_model(folder: Path, out: Path | None = None, *, overwrite: bool = False) -> Path:
+    """Write the model of a simulator of another kind with posterior means in it, and 90 % ranges in its head.
+
+    What mechanisms of actuation and sensing add is in no such file.
+
+    Returns:
+        the file written, ``calibrated`` with the suffix of such files, to ``out``, or to the run's folder.
+
+    Raises:
+        InputError: no finished run in ``folder``, or a simulator that cannot write its model.
+    """
+    model = Model.read(folder / CONFIG)
+    write = getattr(getattr(model.robot, "function", None), "written", None)
+    if write is None:
+        raise InputError(f"{model.name} cannot write its model", where=str(folder), remedy="use --phi")
+    record = PosteriorRecord.load(folder / POSTERIOR)
+    known = {spec.name: spec for spec in model.robot.specs} if isinstance(model.robot, BlackBox) else {}
+    draws = {info.name: record.flat(info.name) for info in record.free if info.name in known}
+    values = {name: float(own.mean()) for name, own in draws.items()}
+    values |= {name: value for name, value in model.spec.fixed.items() if name in known}
+    lines = ["Calibrated by rfdropo_bayes: posterior means; in brackets the 90 % range to randomise over."]
+    for name, value in values.items():
+        low, high = np.quantile(draws[name], [0.05, 0.95]) if name in draws else (value, value)
+        lines.append(f"{name} = {value:.6g} [{low:.6g}, {high:.6g}] {known[name].unit}")
+    if model.mechanisms:
+        lines.append(f"Not in this file: {', '.join(model.mechanisms)}.")
+    suffix, text = write(values, lines)
+    path = output_folder(out or folder) / f"calibrated{suffix}"
+    _check_absent([path], overwrite)
+    with whole(path) as partial:
+        Path(partial).write_text(text, encoding="utf-8")
     return path
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from rfdropo_bayes.data import lerobot, motive_csv, rosbag
@@ -97,7 +98,11 @@ def write_first_files(
             raise InputError("is there already", where=str(path), remedy="choose another folder, or move the file away")
     robot.write_text(robot_text(outline), encoding="utf-8")
     Robot.load(robot)
-    data = _random_commands(outline) if guess is None else _data(folder, outline, recordings, commands, guess)
+    data = (
+        _random_commands(outline)
+        if guess is None
+        else data_tables(folder, outline.markers, recordings, commands, guess, outline.gravity)
+    )
     experiment.write_text("\n".join([*_head(outline.name), *data, *_model(outline, guess)]), encoding="utf-8")
     load_experiment(experiment)
     return robot, experiment
@@ -126,13 +131,21 @@ def _entries(folder: Path, recordings: list[Path], commands: list[Path], guess: 
     return names
 
 
-def _data(folder: Path, outline: RobotOutline, recordings: list[Path], commands: list[Path], guess: Guess) -> list[str]:
+def data_tables(
+    folder: Path,
+    markers: Iterable[str],
+    recordings: list[Path],
+    commands: list[Path],
+    guess: Guess,
+    gravity: str = "",
+) -> list[str]:
+    """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it."""
     entries = _entries(folder, recordings, commands, guess)
     fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
     masked = ['missing = "mask"  # positions that motion capture lost are left out'] if guess.format in CAPTURED else []
     axes, assumed = ["x", "y", "z"], ""
     if guess.format == motive_csv.FORMAT:
-        axes, assumed = AXES.get(outline.gravity, axes), "  # ASSUMED: Motive's y axis points up"
+        axes, assumed = AXES.get(gravity, axes), "  # ASSUMED: Motive's y axis points up"
     optional = [
         f"{key} = {json.dumps(values)}"
         for key, values in (("tensions", guess.tensions), ("motor_angles", guess.motor_angles))
@@ -156,7 +169,7 @@ def _data(folder: Path, outline: RobotOutline, recordings: list[Path], commands:
         *(f"    {json.dumps(triple)}," for triple in guess.positions),
         "]",
         f'position_unit = "{guess.position_unit}"',
-        f"markers = {json.dumps(list(outline.markers))}  # the robot's names, in the order of positions",
+        f"markers = {json.dumps(list(markers))}  # the robot's names, in the order of positions",
         "# x, y, z of the robot's base in terms of the file's axes: z runs away from the clamp.",
         f"axes = {json.dumps(axes)}{assumed}",
         *optional,

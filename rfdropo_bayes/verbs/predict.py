@@ -32,11 +32,12 @@ from rfdropo_bayes.data import (
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json
-from rfdropo_bayes.groups import group_of, in_group
+from rfdropo_bayes.groups import Patterns, group_of, in_group
 from rfdropo_bayes.model.assembly import KNOWN, fixed_values, model_specs, with_groups
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.prediction.day_error import DayError, day_sentence, recorded_day_error
 from rfdropo_bayes.prediction.model_error import recorded_model_error
 from rfdropo_bayes.prediction.predictive import (
     ADAPTED_TO,
@@ -54,6 +55,7 @@ from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.results.predicted import LEVELS, OBJECT, Prediction
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.verbs.left_out_days import OPENINGS, of_unseen_days
 
 DRAWS = 200
 SCHEMA_VERSION = 1
@@ -101,6 +103,7 @@ def predict(
     values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     belonging = sorted({info.name.partition(SEPARATOR)[2] for info in record.free if SEPARATOR in info.name})
     fitted = record.attrs.get(FITTED, belonging)
+    slow = _slow_error(record, unseen, groups, space)
     found = predict_new(
         program,
         [unseen],
@@ -110,6 +113,7 @@ def predict(
         fitted=fitted,
         left=recorded_model_error(record),
         groups=groups,
+        slow=slow,
     )
     predicted = found.recordings[0]
     bands = summarise(predicted)
@@ -120,7 +124,24 @@ def predict(
     cautions = match_cautions(found)
     if isinstance(simulator, RobotSimulator):
         cautions += simulator.robot.unstated([unseen.name])
-    return Prediction(bands, predicted, group, group in known if known else None, cautions)
+    said = [day_sentence(error) for error in slow.values() if not error.shown and group not in known]
+    return Prediction(bands, predicted, group, group in known if known else None, cautions, "".join(said))
+
+
+def _slow_error(
+    record: PosteriorRecord, unseen: Trajectory, groups: Patterns, space: ParameterSpace
+) -> dict[str, DayError]:
+    """The slow error of the day of a recording, by its name; empty where the fit has seen the day, or has no days."""
+    days = {p.recording for p in space.parameters if p.added_to}
+    error = recorded_day_error(record) if days else None
+    if error is None:
+        return {}
+    day = group_of(unseen.name, groups)
+    if day == record.attrs.get(ADAPTED_TO):
+        return {unseen.name: error}
+    if not of_unseen_days([unseen], groups, list(days), record.attrs.get(OPENINGS)):
+        return {}
+    return {unseen.name: error._replace(shown=())}
 
 
 def model_of(fit: Calibration) -> Model:
@@ -220,6 +241,7 @@ def run_prediction(
             "first_command": unseen.first_command,
             "group": found.group,
             "group_fitted": found.group_fitted,
+            "unseen_day": found.unseen or None,
             "rows": len(found.drawn.time),
             "draws": int(found.drawn.predicted.shape[0]),
             "draws_that_did_not_match_the_first_row": found.bands.attrs["draws_that_did_not_match_the_first_row"],

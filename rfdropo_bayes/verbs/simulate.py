@@ -123,9 +123,9 @@ def simulate_all(model: Model, out: Path, *, balance: bool = False, overwrite: b
 
 def _simulate_into(out: Path, model: Model, balance: bool) -> dict[str, Any]:
     """See `simulate_all`."""
-    robot_of(model.spec)
     simulator, measured = model.simulator, model.settings.data is not None
-    assert isinstance(simulator, RobotSimulator)
+    if balance:
+        robot_of(model.spec)
     values = physical_values(model.spec, simulator)
     sources = _sources(model)
     report: dict[str, Any] = {"simulator": simulator.description, "parameters": values, "recordings": {}}
@@ -143,7 +143,7 @@ def _simulate_into(out: Path, model: Model, balance: bool) -> dict[str, Any]:
             "files": [str(out / f"{stem}.nc"), str(out / f"{stem}.csv")],
             "error_mm": _errors([distances[-1]]) if measured else None,
         }
-        if balance:
+        if isinstance(simulator, RobotSimulator) and balance:
             written = append_balance(simulator, values, found.commands, source.time, out / f"{stem}.nc")
             report["recordings"][source.name]["balance"] = written
         if pose is not None and source.object_pose is not None:

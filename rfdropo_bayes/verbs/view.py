@@ -19,9 +19,11 @@ from rfdropo_bayes.report.motion import DrawnMotion, cube_corners, save_frames, 
 from rfdropo_bayes.report.motion_figures import save_animation, save_still
 from rfdropo_bayes.results.predicted import OBJECT
 from rfdropo_bayes.robots import Robot, known_robots
+from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.verbs.simulate import simulate
 
 PREDICTED = "mean"  # variable of a prediction's file
+SLENDER = 0.01  # half width of a line through markers over the extent of their motion
 STILLS, ANIMATIONS = (".png", ".svg", ".pdf"), (".gif", ".mp4")
 
 
@@ -106,7 +108,22 @@ def _from_experiment(path: Path, overrides: list[str], recording: str | None) ->
     made = simulate(model, [runs[name]] if table is None else table.model_dump(), seed=model.settings.seed)
     simulated = next(run for run in made if run.name == name)
     side = simulated.settings.get("parameters", {}).get("cube_side")
+    if isinstance(model.robot, BlackBox):
+        return _markers_alone(simulated, model.robot, runs.get(name))
     return _motion(simulated, robot_of(model.spec), runs.get(name), side)
+
+
+def _markers_alone(shown: Trajectory, box: BlackBox, measured: Trajectory | None) -> DrawnMotion:
+    """A line through the markers of a simulator that shows nothing else, from the origin where there is one only."""
+    turn, position = upright(box.gravity), shown.position
+    if position.shape[1] == 1:
+        position = np.concatenate([np.zeros_like(position), position], axis=1)
+    line, at = smooth_line(position, np.arange(float(position.shape[1])))
+    extent = float(np.ptp(position.reshape(-1, 3), axis=0).max())
+    dots = None
+    if measured is not None:
+        dots = np.where(measured.position_mask[..., None], measured.position, np.nan) @ turn.T
+    return DrawnMotion(shown.name, shown.time, line @ turn.T, np.full(len(at), SLENDER * extent), dots, None, None)
 
 
 class _Shown(NamedTuple):

@@ -12,7 +12,13 @@ import pytest
 from rfdropo_bayes.data import DataSpec, Measured, Origin, SentCommands, Trajectory, load_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report import BaselineErrors, baseline_errors
-from rfdropo_bayes.report.baselines import copied_mean, held_initial_pose, mean_pose
+from rfdropo_bayes.report.baselines import (
+    copied_mean,
+    held_initial_pose,
+    mean_pose,
+    repeated_mean,
+    with_fitted_commands,
+)
 from rfdropo_bayes.report.fir import fit_fir
 
 
@@ -73,6 +79,33 @@ def test_a_masked_row_teaches_nothing(run: Any) -> None:
     spoiled["position"].values[~source.position_mask] = 0.3
     one, other = (fit_fir([t, run.fit[0]], [[0], [1]], degree=1) for t in (source, Trajectory(spoiled)))
     np.testing.assert_allclose(one.predict(run.test[0]), other.predict(run.test[0]), rtol=1e-9)
+
+
+def test_the_mean_of_repeats_is_that_of_the_same_commands_alone(run: Any) -> None:
+    """Its last pose is held where the repeats end; a recording of other commands has none."""
+    a, c = run.fit[0], run.fit[2]
+    b = a.with_attributes(name="again")
+    short = a.slice_rows(0, 20)
+    other = Trajectory(c.dataset.assign(command=c.dataset["command"] + 0.01)).with_attributes(name="other")
+    predicted = repeated_mean([short, other])(b)
+    usable = short.position_mask[:, 1]
+    np.testing.assert_allclose(predicted[:21][usable, 1], a.position[:21][usable, 1], atol=1e-12)
+    last = short.position[usable, 1][-1]
+    np.testing.assert_allclose(predicted[21:, 1], np.broadcast_to(last, b.position[21:, 1].shape), atol=1e-12)
+    with pytest.raises(InputError, match="no other fit recording has its commands"):
+        repeated_mean([a, b])(other)
+    assert with_fitted_commands([short], [b, other]) == [b.name]
+
+
+def test_repeats_of_the_paper_s_trunk_are_predicted_by_their_mean(datasets: Path) -> None:
+    """Who has seen the other repeats of an experiment is 2.7 mm off; left-out repeats are shown beside it."""
+    every = load_recordings(DataSpec(format="optitrack-csv", fit=["sim2real_trunk/*.csv"]), datasets)
+    left_out = ("171618", "184917", "104902")
+    fit = [t for t in every if not t.name.endswith(left_out)]
+    test = [t for t in every if t.name.endswith(left_out)]
+    assert (len(fit), len(test)) == (8, 3)
+    errors = baseline_errors(fit, test)
+    assert headline(errors["repeated_mean"]) == pytest.approx(2.67, abs=0.05)
 
 
 def headline(errors: BaselineErrors) -> float:

@@ -1,0 +1,218 @@
+"""How far a model is off on a day that no fit has seen, beyond what its draws say: a slow error with heavy tails.
+
+What a model leaves of fitted recordings is what parameters could not follow. On another day they follow nothing. The
+error there is measured on days left out of the fit, in units of what was left of the fitted ones: a model that is twice
+as far off where it was fitted is taken to be twice as far off elsewhere, and a robot that moves twice as far, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.prediction.model_error import ModelError, recorded_model_error
+
+DAY_ERROR = "day_error"  # among the attributes of a posterior
+
+# The prior of `times`, in force where no day was left out, and worth FREEDOM days where some were. docs/days.md has the
+# days of two robots that it rests on.
+TIMES, FREEDOM = 0.6, 3.0
+CONSTANT = 0.6  # share of the variance that lasts for a whole recording
+CORRELATION_TIME = 1.0  # [s] of the rest
+SMALLEST_REACH = 1e-6  # [m]
+
+
+class DayError(NamedTuple):
+    """The slow error of a model on a day that it was not fitted to.
+
+    Attributes:
+        markers: names.
+        left: root mean square distance [m] of each marker in the fitted recordings.
+        reach: root mean square over these of how far each marker had been from where it started [m]; empty where that
+            is not known: a recording is then taken to go as far as the fitted ones.
+        times: scale of the error in units of ``left``, where a marker has been as far as ``reach``.
+        freedom: degrees of freedom of that scale: the error is Student's t.
+        constant: share of its variance that lasts for a whole recording.
+        correlation_time: over which the rest forgets its sign [s].
+        days: error of the last marker [m] on each day left out, by its group; empty without one.
+        held: share of the coordinates of these days in the 90 % bands, each day's widened by the others; None without.
+        shown: how far each marker went in a recording of the day that was fitted [m]: only what goes beyond counts;
+            empty where no recording of the day was seen.
+    """
+
+    markers: tuple[str, ...]
+    left: tuple[float, ...]
+    reach: tuple[float, ...]
+    times: float = TIMES
+    freedom: float = FREEDOM
+    constant: float = CONSTANT
+    correlation_time: float = CORRELATION_TIME
+    days: Mapping[str, float] = {}
+    held: float | None = None
+    shown: tuple[float, ...] = ()
+
+    def unit(
+        self, path: Float[np.ndarray, "time marker 3"], markers: Sequence[str]
+    ) -> Float[np.ndarray, "time marker"]:
+        """What ``times`` multiplies [m], for each coordinate: it grows with how far the marker has been from its start.
+
+        Args:
+            path: mean prediction [m].
+            markers: names.
+        """
+        index = [self.markers.index(name) for name in markers]
+        far = reach_of(path)
+        known = np.array(self.shown)[index] if self.shown else 0.0
+        whole = np.array(self.reach)[index] if self.reach else np.maximum(far[-1], SMALLEST_REACH)
+        beyond = np.sqrt(np.maximum(far**2 - known**2, 0.0))
+        return beyond * np.array(self.left)[index] / (whole * np.sqrt(3.0))
+
+    def draw(
+        self,
+        key: PRNGKeyArray,
+        count: int,
+        time: Float[np.ndarray, " time"],
+        unit: Float[np.ndarray, "time marker"],
+    ) -> Float[np.ndarray, "draw time marker 3"]:
+        """Realisations [m]: each draw has one scale for all markers, and a constant and a slow part for each axis."""
+        rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        scale = self.times * np.sqrt(self.freedom / rng.chisquare(self.freedom, size=count))
+        shape = (count, *unit.shape, 3)
+        slow = rng.standard_normal(shape)
+        memory = np.exp(-np.diff(time) / self.correlation_time)
+        for row, kept in enumerate(memory, start=1):
+            slow[:, row] = kept * slow[:, row - 1] + np.sqrt(1.0 - kept**2) * slow[:, row]
+        lasting = rng.standard_normal((count, 1, unit.shape[1], 3))
+        series = np.sqrt(self.constant) * lasting + np.sqrt(1.0 - self.constant) * slow
+        return scale[:, None, None, None] * unit[None, :, :, None] * series
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values; `from_dict` undoes it."""
+        return {**self._asdict(), "days": dict(self.days)}
+
+    @classmethod
+    def from_dict(cls, given: Mapping[str, Any]) -> DayError:
+        """From plain values."""
+        return cls(**{**given, **{name: tuple(given[name]) for name in ("markers", "left", "reach", "shown")}})
+
+
+def reach_of(path: Float[np.ndarray, "time marker 3"]) -> Float[np.ndarray, "time marker"]:
+    """How far [m] each marker has been from where it started, by each row."""
+    return np.maximum.accumulate(np.linalg.norm(path - path[0], axis=-1), axis=0)
+
+
+def prior_day_error(left: ModelError, fitted: Sequence[RecordingPrediction]) -> DayError:
+    """The slow error of a day where no day was left out of the fit.
+
+    Args:
+        left: what the model left of the fitted recordings.
+        fitted: their predictions, as far as they are known.
+    """
+    scale = tuple(np.linalg.norm(np.reshape(left.scale, (-1, 3)), axis=1).tolist())
+    if not fitted:
+        return DayError(left.markers, scale, ())
+    squares = np.concatenate([reach_of(p.central) ** 2 for p in fitted])
+    reach = np.maximum(np.sqrt(squares.mean(axis=0)), SMALLEST_REACH)
+    return DayError(left.markers, scale, tuple(reach.tolist()))
+
+
+def day_error(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]]) -> DayError:
+    """The slow error of a day by days that were left out of a fit each.
+
+    Each day's scale is the excess of its squared error over the variance of its draws. The prior counts as `FREEDOM`
+    days of `TIMES` (a scaled inverse chi-square distribution, to which days add).
+
+    Args:
+        prior: without any.
+        days: predictions of recordings of each day by a fit without it, their slow error left out, by group.
+    """
+    squares = {group: _squared_times(prior, found) for group, found in days.items()}
+    if not squares:
+        return prior
+    return _with_times(prior, list(squares.values()))._replace(
+        days={group: _tip_error(found) for group, found in days.items()},
+        constant=_constant_share(prior, [p for found in days.values() for p in found]),
+        held=_held(prior, days, squares),
+    )
+
+
+def recorded_day_error(record: PosteriorRecord) -> DayError | None:
+    """As a fit says, or its prior for one that does not; None where it does not say what its model leaves either."""
+    given = record.attrs.get(DAY_ERROR)
+    if given is not None:
+        return DayError.from_dict(given)
+    left = recorded_model_error(record)
+    return None if left is None else prior_day_error(left, [p for p in record.recordings if p.split == "fit"])
+
+
+def _with_times(prior: DayError, squares: Sequence[float]) -> DayError:
+    freedom = FREEDOM + len(squares)
+    times = float(np.sqrt((FREEDOM * TIMES**2 + sum(squares)) / freedom))
+    return prior._replace(times=times, freedom=freedom)
+
+
+def _squared_times(prior: DayError, predictions: Sequence[RecordingPrediction]) -> float:
+    """The mean over the markers of what squared errors exceed the variance of the draws by, in squared units."""
+    excess, units = np.zeros(len(predictions[0].marker_names)), np.zeros(len(predictions[0].marker_names))
+    for p in predictions:
+        error = (p.observed - p.central) ** 2 - p.predicted.var(axis=0)
+        excess += np.sum(error.mean(axis=-1) * p.mask, axis=0)
+        units += np.sum(prior.unit(p.central, p.marker_names) ** 2 * p.mask, axis=0)
+    return max(float(np.mean(excess / np.maximum(units, SMALLEST_REACH**2))), 0.0)
+
+
+def _constant_share(prior: DayError, predictions: Sequence[RecordingPrediction]) -> float:
+    """Of the squared error in units, the share of its mean over each recording."""
+    constant, total = 0.0, 0.0
+    for p in predictions:
+        unit = prior.unit(p.central, p.marker_names)
+        error = (p.observed - p.central) / np.maximum(unit, 0.1 * unit.max(axis=0))[..., None]
+        error, weight = np.where(p.mask[..., None], error, 0.0), np.maximum(p.mask.sum(axis=0), 1)[:, None]
+        constant += float(np.sum(np.sum(error, axis=0) ** 2 / weight))
+        total += float(np.sum(error**2))
+    return constant / total if total > 0.0 else CONSTANT
+
+
+def _tip_error(predictions: Sequence[RecordingPrediction]) -> float:
+    """Root mean square distance [m] of the last marker."""
+    squares = [np.sum((p.observed - p.central)[p.mask[:, -1], -1] ** 2, axis=-1) for p in predictions]
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
+
+
+def _held(prior: DayError, days: Mapping[str, Sequence[RecordingPrediction]], squares: Mapping[str, float]) -> float:
+    """Share of the coordinates of days left out in 90 % bands that know of the other days alone."""
+    inside = []
+    for number, (group, found) in enumerate(days.items()):
+        other = _with_times(prior, [square for name, square in squares.items() if name != group])
+        for place, p in enumerate(found):
+            key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), number), place)
+            slow = other.draw(key, len(p.predicted), p.time, other.unit(p.central, p.marker_names))
+            low, high = np.quantile(p.predicted + slow, [0.05, 0.95], axis=0)
+            inside.append(((p.observed >= low) & (p.observed <= high))[p.mask].ravel())
+    return float(np.mean(np.concatenate(inside)))
+
+
+def day_sentence(error: DayError) -> str:
+    """What is known of the error on a day of which no recording was seen, for people."""
+    begin = "No recording of this day was seen."
+    if not error.days:
+        return (
+            f"{begin} Nor was any other day left out of the fit: the bands rest on how far models of two other robots "
+            f"were off on days left out, {error.times:.2g} times what they left of fitted days."
+        )
+    return f"{begin} {left_out_sentence(error)}"
+
+
+def left_out_sentence(error: DayError) -> str:
+    """How far the model was off on days left out of the fit, and what its bands held; empty without one."""
+    if not error.days:
+        return ""
+    low, high = 1e3 * min(error.days.values()), 1e3 * max(error.days.values())
+    far = f"{low:.2g}" if len(error.days) == 1 else f"{low:.2g} to {high:.2g}"
+    held = "" if error.held is None else f"; its 90 % bands held {100.0 * error.held:.0f} %"
+    return f"On days left out this model was {far} mm off{held}."

@@ -1,0 +1,139 @@
+"""``rfdropo init MODEL``: an experiment file for a model of another simulator, from its file and a recording."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.data import DataSpec, load_recordings
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import output_folder
+from rfdropo_bayes.model.experiment import load_experiment
+from rfdropo_bayes.model.model_spec import find_robot
+from rfdropo_bayes.simulators.adapters import first_tables
+from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.verbs.column_names import Guess
+from rfdropo_bayes.verbs.init import data_tables
+
+OF_CABLE = {"m": ("m", "cm", "mm"), "rad": ("rad", "deg")}
+"""Units that a recording may have of what a simulator takes in each of these."""
+
+
+def write_model_experiment(
+    model: Path, folder: Path, recordings: list[Path], commands: list[Path], guess: Guess | None
+) -> tuple[Path, list[str]]:
+    """Write ``experiment.toml`` for a model's file, and read it back.
+
+    Args:
+        model: file of the model, which stays where it is.
+        folder: to write to; it is made.
+        recordings: files to fit; of several, the last one is for testing.
+        commands: the file of commands of each, where they have any.
+        guess: what their columns are; None without recordings.
+
+    Returns:
+        the file, and what of it was assumed.
+
+    Raises:
+        InputError: a model that cannot be read, more markers or commands than it has, or a file that is there already.
+    """
+    if not model.is_file():
+        raise InputError("no such file", where=str(model), remedy="give the path of the model")
+    experiment = output_folder(folder) / "experiment.toml"
+    if experiment.exists():
+        raise InputError(
+            "is there already", where=str(experiment), remedy="choose another folder, or move the file away"
+        )
+    names = [] if guess is None else guess.commands
+    tables, assumed = first_tables(model, {} if guess is None else _first_seen(guess, recordings, commands), names)
+    name = os.path.relpath(model, folder)
+    box: Any = find_robot(name, folder, tables)
+    if guess is not None and guess.command_unit not in OF_CABLE.get(box.command_unit, ()):
+        guess = guess._replace(command_unit=box.command_unit)
+    text = [
+        "# Written by rfdropo init; docs/reference/experiment.md has every key. Look it over, then: rfdropo check.",
+        f"title = {json.dumps(model.stem)}",
+        f"robot = {json.dumps(name)}",
+        "seed = 0",
+        "",
+        *_adapter(tables, assumed),
+        *(_random(box) if guess is None else data_tables(folder, list(tables["markers"]), recordings, commands, guess)),
+        *_inferred(tables),
+    ]
+    experiment.write_text("\n".join(text), encoding="utf-8")
+    load_experiment(experiment)
+    return experiment, assumed
+
+
+def _first_seen(guess: Guess, recordings: list[Path], commands: list[Path]) -> dict[str, Float[np.ndarray, "3"] | None]:
+    """Where each marker of the first recording is first seen."""
+    columns: dict[str, Any] = {
+        "commands": guess.commands,
+        "command_unit": guess.command_unit,
+        "positions": guess.positions,
+        "position_unit": guess.position_unit,
+        "markers": guess.markers,
+    }
+    columns |= {"sample_time": 0.05} if guess.time is None else {"time": guess.time, "time_unit": guess.time_unit}
+    entry = str(recordings[0]) if not commands else {"observations": str(recordings[0]), "commands": str(commands[0])}
+    table = {"format": guess.format, "fit": [entry], "columns": columns, "missing": "mask"}
+    try:
+        run = load_recordings(parse_table(DataSpec, table, where="--recording"), Path(), role="fit")[0]
+    except InputError:  # what is wrong with it is said by check, which the user runs next
+        return dict.fromkeys(guess.markers)
+    return {marker: run.position[0, k] for k, marker in enumerate(run.marker_names)}
+
+
+def _adapter(tables: dict[str, Any], assumed: list[str]) -> list[str]:
+    """The table [adapter] and its tables."""
+    lines = [
+        "[adapter]",
+        'start = "rest"           # or "settled" under the first command, or the name of a keyframe',
+        "",
+    ]
+    said = {
+        "markers": "# What each marker is: site/NAME, body/NAME or geom/NAME.",
+        "channels": "# The actuator of each command, by name, or by number from 0.",
+        "parameters": "# What may be inferred: kind/name/attribute, or * for a factor on all.",
+    }
+    for key, words in said.items():
+        lines += [words, f"[adapter.{key}]"]
+        lines += [f"{json.dumps(name)} = {json.dumps(value)}" for name, value in tables[key].items()]
+        lines.append("")
+    return [*(f"# ASSUMED: {line}" for line in assumed), *lines]
+
+
+def _random(box: Any) -> list[str]:
+    step = 0.2 * (box.stroke or 1.0)
+    return [
+        "# No recording was given: simulate makes one from random commands. Put [data] in the place of this table.",
+        "[commands]",
+        "duration = 4.0",
+        "interval = 0.2",
+        f"step = {step:g}",
+        f"low = {-3 * step:g}",
+        f"high = {3 * step:g}",
+        "sample_time = 0.05",
+        'recordings = ["try_1"]',
+        "",
+    ]
+
+
+def _inferred(tables: dict[str, Any]) -> list[str]:
+    return [
+        "[model]",
+        "mechanisms = []         # effects of drives and cameras on top: rfdropo mechanisms lists them",
+        "",
+        "[model.priors]          # what to infer; {} asks for the default prior of its kind",
+        *(f"{json.dumps(name)} = {{}}" for name in tables["parameters"]),
+        "",
+        "[inference]",
+        'method = "smc"          # rfdropo methods lists them',
+        "rollouts = 20000        # the budget",
+        "",
+    ]

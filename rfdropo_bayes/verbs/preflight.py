@@ -1,0 +1,448 @@
+"""Before a fit: which combinations of parameters recordings cannot determine, what would, and what the fit costs.
+
+The derivatives of all that is measured, at draws of the prior, give the Fisher information averaged over the prior. In
+coordinates in which the prior is a standard normal distribution (logarithms of what has a scale), with information
+:math:`F`, a direction :math:`v` keeps the share :math:`\\sqrt{v^T (1 + F)^{-1} v}` of its prior standard deviation.
+Directions that keep most of it are undetermined. What else could be measured adds its own information to :math:`F`.
+"""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from scipy.linalg import solve_triangular
+
+from rfdropo_bayes.bayes.batches import chunk_sizes
+from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
+from rfdropo_bayes.bayes.noise import LASTING_NOISE, NOISE_CORRELATION_TIME, OBSERVATION_NOISE
+from rfdropo_bayes.data import Trajectory, noise_floor
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.report.identifiability import DETERMINED, FREE, NEGLIGIBLE, WELL_AWAY
+from rfdropo_bayes.simulators.black_box import BlackBox
+from rfdropo_bayes.simulators.protocol import Observation, Result
+from rfdropo_bayes.tables import changed
+
+STEP = 2e-3  # of a derivative, in prior standard deviations: error of second order, beside information of up to 1e6
+SETS = 128  # parameter sets that are rolled out in all, about
+PATIENCE = 10.0  # [s]: no more rollouts are begun after these
+FEWEST, MOST = 4, 16  # draws of the prior
+PRIOR_DRAWS = 2000
+KNOWN = 0.01  # relative error with which a part is weighed, or a parameter measured by itself
+TENSION_ERROR = 0.05  # relative error of tensions that are not measured yet
+TURNS, STILL = 200, 1e-10  # of the rotation to readable directions
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A combination of parameters that recordings leave undetermined.
+
+    Attributes:
+        together: how the parameters change together: of the logarithm of those with a scale, of the others in their
+            unit; the largest is 1 in prior standard deviations.
+        kept: posterior over prior standard deviation.
+        ended_by: what would determine it, with the share that would be kept then, best first.
+        sentence: the same in words.
+    """
+
+    together: dict[str, float]
+    kept: float
+    ended_by: dict[str, float]
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """What recordings can say of a model's parameters, before anything is fitted.
+
+    Attributes:
+        directions: what they cannot determine, the worst first.
+        parameters: for each parameter the share of its prior standard deviation that is kept: ``alone``, were all else
+            known, and ``kept``.
+        channels: for each recording the channels of commands that do not change.
+        noise: what was taken for the noise of the positions, in words.
+        draws: draws of the prior that were looked at; failed: those of them whose rollouts did not end well.
+        rollout_seconds: of one parameter set, all recordings.
+        rollouts: budget of the fit; minutes: that it takes.
+        method: of the fit.
+        seconds: that this took.
+    """
+
+    directions: list[Direction]
+    parameters: pd.DataFrame
+    channels: dict[str, list[str]]
+    noise: str
+    draws: int
+    failed: int
+    rollout_seconds: float
+    rollouts: int
+    minutes: float
+    method: str
+    seconds: float
+    notes: list[str] = field(default_factory=list)
+
+    def lines(self) -> list[tuple[str, str]]:
+        """Pairs of a label and a text, an empty label going on with the one before."""
+        found = [direction.sentence for direction in self.directions] or ["every combination, more or less"]
+        rows = [("undetermined" if self.directions else "determined", found[0]), *(("", text) for text in found[1:])]
+        rows += [("" if index else "excited", text) for index, text in enumerate(self._excitation())]
+        cost = (
+            f"{self.method}: {self.rollouts} rollouts of {1e3 * self.rollout_seconds:.3g} ms, {minutes(self.minutes)}"
+        )
+        rows += [("cost", cost), ("assumed", self.noise)]
+        return rows
+
+    def _excitation(self) -> list[str]:
+        blind = [name for name, row in self.parameters.iterrows() if row["alone"] > FREE]
+        words = (
+            [f"{', '.join(map(str, blind))}: the motion hardly depends on it, even were all else known"]
+            if blind
+            else []
+        )
+        words += [f"{run}: {', '.join(names)} never changes" for run, names in self.channels.items() if names]
+        return words or ["all parameters change the motion by more than the noise, and all channels move"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For a JSON file."""
+        rest = {k: v for k, v in vars(self).items() if k not in ("directions", "parameters")}
+        return {
+            **rest,
+            "directions": [vars(direction) for direction in self.directions],
+            "parameters": {str(k): dict(row) for k, row in self.parameters.iterrows()},
+        }
+
+    def __str__(self) -> str:
+        width = max(len(label) for label, _ in self.lines())
+        return "\n".join(f"{label:<{width}}  {text}" for label, text in self.lines())
+
+    def _repr_html_(self) -> str:
+        body = "".join(f"<tr><th>{label}</th><td>{text}</td></tr>" for label, text in self.lines())
+        return f"<table>{body}</table>{self.parameters.to_html(float_format='%.3g')}"
+
+
+def minutes(value: float) -> str:
+    """A duration in words."""
+    return f"about {60.0 * value:.0f} s" if value < 1.5 else f"about {value:.0f} min"
+
+
+class _Coordinates(NamedTuple):
+    """Coordinates in which the prior is about a standard normal distribution."""
+
+    names: tuple[str, ...]
+    logarithmic: np.ndarray
+    mean: Float[np.ndarray, " parameter"]
+    sd: Float[np.ndarray, " parameter"]
+
+    def values(self, x: Float[np.ndarray, "n parameter"]) -> dict[str, np.ndarray]:
+        scaled = self.mean + self.sd * x
+        return {
+            name: np.exp(scaled[:, k]) if self.logarithmic[k] else scaled[:, k] for k, name in enumerate(self.names)
+        }
+
+
+class _Noise(NamedTuple):
+    """What was taken for the noise of the positions [m], [s]."""
+
+    white: float
+    lasting: float
+    time: float
+    words: str
+
+
+def preflight(
+    model: Model, runs: Sequence[Trajectory], *, method: str = "", rollouts: int = 0, seed: int = 0
+) -> Preflight:
+    """Say what a fit of these recordings can determine, in seconds.
+
+    Args:
+        model: what would be fitted.
+        runs: recordings.
+        method: and ``rollouts``: its budget; those of the model's experiment by default.
+        seed: of the draws of the prior.
+
+    Raises:
+        InputError: no parameter to infer, or no prior draw whose rollouts end well.
+    """
+    begun = clock.perf_counter()
+    model = _precise(model)
+    problem = model.problem(runs)
+    problem = problem.holding(problem.typical_scales)
+    key, second = jax.random.split(jax.random.key(seed))
+    drawn = {name: np.asarray(values) for name, values in problem.sample_prior(key, PRIOR_DRAWS).items()}
+    coordinates = _coordinates(problem, drawn)
+    if not coordinates.names:
+        raise InputError("no parameter of the simulator is inferred", where="check", remedy="add [model.priors]")
+    count = int(np.clip(SETS // (2 * len(coordinates.names)), FEWEST, MOST))
+    start = np.asarray(jax.random.permutation(second, PRIOR_DRAWS))[:count]
+    noise = _noise(model, problem, drawn, runs)
+    slopes, good, per_set, observed = _slopes(problem, coordinates, drawn, start)
+    if not good.any():
+        raise InputError("no draw of the prior can be simulated", where="check", remedy=observed.remedy)
+    whiten = _Whitening(problem, noise)
+    measured = whiten.positions(slopes.position[good])
+    tension = whiten.tensions(slopes.tension[good], slopes.level[good])
+    weighed = _weighed(model, problem, coordinates, drawn)
+    known = _information(measured) + _information(weighed[None])
+    if model.spec.channels.tension:
+        known += _information(tension)
+    more = _further(model, coordinates, tension)
+    settings = model.settings.inference
+    budget = rollouts or settings.rollouts
+    return Preflight(
+        _directions(coordinates, known, more),
+        _shares(coordinates, known),
+        {run.name: _held(run) for run in runs},
+        noise.words,
+        len(good),
+        int(np.sum(~good)),
+        per_set,
+        budget,
+        budget * per_set / 60.0,
+        method or settings.method,
+        clock.perf_counter() - begun,
+    )
+
+
+def _precise(model: Model) -> Model:
+    """The model in double precision: differences of a rounded motion are information that is not there."""
+    if isinstance(model.robot, BlackBox) or model.spec.simulator.precision == "float64":
+        return model
+    table = changed(model.spec.simulator, where="[simulator]", precision="float64")
+    return Model.of(replace(model.spec, simulator=table), model.settings)
+
+
+def _coordinates(problem: CalibrationProblem, drawn: Mapping[str, np.ndarray]) -> _Coordinates:
+    names = tuple(name for name in problem.physical_names if np.ptp(drawn[name]) > 0.0)
+    logarithmic = np.array([_has_scale(problem, name, drawn[name]) for name in names], dtype=bool)
+    columns = [np.log(drawn[n]) if log else drawn[n] for n, log in zip(names, logarithmic, strict=True)]
+    return _Coordinates(names, logarithmic, np.array([c.mean() for c in columns]), np.array([c.std() for c in columns]))
+
+
+def _has_scale(problem: CalibrationProblem, name: str, draws: np.ndarray) -> bool:
+    family = (problem.model.space[name].table or {}).get("distribution")
+    return bool(
+        np.all(draws > 0.0) and (family in ("LogNormal", "LogUniform") or draws.std() < WELL_AWAY * draws.mean())
+    )
+
+
+def _noise(
+    model: Model, problem: CalibrationProblem, drawn: Mapping[str, np.ndarray], runs: Sequence[Trajectory]
+) -> _Noise:
+    stated, floor = model.spec.stated, noise_floor(runs)
+    if stated is not None and stated.standard_deviation > 0.0:
+        sd, lasts = stated.standard_deviation, stated.correlation_time
+        words = f"noise of {1e3 * sd:.3g} mm, as [noise] states it"
+        return _Noise(sd, 0.0, 1.0, words) if lasts is None else _Noise(0.01 * sd, sd, lasts, words)
+    if floor:
+        sd = float(np.sqrt(np.mean(np.square(list(floor.values())))))
+        return _Noise(sd, 0.0, 1.0, f"noise of {1e3 * sd:.3g} mm, the spread of the repeats")
+
+    def typical(name: str, otherwise: float) -> float:
+        return float(np.median(drawn[name])) if name in drawn else problem.model.fixed.get(name, otherwise)
+
+    white = typical(OBSERVATION_NOISE.name, 1e-3)
+    lasting = typical(LASTING_NOISE.name, 0.0) if model.spec.noise == "auto" else 0.0
+    words = f"noise of {1e3 * white:.3g} mm" + (f", and {1e3 * lasting:.3g} mm that lasts" if lasting else "")
+    return _Noise(white, lasting, typical(NOISE_CORRELATION_TIME.name, 1.0), f"{words}: medians of the priors")
+
+
+class _Slopes(NamedTuple):
+    """Derivatives along the coordinates, and tensions at the draws."""
+
+    position: Float[np.ndarray, "draw parameter recording time marker 3"]
+    tension: Float[np.ndarray, "draw parameter recording time cable"]
+    level: Float[np.ndarray, "draw recording time cable"]
+
+
+def _slopes(
+    problem: CalibrationProblem, coordinates: _Coordinates, drawn: Mapping[str, np.ndarray], start: np.ndarray
+) -> tuple[_Slopes, np.ndarray, float, Result]:
+    """Derivatives at draws of the prior, which draws ended well, seconds of a parameter set, and the worst result."""
+    dimension, count = len(coordinates.names), len(start)
+    rows = [
+        np.log(drawn[n][start]) if log else drawn[n][start]
+        for n, log in zip(coordinates.names, coordinates.logarithmic, strict=True)
+    ]
+    x = (np.stack(rows, axis=1) - coordinates.mean) / coordinates.sd
+    steps = STEP * np.concatenate([np.eye(dimension), -np.eye(dimension)])
+    moved = (x[:, None] + steps).reshape(-1, dimension)
+    values = coordinates.values(moved)
+    for name, own in values.items():
+        low, high = problem.bounds[name]
+        values[name] = np.clip(own, low, high)
+    rest = {n: np.repeat(drawn[n][start], 2 * dimension) for n in problem.names if n not in values}
+    seen, per_set = _observed(problem, {**rest, **values}, 2 * dimension)
+    count = len(seen.status) // (2 * dimension)
+    status = np.asarray(seen.status).reshape(count, -1)
+    ended = (status == Result.OK).all(axis=1) & np.isfinite(np.asarray(seen.position)).all(axis=(1, 2, 3, 4)).reshape(
+        count, -1
+    ).all(axis=1)
+
+    def slope(part: Any) -> np.ndarray:
+        both = np.asarray(part).reshape(count, 2, dimension, *part.shape[1:])
+        return (both[:, 0] - both[:, 1]) / (2.0 * STEP)
+
+    level = np.asarray(seen.tension).reshape(count, 2 * dimension, *seen.tension.shape[1:])[:, 0]
+    return _Slopes(slope(seen.position), slope(seen.tension), level), ended, per_set, Result(int(status.max()))
+
+
+def _observed(problem: CalibrationProblem, every: Mapping[str, np.ndarray], whole: int) -> tuple[Observation, float]:
+    """What parameter sets show, and seconds of one, in batches of one size, as each size takes a compilation.
+
+    When `PATIENCE` is up, what is left is not simulated; what is there is a multiple of ``whole`` sets.
+    """
+    count = len(next(iter(every.values())))
+    size = max(each for each in chunk_sizes(problem.chunk) if each <= max(count, min(chunk_sizes(problem.chunk))))
+    parts: list[Observation] = []
+    seconds: list[float] = []
+    for first in range(0, count, size):
+        if sum(seconds) > PATIENCE and first >= whole:
+            count = first // whole * whole
+            break
+        rows = np.arange(first, first + size) % count
+        begun = clock.perf_counter()
+        parts.append(problem.observe({name: column[rows] for name, column in every.items()}))
+        seconds.append(clock.perf_counter() - begun)
+    if len(parts) == 1:
+        begun = clock.perf_counter()
+        problem.observe({name: column[:size] for name, column in every.items()})
+        seconds.append(clock.perf_counter() - begun)
+    seen = jax.tree.map(lambda *each: np.concatenate(each)[:count], *parts)
+    return seen, float(np.min(seconds[1:])) / size
+
+
+class _Whitening:
+    """Derivatives over the noise of what they are of."""
+
+    def __init__(self, problem: CalibrationProblem, noise: _Noise) -> None:
+        self.noise, recordings = noise, problem.model.recordings
+        self.rows = [int(n) for n in recordings.rows]
+        self.valid = np.asarray(recordings.line.valid)
+        self.factors = []
+        for times, rows in zip(np.asarray(recordings.time), self.rows, strict=True):
+            apart = np.abs(times[:rows, None] - times[None, :rows])
+            lasting = noise.lasting**2 * np.exp(-apart / noise.time)
+            self.factors.append(np.linalg.cholesky(noise.white**2 * np.eye(rows) + lasting))
+
+    def positions(self, slope: Float[np.ndarray, "draw parameter recording time marker 3"]) -> np.ndarray:
+        """Over the noise of the positions; masked ones count for nothing."""
+        parts = []
+        for index, (rows, factor) in enumerate(zip(self.rows, self.factors, strict=True)):
+            own = slope[:, :, index, :rows] * self.valid[index, :rows, :, None]
+            flat = np.moveaxis(own, 2, 0).reshape(rows, -1)
+            white = solve_triangular(factor, flat, lower=True).reshape(rows, *own.shape[:2], -1)
+            parts.append(np.moveaxis(white, 0, 2).reshape(*own.shape[:2], -1))
+        return np.concatenate(parts, axis=-1)
+
+    def tensions(self, slope: np.ndarray, level: np.ndarray) -> np.ndarray:
+        """Over a relative noise of the tensions."""
+        typical = np.sqrt(np.mean(level**2, axis=(1, 2), keepdims=True))[:, None]
+        error = TENSION_ERROR * np.where(typical > 0.0, typical, np.inf)
+        parts = [(slope / error)[:, :, index, :rows] for index, rows in enumerate(self.rows)]
+        return np.concatenate([part.reshape(*part.shape[:2], -1) for part in parts], axis=-1)
+
+
+def _information(white: Float[np.ndarray, "draw parameter row"]) -> Float[np.ndarray, "parameter parameter"]:
+    """Fisher information, averaged over draws."""
+    return np.einsum("dpr,dqr->pq", white, white) / max(len(white), 1)
+
+
+def _weighed(
+    model: Model, problem: CalibrationProblem, coordinates: _Coordinates, drawn: Mapping[str, np.ndarray]
+) -> Float[np.ndarray, "parameter row"]:
+    """Derivatives of what was weighed over its error."""
+    found = np.zeros((len(coordinates.names), len(model.spec.weighed)))
+    for column, entry in enumerate(model.spec.weighed):
+        for name in set(entry.parameters) & set(coordinates.names):
+            k = coordinates.names.index(name)
+            slope = np.median(drawn[name]) if coordinates.logarithmic[k] else 1.0
+            found[k, column] = coordinates.sd[k] * slope / entry.sd
+    return found
+
+
+def _further(model: Model, coordinates: _Coordinates, tension: np.ndarray) -> dict[str, np.ndarray]:
+    """Information of what could be measured as well, by what it is."""
+    found: dict[str, np.ndarray] = {}
+    if tension.shape[-1] and not model.spec.channels.tension:
+        found[f"tensions of the cables (to {100 * TENSION_ERROR:g} %)"] = _information(tension)
+    units = {spec.name: spec.unit for spec in model.simulator.parameters}
+    for k, name in enumerate(coordinates.names):
+        weight = np.zeros((len(coordinates.names),) * 2)
+        size = 1.0 if coordinates.logarithmic[k] else max(abs(coordinates.mean[k]), coordinates.sd[k])
+        weight[k, k] = (coordinates.sd[k] / (KNOWN * size)) ** 2
+        word = "weighed" if units.get(name) == "kg" or "mass" in name else "measured by itself"
+        found[f"{name} {word} (to {100 * KNOWN:g} %)"] = weight
+    return found
+
+
+def _directions(coordinates: _Coordinates, information: np.ndarray, more: Mapping[str, np.ndarray]) -> list[Direction]:
+    """What keeps most of its prior standard deviation."""
+    values, vectors = np.linalg.eigh(information)
+    loose = vectors[:, 1.0 / np.sqrt(1.0 + np.maximum(values, 0.0)) > FREE]
+    found = []
+    for vector in _readable(loose).T:
+        kept = _kept(information, vector)
+        ended = {what: _kept(information + extra, vector) for what, extra in more.items()}
+        ended = dict(sorted(((w, s) for w, s in ended.items() if s < DETERMINED), key=lambda each: each[1]))
+        vector = vector / vector[np.argmax(np.abs(vector))]
+        names = [k for k in range(len(vector)) if abs(vector[k]) >= NEGLIGIBLE]
+        sign = 1.0 if vector[names[0]] > 0.0 else -1.0
+        together = {coordinates.names[k]: float(sign * vector[k] * coordinates.sd[k]) for k in names}
+        logs = all(coordinates.logarithmic[k] for k in names)
+        found.append(Direction(together, kept, ended, _sentence(together, logs, kept, ended)))
+    return sorted(found, key=lambda direction: -direction.kept)
+
+
+def _kept(information: np.ndarray, vector: np.ndarray) -> float:
+    """Posterior over prior standard deviation along a unit vector."""
+    posterior = np.linalg.inv(np.eye(len(information)) + information)
+    return float(np.sqrt(vector @ posterior @ vector))
+
+
+def _readable(vectors: Float[np.ndarray, "parameter direction"]) -> Float[np.ndarray, "parameter direction"]:
+    """The same directions turned among themselves until each has few parameters (varimax, Kaiser 1958)."""
+    rotation, size = np.eye(vectors.shape[1]), 0.0
+    for _ in range(TURNS if vectors.shape[1] > 1 else 0):
+        turned = vectors @ rotation
+        gradient = vectors.T @ (turned**3 - turned * np.mean(turned**2, axis=0))
+        left, values, right = np.linalg.svd(gradient)
+        rotation = left @ right
+        if values.sum() < size * (1.0 + STILL):
+            break
+        size = values.sum()
+    return vectors @ rotation
+
+
+def _sentence(together: Mapping[str, float], logs: bool, kept: float, ended: Mapping[str, float]) -> str:
+    names = list(together)
+    if len(names) == 1:
+        subject = names[0]
+    elif logs and all(value > 0.0 for value in together.values()):
+        subject = f"the common scale of {', '.join(names[:-1])} and {names[-1]}"
+    else:
+        up = [name for name, value in together.items() if value > 0.0]
+        down = [name for name, value in together.items() if value < 0.0]
+        subject = f"{' and '.join(up)} up" + (f" with {' and '.join(down)} down" if down else " together")
+    remedy = "; nothing that was tried here would end it"
+    if ended:
+        remedy = f"; ended by {', or '.join(f'{what}: {100 * share:.0f} %' for what, share in ended.items())}"
+    return f"{subject} (keeps {100 * kept:.0f} % of its prior spread{remedy})"
+
+
+def _shares(coordinates: _Coordinates, information: np.ndarray) -> pd.DataFrame:
+    posterior = np.linalg.inv(np.eye(len(information)) + information)
+    alone = 1.0 / np.sqrt(1.0 + np.diag(information))
+    return pd.DataFrame({"alone": alone, "kept": np.sqrt(np.diag(posterior))}, index=list(coordinates.names))
+
+
+def _held(run: Trajectory) -> list[str]:
+    """Channels whose command never changes."""
+    sent = np.concatenate([np.asarray(run.initial_command)[None], np.asarray(run.command)])
+    return [name for name, spread in zip(run.cable_names, np.ptp(sent, axis=0), strict=True) if spread == 0.0]

@@ -1,0 +1,141 @@
+"""What is said before a fit: the ridge of a spring, what ends it, commands that excite nothing, the cost of a fit."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import rfdropo_bayes as rb
+from rfdropo_bayes.cli.main import app
+from rfdropo_bayes.verbs.preflight import preflight
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+STEP = 0.02
+TIME = STEP * np.arange(151)
+
+
+def spring(parameters, command):
+    """A mass on a spring whose end is moved: its motion knows stiffness over mass, and its damping ratio; the force in
+    the spring knows the stiffness."""
+    omega = np.sqrt(parameters["stiffness"] / parameters["mass"])[:, None]
+    ratio = parameters["ratio"][:, None]
+    x, v, found = command[:, :1, 0], np.zeros_like(command[:, :1, 0]), []
+    for row in range(command.shape[1]):
+        if row:
+            for _ in range(10):
+                v = v + 0.1 * STEP * (omega**2 * (command[:, row : row + 1, 0] - x) - 2.0 * ratio * omega * v)
+                x = x + 0.1 * STEP * v
+        found.append(x)
+    place = np.stack(found, axis=1)
+    pull = parameters["stiffness"][:, None, None] * (command - place)
+    return {"position": np.concatenate([place, 0.0 * place, 0.1 + 0.0 * place], axis=-1)[:, :, None], "tension": pull}
+
+
+def wide(median):
+    prior = {"distribution": "LogNormal", "median": median, "sigma": 0.5}
+    return {"low": 1e-3 * median, "high": 1e3 * median, "nominal": median, "prior": prior}
+
+
+def model(*, tension=False, cables=("end",), **more):
+    parameters = {"stiffness": {**wide(20.0), "unit": "N/m"}, "mass": {**wide(0.5), "unit": "kg"}, "ratio": wide(0.2)}
+    box = rb.BlackBox(
+        spring,
+        parameters=parameters,
+        markers=["tip"],
+        channels=["end"],
+        cables=cables,
+        time_step=STEP,
+        batched=True,
+        name="spring",
+    )
+    return rb.Model(box, noise={"standard_deviation": 5e-4}, tension=tension, **more)
+
+
+def recording(size=0.03):
+    command = np.repeat(np.random.default_rng(0).uniform(-size, size, 15), 10)[:, None]
+    place = np.stack([np.linspace(0.0, 0.01, len(TIME)), 0.0 * TIME, 0.1 + 0.0 * TIME], axis=-1)[:, None]
+    given = {"markers": ["tip"], "channels": ["end"], "name": "run", "initial_command": "zero"}
+    tension = np.ones((len(TIME), 1))
+    return rb.Trajectory.from_arrays(
+        time=TIME, position=place, command=command, command_time=TIME[:-1], tension=tension, **given
+    )
+
+
+def test_the_scale_of_stiffness_and_mass_is_the_ridge_and_a_force_or_a_balance_ends_it():
+    found = rb.check(model(), [recording()])
+    (direction,) = found.directions
+    assert direction.sentence.startswith("the common scale of stiffness and mass")
+    together = direction.together
+    assert set(together) == {"stiffness", "mass"}
+    assert together["stiffness"] == pytest.approx(together["mass"], rel=0.02)  # k / m stays as it is
+    assert direction.kept == pytest.approx(1.0, abs=0.01)
+    ends = list(direction.ended_by)
+    assert any("tensions" in what for what in ends)
+    assert any("mass weighed" in what for what in ends)
+    assert not any("ratio" in what for what in ends)
+    # sd along the ridge is sqrt(2) 0.5 / 0.01 times less than the prior's, where the mass is known to 1 %
+    shares = found.parameters["kept"]
+    assert shares["mass"] == pytest.approx(np.sqrt(0.5), rel=0.02)
+    assert shares["ratio"] < 0.1
+
+
+def test_what_is_measured_leaves_no_ridge():
+    assert rb.check(model(tension=True), [recording()]).directions == []
+    weighed = model(weighed=[{"parameters": ["mass"], "value": 0.5, "sd": 0.005}])
+    assert rb.check(weighed, [recording()]).directions == []
+
+
+def test_commands_that_do_not_move_excite_nothing():
+    found = rb.check(model(), [recording(size=0.0)])
+    assert len(found.directions) == 3
+    assert (found.parameters["alone"] > 0.99).all()
+    assert found.channels == {"run": ["end"]}
+    assert "run: end never changes" in str(found)
+
+
+def test_the_cost_is_that_of_the_budget():
+    found = preflight(model(), [recording()], method="laplace", rollouts=600)
+    assert found.minutes == pytest.approx(600 * found.rollout_seconds / 60.0)
+    assert "laplace: 600 rollouts" in str(found)
+    json.dumps(found.as_dict())
+    assert "common scale" in found._repr_html_()
+
+
+def test_an_arm_of_mujoco_with_stiff_drives_leaves_a_common_scale(tmp_path):
+    pytest.importorskip("mujoco")
+    path = tmp_path / "arm.xml"
+    path.write_text("""
+<mujoco><option timestep="0.005" gravity="0 0 0" integrator="implicitfast"/><worldbody><body name="hand">
+  <joint name="base" axis="0 1 0" armature="1"/><geom size="0.01" mass="1e-3"/>
+  <body name="rod" pos="0 0 -0.02"><joint name="bend" axis="0 1 0" stiffness="0.05" damping="0.002"/>
+    <geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.2" mass="0.05"/><site name="tip" pos="0 0 -0.2"/>
+  </body></body></worldbody>
+  <actuator><position name="drive" joint="base" kp="5000" kv="140"/></actuator></mujoco>""")
+    given = {"mass": "body/rod/mass", "stiffness": "joint/bend/stiffness", "damping": "joint/bend/damping"}
+    box = rb.MuJoCo(path, parameters=given)
+    assert box.command_unit == "rad"
+    walk = {"duration": 2.0, "interval": 0.2, "step": 0.2, "low": -0.5, "high": 0.5, "sample_time": 0.02}
+    arm = rb.Model(box, noise={"standard_deviation": 5e-4})
+    runs = rb.simulate(arm, {**walk, "recordings": ["a"]})
+    found = rb.check(arm, runs)
+    (direction,) = found.directions
+    assert set(direction.together) == {"mass", "stiffness", "damping"}
+    np.testing.assert_allclose(list(direction.together.values()), direction.together["mass"], rtol=0.1)
+    assert next(iter(direction.ended_by)).startswith(("mass weighed", "stiffness", "damping"))
+    assert found.seconds < 60.0
+
+
+@pytest.mark.slow
+def test_check_says_it_of_the_demo(tmp_path):
+    out = tmp_path / "check"
+    told = CliRunner().invoke(app, ["check", str(REPOSITORY / "experiments" / "demo.toml"), "--out", str(out)])
+    assert told.exit_code == 0, told.output
+    assert "the common scale of young_modulus and trunk_mass" in told.output
+    content = json.loads((out / "check.json").read_text())
+    (direction,) = content["preflight"]["directions"]
+    assert any("tensions" in what for what in direction["ended_by"])
+    assert any("trunk_mass weighed" in what for what in direction["ended_by"])
