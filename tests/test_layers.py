@@ -51,7 +51,7 @@ KERNEL = "a kernel of one lane block: what may be absent is an argument of its o
 MORE_ARGUMENTS_FOR_A_REASON: dict[str, str] = {
     "data/in_memory.py:from_arrays": "a user's way in: every array, its names and its unit by name",
     "verbs/audit.py:audit": "a user's way in: what an audit may be told, by name",
-    "simulators/adapters/mujoco_model.py:MuJoCo": "a user's way in: what of a model is a channel, a marker, a parameter, by name",
+    "simulators/adapters/mujoco_model.py:MuJoCo": "a user's way in: parts of a MuJoCo model by name",
     "fem/native/contact_geometry.py:_list": "three vectors by component, as SIMD lanes have them",
     "fem/native/layered_constraints.py:_hold": KERNEL,
     "fem/native/layered_constraints.py:constrained_stage": KERNEL,
