@@ -1,4 +1,4 @@
-"""Sessions of a MuJoCo model: many lanes that go on from one control period to the next, each with its own parameters."""
+"""Sessions of a MuJoCo model: many lanes that go on from one control period to the next, each with own parameters."""
 
 from __future__ import annotations
 
