@@ -361,7 +361,7 @@ class MuJoCoRollouts:
             InputError: the file cannot say what the model is.
         """
         (model,) = self.models({name: np.array([value]) for name, value in values.items()}, 1)
-        return ".xml", model_text(self, model, self.path, remarks)
+        return ".xml", model_text(self, model, self.path, values, remarks)
 
     @cached_property
     def _touched(self) -> dict[str, np.ndarray]:
