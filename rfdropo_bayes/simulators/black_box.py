@@ -307,6 +307,18 @@ class BlackBoxSimulator(ExtendedSimulator):
         angle = self.driven(values, commands, self.time_step)
         return Observation(position, sample(moved.tension, commands), None, status, angle)
 
+    def session(self, lanes: int, period: float) -> Any:
+        """Lanes that go on from one control period [s] to the next, where the function has a method ``session``.
+
+        Raises:
+            InputError: it has none, or there are mechanisms around it.
+        """
+        begin = getattr(self.box.function, "session", None)
+        if begin is None or self.mechanisms:
+            why = "has no session" if begin is None else "has no session with mechanisms around it"
+            raise InputError(why, where=self.box.name, remedy="simulate whole rollouts")
+        return begin(lanes, period)
+
     @cached_property
     def _differentiable(self) -> Any:
         sizes = {

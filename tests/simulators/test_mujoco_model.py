@@ -224,6 +224,7 @@ def test_a_model_that_is_written_and_read_again_moves_alike(tmp_path, canonical)
     suffix, told = box.function.written({**TRUTH, "place": -0.23}, ["Calibrated.", "k = 1 [0.9, 1.1]"])
     assert suffix == ".xml"
     assert "k = 1 [0.9, 1.1]" in told
+    assert canonical or told.count("armature") == 1  # what was not calibrated stays where it was
     (tmp_path / "far").mkdir()
     again = BlackBoxSimulator(MuJoCo(written(tmp_path / "far", told), markers=["tip"]))
     simulator = BlackBoxSimulator(box)
@@ -245,3 +246,28 @@ def test_tensions_are_what_actuators_pull_with(tmp_path):
     seen = simulator.rollout({}, sent(simulator, size=3.0))
     assert simulator.cable_names == ("wire",)
     np.testing.assert_allclose(seen.tension[1:-1, 0], -np.asarray(sent(simulator, size=3.0).step)[1:, 0], atol=1e-12)
+
+
+def test_a_session_goes_on_as_the_rollout_does(spring):
+    simulator = BlackBoxSimulator(spring)
+    commands = sent(simulator, seconds=1.0, size=2.0)
+    values = {"k": np.array([30.0, 60.0])}
+    whole = jax.vmap(lambda k: simulator.rollout({"k": k}, commands).position)(values["k"])
+    session = simulator.session(2, 0.1)
+    start = session.reset(np.arange(2), values)
+    np.testing.assert_allclose(start.position, whole[:, 0], atol=1e-13)
+    for period in range(10):
+        if period == 5:
+            kept = session.save()
+            session.act(np.full((2, 1), -2.0))
+            session.restore(kept)
+        level = np.asarray(commands.step)[100 * period]
+        seen = session.act(np.tile(level, (2, 1)))
+        np.testing.assert_allclose(seen.position, whole[:, 100 * (period + 1)], atol=1e-12)
+        assert seen.status.tolist() == [Result.OK, Result.OK]
+    session.reset(np.array([1]), {"k": 45.0})
+    np.testing.assert_allclose(session.time, [1.0, 0.0])
+    with pytest.raises(InputError, match="no whole number"):
+        simulator.session(2, 0.0105)
+    with pytest.raises(InputError, match="mechanisms around it"):
+        BlackBoxSimulator(spring, mechanisms_named(["command_delay"], spring)).session(1, 0.1)

@@ -22,13 +22,13 @@ IN_BODIES = {"joint": ("joint", "freejoint"), "geom": ("geom",), "site": ("site"
 TRANSPARENT = ("frame",)
 
 
-def model_text(rollouts: Any, model: Any, path: Path, remarks: Sequence[str]) -> str:
-    """Text of an MJCF file of ``model``, which differs from that of ``rollouts`` by its parameters.
+def model_text(rollouts: Any, model: Any, path: Path, names: Iterable[str], remarks: Sequence[str]) -> str:
+    """Text of an MJCF file of ``model``, which differs from that of ``rollouts`` by the parameters of these names.
 
     Raises:
         InputError: the file cannot say what the model is.
     """
-    elements = sorted({element for edit in rollouts.edits.values() for element in edit.elements})
+    elements = sorted({element for name in names for element in rollouts.edits[name].elements})
     for text in _texts(rollouts.spec, path):
         written = _edited(text, model, elements, path.parent, remarks)
         if written is not None and _same(rollouts, model, written):

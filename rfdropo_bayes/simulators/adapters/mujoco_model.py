@@ -33,6 +33,7 @@ from rfdropo_bayes.simulators.adapters.mujoco_elements import (
     searched,
 )
 from rfdropo_bayes.simulators.adapters.mujoco_file import model_text
+from rfdropo_bayes.simulators.adapters.mujoco_session import MuJoCoSession
 from rfdropo_bayes.simulators.adapters.mujoco_start import adapter_tables
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.tables import nearest
@@ -192,6 +193,7 @@ class MuJoCoRollouts:
         model: compiled, with sensors of the markers and cables.
         channels: number of the actuator's command in ``ctrl``, by channel.
         edits: how each parameter changes the model, by name.
+        first: state, and ``ctrl``, before anything settles.
 
     Raises:
         InputError: a model that does not compile, or names that it does not have.
@@ -238,7 +240,7 @@ class MuJoCoRollouts:
         self._pulls = np.array([self.model.sensor(f"rfdropo cable {c}").adr[0] for c in self.cables], dtype=int)
         self.edits: dict[str, Edit] = {}
         self._models: list[Any] = []
-        self._initial = self._first_state()
+        self.first = self._first_state()
 
     def bodies(self, markers: Mapping[str, tuple[str, str]]) -> list[int]:
         """Numbers of the bodies that markers are on."""
@@ -325,16 +327,14 @@ class MuJoCoRollouts:
         """Roll out a batch: positions (n, row, marker, 3) [m] and tensions (n, row, cable) [N], NaN where a rollout
         diverged."""
         models = self.models(values, len(commands))
-        ctrl = np.tile(self._initial[1], (*commands.shape[:2], 1))
+        ctrl = np.tile(self.first[1], (*commands.shape[:2], 1))
         ctrl[:, :, list(self.channels.values())] = commands
-        with _unheard():
-            state, found = self._begun(models, ctrl[:, 0])
-            # MuJoCo's sensors tell of the state before a step: one step more than rows shows the last row.
-            played = np.concatenate([ctrl[:, 1:], ctrl[:, -1:]], axis=1)
-            last, sensed = self._rolled(models, state, played)
-        found &= self._arrived(last, len(commands[0]))
-        position = sensed[:, :, self._places]
-        pull = -sensed[:, :, self._pulls]
+        state, found = self.begun(models, ctrl[:, 0])
+        # MuJoCo's sensors tell of the state before a step: one step more than rows shows the last row.
+        played = np.concatenate([ctrl[:, 1:], ctrl[:, -1:]], axis=1)
+        states, sensed = self.rolled(models, state, played)
+        found &= self._arrived(states[:, -1], len(commands[0]))
+        position, pull = self.shown(sensed)
         position[~found], pull[~found] = np.nan, np.nan
         return {"position": position, "tension": pull} if self.cables else {"position": position}
 
@@ -361,7 +361,7 @@ class MuJoCoRollouts:
             InputError: the file cannot say what the model is.
         """
         (model,) = self.models({name: np.array([value]) for name, value in values.items()}, 1)
-        return ".xml", model_text(self, model, self.path, remarks)
+        return ".xml", model_text(self, model, self.path, values, remarks)
 
     @cached_property
     def _touched(self) -> dict[str, np.ndarray]:
@@ -381,23 +381,33 @@ class MuJoCoRollouts:
 
         return Rollout(nthread=self.threads)
 
-    def _rolled(
+    def rolled(
         self, models: list[Any], state: Float[np.ndarray, "n state"], ctrl: Float[np.ndarray, "n step ctrl"]
-    ) -> tuple[Float[np.ndarray, "n state"], Float[np.ndarray, "n step sensor"]]:
-        """States after the last step, and what sensors told in each."""
-        states, sensed = self._pool.rollout(models, self._data, state, np.ascontiguousarray(ctrl))
-        return states[:, -1], sensed
+    ) -> tuple[Float[np.ndarray, "n step state"], Float[np.ndarray, "n step sensor"]]:
+        """States after each step, and what sensors told before it."""
+        with _unheard():
+            return self._pool.rollout(models, self._data, state, np.ascontiguousarray(ctrl))
+
+    def shown(
+        self, sensed: Float[np.ndarray, "n step sensor"]
+    ) -> tuple[Float[np.ndarray, "n step marker 3"], Float[np.ndarray, "n step cable"]]:
+        """Positions of the markers [m] and pulls of the cables [N] in what sensors told."""
+        return sensed[:, :, self._places], -sensed[:, :, self._pulls]
+
+    def session(self, lanes: int, period: float) -> MuJoCoSession:
+        """Lanes that are commanded one control period [s] at a time; see `MuJoCoSession`."""
+        return MuJoCoSession(self, lanes, period)
 
     def _arrived(self, state: Float[np.ndarray, "n state"], steps: int) -> Bool[np.ndarray, " n"]:
         """Which rollouts went on to the end: MuJoCo stops the clock of one with a warning."""
-        late = state[:, 0] - self._initial[0][0] - steps * self.model.opt.timestep
+        late = state[:, 0] - self.first[0][0] - steps * self.model.opt.timestep
         return (np.abs(late) < 0.5 * self.model.opt.timestep) & np.isfinite(state).all(axis=1)
 
-    def _begun(
+    def begun(
         self, models: list[Any], ctrl: Float[np.ndarray, "n ctrl"]
     ) -> tuple[Float[np.ndarray, "n state"], Bool[np.ndarray, " n"]]:
-        """Initial states, and which of them were found."""
-        state = np.tile(self._initial[0], (len(models), 1))
+        """Initial states under the first commands, and which of them were found."""
+        state = np.tile(self.first[0], (len(models), 1))
         found = np.ones(len(models), dtype=bool)
         if self.start != SETTLED:
             return state, found
@@ -409,15 +419,15 @@ class MuJoCoRollouts:
             if not moving.any():
                 break
             rows = np.flatnonzero(moving)
-            state[rows, 0] = self._initial[0][0]
-            state[rows] = self._rolled([models[k] for k in rows], state[rows], held[rows])[0]
+            state[rows, 0] = self.first[0][0]
+            state[rows] = self.rolled([models[k] for k in rows], state[rows], held[rows])[0][:, -1]
             found[rows] = self._arrived(state[rows], PERIOD)
             energy = np.sum(state[:, speed] ** 2, axis=1)
             still = np.where(np.abs(state[:, speed]).max(axis=1, initial=0.0) < STILL, still + 1, 0)
             turned = moving & (energy < before)
             state[turned, speed] = 0.0
             before = np.where(turned, 0.0, energy)
-        state[:, 0] = self._initial[0][0]
+        state[:, 0] = self.first[0][0]
         return state, found & (still >= SHAKES)
 
 
