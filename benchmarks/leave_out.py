@@ -2,9 +2,9 @@
 
     python benchmarks/leave_out.py [SETTINGS.toml] [--out DIR]
 
-The settings name experiments, patterns of recordings that are left out together, such as those of a day, and the seconds
-of the first of them that each fit is then adapted to. Recordings are predicted whole, also where the experiment fits some
-rows of them; after an adaptation the first one as far as it was not shown.
+The settings name experiments, patterns of recordings that are left out together, such as those of a day, and the
+seconds of the first of them that each fit is then adapted to. Recordings are predicted whole, also where the experiment
+fits some rows of them; after an adaptation the first one as far as it was not shown.
 
 Every figure is a line of DIR/ledger.jsonl: how far the last marker is off [mm], and which share of the measured
 coordinates lies in the 90 % bands: of all markers, of the last, and of rows whose last marker is inside in all three.
