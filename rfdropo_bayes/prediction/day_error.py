@@ -21,7 +21,7 @@ DAY_ERROR = "day_error"  # among the attributes of a posterior
 
 # The prior of `times`, in force where no day was left out, and worth FREEDOM days where some were. docs/days.md has the
 # days of two robots that it rests on.
-TIMES, FREEDOM = 0.6, 3.0
+TIMES, FREEDOM = 0.8, 3.0
 CONSTANT = 0.6  # share of the variance that lasts for a whole recording
 CORRELATION_TIME = 1.0  # [s] of the rest
 SMALLEST_REACH = 1e-6  # [m]
@@ -202,8 +202,8 @@ def day_sentence(error: DayError) -> str:
     begin = "No recording of this day was seen."
     if not error.days:
         return (
-            f"{begin} Nor was any other day left out of the fit: the bands rest on how far models of two other robots "
-            f"were off on days left out, {error.times:.2g} times what they left of fitted days."
+            f"{begin} This run has no days that were left out of its fit: its bands are widened by {error.times:.2g} "
+            "times what it left of fitted days, as days left out of the fits of two other robots ask for."
         )
     return f"{begin} {left_out_sentence(error)}"
 

@@ -16,6 +16,8 @@ from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 MODEL_ERROR = "model_error"  # among the attributes of a posterior
 MOST_LAGS = 100  # rows of memory, of noise that lasts: longer recordings forget its constant part over as many
 MOST_CONSTANT = 0.95
+FEWEST_ROWS = 4  # that say how long an error lasts
+ADAPTED_TO = "adapted_to"  # among the attributes of a posterior: the day, of an adaptation
 CONSTANT_ROUNDS = 5  # until share and memory agree
 
 
@@ -28,13 +30,17 @@ class ModelError(NamedTuple):
         correlation_time: over which it forgets its sign [s].
         share: what a coordinate of a row counts, because markers err together: independent coordinates of equal worth
             are as many as their correlation matrix has eigenvalues of note (its participation ratio).
+        step: time between rows of the fitted recordings [s].
+        memory: correlation of an error with that of 0, 1, 2 ... rows before, its mean not taken out; empty where it
+            is not known.
     """
 
     markers: tuple[str, ...]
     scale: tuple[float, ...]
     correlation_time: float
     share: float = 1.0
-    constant: float = 0.0
+    step: float = 0.0
+    memory: tuple[float, ...] = ()
 
     def of_marker(self, name: str) -> float:
         """How far [m] a marker is off, root mean square, where all coordinates of a row are taken for independent."""
@@ -52,12 +58,26 @@ class ModelError(NamedTuple):
         A first-order autoregression forgets that part, and takes a few seconds of a constant error for many
         measurements of it.
         """
-        if self.constant == 0.0:
+        constant = self.constant(step * rows)
+        if constant == 0.0:
             return self.every(step)
-        fast = _memory(np.exp(-step / self.correlation_time), self.constant)
+        fast = _fast(np.exp(-step / self.correlation_time), constant)
         lags = np.arange(min(rows, MOST_LAGS))
-        memory = self.constant + (1.0 - self.constant) * fast**lags
+        memory = constant + (1.0 - constant) * fast**lags
         return Autoregression(np.array(self.scale), memory, RESIDUALS, np.inf)
+
+    def constant(self, seconds: float) -> float:
+        """Share of the variance that lasts for so many seconds: with it, the mean error over as many varies as it did
+        in the fitted recordings; zero where that is not known."""
+        rows = min(round(seconds / self.step), len(self.memory)) if self.step else 0
+        if rows < FEWEST_ROWS:
+            return 0.0
+        memory, found = float(np.exp(-self.step / self.correlation_time)), 0.0
+        seen = _mean_variance(np.array(self.memory[:rows]))
+        for _ in range(CONSTANT_ROUNDS):
+            chance = _mean_variance(_fast(memory, found) ** np.arange(rows))
+            found = float(np.clip((seen - chance) / (1.0 - chance), 0.0, min(MOST_CONSTANT, memory)))
+        return found
 
 
 def model_error(
@@ -91,41 +111,33 @@ def model_error(
     step = sample_time(*(p.time for p in fitted))
     memory = float(np.clip(noise.autocorrelation[1], 1e-3, 0.999))
     scale, lasts = tuple((widened * noise.scale).tolist()), float(-step / np.log(memory))
-    return ModelError(tuple(markers), scale, lasts, share, constant_share(fitted, memory))
+    return ModelError(tuple(markers), scale, lasts, share, step, error_memory(fitted))
 
 
-def constant_share(fitted: Sequence[RecordingPrediction], memory: float) -> float:
-    """Share of the squared error that is constant in each recording, beyond what one that is forgotten would show.
-
-    Args:
-        fitted: predictions, of which the mean errs.
-        memory: correlation of the errors of neighbouring rows.
-    """
-    means, total, expected = 0.0, 0.0, []
+def error_memory(fitted: Sequence[RecordingPrediction]) -> tuple[float, ...]:
+    """Correlation of the error of mean predictions with that of 0, 1, 2 ... rows before, about zero; of half a
+    recording at most, beyond which there are few pairs."""
+    count = min(MOST_LAGS, max(len(p.time) for p in fitted) // 2)
+    products, pairs = np.zeros(count), np.zeros(count)
     for p in fitted:
-        error, rows = np.where(p.mask[..., None], p.observed - p.central, 0.0), p.mask.sum(axis=0)
-        means += float(np.sum(np.sum(error, axis=0) ** 2 / np.maximum(rows, 1)[:, None]))
-        total += float(np.sum(error**2))
-        expected.append(len(p.time))
-    if total == 0.0:
-        return 0.0
-    found = 0.0
-    for _ in range(CONSTANT_ROUNDS):
-        fast = _memory(memory, found)
-        chance = float(np.mean([_mean_variance(fast, rows) for rows in expected]))
-        found = float(np.clip((means / total - chance) / (1.0 - chance), 0.0, min(MOST_CONSTANT, memory)))
-    return found
+        error = np.where(p.mask[..., None], p.observed - p.central, 0.0)
+        for lag in range(min(count, len(p.time))):
+            products[lag] += float(np.sum(error[lag:] * error[: len(error) - lag]))
+            pairs[lag] += float(np.sum(p.mask[lag:] & p.mask[: len(error) - lag]))
+    mean = products / np.maximum(pairs, 1.0)
+    return tuple((mean / mean[0]).tolist()) if count and mean[0] > 0.0 else ()
 
 
-def _memory(memory: float, constant: float) -> float:
+def _fast(memory: float, constant: float) -> float:
     """Correlation of neighbouring rows in the part of an error that is not constant."""
     return max((memory - constant) / (1.0 - constant), 0.0)
 
 
-def _mean_variance(memory: float, rows: int) -> float:
-    """Variance of the mean of rows of a first-order autoregression, over that of one row."""
+def _mean_variance(memory: Float[np.ndarray, " lag"]) -> float:
+    """Variance of the mean of as many rows as there are lags, over that of one row."""
+    rows = len(memory)
     lags = np.arange(1, rows)
-    return float((1.0 + 2.0 * np.sum((1.0 - lags / rows) * memory**lags)) / rows)
+    return float((1.0 + 2.0 * np.sum((1.0 - lags / rows) * memory[1:])) / rows)
 
 
 def recorded_model_error(record: PosteriorRecord) -> ModelError | None:
@@ -134,9 +146,9 @@ def recorded_model_error(record: PosteriorRecord) -> ModelError | None:
     given = record.attrs.get(MODEL_ERROR)
     if given is None:
         return model_error(record.recordings)
-    lists = {name: tuple(given[name]) for name in ("markers", "scale")}
+    lists = {name: tuple(given.get(name, ())) for name in ("markers", "scale", "memory")}
     found, fitted = ModelError(**{**given, **lists}), [p for p in record.recordings if p.split == "fit"]
-    if "constant" in given or not fitted:
+    if found.memory or not fitted or record.attrs.get(ADAPTED_TO):
         return found
-    step = sample_time(*(p.time for p in fitted))  # an earlier version did not say
-    return found._replace(constant=constant_share(fitted, float(np.exp(-step / found.correlation_time))))
+    # An earlier version did not say how long errors last.
+    return found._replace(step=sample_time(*(p.time for p in fitted)), memory=error_memory(fitted))

@@ -40,7 +40,6 @@ from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
 # Among the attributes of a posterior.
 FITTED, HELD = "fitted_recordings", "held_parameters"
-ADAPTED_TO = "adapted_to"  # the day, of an adaptation
 NOISE, BEGUN = "noise_model", "fitted_recordings_begin"
 KNOWN_NOISE = "known_noise"  # of the positions, where its parameters are not inferred
 SIZES = (OBJECT_NOISE, OBJECT_TURN_NOISE, OBJECT_CORRELATION_TIME)

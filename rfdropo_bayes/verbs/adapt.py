@@ -36,10 +36,9 @@ from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.day import DayFit, fit_day
 from rfdropo_bayes.prediction.day_error import DAY_ERROR, DayError, reach_of, recorded_day_error
-from rfdropo_bayes.prediction.model_error import ModelError, recorded_model_error
+from rfdropo_bayes.prediction.model_error import ADAPTED_TO, ModelError, recorded_model_error
 from rfdropo_bayes.prediction.own_fit import MOST_STEPS
 from rfdropo_bayes.prediction.predictive import (
-    ADAPTED_TO,
     FITTED,
     KNOWN_NOISE,
     NOISE,

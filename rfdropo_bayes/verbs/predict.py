@@ -38,9 +38,8 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.day_error import DayError, day_sentence, recorded_day_error
-from rfdropo_bayes.prediction.model_error import recorded_model_error
+from rfdropo_bayes.prediction.model_error import ADAPTED_TO, recorded_model_error
 from rfdropo_bayes.prediction.predictive import (
-    ADAPTED_TO,
     BEGUN,
     FITTED,
     HELD,

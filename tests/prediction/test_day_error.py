@@ -17,7 +17,7 @@ from rfdropo_bayes.prediction.day_error import (
     prior_day_error,
     reach_of,
 )
-from rfdropo_bayes.prediction.model_error import ModelError, constant_share
+from rfdropo_bayes.prediction.model_error import ModelError, error_memory
 from rfdropo_bayes.prediction.predictive import with_day_error
 
 TIME = 0.1 * np.arange(100)
@@ -109,23 +109,26 @@ def test_the_sentences(prior):
         "No recording of this day was seen. On days left out this model was 7.1 to 16 mm off; its 90 % bands held 88 %."
     )
     assert left_out_sentence(prior) == ""
-    assert day_sentence(prior).startswith(
-        "No recording of this day was seen. Nor was any other day left out of the fit"
-    )
+    assert day_sentence(prior).startswith("No recording of this day was seen. This run has no days that were left out")
 
 
-def test_the_constant_part_of_an_error_is_told_from_one_that_is_forgotten():
-    """200 recordings of 100 rows: half of the variance is constant, the rest lasts for five rows, or all of it does."""
+def test_the_lasting_part_of_an_error_is_told_from_one_that_is_forgotten():
+    """200 recordings of 100 rows: half of the variance is constant, the rest lasts for five rows, or all of it does.
+
+    Over 50 rows; means of 200 recordings of three axes have a standard error of 4 %.
+    """
     rng, memory = np.random.default_rng(5), np.exp(-0.2)
     for constant in (0.5, 0.0):
-        found = []
+        found, none = [], np.zeros((100, 1, 3))
         for _ in range(200):
             fast = [rng.normal(size=3)]
             for _ in range(99):
                 fast.append(memory * fast[-1] + np.sqrt(1.0 - memory**2) * rng.normal(size=3))
             error = np.sqrt(1.0 - constant) * np.stack(fast) + np.sqrt(constant) * rng.normal(size=3)
-            found.append(
-                RecordingPrediction("a", "fit", TIME, ("tip",), error[:, None], MASK, 0 * PATH[None], 0 * PATH)
-            )
-        total = constant + (1.0 - constant) * memory
-        assert constant_share(found, total) == pytest.approx(constant, abs=0.06)
+            found.append(RecordingPrediction("a", "fit", TIME, ("tip",), error[:, None], MASK, none[None], none))
+        lasts = -0.1 / np.log(constant + (1.0 - constant) * memory)
+        left = ModelError(("tip",), (1.0, 1.0, 1.0), lasts, step=0.1, memory=error_memory(found))
+        assert left.constant(5.0) == pytest.approx(constant, abs=0.06)
+        correlation = left.lasting(0.1, 50).autocorrelation
+        assert correlation[-1] == pytest.approx(constant, abs=0.06)
+        assert LEFT.lasting(0.1, 50).order == 1
