@@ -25,9 +25,9 @@ AHEAD_SHORTEST, AHEAD_FACTOR = 1e-3, 1.5
 """The same, and a factor on all springs, for forces that are taken where the velocity leads (``fem.integrators``).
 
 In a motion without mass SDIRK2 swings with growing amplitude where the matrix lacks over a seventh of the stiffness;
-with more than all of it the motion is only slower. Opposed cables bring crossings as near as 60 um, 1 % of a neck, where
+with more than all of it the motion is only slower. Opposed cables bring crossings as near as 60 um, 1 % of a neck. Then
 `SHORTEST` leaves half of the stiffness, and the springs lack up to a quarter of it anyway: tensions of a trunk that
-should be still swing by hundreds of newtons. The order stays, as springs act on the change of the velocity only."""
+should be still swing by hundreds of newtons. The order stays: springs act on the change of the velocity only."""
 
 
 def crossing_weights(body: LayeredBody, layout: CableLayout) -> Float[np.ndarray, "layers cables nodes2"]:
