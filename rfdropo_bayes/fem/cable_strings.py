@@ -21,6 +21,13 @@ from rfdropo_bayes.fem.layered import LayeredBody, attach, rest_positions
 
 SHORTEST = 0.02
 """Crossings closer than this share of the layer's length at rest count as this far apart: a layer may fold."""
+AHEAD_SHORTEST, AHEAD_FACTOR = 1e-3, 1.5
+"""The same, and a factor on all springs, for forces that are taken where the velocity leads (``fem.integrators``).
+
+In a motion without mass SDIRK2 swings with growing amplitude where the matrix lacks over a seventh of the stiffness;
+with more than all of it the motion is only slower. Opposed cables bring crossings as near as 60 um, 1 % of a neck. Then
+`SHORTEST` leaves half of the stiffness, and the springs lack up to a quarter of it anyway: tensions of a trunk that
+should be still swing by hundreds of newtons. The order stays: springs act on the change of the velocity only."""
 
 
 def crossing_weights(body: LayeredBody, layout: CableLayout) -> Float[np.ndarray, "layers cables nodes2"]:
@@ -46,6 +53,7 @@ def string_stiffness(
     gradient: Float[Array, "layers nodes2 3"],
     turned: Float[Array, "layers nodes2 3"],
     tension: Float[Array, " cables"],
+    ahead: bool = False,
 ) -> Float[Array, "layers dofs dofs"]:
     """Stiffness [N/m] that tensions [N] add to every layer in its frame; positive semi-definite.
 
@@ -58,14 +66,16 @@ def string_stiffness(
         gradient: from ``layered.centre_gradient``.
         turned: node positions in the frames [m], relative to any point.
         tension: of the cables.
+        ahead: for forces that are taken where the velocity leads, see `AHEAD_FACTOR`.
     """
+    shortest, factor = (AHEAD_SHORTEST, AHEAD_FACTOR) if ahead else (SHORTEST, 1.0)
     way = jnp.einsum("lcn,lni->lci", weights, turned)
-    least = SHORTEST * np.diff(body.station)[:, None]
+    least = shortest * np.diff(body.station)[:, None]
     square = jnp.sum(way**2, axis=-1)
     length = jnp.where(square > least**2, jnp.sqrt(jnp.maximum(square, least**2)), least)
     stretch = jnp.einsum("lni,lni->li", turned, gradient)
     lever = length / (0.5 * (stretch[:, 0] + stretch[:, 1]) + stretch[:, 2])[:, None]
-    spring = np.any(weights != 0.0, axis=-1) * tension / length
+    spring = factor * np.any(weights != 0.0, axis=-1) * tension / length
     relative = weights - lever[..., None] * gradient[:, None, :, 2]
     straight = jnp.einsum("lc,lcn,lcm->lnm", spring, relative, relative)
     mixed = jnp.einsum("lc,lcn,lma->lnma", spring * lever, relative, gradient[..., :2])

@@ -256,11 +256,12 @@ def strings(
     frame: Float[Array, "layers 3 3"],
     position: Float[Array, "nodes 3"],
     tension: Float[Array, " cables"],
+    ahead: bool = False,
 ) -> Float[Array, "layers dofs dofs"]:
-    """What taut cables add to the stiffness of every layer in its frame."""
+    """What taut cables add to the stiffness of every layer in its frame; ``ahead``: see `string_stiffness`."""
     turned = corotational.turned_back(frame, layered.layer_positions(system.body, position))
     weights, nodes = crossing_weights(system.body, system.cables), 2 * system.body.section_nodes
-    return string_stiffness(system.body, weights, prepared.gradient, turned.reshape(-1, nodes, 3), tension)
+    return string_stiffness(system.body, weights, prepared.gradient, turned.reshape(-1, nodes, 3), tension, ahead)
 
 
 class _Elastic(NamedTuple):
@@ -313,7 +314,7 @@ def _elastic(system: System, prepared: Prepared, state: State, stage: Stage, tim
         force, packed = left * force, left * packed
     lookahead = length * (1.0 + gain) + prepared.rayleigh_stiffness
     behind = prepared.rayleigh_stiffness if stage.predicted else lookahead
-    taut = strings(system, prepared, frame, state.position, state.tension)
+    taut = strings(system, prepared, frame, state.position, state.tension, stage.predicted)
     tangent = corotational.tangent(packed + length / lookahead * corotational.pack(taut), frame)
     moving = corotational.turned_back(frame, layered.layer_positions(system.body, state.velocity))
     viscous_force = left * behind * jnp.einsum("lij,lj->li", prepared.stiffness, moving)

@@ -291,12 +291,12 @@ def subtract_tangent_product(tables, samples, factors, change, field, work, toke
 
 
 @kernel
-def assemble_layer(tables, samples, factors, layer, square, strings, work, whole, token):
+def assemble_layer(tables, samples, factors, layer, square, ahead, work, whole, token):
     """Frame and force of a layer, and its part of the matrix, of a stage whose length has this ``square``; see
-    `add_layer_force` for ``strings`` and `_layer_tangent` for ``whole``."""
+    `measure_strings` for ``ahead`` and `_layer_tangent` for ``whole``."""
     layer_frame(tables, layer, work, token)
-    measure_strings(tables, layer, square, work, token)
-    add_layer_force(tables, samples, factors, layer, work, strings, token)
+    measure_strings(tables, layer, square, ahead, work, token)
+    add_layer_force(tables, samples, factors, layer, work, not ahead, token)
     first = layer * tables.entries
     _layer_tangent(tables.parity, tables.modes, samples.stiffness, first, layer, whole, factors, work, token)
     add_strings(tables, layer, work, whole, token)

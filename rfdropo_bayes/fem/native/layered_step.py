@@ -176,7 +176,7 @@ def condense_increment(tables, samples, factors, work, stage, token):
     for station in range(stations - 1, held - 1, -1):
         last = station == held
         if station > 0:
-            assemble_layer(tables, samples, factors, station - 1, square, not predicted, work, not last, token)
+            assemble_layer(tables, samples, factors, station - 1, square, predicted, work, not last, token)
             stiffen(tables, factors, station - 1, rate, work, not last, token)
             if not predicted:
                 resist_lateral(tables, station - 1, work.velocity, work.field, work, token)

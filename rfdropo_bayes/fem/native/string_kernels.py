@@ -8,7 +8,7 @@ is z. Cables that are slack in all lanes, or end before the layer, are left out:
 
 from __future__ import annotations
 
-from rfdropo_bayes.fem.cable_strings import SHORTEST
+from rfdropo_bayes.fem.cable_strings import AHEAD_FACTOR, AHEAD_SHORTEST, SHORTEST
 from rfdropo_bayes.fem.native.chain_cholesky import subtract_product
 from rfdropo_bayes.fem.native.fields import clear
 from rfdropo_bayes.fem.native.simd import (
@@ -38,12 +38,16 @@ def _way(tables, layer, c, field, token):
 
 
 @kernel
-def measure_strings(tables, layer, square, work, token):
-    """Spring, times the ``square`` of a stage's length, and lever of every cable in a layer, whose frame is known."""
+def measure_strings(tables, layer, square, ahead, work, token):
+    """Spring, times the ``square`` of a stage's length, and lever of every cable in a layer, whose frame is known;
+    ``ahead`` as in ``fem.cable_strings.string_stiffness``."""
+    shortest = AHEAD_SHORTEST if ahead else SHORTEST
+    if ahead:
+        square = AHEAD_FACTOR * square
     modes, cables, axes, a = tables.modes, tables.cables, work.axes, 9 * layer
     zero, one, half = fill(0.0, axes, token), fill(1.0, axes, token), fill(0.5, axes, token)
     base, first, stretch = 3 * layer * modes, 2 * modes * layer, zero
-    least = fill(SHORTEST * (tables.rest[base + 3 * modes + 2] - tables.rest[base + 2]), axes, token)
+    least = fill(shortest * (tables.rest[base + 3 * modes + 2] - tables.rest[base + 2]), axes, token)
     for k in range(2 * modes):
         kind, slope = tables.parity[k], fill(tables.gradient[first + k], axes, token)
         axis, along = (2 if kind == 0 else kind - 1), zero
