@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rich.markup import escape
 from rich.table import Table
 
 from rfdropo_bayes.deployment.loop import Snapshot
@@ -19,13 +20,13 @@ def session_table(snapshot: Snapshot, mode: str) -> Table:
         table.add_column(column, justify="left" if column in ("channel", "state") else "right")
     for drive, length in zip(snapshot.drives, snapshot.set_point, strict=True):
         if drive.reading is None:
-            table.add_row(drive.motor.channel, str(drive.motor.node), "silent", "", "", "")
+            table.add_row(escape(drive.motor.channel), str(drive.motor.node), "silent", "", "", "")
             continue
         state = drive.state
         limit = drive.motor.tension_limit_n[1]
         tension = f"{drive.tension:.2f}"
         table.add_row(
-            drive.motor.channel,
+            escape(drive.motor.channel),
             str(drive.motor.node),
             "unknown" if state is None else state.words,
             f"{1e3 * length:.2f}",

@@ -27,7 +27,7 @@ from rfdropo_bayes.policies.parity import check_exportable
 from rfdropo_bayes.policies.training_config import TrainingTable
 
 EVALUATION_SEED = 1_000_003  # cases of an evaluation are none of the episodes that training begins with
-CHECKPOINT, EPISODES = "checkpoints", "episodes.jsonl"
+CHECKPOINT, EPISODES, REPLAY = "checkpoints", "episodes.jsonl", "replay.pkl"
 LAST, BEST = "", "best_"  # what files of a checkpoint begin with
 STATE = ("known", "leg", "seconds", "diverged", "redrawn", "curve", "logged")
 """Keys of a checkpoint's state.json."""
@@ -164,8 +164,11 @@ def _begin(
                 remedy=f"see the options of {maker.__name__} in the documentation of Stable-Baselines3",
             ) from error
     model, normalisation = _load(maker, venv, table, folder, LAST, tensorboard)
-    if (folder / "replay.pkl").exists():
-        model.load_replay_buffer(folder / "replay.pkl")
+    if getattr(model, "replay_buffer", None) is not None:
+        if not (folder / REPLAY).exists():
+            remedy = "start anew with --overwrite: without what it has seen, the run would go on as another one"
+            raise InputError(f"the checkpoint has no {REPLAY}", where=str(folder), remedy=remedy)
+        model.load_replay_buffer(folder / REPLAY)
     return model, normalisation
 
 
@@ -277,7 +280,7 @@ def _save(model: Any, normalisation: Any, folder: Path, state: Mapping[str, Any]
             for path in folder.glob(f"{BEST}*"):
                 shutil.copy2(path, partial)
         if getattr(model, "replay_buffer", None) is not None:
-            model.save_replay_buffer(partial / "replay.pkl")
+            model.save_replay_buffer(partial / REPLAY)
         (partial / "state.json").write_text(json.dumps(state), encoding="utf-8")
     except OSError as error:
         shutil.rmtree(partial, ignore_errors=True)

@@ -18,6 +18,8 @@ ARGUMENTS = {
     "LogUniform": ("low", "high"),
 }
 """Prior distributions (names of numpyro) and their arguments; LogNormal's ``sigma`` is that of the logarithm."""
+ENDS = {"TruncatedNormal": ("low", "high")}
+"""Arguments that may be left out: where a normal ends, beside the hard bounds."""
 
 
 class Parameter(RobotTable):
@@ -50,15 +52,18 @@ def _check_prior(prior: dict[str, Any], low: float, high: float) -> None:
     family = prior.get("distribution")
     if family not in ARGUMENTS:
         raise ValueError(f"unknown distribution {family!r}; {nearest(str(family), ARGUMENTS)}")
-    names = ARGUMENTS[family]
-    if set(prior) - {"distribution"} != set(names):
-        raise ValueError(f"{family} takes exactly {', '.join(names)}")
-    for name in names:
+    names, given = ARGUMENTS[family], set(prior) - {"distribution"}
+    ends = ENDS.get(family, ())
+    if given - set(ends) != set(names):
+        raise ValueError(f"{family} takes {', '.join(names)}" + (f", perhaps {' and '.join(ends)}" if ends else ""))
+    for name in given:
         value = prior[name]
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ValueError(f"{name} of the prior is not a number")
         if name in ("scale", "sigma", "median") and value <= 0:
             raise ValueError(f"{name} of the prior is not positive")
+    if family == "TruncatedNormal" and not prior.get("low", low) < prior.get("high", high):
+        raise ValueError("the prior ends before it begins: low is not below high")
     if family in ("Uniform", "LogUniform"):
         inside = low <= prior["low"] < prior["high"] <= high
     else:

@@ -217,6 +217,22 @@ def test_a_checkpoint_of_other_settings_is_refused(trained, tmp_path, change, se
         train(Points, TABLE.model_copy(update=change), tmp_path, seed=seed, gamma=0.9, resume=True)
 
 
+def test_a_checkpoint_without_its_replay_buffer_is_refused(tmp_path) -> None:
+    options = {"learning_starts": 32, "net_arch": [8]}
+    shared = {
+        "algorithm": "SAC",
+        "options": options,
+        "environments": 16,
+        "evaluate_every": 64,
+        "evaluation_episodes": 2,
+    }
+    train(Points, TrainingTable(steps=64, **shared), tmp_path, seed=3, gamma=0.9)
+    (lost,) = tmp_path.rglob("replay.pkl")
+    lost.unlink()
+    with pytest.raises(InputError, match="has no replay"):
+        train(Points, TrainingTable(steps=64, **shared), tmp_path, seed=3, gamma=0.9, resume=True)
+
+
 def test_nothing_to_resume_is_an_error(tmp_path) -> None:
     with pytest.raises(InputError, match="no checkpoint"):
         train(Points, TABLE, tmp_path, seed=3, gamma=0.9, resume=True)

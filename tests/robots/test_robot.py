@@ -10,6 +10,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot, known_robots
+from rfdropo_bayes.robots.parameter import Parameter
 
 TRUNKS = ("trunk_sofa", "trunk_physical")
 ROBOTS = (*TRUNKS, "asl_trunk")
@@ -62,7 +63,7 @@ def test_unknown_robot_lists_the_known_ones():
         ("high = 0.499", "high = 0.5", "0.499"),
         ("nominal = 0.42\nlow = 0.0001", "nominal = 0.42\nlow = 0.0", "massless"),
         ('"LogNormal", median = 4e+06', '"LogNormal", median = 4e+02', "prior lies outside the bounds"),
-        ('"LogNormal", median = 4e+06', '"LogNormal", mean = 4e+06', "takes exactly median, sigma"),
+        ('"LogNormal", median = 4e+06', '"LogNormal", mean = 4e+06', "takes median, sigma"),
         ('distribution = "LogNormal"', 'distribution = "Lognormal"', "'Lognormal'; did you mean 'LogNormal'"),
     ],
 )
@@ -241,3 +242,11 @@ def test_a_variant_replaces_tables_of_its_base(tmp_path):
     path.write_text(f'base = "{path}"\n')
     with pytest.raises(InputError, match="is its own base"):
         Robot.load(path)
+
+
+def test_a_default_prior_may_end_before_the_bounds_do() -> None:
+    known = {"unit": "m", "nominal": 0.0, "low": -1.0, "high": 1.0, "description": "a length"}
+    table = {"distribution": "TruncatedNormal", "loc": 0.0, "scale": 0.1, "low": 0.0}
+    assert Parameter(**known, prior=table).prior == table
+    with pytest.raises(ValueError, match="ends before it begins"):
+        Parameter(**known, prior=table | {"high": -0.5})
