@@ -265,7 +265,7 @@ class Forward:
             self.start,
             self.lanes.fields,
             *prior,
-            *map(np.asarray, self.commands),
+            *map(np.asarray, self.commands[:4]),
         )
 
     def with_difference(self, step: float) -> Forward:

@@ -239,7 +239,7 @@ def units_said(data: DataSpec | None) -> str:
 def _shaped(sequences: Sequence[Commands], like: Commands) -> list[Commands]:
     """Sequences padded and cut to the shape of the recordings at hand, which the compiled simulator expects."""
     steps, rows = like.step.shape[1], like.sample_step.shape[1]
-    stacked = stack_commands([*sequences, Commands(*(np.asarray(part)[0] for part in like))])
+    stacked = stack_commands([*sequences, like.of(0)])
     return [
         Commands(
             np.asarray(stacked.initial)[k],
