@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.deadline import OutOfTime
-from rfdropo_bayes.audit.fit import FIRST, Fit, FitTarget, climb
+from rfdropo_bayes.audit.fit import Fit, FitTarget, climb
 from rfdropo_bayes.audit.inadequacy import as_measured, fit_with_noise
 from rfdropo_bayes.audit.port_evidence import PortEvidence, evidences
 from rfdropo_bayes.audit.ported import FeatureTable, PlacedTerm, PortedForward, placed
@@ -32,7 +32,9 @@ STOP = 10.0
 """Log evidence of a port from which on a further term is looked for: without discrepancy the most was 7.4."""
 SURE = 4.0  # deviations from zero that a coefficient must have to stay
 TERMS = 3  # of a law
-BY_EVIDENCE, BY_GAIN = 3, 4  # ports that are refitted
+BY_EVIDENCE, BY_GAIN = 3, 2  # ports and terms that are refitted
+EXCHANGES = 2  # rounds in which a term may take the place of the one that was chosen
+GLANCE = 4  # steps of a refit that only ranks
 TIED = 10.0  # nats by which a refit must be worse to be told apart from the best
 PIECES = 3  # parts of a single recording, which are left out in turn
 NULLS = 199  # simulated data sets behind the p-values of ports
@@ -76,6 +78,12 @@ class Refit:
     fit: Fit
     gain: TermGain
     score: float
+
+    @property
+    def square(self) -> float:
+        """Sum of squares that the model leaves, in deviations of the measurement's noise."""
+        left = as_measured(self.target, self.fit).residual
+        return float(left @ left)
 
 
 @dataclass(frozen=True)
@@ -219,7 +227,7 @@ class LawSearch:
                 if not refits or refits[0].score <= 0.0:
                     break
                 tried = tried or refits
-                best = self._climbed(refits[0])
+                best = self._exchanged(known, terms, found, values, refits[0])
                 if not _sure(best):
                     break
                 terms.append(best)
@@ -257,6 +265,39 @@ class LawSearch:
                 rows.append(TermGain(port, self.table.features[k], float(gain[k]), float(share[k]), *parts))
         return sorted(rows, key=lambda row: -row.gain)
 
+    def _exchanged(
+        self, known: FitTarget, terms: Sequence[Refit], found: Responses, values: np.ndarray, chosen: Refit
+    ) -> Refit:
+        """A term climbed to its end, or another one in its place.
+
+        The base model has made up for a part of what it lacks, and the linear model does not see how far it goes back
+        with a law. With a law in the model the base parameters are nearer to the truth: there the terms are ranked anew.
+        """
+        best, tried = self._climbed(chosen), {(chosen.term.port, chosen.term.feature)}
+        for _ in range(EXCHANGES):
+            fit = as_measured(best.target, best.fit)
+            without = fit.x.copy()
+            without[-1] = 0.0
+            residual = best.target.measured.residual(without[None])[0]
+            bare = replace(fit, x=without[:-1], free=fit.free[:-1], residual=residual, jacobian=fit.jacobian[:, :-1],
+                           covariance=fit.covariance[:-1, :-1])  # fmt: skip
+            ranked = self._ranked(_relinearised(known, found, bare), values)
+            fresh = [row for row in ranked if (row.port, row.feature) not in tried][:BY_GAIN]
+            tried |= {(row.port, row.feature) for row in fresh}
+            others = [self._refit(known, terms, bare, row) for row in fresh]
+            better = max(others, key=lambda refit: refit.score, default=best)
+            if better.square >= best.square - 2.0:
+                break
+            self.report(f"instead: {better.term.port.name}: {better.term.feature.formula(self.units[0])}")
+            best = self._climbed(better)
+        before = chosen.square + 2.0 * (chosen.score + self._cost(known))
+        return replace(best, score=0.5 * (before - best.square) - self._cost(known))
+
+    def _cost(self, known: FitTarget) -> float:
+        """Nats that a term costs: its parameter, and the choice among all features at all ports."""
+        count = max(float(np.sum(known.measurements.valid)), 2.0)
+        return float(0.5 * np.log(count) + np.log(len(self.ports.ports) * len(self.table.features)))
+
     def _refits(
         self, known: FitTarget, terms: Sequence[Refit], fit: Fit, where: Sequence[PortEvidence], ranked: list[TermGain]
     ) -> list[Refit]:
@@ -264,19 +305,18 @@ class LawSearch:
         by_port: dict[Port, TermGain] = {}
         for row in ranked:
             by_port.setdefault(row.port, row)
-        chosen = list(by_port.values())[:BY_GAIN]
+        chosen = list(by_port.values())[: BY_GAIN + 1]
         chosen += [by_port[row.port] for row in where[:BY_EVIDENCE] if row.port in by_port]
         chosen += ranked[:BY_GAIN]
-        choices = len(self.ports.ports) * len(self.table.features)
         refits = []
         for row in dict.fromkeys(chosen):
-            found = self._refit(known, terms, fit, row, choices)
+            found = self._refit(known, terms, fit, row)
             refits.append(found)
             words = f"{row.port.name}: {row.feature.formula(self.units[0])}"
             self.report(f"refit with {words}: left-out gain {row.gain:.1f}, score {found.score:.1f}")
         return sorted(refits, key=lambda refit: -refit.score)
 
-    def _refit(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, row: TermGain, choices: int) -> Refit:
+    def _refit(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, row: TermGain) -> Refit:
         """The model with one more term, climbed a few steps from where the linear model has it."""
         names, unit = self.units
         term = placed(row.port, row.feature, row.typical, names, unit)
@@ -286,10 +326,9 @@ class LawSearch:
         start = np.append(fit.x, np.clip(row.size / scale, -FARTHEST, FARTHEST))
         free = np.append(fit.free, len(start) - 1)
         target = replace(known, forward=forward)
-        found = climb(target, start, free, evaluations=FIRST)
-        before, after = (float(r @ r) for r in (fit.residual, found.residual))
-        cost = 0.5 * np.log(max(np.count_nonzero(fit.residual), 2)) + np.log(choices)
-        return Refit(term, target, found, row, 0.5 * (before - after) - cost)
+        found = climb(target, start, free, evaluations=GLANCE)
+        gained = float(fit.residual @ fit.residual - found.residual @ found.residual)
+        return Refit(term, target, found, row, 0.5 * gained - self._cost(known))
 
     def _climbed(self, refit: Refit) -> Refit:
         """The same, climbed to its end."""

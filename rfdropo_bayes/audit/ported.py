@@ -114,7 +114,10 @@ def signals_of(ports: PortMap, acting: Sequence[tuple[Port, Signals]]) -> Any:
 
 
 def as_sensed(
-    acting: Sequence[tuple[Port, Signals]], position: Float[np.ndarray, "lane time marker 3"], commands: Commands, dt: float
+    acting: Sequence[tuple[Port, Signals]],
+    position: Float[np.ndarray, "lane time marker 3"],
+    commands: Commands,
+    dt: float,
 ) -> np.ndarray:
     """Positions as they are measured with signals at ports of sensing."""
     time = np.asarray(observed_at(commands, dt))
@@ -212,7 +215,9 @@ def placed(port: Port, feature: Feature, size: float, channels: Sequence[str], u
     name = f"law_{at.replace(' ', '_')}{shape}"
     words = f"of the law at {port.name}: it changes {feature.words(channels)}"
     return PlacedTerm(
-        port, feature, ParameterSpec(name, unit_of(port.unit, feature, unit), -FAR * scale, FAR * scale, 0.0, normal(scale), words)
+        port,
+        feature,
+        ParameterSpec(name, unit_of(port.unit, feature, unit), -FAR * scale, FAR * scale, 0.0, normal(scale), words),
     )
 
 

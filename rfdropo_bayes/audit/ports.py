@@ -171,4 +171,3 @@ def feature_columns(
 def signal_sizes(features: Float[np.ndarray, "group feature row"]) -> Float[np.ndarray, " feature"]:
     """Root mean square of features over all recordings."""
     return np.sqrt(np.mean(features**2, axis=(0, 2)))
-

@@ -92,9 +92,7 @@ class Feature(NamedTuple):
             return first[self.channels[0]] * first[self.channels[1]]
         return jnp.ones((), first.dtype) if self.kind == "constant" else jnp.zeros((), first.dtype)
 
-    def advance(
-        self, memory: Any, given: Float[Array, " channel"], interval: float
-    ) -> tuple[Any, Float[Array, ""]]:
+    def advance(self, memory: Any, given: Float[Array, " channel"], interval: float) -> tuple[Any, Float[Array, ""]]:
         """Memory and value at the end of a step of so many seconds, given the command that has been reached."""
         own = [given[k] for k in self.channels]
         if self.kind not in ("time", "rate", "direction", "low_pass", "play", "largest", "travelled"):

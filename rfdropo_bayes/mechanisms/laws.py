@@ -21,7 +21,7 @@ from rfdropo_bayes.mechanisms.ports import Port, PortMap, sensed
 from rfdropo_bayes.simulators.commands import sample
 from rfdropo_bayes.simulators.mechanisms import Meanwhile, Mechanism, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
-from rfdropo_bayes.simulators.ports import BodySignals
+from rfdropo_bayes.simulators.ports import BodySignals, read_late
 
 WHERE = "[[model.laws]]"
 FAR = 1e3  # prior scales to each side of null, where a coefficient's hard bounds are
@@ -64,13 +64,14 @@ class Law:
         port: where it acts.
         terms: what it is made of.
         ports: all ports of the robot.
+        formula: in symbols, for its name.
     """
 
     stage: str
 
-    def __init__(self, port: Port, terms: Sequence[Term], ports: PortMap) -> None:
+    def __init__(self, port: Port, terms: Sequence[Term], ports: PortMap, formula: str = "") -> None:
         self.port, self.terms, self._ports = port, tuple(terms), ports
-        self.name = f"law at {port.name}"
+        self.name = f"law at {port.name}: {formula}" if formula else f"law at {port.name}"
         self.parameters = tuple(term.spec for term in terms)
         self.cause = f"something acts at {port.name} by a law that stands for no mechanism of the library"
         self.remedy = f"look at {port.look}"
@@ -134,8 +135,6 @@ class DelayLaw(Law):
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
     ) -> Float[Array, "step channel"]:
         """See `ActuationMechanism`."""
-        from rfdropo_bayes.simulators.ports import read_late
-
         levels = jnp.concatenate([jnp.asarray(initial, command.dtype)[None], command])
         return read_late(levels, self.signal(values, levels, time_step) / time_step)[1:]
 
@@ -146,9 +145,7 @@ class BodyLaw(Law):
     stage = "body"
     bodies = ("layered",)
 
-    def push(
-        self, values: Values, command: Float[Array, "row channel"], time_step: float, places: int
-    ) -> BodySignals:
+    def push(self, values: Values, command: Float[Array, "row channel"], time_step: float, places: int) -> BodySignals:
         """See `PushingMechanism`."""
         return self._ports.push(self.port, self.signal(values, command, time_step))
 
@@ -197,16 +194,16 @@ class ClockedSensingLaw(Law):
         return sum((values[t.spec.name] * own[t.feature.kind] for t in self.terms), jnp.zeros_like(time))
 
 
-def law_at(port: Port, terms: Sequence[Term], ports: PortMap) -> Mechanism:
+def law_at(port: Port, terms: Sequence[Term], ports: PortMap, formula: str = "") -> Mechanism:
     """The law of these terms at a port, in the form that its stage has."""
     if port.kind == "cable":
-        return CableLaw(port, terms, ports)
+        return CableLaw(port, terms, ports, formula)
     if port.kind == "delay":
-        return DelayLaw(port, terms, ports)
+        return DelayLaw(port, terms, ports, formula)
     if port.stage == "body":
-        return BodyLaw(port, terms, ports)
+        return BodyLaw(port, terms, ports, formula)
     of_time = all(not KINDS[term.feature.kind].channels for term in terms)
-    return (ClockedSensingLaw if of_time and port.kind != "observation" else SensingLaw)(port, terms, ports)
+    return (ClockedSensingLaw if of_time and port.kind != "observation" else SensingLaw)(port, terms, ports, formula)
 
 
 def make_law(choice: LawChoice, ports: PortMap, channels: Sequence[str], command_unit: str) -> Mechanism:
@@ -233,4 +230,5 @@ def make_law(choice: LawChoice, ports: PortMap, channels: Sequence[str], command
     names = [term.spec.name for term in terms]
     if len(set(names)) < len(names):
         raise InputError("two terms share a coefficient", where=where, remedy="name each after what it does")
-    return law_at(port, terms, ports)
+    formula = " + ".join(f"{term.spec.name} {term.feature.formula(channels)}" for term in terms)
+    return law_at(port, terms, ports, formula)

@@ -17,6 +17,7 @@ from rfdropo_bayes.bayes.channels import Weighed
 from rfdropo_bayes.data import DataSpec
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns
+from rfdropo_bayes.mechanisms.laws import LawChoice
 from rfdropo_bayes.mechanisms.registry import MechanismChoice, choose_mechanisms
 from rfdropo_bayes.model.experiment import (
     AuditTable,
@@ -24,6 +25,7 @@ from rfdropo_bayes.model.experiment import (
     DesignTable,
     Experiment,
     InferenceTable,
+    LawTable,
     NoiseModel,
     NoiseTable,
     SeparationTable,
@@ -132,7 +134,11 @@ class ModelSpec:
         }
         model = {"noise": self.noise, **{key: value for key, value in given.items() if value}}
         rest = {"noise": self.stated, "simulator": self.simulator}
-        return {**_dumped(rest), "model": {**model, "mechanisms": list(self.sources)}}
+        laws = [choice.kind for choice in self.mechanisms if isinstance(choice.kind, LawChoice)]
+        if laws:
+            model["laws"] = [{"port": law.port, "terms": [dict(term) for term in law.terms]} for law in laws]
+        named = [choice.source for choice in self.mechanisms if not isinstance(choice.kind, LawChoice)]
+        return {**_dumped(rest), "model": {**model, "mechanisms": named}}
 
 
 @dataclass(frozen=True)
@@ -200,7 +206,7 @@ def spec_of(
     return ModelSpec(
         robot=find_robot(experiment.robot, folder) if robot is None else robot,
         named=experiment.robot if robot is None else "",
-        mechanisms=choose_mechanisms(asked, folder=folder),
+        mechanisms=(*choose_mechanisms(asked, folder=folder), *(law_choice(law) for law in table.laws)),
         simulator=experiment.simulator,
         priors=table.priors,
         fixed=table.fixed,
@@ -214,6 +220,12 @@ def spec_of(
         weighed=tuple(Weighed(tuple(entry.parameters), entry.value, entry.sd) for entry in table.weighed),
         folder=folder,
     )
+
+
+def law_choice(table: LawTable) -> MechanismChoice:
+    """A law of a file as one of the model's mechanisms."""
+    terms = tuple(term.model_dump(exclude_none=True, exclude_defaults=True) for term in table.terms)
+    return MechanismChoice(f"law at {table.port}", LawChoice(table.port, terms))
 
 
 def find_robot(name: str, folder: Path) -> Robot:

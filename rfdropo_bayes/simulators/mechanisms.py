@@ -126,9 +126,7 @@ class CommandedSensingMechanism(Mechanism, Protocol):
 class PushingMechanism(Mechanism, Protocol):
     """Acts on a layered body from step to step, in a way that depends on time and on what is commanded."""
 
-    def push(
-        self, values: Values, command: Float[Array, "row channel"], time_step: float, places: int
-    ) -> BodySignals:
+    def push(self, values: Values, command: Float[Array, "row channel"], time_step: float, places: int) -> BodySignals:
         """Return what acts on the body, given the commands that reach the cables; row 0 is before the first step."""
 
 

@@ -7,7 +7,7 @@ need no rollout (see `mechanisms.laws`).
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jaxtyping import Array, Float
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.fit import FitTarget
-from rfdropo_bayes.audit.pipeline import measurements_of, simulated
+from rfdropo_bayes.audit.problem import measurements_of, simulated
 from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
@@ -133,9 +133,7 @@ EFFECTS: dict[str, Effect] = {
         ("cable right",),
         ("travelled",),
         lambda a, s: {
-            "command": _channel(
-                3, -0.05 * a * jnp.cumsum(jnp.abs(jnp.diff(s.levels[:, 3], prepend=s.levels[:1, 3])))
-            )
+            "command": _channel(3, -0.05 * a * jnp.cumsum(jnp.abs(jnp.diff(s.levels[:, 3], prepend=s.levels[:1, 3]))))
         },
     ),
     "one_lagging_cable": Effect(
@@ -155,9 +153,7 @@ EFFECTS: dict[str, Effect] = {
     "softening_by_use": Effect(
         ("stiffness",),
         ("largest", "travelled", "time"),
-        lambda a, s: {
-            "stiffness": -10.0 * a * jax.lax.cummax(jnp.linalg.norm(s.tip[:, :2] - s.tip[:1, :2], axis=1))
-        },
+        lambda a, s: {"stiffness": -10.0 * a * jax.lax.cummax(jnp.linalg.norm(s.tip[:, :2] - s.tip[:1, :2], axis=1))},
         moves=True,
     ),
     "sliding_marker": Effect(("marker m3 along the body", "marker m3 z"), ("time",), sees=_slide),
