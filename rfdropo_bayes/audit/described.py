@@ -32,8 +32,8 @@ class Described:
         found: ports and law.
         beside: mechanisms that the law stands beside, in the model.
         stand_ins: mechanisms of the library that the law takes the place of.
-        gain: of the law on recordings that no fit has seen, against the model without it; None where there is no law, or
-            the time was up.
+        gain: of the law on recordings that no fit has seen, against the model without it; None where there is no
+            law, or the time was up.
         overall: the same against the base model.
         held_out: predictions of these recordings: of the base model, and last of the model with the law.
         holds: whether unseen recordings clearly support the law.
@@ -95,9 +95,9 @@ def describe(
         if not steps:
             return answer
         names = tuple(step.name for step in steps)
-        if answer.holds and held_out is not None and answer.held_out is not None:
-            if answer.held_out.beside(held_out.after(len(steps))).clear:
-                return replace(answer, stand_ins=names)
+        seen = answer.held_out if answer.holds else None
+        if held_out is not None and seen is not None and seen.beside(held_out.after(len(steps))).clear:
+            return replace(answer, stand_ins=names)
         further = _beside(problem, Model(steps[-1].judge, steps[-1].fit, tuple(steps)), judge, base, report)
         return replace(further, beside=names) if further.holds else replace(answer, holds=False, beside=())
     return answer

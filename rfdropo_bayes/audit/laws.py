@@ -34,6 +34,7 @@ SURE = 4.0  # deviations from zero that a coefficient must have to stay
 TERMS = 3  # of a law
 BY_EVIDENCE, BY_GAIN = 3, 2  # ports and terms that are refitted
 EXCHANGES = 2  # rounds in which a term may take the place of the one that was chosen
+FRESH = 3  # terms that are refitted in each round
 GLANCE = 4  # steps of a refit that only ranks
 TIED = 10.0  # nats by which a refit must be worse to be told apart from the best
 PIECES = 3  # parts of a single recording, which are left out in turn
@@ -154,15 +155,19 @@ def _sums(found: Responses, columns: Float[np.ndarray, "group value feature"]) -
     )
 
 
-def left_out_gains(sums: _Sums) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def left_out_gains(
+    sums: _Sums, precision: Float[np.ndarray, "d d"] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Gain [nat], share, size and deviation of every feature, each alone beside the base parameters.
 
-    The prior of the base parameters, of unit deviation in these columns, holds what no data determine.
+    The prior of the base parameters holds what no data determine; its ``precision`` is one in these columns, unless
+    more is known of them.
     """
-    dimension, before, gain = sums.jj.shape[1], 0.0, np.zeros(sums.xx.shape[1])
+    before, gain = 0.0, np.zeros(sums.xx.shape[1])
+    held = np.eye(sums.jj.shape[1]) if precision is None else precision
     for p in range(len(sums.yy)):
         others = [part.sum(axis=0) - part[p] for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
-        b, u, c, _ = _solved(*others, dimension)
+        b, u, c, _ = _solved(*others, held)
         left_j = sums.jy[p] - sums.jj[p] @ b
         left_x = sums.xy[p] - sums.jx[p].T @ b
         along = left_x - u.T @ left_j
@@ -170,15 +175,15 @@ def left_out_gains(sums: _Sums) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
         gain += 2.0 * c * along - c**2 * square
         before += sums.yy[p] - 2.0 * float(b @ sums.jy[p]) + float(b @ sums.jj[p] @ b) - sums.count[p]
     whole = [part.sum(axis=0) for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
-    _, _, size, sd = _solved(*whole, dimension)
+    _, _, size, sd = _solved(*whole, held)
     return 0.5 * gain, gain / max(before, 1e-300), size, sd
 
 
 def _solved(
-    jj: np.ndarray, jx: np.ndarray, xx: np.ndarray, jy: np.ndarray, xy: np.ndarray, dimension: int
+    jj: np.ndarray, jx: np.ndarray, xx: np.ndarray, jy: np.ndarray, xy: np.ndarray, precision: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Base parameters alone, what they take of every feature, and each feature's coefficient and deviation."""
-    prior = jj + np.eye(dimension)
+    prior = jj + precision
     b, u = np.linalg.solve(prior, jy), np.linalg.solve(prior, jx)
     left = xx - np.sum(u * jx, axis=0)
     seen = left > COLLINEAR * np.maximum(xx, 1e-300)
@@ -254,12 +259,14 @@ class LawSearch:
         draws = null_residuals(known.measurements, known.noise, found.base, len(fit.free), rng, NULLS)
         return evidences(found, draws[:, : found.residual.size])
 
-    def _ranked(self, found: Responses, values: np.ndarray) -> list[TermGain]:
-        """All features at all ports that pass the gate, the largest gain first."""
+    def _ranked(
+        self, found: Responses, values: np.ndarray, precision: Float[np.ndarray, "d d"] | None = None
+    ) -> list[TermGain]:
+        """All features at all ports that pass the gate, the largest gain first; see `left_out_gains`."""
         sizes, rows = signal_sizes(values), []
         for port in found.whitened:
             columns = feature_columns(found, port, values / np.maximum(sizes, 1e-300)[:, None])
-            gain, share, size, sd = left_out_gains(_sums(found, columns))
+            gain, share, size, sd = left_out_gains(_sums(found, columns), precision)
             for k in np.flatnonzero((gain >= GATE) & (share >= LEAST)):
                 parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
                 rows.append(TermGain(port, self.table.features[k], float(gain[k]), float(share[k]), *parts))
@@ -271,7 +278,8 @@ class LawSearch:
         """A term climbed to its end, or another one in its place.
 
         The base model has made up for a part of what it lacks, and the linear model does not see how far it goes back
-        with a law. With a law in the model the base parameters are nearer to the truth: there the terms are ranked anew.
+        with a law. With a law in the model the base parameters are nearer to the truth. There the terms are ranked
+        anew, with base parameters held to what is then known of them.
         """
         best, tried = self._climbed(chosen), {(chosen.term.port, chosen.term.feature)}
         for _ in range(EXCHANGES):
@@ -281,8 +289,9 @@ class LawSearch:
             residual = best.target.measured.residual(without[None])[0]
             bare = replace(fit, x=without[:-1], free=fit.free[:-1], residual=residual, jacobian=fit.jacobian[:, :-1],
                            covariance=fit.covariance[:-1, :-1])  # fmt: skip
-            ranked = self._ranked(_relinearised(known, found, bare), values)
-            fresh = [row for row in ranked if (row.port, row.feature) not in tried][:BY_GAIN]
+            linear = _relinearised(known, found, bare)
+            ranked = self._ranked(linear, values, _precision(known, bare))
+            fresh = [row for row in ranked if (row.port, row.feature) not in tried][:FRESH]
             tried |= {(row.port, row.feature) for row in fresh}
             others = [self._refit(known, terms, bare, row) for row in fresh]
             better = max(others, key=lambda refit: refit.score, default=best)
@@ -344,13 +353,24 @@ def _sure(refit: Refit) -> bool:
     return bool(abs(refit.fit.x[-1]) > SURE * np.sqrt(refit.fit.covariance[-1, -1]))
 
 
+def _scale(known: FitTarget, fit: Fit) -> Float[np.ndarray, " free"]:
+    """Prior deviations of a fit's parameters; coefficients of laws have their own as a unit."""
+    base = fit.free < len(known.forward.coordinates.names)
+    return np.append(known.forward.coordinates.prior_sd[fit.free[base]], np.ones(np.count_nonzero(~base)))
+
+
+def _precision(known: FitTarget, fit: Fit) -> Float[np.ndarray, "free free"]:
+    """What is known of a fit's parameters, in deviations of their priors."""
+    scale = _scale(known, fit)
+    return np.linalg.inv(fit.covariance / np.outer(scale, scale))
+
+
 def _relinearised(known: FitTarget, found: Responses, fit: Fit) -> Responses:
     """The same responses beside the residual and the slopes of another fit, the coefficients of laws among them."""
     groups = found.residual.shape[0]
     white = known.measurements.series(fit.residual).reshape(groups, -1)
     slopes = known.measurements.series(fit.jacobian.T).reshape(len(fit.free), groups, -1)
-    base = fit.free < len(known.forward.coordinates.names)
-    scale = np.append(known.forward.coordinates.prior_sd[fit.free[base]], np.ones(np.count_nonzero(~base)))
+    scale = _scale(known, fit)
     return replace(found, residual=white, jacobian=np.moveaxis(slopes * scale[:, None, None], 0, 2))
 
 

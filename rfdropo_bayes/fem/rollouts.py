@@ -63,7 +63,7 @@ def roll(
     """Rollout of any body, given how it takes a step to commanded cable displacements [m].
 
     Args:
-        displacement: (rows, substeps, cables), or a tree of arrays (rows, substeps, ...) of which a step takes its part.
+        displacement: (rows, substeps, cables), or a tree of arrays (rows, substeps, ...) of which a step takes a part.
         horizon: rows to compute; later ones are zero. It may be traced: one compilation serves every prefix, rows
             beyond it cost nothing, and there is no reverse mode. None computes all, in reverse mode, too.
     """

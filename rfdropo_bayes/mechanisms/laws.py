@@ -104,7 +104,7 @@ class CableLaw(Law):
     def settle(self, values: Values, held: Float[Array, " channel"]) -> Float[Array, " channel"]:
         """See `ActuationMechanism`."""
         w = sum((values[term.spec.name] * term.feature.at_rest(held) for term in self.terms), jnp.zeros(()))
-        return held.at[self.port.index].add(w)
+        return held.at[self.port.number].add(w)
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Any, ...]:
         """See `SteppedMechanism`."""
@@ -115,14 +115,14 @@ class CableLaw(Law):
     ) -> tuple[tuple[Any, ...], Float[Array, " channel"]]:
         """Add the signal of a step."""
         memory, w = self._advance(values, memory, given, now)
-        return memory, given.at[self.port.index].add(w)
+        return memory, given.at[self.port.number].add(w)
 
     def actuate(
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
     ) -> Float[Array, "step channel"]:
         """See `ActuationMechanism`."""
         levels = jnp.concatenate([jnp.asarray(initial, command.dtype)[None], command])
-        return command.at[:, self.port.index].add(self.signal(values, levels, time_step)[1:])
+        return command.at[:, self.port.number].add(self.signal(values, levels, time_step)[1:])
 
 
 class DelayLaw(Law):

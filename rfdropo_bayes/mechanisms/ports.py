@@ -27,7 +27,7 @@ class Port(NamedTuple):
         name: as in a file, such as "cable left" or "marker m3 along".
         stage: "actuation", "body" or "sensing".
         kind: what it is a port of.
-        index: which one of its kind: a channel, a place or a marker.
+        number: which one of its kind: a channel, a place or a marker.
         axis: 0 to 2, and 3 along the body; -1 where there is none.
         unit: of the signal.
         size: of an effect that a laboratory might see: the scale of priors and of differences.
@@ -37,7 +37,7 @@ class Port(NamedTuple):
     name: str
     stage: str
     kind: str
-    index: int
+    number: int
     axis: int
     unit: str
     size: float
@@ -78,7 +78,7 @@ class PortMap(NamedTuple):
         """A signal at a port of actuation or of the body, as a rollout takes it."""
         none = self.silent(len(w))
         if port.kind == "cable":
-            return none._replace(command=none.command.at[:, port.index].set(w))
+            return none._replace(command=none.command.at[:, port.number].set(w))
         if port.kind == "delay":
             return none._replace(delay=w)
         assert none.body is not None
@@ -93,7 +93,7 @@ class PortMap(NamedTuple):
         if port.kind == "damping":
             return none._replace(damping=w)
         if port.kind == "force":
-            return none._replace(force=none.force.at[:, port.index, port.axis].set(w))
+            return none._replace(force=none.force.at[:, port.number, port.axis].set(w))
         axis = jnp.eye(3)[port.axis]
         return none._replace(gravity=w[:, None] * jnp.cross(axis, jnp.asarray(self.gravity)))
 
@@ -106,8 +106,8 @@ def sensed(
         return read_at(position, time, time - w)
     axis, w = jnp.eye(3)[min(max(port.axis, 0), 2)], w[:, None]
     if port.kind == "marker":
-        moved = w * (direction_along(position)[:, port.index] if port.axis == 3 else axis)
-        return position.at[:, port.index].add(moved)
+        moved = w * (direction_along(position)[:, port.number] if port.axis == 3 else axis)
+        return position.at[:, port.number].add(moved)
     if port.kind == "camera":
         return position + w[:, None] * axis
     if port.kind == "turn":
@@ -128,15 +128,15 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
         left_out["cables, command delay"] = "the simulator takes no signals"
     else:
         ports += _of_actuation(channels, getattr(simulator, "command_unit", "m"))
-    carries = engine is not None and engine.carries_loads
-    gravity = tuple(float(g) for g in robot.gravity) if carries and robot is not None else (0.0, 0.0, 0.0)
-    if carries:
-        ports += _of_body(len(engine.load_stations), gravity)
+    gravity, places = (0.0, 0.0, 0.0), 0
+    if engine is not None and robot is not None and engine.carries_loads:
+        places = len(engine.load_stations)
+        gravity = (float(robot.gravity[0]), float(robot.gravity[1]), float(robot.gravity[2]))
+        ports += _of_body(places, gravity)
     else:
         body = BLACK_BOX if engine is None else f"a body of {BODIES[1]}, or one before a cube,"
         left_out["forces, stiffness, damping, base tilt"] = f"{body} takes no signals"
     ports += _of_sensing(markers)
-    places = len(engine.load_stations) if carries else 0
     return PortMap(tuple(ports), left_out, len(channels), places, gravity)
 
 

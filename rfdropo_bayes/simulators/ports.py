@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 
 class BodySignals(NamedTuple):
-    """What acts on a layered body from step to step; forces at the engine's `load_stations`. See `fem.section_loads`."""
+    """What acts on a layered body from step to step, see `fem.section_loads`; forces at the engine's stations."""
 
     force: Float[Array, "*batch row place 3"]  # [N]
     stiffness: Float[Array, "*batch row"]  # logarithm of a factor
@@ -41,7 +41,7 @@ def reached(
     command: Float[Array, "step channel"],
     time_step: float,
 ) -> tuple[Float[Array, " channel"], Float[Array, "step channel"]]:
-    """Commands that reach the cables before the first step and at the end of every step, given those without signals."""
+    """Commands that reach the cables before the first step and at the end of each, given those without signals."""
     import jax.numpy as jnp
 
     late = read_late(jnp.concatenate([initial[None], command]), signals.delay / time_step) + signals.command

@@ -1,5 +1,5 @@
-"""Effects that no mechanism of the library has, hidden in recordings of an arm: where, and by what law, does the audit say
-that they act? Each is written here as a law, in code that the audit never sees.
+"""Effects that no mechanism of the library has, hidden in recordings of an arm: where, and by what law, does the audit
+say that they act? Each is written here as a law, in code that the audit never sees.
 
 Three repeats of one random command and three recordings of others are fitted, four more are untouched. Data come from a
 finer mesh and time step than the audit's own. Sizes are rho, see `hidden_effects`.
