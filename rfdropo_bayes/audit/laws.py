@@ -18,7 +18,7 @@ from rfdropo_bayes.audit.fit import Fit, FitTarget, climb
 from rfdropo_bayes.audit.inadequacy import as_measured, fit_with_noise
 from rfdropo_bayes.audit.port_evidence import PortEvidence, evidences
 from rfdropo_bayes.audit.ported import FeatureTable, PlacedTerm, PortedForward, placed
-from rfdropo_bayes.audit.ports import Responses, feature_columns, responses, signal_sizes
+from rfdropo_bayes.audit.ports import Responses, feature_columns, responses, signal_sizes, with_exact_columns
 from rfdropo_bayes.audit.screen import null_residuals
 from rfdropo_bayes.mechanisms.features import Feature, dictionary
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
@@ -226,6 +226,7 @@ class LawSearch:
         first, terms, tried, gains = where, list[Refit](), list[Refit](), list[TermGain]()
         try:
             while len(terms) < TERMS and self._acts(where):
+                found = found if terms else self._sharpened(known, fit, found, values, where)
                 ranked = self._ranked(found, values)
                 gains = gains or ranked
                 refits = self._refits(known, terms, fit, where, ranked)
@@ -245,6 +246,16 @@ class LawSearch:
         ties = [r for r in tried[1:] if r.score > tried[0].score - TIED]
         last = where[0] if terms else None
         return FoundLaw(first, dict(self.ports.left_out), terms, ties, last, tried, found.basis.centre, gains)
+
+    def _sharpened(
+        self, known: FitTarget, fit: Fit, found: Responses, values: np.ndarray, where: Sequence[PortEvidence]
+    ) -> Responses:
+        """Responses with exact columns at the ports that lead by evidence or gain, and at all that need no rollouts."""
+        by_gain = dict.fromkeys(row.port for row in self._ranked(found, values))
+        leading = [row.port for row in where[:BY_EVIDENCE]] + list(by_gain)[:BY_GAIN]
+        chosen = [p for p in found.whitened if p.stage == "sensing" or p in leading]
+        sizes = np.maximum(signal_sizes(values), 1e-300)[:, None]
+        return with_exact_columns(known, fit, found, chosen, values / sizes)
 
     def _acts(self, where: Sequence[PortEvidence]) -> bool:
         return where[0].log_evidence >= STOP and where[0].adjusted_p <= self.family

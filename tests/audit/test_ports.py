@@ -92,9 +92,9 @@ def brute(found: Responses, column: np.ndarray) -> float:
         jj, yy, xx = (np.concatenate([part[k] for k in others]) for part in (j, y, x))
         ridge = np.eye(jj.shape[1])
 
-        def left(design, held, own, ridge=ridge, yy=yy):
+        def left(design, held, own, yy=yy, own_y=y[p]):
             fit = np.linalg.solve(design.T @ design + held, design.T @ yy)
-            return float(np.sum((y[p] - own @ fit) ** 2))
+            return float(np.sum((own_y - own @ fit) ** 2))
 
         wider = np.zeros((jj.shape[1] + 1,) * 2)
         wider[:-1, :-1] = ridge
