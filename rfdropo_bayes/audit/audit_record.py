@@ -10,12 +10,13 @@ import numpy as np
 from rfdropo_bayes.audit.candidates import spoken
 from rfdropo_bayes.audit.extension import DISCRETISATION, Added
 from rfdropo_bayes.audit.gain import LEVELS, noise_distance
+from rfdropo_bayes.audit.law_words import law_record, ports_record
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.prequential import in_words, prequential
 from rfdropo_bayes.audit.score import likeness
 from rfdropo_bayes.audit.screen import Screen, ScreenRow
 from rfdropo_bayes.audit.sentence import sentence
-from rfdropo_bayes.audit.verdict import NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED
+from rfdropo_bayes.audit.verdict import NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS
 from rfdropo_bayes.bayes.space import SEPARATOR, force_power
 
@@ -79,6 +80,8 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         },
         "where": _where(answer),
         "base_parameters": _parameters(answer, answer.base.free, answer.base.x),
+        "ports": ports_record(answer),
+        "law": law_record(answer),
         "next_experiment": next_experiment,
         "rollouts": answer.cost.rollouts,
         "seconds": round(answer.cost.seconds, 2),
@@ -109,6 +112,11 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
     apart = next((step for step in answer.causes.steps if len(step.members) > 1), None)
     if answer.verdict == NO_DISCREPANCY:
         words = "Nothing is to be mended for commands like these; record larger and faster ones, and audit them."
+    elif answer.verdict == NEGLIGIBLE:
+        words = "Nothing need be done: what is left is too small to matter."
+    elif answer.law is not None:
+        looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in answer.law.found.terms))
+        words = f"Look at {looks}: the library has no mechanism that acts so."
     elif not answer.fitted:
         words = "Nothing yet: raise [audit] minutes and go on with --resume, or start anew from a calibration (--base)."
     elif not answer.base.converged:

@@ -52,6 +52,7 @@ class Rules:
         minutes: for the whole audit; when they are up it finishes with what it knows.
         base_passes, extended_passes: p-values of the joint test from which a model is let pass.
         explained, significant: shares of the discrepancy for "explained" and for "partly explained".
+        matters: distance of a marker [m] below which a discrepancy does not; None where nobody says.
     """
 
     family: float = 0.02
@@ -66,6 +67,7 @@ class Rules:
     extended_passes: float = 0.05
     explained: float = 0.8
     significant: float = 0.2
+    matters: float | None = None
 
 
 @dataclass(frozen=True)

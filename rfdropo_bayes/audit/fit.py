@@ -168,6 +168,10 @@ class FitTarget:
         """
         return np.asarray(self._errors(self.forward.observe_one(x))[0])
 
+    def shown_errors(self, shown: Fields) -> Float[np.ndarray, "group time column"]:
+        """Measured less simulated readings, given what one point shows."""
+        return np.asarray(self._errors(shown)[0])
+
     def error_slopes(
         self, points: Float[np.ndarray, "k d"], directions: Float[np.ndarray, "k d"]
     ) -> tuple[Float[np.ndarray, "k group time column"], Float[np.ndarray, " k"]]:

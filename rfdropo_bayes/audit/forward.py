@@ -265,7 +265,7 @@ class Forward:
             self.start,
             self.lanes.fields,
             *prior,
-            *map(np.asarray, self.commands),
+            *map(np.asarray, self.commands[:4]),
         )
 
     def with_difference(self, step: float) -> Forward:
@@ -285,8 +285,9 @@ class Forward:
         """
         points = np.atleast_2d(points)
         theta = self.coordinates.physical_values(points, self.slots)
-        flat, start, commands = self._per_lane(theta)
-        once, again = distinct([np.tile(np.arange(self.count), len(theta)), flat])
+        flat, start, commands = self._per_lane(theta, points)
+        beside = np.repeat(self._beside(points), self.count, axis=0)
+        once, again = distinct([np.tile(np.arange(self.count), len(theta)), flat, beside])
         began = time.monotonic()
         every = self.commands.step.shape[1]
         steps = None if rows is None else min(int(self.commands.sample_step[:, :rows].max()) + 1, every)
@@ -296,6 +297,7 @@ class Forward:
             self.pace = (time.monotonic() - began) / (-(-len(status) // self.lanes.width) * self.lanes.width)
         self.rollouts += len(status)
         status, found = status[again], {name: part[again] for name, part in found.items()}
+        found = self._as_seen(found, theta, points)
         fine = status == Result.OK
         for name in self.lanes.fields:
             fine &= np.isfinite(found[name][:, :rows]).reshape(len(fine), -1).all(axis=1)
@@ -319,7 +321,7 @@ class Forward:
         at null."""
         theta = self.coordinates.physical_values(points, self.slots)
         tangent = self.coordinates.physical_tangents(points, directions, self.slots)
-        flat, start, commands = self._per_lane(theta)
+        flat, start, commands = self._per_lane(theta, points)
         along = tangent.reshape(flat.shape)
         # Recordings that a direction does not touch, such as those of another group, stay as they are.
         moved = np.flatnonzero(along.any(axis=1))
@@ -342,7 +344,15 @@ class Forward:
                 found[..., axis] = theta[..., self.lanes.physical.index(name)]
         return found
 
-    def _per_lane(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, Commands]:
+    def _beside(self, points: Points) -> Float[np.ndarray, "n k"]:
+        """What a rollout depends on beside the simulator's parameters."""
+        return np.zeros((len(points), 0))
+
+    def _as_seen(self, found: Fields, theta: np.ndarray, points: Points) -> Fields:
+        """What is measured of what rollouts show, one row a lane."""
+        return found
+
+    def _per_lane(self, theta: np.ndarray, points: Points) -> tuple[np.ndarray, np.ndarray, Commands]:
         """Parameters (point, recording, physical), starts and commands of each lane."""
         lane = np.tile(np.arange(self.count), len(theta))
         return theta.reshape(-1, theta.shape[-1]), self.start[lane], self.commands.of(lane)

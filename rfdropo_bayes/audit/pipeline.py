@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -11,11 +11,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.candidates import Candidate
-from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.deadline import Deadline, OutOfTime, about
-from rfdropo_bayes.audit.differences import Groups
-from rfdropo_bayes.audit.extension import DISCRETISATION, Added, ExtensionSearch, Rules, numerical_shift
+from rfdropo_bayes.audit.described import Described, describe
+from rfdropo_bayes.audit.extension import DISCRETISATION, Added, ExtensionSearch, numerical_shift
 from rfdropo_bayes.audit.fit import (
     WITHIN,
     Fit,
@@ -29,64 +27,24 @@ from rfdropo_bayes.audit.fit import (
     widened,
     with_usable_differences,
 )
-from rfdropo_bayes.audit.forward import Forward, Lanes
-from rfdropo_bayes.audit.gain import Gain, Unseen, UnseenErrors, measure_gain
+from rfdropo_bayes.audit.forward import Forward
+from rfdropo_bayes.audit.gain import Gain, Unseen, UnseenErrors, noise_distance
+from rfdropo_bayes.audit.held_out import HeldOut, supported_steps
 from rfdropo_bayes.audit.inadequacy import as_measured, fit_with_noise, spread
 from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.measurements import Measurements, gather_measurements
+from rfdropo_bayes.audit.measurements import Measurements
+from rfdropo_bayes.audit.problem import AuditProblem, measurements_of, simulated
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Screen, p_in_words, screen
-from rfdropo_bayes.audit.verdict import NO_VERDICT, PARTLY, UNEXPLAINED, decide
-from rfdropo_bayes.bayes.channels import ObjectPose, Series
+from rfdropo_bayes.audit.verdict import DESCRIBED, NEGLIGIBLE, NO_VERDICT, PARTLY, UNEXPLAINED, decide, negligible
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import RESIDUALS, STATED
 from rfdropo_bayes.bayes.noise.stacked import Stacked
-from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.commands import Commands
 
-DRAWS = 60
 AGAIN = 3  # times that a base fit is climbed on from a better point beside it, before it counts as not converged
 # White noise of each channel in its own unit, until something better is known: millimetres, and the medians of priors.
 GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3}
-HELD_OUT_ROWS = 0.6  # of a single recording, which is all that is fitted of it when the rest is to be predicted
-
-
-@dataclass(frozen=True)
-class AuditProblem:
-    """What is audited.
-
-    Attributes:
-        lanes: simulator with the base model's mechanisms, and every candidate at its null value.
-        finer: the same on a finer mesh and time step, with the commands on its own clock; None without.
-        coordinates: of all parameters.
-        model: base model and candidates, of all recordings, fitted ones first.
-        trajectories: the fitted ones.
-        candidates: that may be named.
-        stated_noise: from the experiment file, used where nothing was repeated; None without.
-        start: values of base parameters to start from, of an earlier calibration; None for a search.
-        rules, seed: see `Rules`.
-        left_out: mechanisms that do not run on this body or engine, with the reason.
-        groups: of recordings that are compared; None for an audit of all.
-    """
-
-    lanes: Lanes
-    finer: tuple[Lanes, Commands] | None
-    coordinates: Coordinates
-    model: TrajectoryModel
-    trajectories: Sequence[Trajectory]
-    candidates: Sequence[Candidate]
-    stated_noise: Stacked | None
-    start: dict[str, float] | None
-    rules: Rules
-    seed: int
-    left_out: Mapping[str, str] = field(default_factory=dict)
-    groups: Groups | None = None
-
-    def candidate(self, name: str) -> Candidate | None:
-        """A candidate by its name; None for the mesh and time step, which are none of the library's."""
-        return next((candidate for candidate in self.candidates if candidate.name == name), None)
 
 
 @dataclass(frozen=True)
@@ -97,11 +55,13 @@ class Causes:
         steps: that unseen recordings support, all of them where these support none.
         unsupported: mechanisms that the fitted recordings asked for and unseen ones do not support.
         screens: of the base model, and after each step.
+        described: what acts that the library does not have; None where nothing was left to describe.
     """
 
     steps: list[Added]
     unsupported: list[str]
     screens: list[Screen]
+    described: Described | None = None
 
 
 @dataclass(frozen=True)
@@ -197,11 +157,33 @@ class Answer:
         return self.causes.steps[-1].fit if self.causes.steps else self.base
 
     @property
+    def law(self) -> Described | None:
+        """The law that joins the model for good; None without one."""
+        found = self.causes.described
+        return found if found is not None and found.holds else None
+
+    @property
     def adopted(self) -> list[Added]:
         """Steps that join the model for good: those that unseen recordings clearly support, in a model that explains
         more than next to nothing."""
         gain = self.validation.gain
+        if self.law is not None:
+            gain = self.validation.gain or self.law.gain
         return self.causes.steps if gain is not None and gain.clear and self.verdict != UNEXPLAINED else []
+
+
+def _leaves_something(verdict: str, base: Fit) -> bool:
+    """Whether there is something to describe: a discrepancy that the library does not explain, or a base model that
+    could not be fitted for it."""
+    return verdict in (PARTLY, UNEXPLAINED) or (verdict == NO_VERDICT and not base.converged)
+
+
+def _described_validation(described: Described) -> Validation:
+    """What unseen recordings say of the base model with a law alone."""
+    held = described.held_out
+    if held is None:
+        return Validation()
+    return Validation(described.overall, [], held.which, (held.predictions[0], held.predictions[-1]), held.unseen)
 
 
 def audit(
@@ -235,7 +217,7 @@ def audit(
     search, base, steps, last = _searched(search, base)
     judge = judge if judge.known is not None else search.target.on(judge.forward)
     asked = [step.name for step in steps]
-    steps, last, held_out = _supported(problem, judge, search, base, steps, last)
+    steps, last, held_out = supported_steps(problem, judge, search, base, steps, last)
     base, steps = as_measured(judge, base), [replace(s, fit=as_measured(s.judge, s.fit)) for s in steps]
     unsupported = [name for name in asked if name not in [step.name for step in steps]]
     if unsupported:
@@ -247,18 +229,34 @@ def audit(
     screens = [*(step.before for step in steps), last]
     validation = _validation(held_out, len(steps))
     verdict, suspected = _verdict(replace(search, target=judge), base, steps, screens, validation.gain, deadline)
+    described = None
+    if fitted and not deadline.reached and _leaves_something(verdict, base):
+        described = describe(problem, judge, base, steps, held_out, report)
+    if described is not None and described.holds:
+        verdict, suspected = DESCRIBED, None
+        if described.stand_ins:
+            report(f"the law takes the place of {' and '.join(described.stand_ins)}")
+            steps, screens, validation = [], screens[:1], _described_validation(described)
+            extended = base
     stopped = deadline.reached
     deadline.lift()  # what is left are single rollouts, for the report
     sizes = widened(extended, problem.coordinates)
     shown = None if DISCRETISATION in asked or finer is None else numerical_shift(target, finer, extended)
+    left = extended.residual
+    if described is not None and described.holds and described.last is not None:
+        left = as_measured(described.last.target, described.last.fit).residual
+    remainder = describe_remainder(target.measurements, left, target.noise.first)
+    if verdict in (PARTLY, UNEXPLAINED) and not steps and (described is None or not described.holds):
+        size, noise = float(np.sqrt(3.0) * remainder.amplitude), noise_distance(target.noise.first)
+        verdict = NEGLIGIBLE if negligible(problem.rules, size, noise, shown) else verdict
     return Answer(
         verdict,
         problem,
         target,
         base,
-        Causes(steps, unsupported, screens),
+        Causes(steps, unsupported, screens, described),
         validation,
-        describe_remainder(target.measurements, extended.residual, target.noise.first),
+        remainder,
         sizes,
         sizes.draws(np.random.default_rng([problem.seed, 5]), 1000, *problem.coordinates.bounds),
         Doubts(suspected, target.measurements.shift, shown),
@@ -274,19 +272,6 @@ def _validation(held_out: HeldOut | None, steps: int) -> Validation:
     explained, predictions = [gain.explained for gain in gains], held_out.predictions
     last = gains[-1] if gains else None
     return Validation(last, explained, held_out.which, (predictions[0], predictions[steps]), held_out.unseen)
-
-
-def _supported(
-    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: list[Added], last: Screen
-) -> tuple[list[Added], Screen, HeldOut | None]:
-    """The steps that recordings which no fit has seen support, all of them where these support none; the screen
-    of the model with them; and the predictions of these recordings."""
-    held_out = _held_out(problem, judge, search, base, steps)
-    if held_out is None or not (kept := held_out.supported()):
-        return steps, last, held_out
-    last = steps[kept].before if kept < len(steps) else last
-    steps, held_out = _without_carried(problem, judge, search, base, steps[:kept], held_out.after(kept))
-    return steps, last if len(steps) == kept else search.tested(steps[-1].fit, len(steps)), held_out
 
 
 def _far_off(target: FitTarget, fit: Fit) -> str:
@@ -350,23 +335,6 @@ def _with_differences_of(problem: AuditProblem, target: FitTarget) -> AuditProbl
 
 def _forward(problem: AuditProblem, finer: bool, measurements: Measurements, deadline: Deadline | None) -> Forward:
     return simulated(problem, finer, measurements, [group[0] for group in measurements.members], deadline)
-
-
-def simulated(
-    problem: AuditProblem,
-    finer: bool,
-    measurements: Measurements,
-    chosen: Sequence[int],
-    deadline: Deadline | None = None,
-) -> Forward:
-    """Some of the recordings, on the simulator itself or on the finer one; an object starts where they measured it."""
-    lanes, commands = problem.lanes, problem.model.recordings.commands
-    if finer and problem.finer is not None:
-        lanes, commands = problem.finer
-    names = {problem.model.recordings.names[i]: i for i in chosen}
-    rows = int(problem.model.recordings.rows[list(chosen)].max())
-    start = next((c.readings[:, 0] for c in measurements.channels if isinstance(c, ObjectPose)), None)
-    return Forward(lanes, problem.coordinates, commands, names, rows, deadline, start)
 
 
 def base_model(
@@ -449,15 +417,6 @@ def first_target(problem: AuditProblem, journal: Journal, deadline: Deadline | N
     return FitTarget(_forward(problem, False, measurements, deadline), measurements, noise, journal)
 
 
-def measurements_of(problem: AuditProblem, chosen: Sequence[int], repeats: Sequence[Trajectory] = ()) -> Measurements:
-    """Some of the recordings, no more rows than the longest of them has; repeats are joined where they are given."""
-    index = list(chosen)
-    kinds = [tuple(slots) for slots in problem.coordinates.slots([problem.model.recordings.names[i] for i in index])]
-    rows = int(problem.model.recordings.rows[index].max())
-    channels = [c.of_recordings(index, rows) if isinstance(c, Series) else c for c in problem.model.channels]
-    return gather_measurements(problem.model.recordings.of(index, rows), channels, repeats, kinds)
-
-
 def _base_fit(
     target: FitTarget,
     start: dict[str, float] | None,
@@ -534,165 +493,3 @@ def _suspected(search: ExtensionSearch, base: Fit) -> Stacked | None:
     found, _ = replace(search, target=target).screened(fit)
     passes = found.omnibus.p > search.rules.base_passes and not target.noise.doubtful
     return target.noise if passes else None
-
-
-def _predict(target: FitTarget, fit: Fit, seed: Sequence[int]) -> UnseenErrors:
-    """Predictions under the normal approximation, linear around the mode: along a ridge that the data leave free, such
-    as the common scale of stiffness and mass, a draw would lie far from where the approximation holds."""
-    centre = target.errors(fit.x)
-    points = np.repeat(fit.x[None], len(fit.free), axis=0)
-    slopes, _ = target.error_slopes(points, np.eye(len(fit.x))[fit.free])
-    z = np.random.default_rng(seed).multivariate_normal(np.zeros(len(fit.free)), fit.covariance, DRAWS, method="eigh")
-    z -= z.mean(axis=0)
-    return UnseenErrors(centre + np.tensordot(z, slopes, axes=1))
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Recordings that no fit has seen, as the base model and the model after each step predict them.
-
-    Attributes:
-        which: in words.
-        unseen: the measurements.
-        predictions: of the base model, then after each step.
-        patterns: what each of these models leaves where it was fitted, see `measure_gain`.
-        noise: of the measurements.
-        judges: the noise under which each of the models is judged, see `inadequacy`.
-        spreads: deviation of what each of them leaves, by column.
-        seed: of the gain's interval.
-    """
-
-    which: str
-    unseen: Unseen
-    predictions: list[UnseenErrors]
-    patterns: list[np.ndarray]
-    noise: Stacked
-    judges: list[Stacked]
-    spreads: list[np.ndarray]
-    seed: int
-
-    def gain(self, before: int, after: int) -> Gain:
-        """What the model after some steps is worth beside that after fewer."""
-        return self.after(after).beside(self.after(before))
-
-    def beside(self, other: HeldOut) -> Gain:
-        """What the last model is worth beside the last one of another sequence of steps."""
-        rng, judge, pattern = np.random.default_rng([self.seed, 4]), other.judges[-1], other.patterns[-1]
-        first, second, spread = other.predictions[-1], self.predictions[-1], self.spreads[-1]
-        return measure_gain(self.unseen, first, second, self.noise, pattern, rng, judge=judge, spread=spread)
-
-    def after(self, steps: int) -> HeldOut:
-        """The same of no more than so many steps."""
-        parts = ("predictions", "patterns", "judges", "spreads")
-        return replace(self, **{name: getattr(self, name)[: steps + 1] for name in parts})
-
-    def supported(self) -> int:
-        """Number of steps that the unseen recordings clearly support, each beside the last one that they do."""
-        last = 0
-        for after in range(1, len(self.predictions)):
-            if self.gain(last, after).clear:
-                last = after
-        return last
-
-
-def _without_carried(
-    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: list[Added], held_out: HeldOut
-) -> tuple[list[Added], HeldOut]:
-    """Steps less those that were supported beside a later one only, and without which that one does as well.
-
-    Two mechanisms may pay only together. Whether they do is seen by taking the first one out: the model with it, as if
-    it were the last step, must clearly predict unseen recordings better than the model without it. Where the time is
-    up, the steps stay that were supported together.
-    """
-    index, clock = 0, search.target.forward.deadline
-    with clock.stage("gain"), clock.reserve(), suppress(OutOfTime):
-        while index < len(steps) - 1:
-            if held_out.gain(index, index + 1).clear or steps[index].name == DISCRETISATION:
-                index += 1
-                continue
-            search.report(f"is {steps[index].name} needed? The model without it")
-            fewer = search.without(steps, index, base)
-            other = _predicted(problem, judge, search, base, fewer)
-            if held_out.beside(other).clear:
-                index += 1
-            else:
-                steps, held_out, index = fewer, other, 0
-    return steps, held_out
-
-
-def _held_out(
-    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: Sequence[Added]
-) -> HeldOut | None:
-    """The test recordings, or fitted ones that are left out in turn; None where the model was not extended, or the time
-    was up."""
-    if not steps:
-        return None
-    search.report("measuring the gain on recordings that no fit has seen")
-    with search.target.forward.deadline.stage("gain"), suppress(OutOfTime):
-        return _predicted(problem, judge, search, base, steps)
-    return None
-
-
-def _predicted(
-    problem: AuditProblem, judge: FitTarget, search: ExtensionSearch, base: Fit, steps: Sequence[Added]
-) -> HeldOut:
-    """Predictions of the base model, fitted under ``judge``, and of the model after each step."""
-    target, judges = search.target.measured, [judge, *(step.judge for step in steps)]
-    count, every = len(problem.trajectories), len(problem.model.recordings.names)
-    fits = [base, *(step.fit for step in steps)]
-    names = ["", *(step.name for step in steps)]
-    if every > count:
-        which = "test recordings"
-        tested = measurements_of(problem, range(count, every))
-        unseen = _unseen(tested, tested.valid, problem.model.recordings.names[count:])
-        predictions = []
-        for i, fit in enumerate(fits):
-            forward = simulated(problem, DISCRETISATION in names[: i + 1], tested, range(count, every))
-            predictions.append(_predict(replace(target, forward=forward, measurements=tested), fit, [problem.seed, 3]))
-    else:
-        which, unseen, predictions = _left_out(problem, judges, search, fits)
-    seen = list(zip(judges, fits, strict=True))
-    patterns = [target.measurements.series(as_measured(judge, fit).residual) for judge, fit in seen]
-    spreads, noises = [spread(judge, fit) for judge, fit in seen], [judge.noise for judge in judges]
-    return HeldOut(which, unseen, predictions, patterns, target.noise, noises, spreads, problem.seed)
-
-
-def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) -> Unseen:
-    position = np.asarray(tested.channels[0].measured)
-    names = tuple(" and ".join(recordings[i] for i in group) for group in tested.members)
-    return Unseen(position.reshape(*position.shape[:2], -1), valid, names)
-
-
-def _left_out(
-    problem: AuditProblem, judges: Sequence[FitTarget], search: ExtensionSearch, fits: Sequence[Fit]
-) -> tuple[str, Unseen, list[UnseenErrors]]:
-    """Predict each group of repeats from the others; where one has parameters that no other tells (a single one has),
-    the later rows of all from the earlier ones."""
-    target = search.target.measured
-    measured = target.measurements
-    groups = len(measured.members)
-    kinds = [tuple(slots) for slots in target.forward.slots]
-    if min(kinds.count(kind) for kind in kinds) > 1:
-        held_out = "fitted recordings, each left out in turn"
-        masks = [np.arange(groups)[:, None, None] == g for g in range(groups)]
-    else:
-        held_out = "the later rows of the only recording" if groups == 1 else "the later rows of the fitted recordings"
-        rows = np.arange(measured.count.shape[1])
-        last = HELD_OUT_ROWS * measured.valid.any(axis=2).sum(axis=1)
-        masks = [rows[None, :, None] >= last[:, None, None]]
-    parts: list[list[np.ndarray]] = [[] for _ in fits]
-    for mask in masks:
-        mask = np.broadcast_to(mask, measured.count.shape)
-        for i, (judge, fit) in enumerate(zip(judges, fits, strict=True)):
-            kept = replace(judge.measurements, count=np.where(mask, 0.0, judge.measurements.count))
-            refitted = climb(replace(judge, measurements=kept), fit.x, fit.free, evaluations=15)
-            parts[i].append(_predict(target.on(judge.forward), refitted, [problem.seed, 3]).errors)
-    draws = min(len(part) for row in parts for part in row)
-    predictions = []
-    for row in parts:
-        joined = np.zeros((draws, *measured.count.shape))
-        for mask, part in zip(masks, row, strict=True):
-            joined = np.where(mask, part[:draws], joined)
-        predictions.append(UnseenErrors(joined))
-    valid = measured.valid & np.any(np.broadcast_arrays(*masks, measured.valid)[:-1], axis=0)
-    return held_out, _unseen(measured, valid, problem.model.recordings.names), predictions

@@ -101,8 +101,8 @@ def screen(
     if target.noise.source == RESIDUALS:  # whose mean square is that of the residuals by construction
         del observed["variance"], simulated["variance"]
     most = reference.max(axis=1) if seen else np.zeros(bootstraps)
-    observed[DIRECTED] = surprises.max(axis=1) if seen else np.zeros(len(residuals))
-    simulated[DIRECTED] = most
+    if seen:  # without candidates there is no test by them, and no p-value of one that says nothing
+        observed[DIRECTED], simulated[DIRECTED] = surprises.max(axis=1), most
     tests = []
     for index, residual in enumerate(residuals):
         white = target.measurements.series(residual)

@@ -10,10 +10,11 @@ import numpy as np
 from rfdropo_bayes.audit.candidates import spoken
 from rfdropo_bayes.audit.extension import DISCRETISATION, TOLD_APART
 from rfdropo_bayes.audit.gain import noise_distance
+from rfdropo_bayes.audit.law_words import law_sentence, ports_sentence
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.prequential import BEGINNING, begins_wrong, prequential
 from rfdropo_bayes.audit.screen import p_in_words
-from rfdropo_bayes.audit.verdict import EXPLAINED, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED, unclear
+from rfdropo_bayes.audit.verdict import EXPLAINED, NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED, unclear
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED
 
 MOST_EXCLUDED = 3
@@ -24,6 +25,7 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     """What was found, how much of the discrepancy it explains, what is excluded, what remains."""
     words = (
         _words(answer, findings)
+        + ports_sentence(answer)
         + _compared(answer, findings)
         + _suspicion(answer)
         + _shifted(answer)
@@ -108,6 +110,10 @@ def _beginning(answer: Answer) -> str:
 def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if not answer.fitted:
         return "No verdict: the fit of the base model is not done."
+    if answer.law is not None:
+        return law_sentence(answer)
+    if answer.verdict == NEGLIGIBLE:
+        return _small(answer)
     if not answer.base.converged:
         left = answer.base.residual
         return (
@@ -156,6 +162,21 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     else:
         head = f"The best of the library, {named}, explains {share}, but {_pattern(answer)}"
     return f"{head}{_excluded(answer)}; {_remains(answer)}{_assumption(answer)}.{_adoption(answer)}"
+
+
+def _small(answer: Answer) -> str:
+    """What is said of a discrepancy that is sure, and too small to matter."""
+    size, noise = answer.remainder.amplitude * np.sqrt(3.0), noise_distance(answer.target.noise.first)
+    limit, numerical = answer.problem.rules.matters, answer.doubts.numerical
+    beside = f"the noise is {1e3 * noise:.2g} mm"
+    if numerical is not None:
+        beside += f", and half the time step and a finer mesh move the markers by {1e3 * numerical:.2g} mm"
+    if limit is not None:
+        beside += f"; [audit] matters_mm is {1e3 * limit:g}"
+    return (
+        f"Negligible: a discrepancy of {1e3 * size:.2g} mm is sure (joint test p {_p(answer)}), for repeats are many, "
+        f"but {beside}. Nothing need be done."
+    )
 
 
 def _invisible(answer: Answer) -> str:

@@ -8,6 +8,8 @@ from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.gain import Gain
 
 NO_VERDICT = "no_verdict"  # the base fit has not converged, or the time was up before anything was found
+DESCRIBED = "described"  # a law at a port, for which the library has no name, holds on unseen recordings
+NEGLIGIBLE = "negligible"  # a discrepancy is sure, and far too small to matter
 NO_DISCREPANCY, EXPLAINED, EQUIVALENT, PARTLY, UNEXPLAINED = (
     "no_discrepancy",
     "explained",
@@ -21,6 +23,21 @@ def unclear(rules: Rules, gain: Gain) -> bool:
     """Whether unseen trajectories do not say how much of the discrepancy is explained: it is too small, or the fraction
     differs too much between them, so that its interval reaches from "none" to "all"."""
     return gain.interval[0] <= rules.significant and gain.interval[1] >= rules.explained
+
+
+SMALL = 0.25
+"""Share of the noise below which a discrepancy is far below it: with it in quadrature errors grow by 3 %."""
+
+
+def negligible(rules: Rules, size: float, noise: float, numerical: float | None) -> bool:
+    """Whether a discrepancy that is sure need not be mended.
+
+    It is where it is smaller than what matters, where that is said. Else it is where it is far below the noise of one
+    measurement, and below what half the time step and a finer mesh move; all as distances of a marker [m].
+    """
+    if rules.matters is not None:
+        return size < rules.matters
+    return numerical is not None and size < SMALL * noise and size < numerical
 
 
 def decide(

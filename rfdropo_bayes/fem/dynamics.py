@@ -81,6 +81,7 @@ class Prepared(NamedTuple):
     rest_length: Float[Array, " cables"]  # cable lengths of the undeformed body [m]
     effects: BodyEffects
     sections: Sections | None  # where the body has a bending law
+    firmness: Float[Array, ""] | None = None  # factor on the stiffness in a step, see ``section_loads``
 
 
 class State(NamedTuple):
@@ -312,6 +313,8 @@ def _elastic(system: System, prepared: Prepared, state: State, stage: Stage, tim
     if prepared.effects.softening_rate is not None and memory.clock is not None:
         left = jnp.exp(-prepared.effects.softening_rate * memory.clock)
         force, packed = left * force, left * packed
+    if prepared.firmness is not None:
+        left, force, packed = prepared.firmness * left, prepared.firmness * force, prepared.firmness * packed
     lookahead = length * (1.0 + gain) + prepared.rayleigh_stiffness
     behind = prepared.rayleigh_stiffness if stage.predicted else lookahead
     taut = strings(system, prepared, frame, state.position, state.tension, stage.predicted)

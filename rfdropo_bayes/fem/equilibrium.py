@@ -65,6 +65,8 @@ def _forces(system: System, prepared: Prepared, iterate: _Iterate) -> _Forces:
     """Forces of the body and of its cables in the current shape, and the tangent of the former."""
     frame, local = frames_and_displacements(system, prepared, iterate.position)
     local_force, packed = resistance(prepared, local)
+    if prepared.firmness is not None:
+        local_force, packed = prepared.firmness * local_force, prepared.firmness * packed
     body = corotational.internal_force(frame, local_force).reshape(-1, 3)
     length, jacobian = lengths_and_jacobian(system.cables, prepared.guides, iterate.position)
     cable = -jnp.einsum("cni,c->ni", jacobian, iterate.tension)

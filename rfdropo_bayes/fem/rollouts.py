@@ -16,6 +16,7 @@ from rfdropo_bayes.fem.integrators import Integrator
 from rfdropo_bayes.fem.layered import PointMap, point_positions
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube
+from rfdropo_bayes.fem.section_loads import SectionLoads, loaded
 
 
 class Rollout(NamedTuple):
@@ -53,20 +54,21 @@ Recorded = tuple[Float[Array, "points 3"], Float[Array, " cables"], Float[Array,
 
 
 def roll(
-    take: Callable[[Any, Float[Array, " cables"]], tuple[Any, StepInfo]],
+    take: Callable[[Any, Any], tuple[Any, StepInfo]],
     start: Any,
-    displacement: Float[Array, "rows substeps cables"],
+    displacement: Any,
     points: PointMap,
     horizon: Int[Array, ""] | int | None = None,
 ) -> Rollout:
     """Rollout of any body, given how it takes a step to commanded cable displacements [m].
 
     Args:
+        displacement: (rows, substeps, cables), or a tree of arrays (rows, substeps, ...) of which a step takes a part.
         horizon: rows to compute; later ones are zero. It may be traced: one compilation serves every prefix, rows
             beyond it cost nothing, and there is no reverse mode. None computes all, in reverse mode, too.
     """
 
-    def one(progress: _Progress, commanded: Float[Array, " cables"]) -> tuple[_Progress, None]:
+    def one(progress: _Progress, commanded: Any) -> tuple[_Progress, None]:
         state, info = take(progress.state, commanded)
         before = progress.info
         codes = StepInfo(before.diverged | info.diverged, before.converged & info.converged)
@@ -77,19 +79,19 @@ def roll(
         pose = None if cube is None else jnp.concatenate([cube.position, cube.orientation])
         return point_positions(points, state.position), state.tension, pose
 
-    def row(progress: _Progress, commands: Float[Array, "substeps cables"]) -> tuple[_Progress, Recorded]:
+    def row(progress: _Progress, commands: Any) -> tuple[_Progress, Recorded]:
         progress = lax.scan(one, progress, commands)[0]
         return progress, recorded(progress.state)
 
     def next_row(index: Int[Array, ""], carry: tuple[_Progress, Any]) -> tuple[_Progress, Any]:
-        progress, here = row(carry[0], displacement[index])
+        progress, here = row(carry[0], jax.tree.map(lambda part: part[index], displacement))
         return progress, jax.tree.map(lambda rows, new: rows.at[index].set(new), carry[1], here)
 
     first = _Progress(start, StepInfo(jnp.array(False), jnp.array(True)))
     if horizon is None:
         last, rows = lax.scan(row, first, displacement)
     else:
-        count = displacement.shape[0]
+        count = jax.tree.leaves(displacement)[0].shape[0]
         empty = jax.tree.map(lambda part: jnp.zeros((count, *part.shape)), recorded(start))
         last, rows = lax.fori_loop(0, jnp.minimum(horizon, count), next_row, (first, empty))
     return Rollout(rows[0], rows[1], last.state, *last.info, rows[2])
@@ -106,13 +108,23 @@ def simulate(
     cube: Cube | None = None,
     horizon: Int[Array, ""] | int | None = None,
     integrator: Integrator = "euler",
+    loads: SectionLoads | None = None,
 ) -> Rollout:
     """Rollout from ``state`` through the commanded cable displacements [m] of every step, recorded after every row.
 
     ``time_step`` [s] is that of one substep. With a ``scene`` and a ``cube`` the body pushes it; ``state.cube``
     is where it starts. ``horizon`` as for `roll`. Where a step has several stages, ``state.commanded`` are the
-    displacements before the first step, zero where that is None.
+    displacements before the first step, zero where that is None. ``loads`` act in every step besides.
     """
+    if loads is not None:
+
+        def pushed(before: State, given: tuple[Float[Array, " cables"], Int[Array, ""]]) -> tuple[State, StepInfo]:
+            under, force = loaded(system, prepared, loads, given[1])
+            return step(system, under, before, given[0], time_step, force, scene, cube, integrator)
+
+        number = 1 + jnp.arange(displacement.shape[0] * displacement.shape[1]).reshape(displacement.shape[:2])
+        begin = remembering(system, prepared, state, scene, integrator)
+        return roll(pushed, begin, (displacement, number), points, horizon)
 
     def take(before: State, commanded: Float[Array, " cables"]) -> tuple[State, StepInfo]:
         return step(system, prepared, before, commanded, time_step, scene=scene, cube=cube, integrator=integrator)

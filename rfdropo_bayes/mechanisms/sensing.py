@@ -179,10 +179,10 @@ class MarkerOffset:
         arm = jnp.stack([values[spec.name] for spec in self.parameters[: 3 * count]]).reshape(count, 3)
         if count == 1:
             return position + arm
-        return position + _turned(_direction(first), _direction(position), arm)
+        return position + _turned(direction_along(first), direction_along(position), arm)
 
 
-def _direction(position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
+def direction_along(position: Float[Array, "time marker 3"]) -> Float[Array, "time marker 3"]:
     """Direction of the body at every marker: the chord of its neighbours."""
     ends = position[:, 1:2] - position[:, :1], position[:, -1:] - position[:, -2:-1]
     chord = jnp.concatenate([ends[0], position[:, 2:] - position[:, :-2], ends[1]], axis=1)
@@ -254,7 +254,7 @@ class ClockOffset:
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
         """Read the positions at other times, linearly between observations; beyond the ends they stand still."""
-        return _read(position, time, time - values["clock_offset"])
+        return read_at(position, time, time - values["clock_offset"])
 
     def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> tuple[Array, Array]:
         """The last observations and their times, as far back as an offset may reach; none before the first."""
@@ -276,10 +276,10 @@ class ClockOffset:
         """Read the positions earlier."""
         position = jnp.concatenate([memory[0][1:], given[None]])
         time = jnp.concatenate([memory[1][1:], jnp.asarray(now, float)[None]])
-        return (position, time), _read(position, time, now - values["clock_offset"])
+        return (position, time), read_at(position, time, now - values["clock_offset"])
 
 
-def _read(
+def read_at(
     position: Float[Array, "time marker 3"], time: Float[Array, " time"], at: Float[Array, "*when"]
 ) -> Float[Array, "*when marker 3"]:
     """Positions at other times, linearly between those given; beyond the ends they stand still."""

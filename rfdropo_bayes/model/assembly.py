@@ -37,6 +37,8 @@ from rfdropo_bayes.data import DataSpec, Trajectory, find_data_file, load_record
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups
 from rfdropo_bayes.mechanisms import mechanisms_named
+from rfdropo_bayes.mechanisms.laws import LawChoice, make_law
+from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.model.engines import backend
 from rfdropo_bayes.model.experiment import matching
@@ -77,7 +79,7 @@ def robot_of(spec: ModelSpec) -> Robot:
 def build_simulator(spec: ModelSpec) -> AnySimulator:
     """The simulator of a model, mechanisms included."""
     if isinstance(spec.robot, BlackBox):
-        return BlackBoxSimulator(spec.robot, tuple(choice.made_for(spec.robot) for choice in spec.mechanisms))
+        return _with_mechanisms(BlackBoxSimulator(spec.robot), spec)
     return build_robot_simulator(spec)
 
 
@@ -91,21 +93,39 @@ def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
     if table.drives == "direct":
         robot = robot.without_command_timing()
     time_step = table.time_step or robot.time_step_s
-    mechanisms = tuple(choice.made_for(robot) for choice in spec.mechanisms)
     trunk: TrunkSimulator | MeshTrunkSimulator
     if table.body == "tetrahedra" and table.tetrahedra is not None:
         options = table.tetrahedra
         mesh = read_tetrahedra(find_data_file(options.mesh, spec.folder), options.unit)
         bound = assemble_mesh(robot, mesh, options)
         engine = Engine(bound, time_step, backend(table, False), integrator=table.integrator)
-        trunk = MeshTrunkSimulator(robot, engine, bound, options, time_step, mechanisms)
+        trunk = MeshTrunkSimulator(robot, engine, bound, options, time_step)
     else:
         discretisation = Discretisation(time_step, table.nodes_across, table.refine)
         assembly = assemble(robot, discretisation)
         settled = robot.initial_state == "equilibrium"
         engine = Engine(assembly, time_step, backend(table, True), settled, integrator=table.integrator)
-        trunk = TrunkSimulator(robot, engine, assembly, discretisation, mechanisms)
-    return trunk.pushing() if table.push else trunk
+        trunk = TrunkSimulator(robot, engine, assembly, discretisation)
+    return _with_mechanisms(trunk.pushing() if table.push else trunk, spec)
+
+
+Extended = TypeVar("Extended", bound=AnySimulator)
+
+
+def _with_mechanisms(simulator: Extended, spec: ModelSpec) -> Extended:
+    """A simulator with the mechanisms of a model, laws at its ports among them.
+
+    Raises:
+        InputError: a port that the simulator does not have.
+    """
+    made: list[Mechanism] = []
+    for choice in spec.mechanisms:
+        if isinstance(choice.kind, LawChoice):
+            ports = port_map(simulator, simulator.marker_names)
+            made.append(make_law(choice.kind, ports, simulator.channel_names, simulator.command_unit))
+        else:
+            made.append(choice.made_for(simulator.robot))
+    return replace(simulator, mechanisms=tuple(made))  # type: ignore[type-var]
 
 
 def with_drives(robot: Robot, drives: Sequence[DriveTravel], groups: Patterns) -> Robot:

@@ -38,12 +38,35 @@ class WeighedTable(ExperimentTable):
     sd: float = Field(gt=0.0, description="standard deviation of the measurement")
 
 
+class LawTermTable(ExperimentTable):
+    """A term of [[model.laws]]: a coefficient times a feature."""
+
+    coefficient: str = Field(description="name of its parameter, zero of which is no effect")
+    feature: str = Field(description="kind of the feature, see docs/mechanisms.md")
+    commands: list[str] = Field(default_factory=list, description="commands that the feature is made of")
+    shape: float | None = Field(
+        default=None, gt=0.0, description="time constant [s] of a low pass, or half the width of a play"
+    )
+    scale: float = Field(gt=0.0, description="scale of the coefficient's default prior, a normal about zero")
+
+
+class LawTable(ExperimentTable):
+    """[[model.laws]]: an effect that no mechanism of the library has, as a law at a port."""
+
+    port: str = Field(description='where it acts, such as "cable left", "stiffness" or "marker m3 along the body"')
+    terms: list[LawTermTable] = Field(min_length=1, description="the signal is their sum")
+
+
 class ModelTable(ExperimentTable):
     """[model]: what is added to the robot's base simulator, and what is inferred."""
 
     mechanisms: list[str] = Field(
         default_factory=list,
         description="effects on top of the base simulator, by name, or file.py:ClassName of one's own",
+    )
+    laws: list[LawTable] = Field(
+        default_factory=list,
+        description="effects that have no name: laws at ports, as an audit describes them",
     )
     noise: NoiseModel = Field(
         default="auto",
@@ -195,6 +218,15 @@ class AuditTable(ExperimentTable):
         description="mechanisms that are tried beside the registry's, e.g. mine.py:MyMechanism",
     )
     exclude: list[str] = Field(default_factory=list, description="mechanisms that are not tried")
+    ports: bool = Field(
+        default=True,
+        description="look for unknown causes, as laws at ports, where the library leaves something",
+    )
+    matters_mm: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="distance of a marker [mm] below which a discrepancy does not matter",
+    )
     bootstraps: int = Field(default=999, ge=199, description="simulated data sets that the p-values rest on")
     minutes: float = Field(
         default=30.0,

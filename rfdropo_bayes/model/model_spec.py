@@ -17,6 +17,7 @@ from rfdropo_bayes.bayes.channels import Weighed
 from rfdropo_bayes.data import DataSpec
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns
+from rfdropo_bayes.mechanisms.laws import LawChoice
 from rfdropo_bayes.mechanisms.registry import MechanismChoice, choose_mechanisms
 from rfdropo_bayes.model.experiment import (
     AuditTable,
@@ -24,6 +25,7 @@ from rfdropo_bayes.model.experiment import (
     DesignTable,
     Experiment,
     InferenceTable,
+    LawTable,
     NoiseModel,
     NoiseTable,
     SeparationTable,
@@ -136,7 +138,11 @@ class ModelSpec:
         model = {"noise": self.noise, **{key: value for key, value in given.items() if value}}
         rest = {"noise": self.stated, "simulator": self.simulator}
         told = {"adapter": dict(self.adapter)} if self.adapter else {}
-        return {**told, **_dumped(rest), "model": {**model, "mechanisms": list(self.sources)}}
+        laws = [choice.kind for choice in self.mechanisms if isinstance(choice.kind, LawChoice)]
+        if laws:
+            model["laws"] = [{"port": law.port, "terms": [dict(term) for term in law.terms]} for law in laws]
+        named = [choice.source for choice in self.mechanisms if not isinstance(choice.kind, LawChoice)]
+        return {**told, **_dumped(rest), "model": {**model, "mechanisms": named}}
 
 
 @dataclass(frozen=True)
@@ -205,7 +211,7 @@ def spec_of(
     return ModelSpec(
         robot=found,
         named=experiment.robot if robot is None else "",
-        mechanisms=choose_mechanisms(asked, folder=folder),
+        mechanisms=(*choose_mechanisms(asked, folder=folder), *(law_choice(law) for law in table.laws)),
         simulator=experiment.simulator,
         priors=table.priors or _own_priors(found, table.fixed),
         fixed=table.fixed,
@@ -227,6 +233,12 @@ def _own_priors(robot: Workpiece, fixed: Mapping[str, float]) -> dict[str, dict[
     if not isinstance(robot, BlackBox):
         return {}
     return {name: {} for name in robot.parameters if name not in fixed and name not in robot.families}
+
+
+def law_choice(table: LawTable) -> MechanismChoice:
+    """A law of a file as one of the model's mechanisms."""
+    terms = tuple(term.model_dump(exclude_none=True, exclude_defaults=True) for term in table.terms)
+    return MechanismChoice(f"law at {table.port}", LawChoice(table.port, terms))
 
 
 def find_robot(name: str, folder: Path, adapter: Mapping[str, Any] | None = None) -> Workpiece:

@@ -18,6 +18,7 @@ from rfdropo_bayes.report.units import display_name
 
 MILLIMETRES = 1e3
 BINS = 12
+MOST_SIGNALS = 4  # recordings side by side
 SIGN = "direction"  # the cause that is a sign
 
 
@@ -53,6 +54,25 @@ def _strongest(series: np.ndarray, main: np.ndarray) -> int:
 
 
 @dataclass(frozen=True)
+class Signal:
+    """A signal at a port, with its band.
+
+    Attributes:
+        port, unit: where, and of what.
+        recordings: names, the first of each group of repeats.
+        time: [s].
+        mean, sd: of every recording [unit].
+    """
+
+    port: str
+    unit: str
+    recordings: tuple[str, ...]
+    time: Float[np.ndarray, " spline"]
+    mean: Float[np.ndarray, "recording spline"]
+    sd: Float[np.ndarray, "recording spline"]
+
+
+@dataclass(frozen=True)
 class Shown:
     """What the figures of an audit show.
 
@@ -67,6 +87,7 @@ class Shown:
             measured, base model, extended model; None without one.
         remainder: time [s], mean and deviation [m] of what the final model leaves of the last marker; None if nothing.
         tracks: unseen recordings as they are replayed.
+        port: the signal at the port where something acts that the library does not have; None where nothing does.
     """
 
     residuals: Residuals
@@ -78,6 +99,7 @@ class Shown:
     unseen: tuple[Float[np.ndarray, " row"], Mapping[str, Float[np.ndarray, "row 3"]]] | None
     remainder: tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row 3"], Float[np.ndarray, "row 3"]] | None
     tracks: Sequence[Track] = ()
+    port: Signal | None = None
 
 
 def causes(residuals: Residuals) -> dict[str, tuple[str, np.ndarray]]:
@@ -221,4 +243,27 @@ def remainder_figure(shown: Shown) -> Figure:
     axes = figure.subplots()
     draw_remainder(axes, shown)
     axes.legend(loc="upper right", ncols=3)
+    return figure
+
+
+def draw_signal(axes: Axes, signal: Signal, recording: int) -> None:
+    """Draw the signal at a port in one recording, with two standard deviations."""
+    mean, sd = signal.mean[recording], signal.sd[recording]
+    axes.plot(signal.time, mean)
+    axes.fill_between(signal.time, mean - 2 * sd, mean + 2 * sd, alpha=0.18, linewidth=0)
+    axes.axhline(0.0, color=style.MEASURED, linewidth=0.8)
+    axes.set_title(signal.recordings[recording])
+    axes.set_xlabel("time [s]")
+
+
+@style.styled
+def signal_figure(signal: Signal) -> Figure:
+    """The signal at a port in the first fitted recordings."""
+    count = min(len(signal.mean), MOST_SIGNALS)
+    figure = Figure(figsize=(style.WIDTH, 2.4))
+    every = np.atleast_1d(figure.subplots(1, count, sharey=True))
+    for recording, axes in enumerate(every):
+        draw_signal(axes, signal, recording)
+    unit = "" if signal.unit == "-" else f" [{signal.unit}]"
+    every[0].set_ylabel(f"{signal.port}{unit}")
     return figure

@@ -116,7 +116,20 @@ def shown(answer: Answer) -> figures.Shown:
         unseen,
         (rest.time, rest.mean[0, :, -3:], rest.sd[0, :, -3:]) if rest.amplitude > 0.0 else None,
         tracks,
+        _signal(answer),
     )
+
+
+def _signal(answer: Answer) -> figures.Signal | None:
+    """The signal at the port of the law, or at the one of most evidence where there is none."""
+    described = answer.causes.described
+    if described is None or not described.found.significant(answer.problem.rules.family):
+        return None
+    row, terms = described.found.ports[0], described.found.terms
+    if terms:
+        row = next(each for each in described.found.ports if each.port == terms[0].term.port)
+    names = answer.target.measurements.names
+    return figures.Signal(row.port.name, row.port.unit, names, described.found.centre, row.mean, row.sd)
 
 
 def _pictures(seen: figures.Shown, outline: Mapping[str, Any] | None) -> dict[str, Picture | None]:
@@ -131,5 +144,6 @@ def _pictures(seen: figures.Shown, outline: Mapping[str, Any] | None) -> dict[st
         "cosines": (figures.cosine_figure(seen), "Cosines between signatures") if len(seen.names) > 1 else None,
         "overlay": (figures.unseen_figure(seen), "Measured, base model and extended model") if seen.unseen else None,
         "remainder": (figures.remainder_figure(seen), "Gaussian process of what remains") if seen.remainder else None,
+        "port": (figures.signal_figure(seen.port), "Signal at the port where something acts") if seen.port else None,
     }
     return {name: None if picture is None else embed(*picture) for name, picture in drawn.items()}

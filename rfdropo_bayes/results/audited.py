@@ -56,7 +56,7 @@ class Audit:
 
     @property
     def verdict(self) -> str:
-        """explained, equivalent, partly_explained, unexplained, no_discrepancy or no_verdict."""
+        """explained, equivalent, partly_explained, described, unexplained, negligible, no_discrepancy or no_verdict."""
         return str(self.content["verdict"])
 
     @property

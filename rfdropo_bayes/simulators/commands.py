@@ -30,17 +30,18 @@ class Commands(NamedTuple):
         sample_step: last step that ends at or before each observation; 0 is the initial state. The first observation
             comes later where commands from before it are known.
         sample_fraction: how far into the following step the observation lies, in [0, 1).
+        signals: that act at the ports of the simulator besides (`ports.PortSignals`); None where nothing does.
     """
 
     initial: Float[Array, "*batch channel"]
     step: Float[Array, "*batch step channel"]
     sample_step: Int[Array, "*batch time"]
     sample_fraction: Float[Array, "*batch time"]
+    signals: Any = None
 
     def of(self, index: Sequence[int] | np.ndarray) -> Commands:
         """Some of a batch."""
-        parts: Any = [np.asarray(part)[index] for part in self]
-        return Commands(*parts)
+        return _taken(self, index)
 
 
 def commands_on_grid(
@@ -219,6 +220,13 @@ def stack_commands(sequences: Sequence[Commands]) -> Commands:
         np.stack([_pad(item.sample_step, rows) for item in sequences]),
         np.stack([_pad(item.sample_fraction, rows) for item in sequences]),
     )
+
+
+def _taken(part: Any, index: Any) -> Any:
+    """Some rows of an array, of all arrays of a named tuple, or nothing of nothing."""
+    if isinstance(part, tuple):
+        return type(part)(*(_taken(own, index) for own in part))
+    return None if part is None else np.asarray(part)[index]
 
 
 def _pad(array: np.ndarray, length: int) -> np.ndarray:

@@ -24,7 +24,9 @@ from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneStart, body_lanes
 from rfdropo_bayes.simulators.commands import carried_out
 from rfdropo_bayes.simulators.mechanisms import (
     ActuationMechanism,
+    CommandedSensingMechanism,
     Mechanism,
+    PushingMechanism,
     SensingMechanism,
     SteppedMechanism,
     TimedSensingMechanism,
@@ -234,6 +236,12 @@ class Session:
 
     def _check_mechanisms(self, mechanisms: tuple[Mechanism, ...]) -> None:
         for mechanism in mechanisms:
+            if isinstance(mechanism, PushingMechanism | CommandedSensingMechanism):
+                raise InputError(
+                    f"{mechanism.name} needs a whole rollout: it acts on the body, or on the markers by the commands",
+                    where="a session",
+                    remedy="train without it; laws at cables, delays, and laws of time on what is measured do step",
+                )
             remembers = isinstance(mechanism, ActuationMechanism | TimedSensingMechanism)
             if remembers and not isinstance(mechanism, SteppedMechanism):
                 raise InputError(

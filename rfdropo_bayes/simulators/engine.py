@@ -37,6 +37,7 @@ from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.rollouts import Motion
+from rfdropo_bayes.fem.section_loads import SectionLoads, loaded
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem
 from rfdropo_bayes.simulators.callbacks import one_callback
 from rfdropo_bayes.simulators.finite_differences import (
@@ -48,6 +49,7 @@ from rfdropo_bayes.simulators.finite_differences import (
     incompressibility_margin,
     with_differences,
 )
+from rfdropo_bayes.simulators.ports import BodySignals
 
 EFFECT_SIZES = BodyEffects(
     bending=BendingLaw(0.2, 0.2, 0.1, 0.1, 0.1),
@@ -64,6 +66,11 @@ CUBE_SIZES = np.repeat([LENGTH, 0.1, 0.1, 1.0], [3, 4, 3, 3])
 """Sizes of a cube's centre [m], quaternion, velocity [m/s] and spin [rad/s]."""
 FRICTION = 0.1
 """Size of a coefficient of friction."""
+LOAD_PLACES = (0.3, 0.65, 1.0)
+"""Shares of a body's length at which forces may act: more places cannot be told apart, as forces at neighbouring ones
+move the markers alike (.95 of one is another's at .06 and .2 m of an arm of .2 m)."""
+BODY_SIGNALS = BodySignals(np.float64(0.1), np.float64(0.1), np.float64(0.1), np.float64(ACCELERATION))  # type: ignore[arg-type]
+"""Sizes of signals that act on a body [N, -, -, m/s2]."""
 
 
 class EngineBody(Protocol):
@@ -112,6 +119,7 @@ class Inputs(NamedTuple):
     start: Float[Array, " cable"]  # displacements before the first step [m]
     displacement: Float[Array, "step cable"]  # at the end of every step [m]
     cube: CubeInputs | None = None
+    loads: BodySignals | None = None
 
 
 @dataclass(frozen=True)
@@ -151,6 +159,22 @@ class Engine:
         return isinstance(self.body.system, System)
 
     @property
+    def carries_loads(self) -> bool:
+        """Whether signals may act on the body."""
+        return self.layered and self.scene is None
+
+    @cached_property
+    def load_stations(self) -> tuple[int, ...]:
+        """Stations of a layered body that forces may act on, from the base to the tip, see `LOAD_PLACES`."""
+        system = self.body.system
+        if not isinstance(system, System):
+            return ()
+        height = np.asarray(system.body.station)
+        aims = height[0] + np.array(LOAD_PLACES) * (height[-1] - height[0])
+        nearest = [int(np.argmin(np.abs(height - aim))) for aim in aims]
+        return tuple(sorted({k for k in nearest if k >= system.clamped_stations}))
+
+    @property
     def lanes(self) -> int:
         """How many rollouts it likes to be given at once."""
         if self.backend.name == "jax":
@@ -176,28 +200,43 @@ class Engine:
         displacement: Float[Array, "step cable"],
         steps: Int[Array, ""] | None = None,
         cube: CubeInputs | None = None,
+        loads: BodySignals | None = None,
     ) -> Motion:
         """Roll out from the initial state; ``steps`` limits the steps computed, later rows hold no meaning.
 
         Derivatives of the compiled backend are differences along each tangent.
 
         Raises:
-            InputError: a cube without a scene, or a scene without a cube.
+            InputError: a cube without a scene, or a scene without a cube; loads on another body than layers alone.
         """
         if (cube is None) != (self.scene is None):
             raise InputError("a cube without a scene, or a scene without a cube", where="engine")
-        inputs = Inputs(material, start, displacement, cube)
+        if loads is not None and not self.carries_loads:
+            raise InputError(
+                "signals on the body act on layers without a cube only",
+                where="engine",
+                remedy='set body = "layered" under [simulator], and leave the cube out',
+            )
+        inputs = Inputs(material, start, displacement, cube, loads)
         if self.backend.name == "jax":
             return self._reference(inputs, steps)
         limit = jnp.asarray(displacement.shape[0] if steps is None else steps, jnp.float64)
         return self._differentiable(inputs, limit)
 
-    def initial(self, material: Material, start: Float[Array, " cable"]) -> tuple[Prepared, State, Float[Array, ""]]:
+    def _section_loads(self, loads: BodySignals) -> SectionLoads:
+        return SectionLoads(*loads, station=self.load_stations)
+
+    def initial(
+        self, material: Material, start: Float[Array, " cable"], loads: BodySignals | None = None
+    ) -> tuple[Prepared, State, Float[Array, ""]]:
         """A layered body in the reference engine before its first step, and the relative force out of balance."""
         system: Any = self.body.system
         prepared, state, residual = prepare(system, material), state_at_rest(system), jnp.zeros(())
         if self.from_equilibrium:
-            state, found = find_equilibrium(system, prepared, start)
+            under, force = prepared, jnp.zeros(())
+            if loads is not None:
+                under, force = loaded(system, prepared, self._section_loads(loads), 0)
+            state, found = find_equilibrium(system, under, start, force)
             residual = found.residual
         if self.integrator != "euler":
             state = state._replace(commanded=jnp.asarray(start))
@@ -211,8 +250,9 @@ class Engine:
         system: Any = self.body.system
         material: Any = inputs.material
         if self.layered:
-            prepared, state, imbalance = self.initial(material, inputs.start)
-            run: Any = partial(simulate, system, prepared)
+            prepared, state, imbalance = self.initial(material, inputs.start, inputs.loads)
+            acting = None if inputs.loads is None else self._section_loads(inputs.loads)
+            run: Any = partial(simulate, system, prepared, loads=acting)
         else:
             state = tetrahedral_dynamics.state_at_rest(system)  # type: ignore[assignment]
             run = partial(tetrahedral_dynamics.simulate, system, material)
@@ -264,7 +304,9 @@ class Engine:
         cube = None if inputs.cube is None else cube_arrays(inputs.cube)
         if isinstance(self.body.system, System):
             begin = {"start" if self.from_equilibrium else "before": inputs.start}
-            return self.native.rollout(inputs.material, inputs.displacement, **begin, steps=steps, cube=cube)
+            acting = None if inputs.loads is None else self._section_loads(inputs.loads)
+            options: dict[str, Any] = {"steps": steps, "cube": cube, "loads": acting}
+            return self.native.rollout(inputs.material, inputs.displacement, **begin, **options)
         commands = inputs.displacement[:, :steps]
         return self.native.rollouts(inputs.material._asdict(), commands, time_step=self.time_step, cube=cube)
 
@@ -278,7 +320,7 @@ def cube_arrays(cube: CubeInputs) -> tuple[Float[np.ndarray, "batch 13"], Float[
 
 def input_sizes(inputs: Inputs) -> Inputs:
     """Sizes that perturbations of the inputs are relative to."""
-    material, start, displacement, cube = inputs
+    material, start, displacement, cube, loads = inputs
     changes: dict[str, Any] = {
         "gravity": jnp.full_like(material.gravity, ACCELERATION),
         "rayleigh_mass": jnp.abs(material.rayleigh_mass) + MASS_DAMPING,
@@ -300,4 +342,6 @@ def input_sizes(inputs: Inputs) -> Inputs:
         widths = np.split(CUBE_SIZES, np.cumsum([3, 4, 3]))
         place = CubeState(*(jnp.broadcast_to(size, v.shape) for size, v in zip(widths, cube.start, strict=True)))
         cube = CubeInputs(solid._replace(friction=jnp.abs(cube.cube.friction) + FRICTION), place)
-    return Inputs(magnitudes, jnp.full_like(start, LENGTH), jnp.full_like(displacement, LENGTH), cube)
+    if loads is not None:
+        loads = jax.tree.map(lambda part, size: jnp.full_like(part, size), loads, BODY_SIGNALS)
+    return Inputs(magnitudes, jnp.full_like(start, LENGTH), jnp.full_like(displacement, LENGTH), cube, loads)

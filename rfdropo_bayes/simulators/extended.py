@@ -13,6 +13,8 @@ from jaxtyping import Array, Float, Int
 from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
 from rfdropo_bayes.simulators.mechanisms import (
     ActuationMechanism,
+    CommandedSensingMechanism,
+    Meanwhile,
     Mechanism,
     SensingMechanism,
     TimedSensingMechanism,
@@ -21,6 +23,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     settled,
 )
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
+from rfdropo_bayes.simulators.ports import reached
 
 
 class ExtendedSimulator:
@@ -86,6 +89,8 @@ class ExtendedSimulator:
             if isinstance(mechanism, ActuationMechanism) and (inside_drive(mechanism) or not drives_only):
                 command = mechanism.actuate(values, command, initial, time_step)
                 initial = settled(mechanism, values, initial)
+        if commands.signals is not None and not drives_only:
+            return reached(commands.signals, initial, command, time_step)
         return initial, command
 
     def driven(self, values: Values, commands: Commands, time_step: float) -> Float[Array, "time channel"]:
@@ -104,18 +109,20 @@ class ExtendedSimulator:
         Mechanisms of sensing may look at later rows, as cameras on a clock that is late do. How far is found from what
         they make of positions that are unknown from some row on.
         """
-        if steps is None or not any(isinstance(mechanism, TimedSensingMechanism) for mechanism in self.mechanisms):
+        ahead = TimedSensingMechanism | CommandedSensingMechanism
+        if steps is None or not any(isinstance(mechanism, ahead) for mechanism in self.mechanisms):
             return steps
         values = {name: jax.lax.stop_gradient(value) for name, value in values.items()}
         end = jnp.asarray(commands.sample_step + (commands.sample_fraction > 0))
         time, rows = observed_at(commands, time_step), len(end)
         wanted = end <= steps
         place = jnp.asarray(self.marker_points())
+        meanwhile = self.meanwhile(values, commands)
 
         def suffices(later: Array) -> Array:
             known = jnp.arange(rows) < wanted.sum() + later
             position = jnp.where(known[:, None, None], place, jnp.nan)
-            seen = jnp.isfinite(self.measured(values, position, time)).all(axis=(1, 2))
+            seen = jnp.isfinite(self.measured(values, position, time, meanwhile)).all(axis=(1, 2))
             return jnp.all(seen | ~wanted)
 
         later = jnp.concatenate([jnp.zeros(1, int), 2 ** jnp.arange(max(rows - 1, 1).bit_length() + 1)])
@@ -124,13 +131,28 @@ class ExtendedSimulator:
         last = jnp.clip(wanted.sum() + found - 1, 0, rows - 1)
         return jnp.where(found > 0, jnp.maximum(steps, end[last]), steps)
 
+    def meanwhile(self, values: Values, commands: Commands) -> Meanwhile | None:
+        """What reaches the cables, where a mechanism of sensing asks for it."""
+        if not any(isinstance(mechanism, CommandedSensingMechanism) for mechanism in self.mechanisms):
+            return None
+        initial, command = self.actuated(values, commands, self.time_step)
+        return Meanwhile(jnp.concatenate([initial[None], command]), commands, self.time_step)
+
     def measured(
-        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
+        self,
+        values: Values,
+        position: Float[Array, "time marker 3"],
+        time: Float[Array, " time"],
+        meanwhile: Meanwhile | None = None,
     ) -> Float[Array, "time marker 3"]:
-        """Marker positions as they are measured [m], given the true ones and when they are seen [s]."""
+        """Marker positions as they are measured [m], given the true ones, when they are seen [s], and what `meanwhile`
+        says."""
         for mechanism in self.mechanisms:
             if isinstance(mechanism, SensingMechanism):
                 position = mechanism.sense(values, position)
             elif isinstance(mechanism, TimedSensingMechanism):
                 position = mechanism.sense_over_time(values, position, time)
+            elif isinstance(mechanism, CommandedSensingMechanism):
+                assert meanwhile is not None
+                position = mechanism.sense_with_commands(values, position, time, meanwhile)
         return position

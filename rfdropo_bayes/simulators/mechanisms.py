@@ -9,14 +9,16 @@ from __future__ import annotations
 import inspect
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.ports import BodySignals
 
 Values = Mapping[str, Float[Array, ""]]
 
@@ -89,6 +91,43 @@ class TimedSensingMechanism(Mechanism, Protocol):
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
     ) -> Float[Array, "time marker 3"]:
         """Return the measured marker positions [m], given the true ones and when they are seen [s]."""
+
+
+class Meanwhile(NamedTuple):
+    """What reaches the cables during a rollout.
+
+    Attributes:
+        levels: commands before the first step and at the end of every step [m or rad].
+        commands: which of the steps are observed.
+        time_step: [s].
+    """
+
+    levels: Float[Array, "row channel"]
+    commands: Commands
+    time_step: float
+
+
+@runtime_checkable
+class CommandedSensingMechanism(Mechanism, Protocol):
+    """Acts on what is measured, in a way that depends on what is commanded meanwhile."""
+
+    def sense_with_commands(
+        self,
+        values: Values,
+        position: Float[Array, "time marker 3"],
+        time: Float[Array, " time"],
+        meanwhile: Meanwhile,
+    ) -> Float[Array, "time marker 3"]:
+        """Return the measured marker positions [m], given the true ones, when they are seen [s], and what reaches the
+        cables meanwhile."""
+
+
+@runtime_checkable
+class PushingMechanism(Mechanism, Protocol):
+    """Acts on a layered body from step to step, in a way that depends on time and on what is commanded."""
+
+    def push(self, values: Values, command: Float[Array, "row channel"], time_step: float, places: int) -> BodySignals:
+        """Return what acts on the body, given the commands that reach the cables; row 0 is before the first step."""
 
 
 @runtime_checkable

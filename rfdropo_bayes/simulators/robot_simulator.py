@@ -23,8 +23,17 @@ from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observ
 from rfdropo_bayes.simulators.cube import cube_at_measured, cube_inputs, push_table, scene_of
 from rfdropo_bayes.simulators.engine import Backend, CubeInputs, Engine
 from rfdropo_bayes.simulators.extended import ExtendedSimulator
-from rfdropo_bayes.simulators.mechanisms import BodyMechanism, Mechanism, Values, check_mechanisms, code_of
+from rfdropo_bayes.simulators.mechanisms import (
+    BodyMechanism,
+    Meanwhile,
+    Mechanism,
+    PushingMechanism,
+    Values,
+    check_mechanisms,
+    code_of,
+)
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
+from rfdropo_bayes.simulators.ports import BodySignals
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 EQUILIBRIUM_TOLERANCE = 1e-3
@@ -172,8 +181,30 @@ class RobotSimulator(ExtendedSimulator):
         """
         values = self.complete(parameters)
         steps = self.steps_seen(values, commands, self.time_step, steps)
-        motion = self.engine.motion(*self.inputs(values, commands), steps, self.body_inputs(values)[1])
+        cube, loads = self.body_inputs(values)[1], self.loads(values, commands)
+        motion = self.engine.motion(*self.inputs(values, commands), steps, cube, loads)
         return self.observation(values, commands, motion, self.unsolved)
+
+    def loads(self, values: Values, commands: Commands) -> BodySignals | None:
+        """What acts on the body from step to step: signals that come with the commands, and mechanisms; None for
+        nothing.
+
+        Raises:
+            InputError: mechanisms that do, on another body than layers without a cube.
+        """
+        pushing = [mechanism for mechanism in self.mechanisms if isinstance(mechanism, PushingMechanism)]
+        found = [] if commands.signals is None or commands.signals.body is None else [commands.signals.body]
+        if pushing:
+            if not self.engine.carries_loads:
+                raise InputError(
+                    f"{pushing[0].name} acts on layers without a cube only",
+                    where="[[model.laws]]",
+                    remedy='set body = "layered" under [simulator], and leave the cube out',
+                )
+            initial, command = self.actuated(values, commands, self.time_step)
+            levels, places = jnp.concatenate([initial[None], command]), len(self.engine.load_stations)
+            found += [mechanism.push(values, levels, self.time_step, places) for mechanism in pushing]
+        return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *found) if found else None
 
     def balance(self, parameters: Values, commands: Commands) -> Balance:
         """Forces on the body, its energies, work and losses of a rollout at the observation times; see `fem.balance`.
@@ -192,6 +223,12 @@ class RobotSimulator(ExtendedSimulator):
                 remedy='use integrator = "euler" under [simulator], with shorter steps',
             )
         values = self.complete(parameters)
+        if self.loads(values, commands) is not None:
+            raise InputError(
+                "forces and energies are not available where laws act on the body",
+                where="balance",
+                remedy="leave them out of [[model.laws]]",
+            )
         inputs = self.inputs(values, commands)
         engine = self.engine.recording(every_node(self.assembly.system.body.nodes))
         motion = engine.motion(*inputs, cube=self.body_inputs(values)[1])
@@ -241,7 +278,8 @@ class RobotSimulator(ExtendedSimulator):
 
     def observation(self, values: Values, commands: Commands, motion: Motion, unsolved: Result) -> Observation:
         """What a motion shows; ``unsolved`` says how a rollout ended whose constraints were not all solved."""
-        position = self.measured(values, sample(motion.position, commands), observed_at(commands, self.time_step))
+        true, at = sample(motion.position, commands), observed_at(commands, self.time_step)
+        position = self.measured(values, true, at, self.meanwhile(values, commands))
         pose = None
         if motion.pose is not None:
             pose = sample(motion.pose, commands)
@@ -300,8 +338,12 @@ class RobotSimulator(ExtendedSimulator):
         return self.robot.marker_points()
 
     def measured(
-        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
+        self,
+        values: Values,
+        position: Float[Array, "time marker 3"],
+        time: Float[Array, " time"],
+        meanwhile: Meanwhile | None = None,
     ) -> Float[Array, "time marker 3"]:
         """See `ExtendedSimulator.measured`; the offset of the measuring frame is added last."""
-        position = super().measured(values, position, time)
+        position = super().measured(values, position, time, meanwhile)
         return position + jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])

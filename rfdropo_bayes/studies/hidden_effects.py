@@ -16,10 +16,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.audit.fit import FitTarget, climb
-from rfdropo_bayes.audit.pipeline import measurements_of, simulated
+from rfdropo_bayes.audit.problem import measurements_of, simulated
 from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.bayes.channels.tension import reading_size
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
@@ -125,7 +125,7 @@ def hide(
     """
     rng = np.random.default_rng(seed)
     out = output_folder(out)
-    experiment = _experiment(setting, exclude)
+    experiment = experiment_tables(setting, exclude)
     blank = _blank_recordings(setting, rng)
     fitted, untouched = blank[: REPEATS + 1], blank[REPEATS + 1 :]
     problem = build_problem(spec_of(experiment, out), AuditTable(), fitted, untouched, seed, workshop=workshop)
@@ -167,11 +167,14 @@ def _belongs(problem: Any, name: str, mechanisms: Sequence[str]) -> bool:
     return name in own or names.index(name) < problem.coordinates.base
 
 
-def _experiment(setting: Setting, exclude: Sequence[str]) -> Experiment:
+def experiment_tables(
+    setting: Setting, exclude: Sequence[str] = (), fit: Sequence[str] = ("fit_*.nc", "screen.nc")
+) -> Experiment:
+    """The experiment file that audits a data set."""
     return Experiment.model_validate(
         {
             "robot": setting.robot,
-            "data": {"format": "netcdf", "fit": ["fit_*.nc", "screen.nc"], "test": ["test_*.nc"]},
+            "data": {"format": "netcdf", "fit": list(fit), "test": ["test_*.nc"]},
             "model": {
                 "priors": {name: dict(table) for name, table in setting.priors.items()},
                 "tension": setting.tension,
@@ -248,7 +251,7 @@ def _made(
     setting: Setting, mechanisms: Sequence[str], values: Mapping[str, float], blank: Sequence[Trajectory]
 ) -> Observation:
     """What the finer simulator shows of every recording."""
-    spec = spec_of(_experiment(setting, ()), Path(), mechanisms=mechanisms)
+    spec = spec_of(experiment_tables(setting, ()), Path(), mechanisms=mechanisms)
     simulator = build_simulator(replace(spec, simulator=SimulatorTable.model_validate(dict(setting.made))))
     recordings = gather_recordings(simulator, blank)
     given = {name: jnp.asarray(v) for name, v in values.items()}
@@ -267,6 +270,21 @@ def _discretisation(target: FitTarget, truth: np.ndarray, made: Observation, mem
     return float(np.sqrt(np.mean(refit.residual**2)))
 
 
+def noisy(
+    recording: Trajectory, position: Float[np.ndarray, "time marker 3"], key: PRNGKeyArray, setting: Setting
+) -> Trajectory:
+    """A recording whose markers are at these positions, and measured with noise."""
+    memory = jnp.asarray(-setting.commands.sample_time / np.log(MEMORY))
+    time, size = jnp.asarray(recording.time), Noise(jnp.asarray(NOISE), memory)
+    noise = np.asarray(draw_noise(key, time, position.shape[1], size))
+    if setting.shared > 0.0:
+        common = np.asarray(draw_noise(jax.random.fold_in(key, 2), time, 1, size))
+        noise = np.sqrt(1.0 - setting.shared) * noise + np.sqrt(setting.shared) * common
+    dataset = recording.dataset.copy()
+    dataset["position"] = dataset["position"].copy(data=position + noise)
+    return Trajectory(dataset)
+
+
 def _write(
     setting: Setting,
     experiment: Experiment,
@@ -275,17 +293,9 @@ def _write(
     seed: int,
     out: Path,
 ) -> None:
-    step = setting.commands.sample_time
     for index, (recording, position) in enumerate(zip(blank, np.asarray(made.position), strict=True)):
         key = jax.random.fold_in(jax.random.key(seed), index)
-        memory = jnp.asarray(-step / np.log(MEMORY))
-        time, size = jnp.asarray(recording.time), Noise(jnp.asarray(NOISE), memory)
-        noise = np.asarray(draw_noise(key, time, position.shape[1], size))
-        if setting.shared > 0.0:
-            common = np.asarray(draw_noise(jax.random.fold_in(key, 2), time, 1, size))
-            noise = np.sqrt(1.0 - setting.shared) * noise + np.sqrt(setting.shared) * common
-        dataset = recording.dataset.copy()
-        dataset["position"] = dataset["position"].copy(data=position + noise)
+        dataset = noisy(recording, position, key, setting).dataset
         if setting.tension:
             pull = np.asarray(made.tension)[index]
             error = np.asarray(jax.random.normal(jax.random.fold_in(key, 1), pull.shape))

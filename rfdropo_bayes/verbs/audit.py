@@ -21,8 +21,10 @@ from rfdropo_bayes.audit.fit import widening
 from rfdropo_bayes.audit.fixed_quantities import OwnParameter, with_fixed_quantities
 from rfdropo_bayes.audit.forward import Lanes, RoutedLanes
 from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.pipeline import Answer, AuditProblem
+from rfdropo_bayes.audit.law_words import law_tables
+from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.pipeline import audit as ask
+from rfdropo_bayes.audit.problem import AuditProblem
 from rfdropo_bayes.bayes.channels import Series
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
 from rfdropo_bayes.bayes.noise.stacked import Stacked
@@ -31,6 +33,7 @@ from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
+from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.mechanisms.registry import source_of
 from rfdropo_bayes.model.assembly import (
     AnySimulator,
@@ -220,10 +223,15 @@ def build_problem(
         candidates,
         _stated(spec, model, fitted[0]),
         start,
-        Rules(bootstraps=table.bootstraps, minutes=table.minutes),
+        Rules(
+            bootstraps=table.bootstraps,
+            minutes=table.minutes,
+            matters=None if table.matters_mm is None else 1e-3 * table.matters_mm,
+        ),
         seed,
         {name: why for name, why in left_out.items() if name not in table.exclude},
         groups,
+        port_map(simulator, model.recordings.markers) if library and table.ports else None,
     )
 
 
@@ -434,6 +442,8 @@ def extended_tables(tables: dict[str, Any], answer: Answer, folder: Path, out: P
         if source not in model.get("mechanisms", []):
             model["mechanisms"] = [*model.get("mechanisms", []), source]
         model.setdefault("priors", {}).update(sized_priors(answer, candidate))
+    if laws := law_tables(answer):
+        model["laws"] = [*model.get("laws", []), *laws]
     audit = extended.get("audit", {})
     if "candidates" in audit:
         adopted = {step.name for step in answer.adopted}

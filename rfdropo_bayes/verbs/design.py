@@ -18,7 +18,8 @@ from rfdropo_bayes.audit.deadline import Deadline, OutOfTime
 from rfdropo_bayes.audit.experiment_design import DesignOutlook, Hypothesis, at_hand, best, outlooks
 from rfdropo_bayes.audit.extension import DISCRETISATION, ExtensionSearch
 from rfdropo_bayes.audit.fit import Fit, FitTarget
-from rfdropo_bayes.audit.pipeline import AuditProblem, base_model
+from rfdropo_bayes.audit.pipeline import base_model
+from rfdropo_bayes.audit.problem import AuditProblem
 from rfdropo_bayes.bayes.recordings import commands_after
 from rfdropo_bayes.data import DataSpec, Trajectory, asl_csv
 from rfdropo_bayes.data.asl_csv import FORMAT as ASL
@@ -217,7 +218,7 @@ def units_said(data: DataSpec | None) -> str:
 def _shaped(sequences: Sequence[Commands], like: Commands) -> list[Commands]:
     """Sequences padded and cut to the shape of the recordings at hand, which the compiled simulator expects."""
     steps, rows = like.step.shape[1], like.sample_step.shape[1]
-    stacked = stack_commands([*sequences, Commands(*(np.asarray(part)[0] for part in like))])
+    stacked = stack_commands([*sequences, like.of(0)])
     return [
         Commands(
             np.asarray(stacked.initial)[k],

@@ -14,7 +14,8 @@ from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.differences import Groups, with_differences
 from rfdropo_bayes.audit.fixed_quantities import families
 from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.pipeline import AuditProblem, audit, first_target
+from rfdropo_bayes.audit.pipeline import audit, first_target
+from rfdropo_bayes.audit.problem import AuditProblem
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel

@@ -13,7 +13,7 @@ from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.forward import Lanes
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.pipeline import AuditProblem
+from rfdropo_bayes.audit.problem import AuditProblem
 from rfdropo_bayes.bayes.channels import Markers, MotorAngle, Tension, Weighed, WeighedParts
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.repeat_noise import mean_of, spread

@@ -14,6 +14,7 @@ from rfdropo_bayes.fem.effects import BodyEffects
 from rfdropo_bayes.fem.integrators import Stage
 from rfdropo_bayes.fem.layered import LayeredBody
 from rfdropo_bayes.fem.native import layered_effects as at
+from rfdropo_bayes.fem.section_loads import SectionLoads
 
 
 def _each(function: Callable[[float], float], values: ArrayLike, count: int) -> Float[np.ndarray, " batch"]:
@@ -88,3 +89,14 @@ def effect_flags(effects: BodyEffects) -> Int[np.ndarray, " flags"]:
     flags[at.FRICTION] = effects.coulomb_friction is not None
     flags[at.FRICTION + 1] = effects.capstan_friction is not None
     return flags
+
+
+def load_rows(loads: SectionLoads | None) -> tuple[Float[np.ndarray, "batch values"], Int[np.ndarray, " places"]]:
+    """What acts on the body as the kernels read it, row by row, and the stations that forces act on."""
+    if loads is None:
+        return np.zeros((1, 1)), np.zeros(1, dtype=np.int64)
+    force = np.asarray(loads.force, float)
+    batch, rows = force.shape[:2]
+    factors = [np.exp(np.asarray(part, float))[..., None] for part in (loads.stiffness, loads.damping)]
+    columns = [force.reshape(batch, rows, -1), *factors, np.asarray(loads.gravity, float)]
+    return np.concatenate(columns, axis=-1).reshape(batch, -1), np.asarray(loads.station, dtype=np.int64)

@@ -13,6 +13,7 @@ from rfdropo_bayes.fem.native.fields import clear
 from rfdropo_bayes.fem.native.layered_effects import (
     BENDING,
     BRANCH,
+    LOADED,
     SURROUNDED,
     add_bending_law,
     add_law_tangent,
@@ -342,7 +343,12 @@ def add_momentum(tables, samples, force, drag, velocity, field, token):
 
 @kernel
 def start_loads(tables, samples, factors, work, token):
-    """``field`` = M (force * gravity - drag * v): the right-hand side without the elastic forces."""
+    """``field`` = M (force * gravity - drag * v) and forces on sections: the right-hand side without elastic forces."""
     clear(work.field, 0, 3 * tables.modes * tables.stations, token)
     force, drag = load(factors.force, 0, token), load(factors.drag, 0, token)
     add_momentum(tables, samples, force, drag, work.velocity, work.field, token)
+    if samples.present[LOADED]:  # the first mode of a section moves it as a whole
+        for station in range(tables.stations):
+            for i in range(3):
+                row, pushed = 3 * station * tables.modes + i, load(work.pushed, 3 * station + i, token)
+                store(work.field, row, fma(force, pushed, load(work.field, row, token)))

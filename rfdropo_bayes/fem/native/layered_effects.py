@@ -12,7 +12,9 @@ from rfdropo_bayes.fem.surroundings import STILL, WALL_SOFTNESS
 
 BENDING, BRANCH, SURROUNDED, FRICTION = range(4)
 """Flags in ``samples.present``; the last one is Coulomb's friction, that of the capstan follows it."""
-FLAGS = FRICTION + 2
+LOADED = FRICTION + 2
+"""Flag of what acts on the body from step to step, see ``fem.section_loads``."""
+FLAGS = LOADED + 1
 GAIN, SHARE, DECAY, LATER_DECAY, DRAG, WALL, DISTANCE, NORMAL_X, NORMAL_Y, GIVE, COULOMB, CAPSTAN = range(12)
 """Rows of ``samples.effects``; gain and share are those of a stage, decay that of the moduli in each stage."""
 EFFECTS = CAPSTAN + 1

@@ -33,9 +33,10 @@ from rfdropo_bayes.fem.native.contact_records import (
     scene_tables,
     touch_storage,
 )
-from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, law_rows
+from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, law_rows, load_rows
 from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
 from rfdropo_bayes.fem.native.layered_constraints import Rows, row_storage
+from rfdropo_bayes.fem.native.layered_effects import LOADED
 from rfdropo_bayes.fem.native.layered_records import (
     KINDS,
     Factors,
@@ -50,6 +51,7 @@ from rfdropo_bayes.fem.native.section_modes import border_panels, layered_tables
 from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rollouts import Motion
+from rfdropo_bayes.fem.section_loads import SectionLoads
 
 Precision = Literal["float64", "float32"]
 # When a step's impulses are found and what counts as a missed contact, as far as the precision resolves them;
@@ -156,6 +158,7 @@ class NativeLayered:
         steps: int | None = None,
         stride: int = 1,
         cube: tuple[Float[np.ndarray, "*batch 13"], Float[np.ndarray, "*batch 4"]] | None = None,
+        loads: SectionLoads | None = None,
     ) -> Motion:
         """Roll out a batch.
 
@@ -170,11 +173,12 @@ class NativeLayered:
             stride: record every so many steps.
             cube: of an engine with a scene: centre [m], unit quaternion (x, y, z, w), velocity [m/s] and spin [rad/s]
                 at the start; mass [kg], side [m], radius of gyration [m] and coefficient of friction.
+            loads: what acts on the body from step to step; None for nothing.
 
         Raises:
             InputError: shapes that do not fit, a cube without a scene or a scene without a cube.
         """
-        run = self.run_of(material, displacement, start, before, steps, stride, cube)
+        run = self.run_of(material, displacement, start, before, steps, stride, cube, loads)
         rubs = material.effects.rubs
         in_blocks(
             lambda first: self.run_block(run, self.records(rubs), first), run.batch.count, self.lanes, self.threads
@@ -213,6 +217,7 @@ class NativeLayered:
         steps: int | None,
         stride: int,
         cube: tuple[np.ndarray, np.ndarray] | None,
+        loads: SectionLoads | None = None,
     ) -> Run:
         """What the kernels read and write; arguments as `rollout`."""
         displacement = np.asarray(displacement, dtype=float)
@@ -224,7 +229,12 @@ class NativeLayered:
         if begin.ndim not in (1, 2) or begin.shape[-1] != cables:
             raise InputError(f"start has shape {begin.shape} for {cables} cables", where="rollout")
         moves = displacement.reshape(-1, displacement.shape[-2] * cables)
-        batch = self._batch(material, {"start": begin.reshape(-1, cables), "displacement": moves})
+        pushed, place = load_rows(loads)
+        batch = self._batch(material, {"start": begin.reshape(-1, cables), "displacement": moves, "loads": pushed})
+        if loads is not None:
+            present = batch.present.copy()
+            present[LOADED] = 1
+            batch = batch._replace(present=present, place=place, places=len(place))
         steps = displacement.shape[-2] if steps is None else min(int(steps), displacement.shape[-2])
         if (cube is None) != (self._scene is None):
             raise InputError("a scene without a cube, or a cube without a scene", where="rollout")
@@ -283,7 +293,8 @@ class NativeLayered:
         }
         arrays = {name: np.ascontiguousarray(array, dtype=self.dtype) for name, array in arrays.items()}
         pitches = {f"{name}_pitch": value.shape[1] if len(value) > 1 else 0 for name, value in commands.items()}
-        return Batch(**arrays, present=effect_flags(effects), count=count, **pitches)
+        nowhere = np.zeros(1, dtype=np.int64)
+        return Batch(**arrays, present=effect_flags(effects), place=nowhere, places=0, count=count, **pitches)
 
 
 @cache

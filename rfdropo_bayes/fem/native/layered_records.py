@@ -90,6 +90,10 @@ class LayeredWork(NamedTuple):
     pulled: Float[np.ndarray, "panel_cables lanes"]  # these times minus their springs
     web: Float[np.ndarray, "tiles lanes"]  # sums over the strings of a layer
     softness: Float[np.ndarray, "1 lanes"]  # what time has left of the moduli
+    firmness: Float[np.ndarray, "1 lanes"]  # factor on the stiffness in a step, and on the damping
+    loss: Float[np.ndarray, "1 lanes"]
+    pushed: Float[np.ndarray, "stations3 lanes"]  # forces on the sections in a step [N]
+    given: Float[np.ndarray, "stations3 lanes"]
     branch: Float[np.ndarray, "layer_values lanes"]  # strain of the dashpots, as displacements
     slope: Float[np.ndarray, "layers6 lanes"]  # derivatives of the bending law's moments
     around: Float[np.ndarray, "stations3 lanes"]  # wall and fluid in the matrix

@@ -14,7 +14,7 @@ from rfdropo_bayes.fem.native.fields import clear, fill_lanes, point
 from rfdropo_bayes.fem.native.kernel_cache import named_by
 from rfdropo_bayes.fem.native.layered_assembly import follow_branch, layer_frame
 from rfdropo_bayes.fem.native.layered_constraints import constrained_stage
-from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, LAW
+from rfdropo_bayes.fem.native.layered_effects import BRANCH, DECAY, EFFECTS, FLAGS, LAW, LOADED
 from rfdropo_bayes.fem.native.layered_records import Factors, LayeredSamples, LayeredWork
 from rfdropo_bayes.fem.native.layered_statics import finish_settling, start_settling, take_increment
 from rfdropo_bayes.fem.native.layered_step import set_factors, solve_statics
@@ -38,9 +38,13 @@ class Batch(NamedTuple):
     present: Int[np.ndarray, " flags"]
     start: Float[np.ndarray, "rows cables"]  # displacements before the first step, those of the initial equilibrium
     displacement: Float[np.ndarray, "rows steps cables"]
+    loads: Float[np.ndarray, "rows values"]  # forces at the places, two factors and gravity, of each step
+    place: Int[np.ndarray, " places"]  # stations that forces act on
+    places: int
     count: int
     start_pitch: int  # from one row to the next, 0 where one serves all
     displacement_pitch: int
+    loads_pitch: int
 
 
 class LayeredOutput(NamedTuple):
@@ -93,6 +97,7 @@ def storage(tables: LayeredTables, lanes: int, dtype: type) -> tuple[LayeredSamp
         beyond=3 * layers, held=layers, string=2 * layers * cables, ways=3 * web * cables,
         pulled=3 * web * cables, web=9 * web**2, branch=layers * section, slope=6 * layers,
         around=3 * stations, unsolved=1, accepted=1, lost=1, failed=1, relaxation=1, imbalance=1, softness=1,
+        firmness=1, loss=1, pushed=3 * stations, given=max(3 * stations, 3),
     )  # fmt: skip
     factors = Factors(**rows(**dict.fromkeys(Factors._fields, 1)))
     return LayeredSamples(**samples, present=np.zeros(FLAGS, dtype=np.int64)), factors, LayeredWork(**work)
@@ -146,6 +151,28 @@ def start_rollouts(tables, batch, samples, work, first, token):
     clear(work.failed, 0, 1, token)
     clear(work.imbalance, 0, 1, token)
     store(work.softness, 0, fill(1.0, work.softness, token))
+    clear(work.pushed, 0, 3 * tables.stations, token)
+
+
+@kernel
+def take_loads(batch, samples, work, row, first, token):
+    """What acts on the body in a step: forces on sections, factors on stiffness and damping, and gravity."""
+    if samples.present[LOADED]:
+        pitch, count, forces = batch.loads_pitch, batch.count, 3 * batch.places
+        at = row * (forces + 5)
+        fill_lanes(batch.loads, pitch, at, forces, first, count, work.given, token)
+        for p in range(batch.places):
+            for i in range(3):
+                store(work.pushed, 3 * batch.place[p] + i, load(work.given, 3 * p + i, token))
+        fill_lanes(batch.loads, pitch, at + forces, 1, first, count, work.firmness, token)
+        fill_lanes(batch.loads, pitch, at + forces + 1, 1, first, count, work.loss, token)
+        fill_lanes(batch.loads, pitch, at + forces + 2, 3, first, count, work.given, token)
+        fill_lanes(batch.gravity, 3, 0, 3, first, count, samples.gravity, token)
+        for i in range(3):
+            store(samples.gravity, i, load(samples.gravity, i, token) + load(work.given, i, token))
+    else:
+        store(work.firmness, 0, fill(1.0, work.firmness, token))
+        store(work.loss, 0, fill(1.0, work.loss, token))
 
 
 @kernel
@@ -181,6 +208,8 @@ def _take_commands(tables, batch, work, step, share, first, token):
 def begin_stage(tables, batch, samples, factors, work, touch, schedule, step, number, first, token):
     """Factors and commands of a stage, and the place where its forces are taken."""
     stage = schedule.stages[number]
+    if number == 0:
+        take_loads(batch, samples, work, step + 1, first, token)
     store(work.softness, 0, load(work.softness, 0, token) * load(samples.effects, DECAY + number, token))
     set_factors(samples, factors, work, stage, fill(1.0, work.softness, token), token)
     share = 1.0 if number + 1 == schedule.count else stage.elapsed / schedule.time_step
@@ -225,6 +254,7 @@ def settle(tables, batch, samples, factors, work, p, schedule, first, token):
     if schedule.resumed:
         return
     start_rollouts(tables, batch, samples, work, first, token)
+    take_loads(batch, samples, work, 0, first, token)
     fill_lanes(batch.start, batch.start_pitch, 0, tables.cables, first, batch.count, work.commanded, token)
     if schedule.static_iterations > 0:
         start_settling(tables, samples, factors, work, token)

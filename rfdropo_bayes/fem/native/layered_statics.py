@@ -116,10 +116,10 @@ def _imbalance(tables, samples, factors, work, token):
 def start_settling(tables, samples, factors, work, token):
     """Make the solves those of a static iteration."""
     one, zero = fill(1.0, factors.force, token), fill(0.0, factors.force, token)
-    store(factors.elasticity, 0, one)
+    store(factors.elasticity, 0, load(work.firmness, 0, token))
     store(factors.inertia, 0, zero)
     store(factors.force, 0, one)
-    store(factors.strain, 0, one)
+    store(factors.strain, 0, load(work.firmness, 0, token))
     store(factors.strain_rate, 0, zero)
     store(factors.drag, 0, zero)
     store(factors.fluid, 0, zero)

@@ -27,9 +27,11 @@ LARGEST = 1e30
 @kernel
 def set_factors(samples, factors, work, stage, wide, token):
     """Factors of a stage, which impacts make so much longer."""
-    length, drag = fill(stage.length, samples.damping, token) * wide, load(samples.damping, 0, token)
+    loss = load(work.loss, 0, token)
+    length, drag = fill(stage.length, samples.damping, token) * wide, load(samples.damping, 0, token) * loss
     one, gain = fill(1.0, drag, token), load(samples.effects, GAIN, token)
-    softness, damping = load(work.softness, 0, token), load(samples.damping, 1, token)
+    softness = load(work.softness, 0, token) * load(work.firmness, 0, token)
+    damping = load(samples.damping, 1, token) * loss
     lookahead = length * (one + gain) + damping
     behind = damping if stage.predicted else lookahead
     store(factors.elasticity, 0, length * lookahead * softness)

@@ -1,0 +1,158 @@
+"""The audit's last word: what acts on the robot that the library does not have, described as a law at a port.
+
+It is asked where the library leaves something: beside the base model, and where that finds nothing better than what the
+library named, beside the model with what it named. A library candidate that a law beats clearly on unseen recordings
+stands in for the law, and is not adopted as a cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from rfdropo_bayes.audit.deadline import OutOfTime
+from rfdropo_bayes.audit.extension import DISCRETISATION, Added, Rules
+from rfdropo_bayes.audit.fit import Fit, FitTarget, widened
+from rfdropo_bayes.audit.gain import Gain
+from rfdropo_bayes.audit.held_out import HeldOut, predicted, stages_of
+from rfdropo_bayes.audit.inadequacy import as_measured
+from rfdropo_bayes.audit.laws import FoundLaw, Refit, law_search
+from rfdropo_bayes.audit.problem import AuditProblem
+
+
+@dataclass(frozen=True)
+class Described:
+    """What a search for laws says of an audit.
+
+    Attributes:
+        found: ports and law.
+        beside: mechanisms that the law stands beside, in the model.
+        stand_ins: mechanisms of the library that the law takes the place of.
+        gain: of the law on recordings that no fit has seen, against the model without it; None where there is no
+            law, or the time was up.
+        overall: the same against the base model.
+        held_out: predictions of these recordings: of the base model, and last of the model with the law.
+        holds: whether unseen recordings clearly support the law.
+    """
+
+    found: FoundLaw
+    beside: tuple[str, ...] = ()
+    stand_ins: tuple[str, ...] = ()
+    gain: Gain | None = None
+    overall: Gain | None = None
+    held_out: HeldOut | None = None
+    holds: bool = False
+
+    @property
+    def last(self) -> Refit | None:
+        """The model with the law."""
+        return self.found.last
+
+    @property
+    def sizes(self) -> tuple[Fit, FitTarget] | None:
+        """The model's fit under priors that do not pull, and its target."""
+        last = self.last
+        return None if last is None else (widened(last.fit, last.target.forward.coordinates), last.target)
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model that a law may stand beside: the target it was fitted under, its fit, and the steps that led to it."""
+
+    judge: FitTarget
+    fit: Fit
+    steps: tuple[Added, ...] = ()
+
+
+def describe(
+    problem: AuditProblem,
+    judge: FitTarget,
+    base: Fit,
+    steps: Sequence[Added],
+    held_out: HeldOut | None,
+    report: Callable[[str], None] = lambda line: None,
+) -> Described | None:
+    """Where something acts that the library does not have, and by what law; None where nobody asks, or no time is left.
+
+    Args:
+        problem: with the ports of its simulator.
+        judge, base: the base model.
+        steps: what the library named.
+        held_out: predictions of unseen recordings by the base model and after each step; None without steps.
+        report: called with a line of words now and then.
+    """
+    if problem.ports is None or problem.groups is not None:
+        return None
+    answer: Described | None = None
+    clock = judge.forward.deadline
+    with clock.stage("ports and laws"), clock.reserve(), suppress(OutOfTime):
+        plain = Model(judge, base)
+        answer = _beside(problem, plain, judge, base, report)
+        if not steps:
+            return answer
+        names = tuple(step.name for step in steps)
+        seen = answer.held_out if answer.holds else None
+        if held_out is not None and seen is not None and seen.beside(held_out.after(len(steps))).clear:
+            return replace(answer, stand_ins=names)
+        further = _beside(problem, Model(steps[-1].judge, steps[-1].fit, tuple(steps)), judge, base, report)
+        return replace(further, beside=names) if further.holds else replace(answer, holds=False, beside=())
+    return answer
+
+
+def _beside(
+    problem: AuditProblem, model: Model, judge: FitTarget, base: Fit, report: Callable[[str], None]
+) -> Described:
+    """The law beside one model, and what it is worth on unseen recordings."""
+    simulator: Any = problem.lanes.simulator
+    assert problem.ports is not None
+    channels, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
+    target = model.judge
+    options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report)
+    found = law_search(target.measured, *options).find(target, as_measured(target, model.fit))
+    last = found.last
+    if last is None:
+        return Described(found)
+    stages = stages_of(judge, base, model.steps)
+    finer = bool(model.steps) and any(step.name == DISCRETISATION for step in model.steps)
+    stages.append(type(stages[0])(last.target, last.fit, finer))
+    held_out = predicted(problem, judge.measured, stages)
+    gain, overall = held_out.gain(len(stages) - 2, len(stages) - 1), held_out.gain(0, len(stages) - 1)
+    return Described(found, (), (), gain, overall, held_out, holds_on(problem.rules, gain))
+
+
+def holds_on(rules: Rules, gain: Gain) -> bool:
+    """Whether a law holds on unseen recordings: they are clearly likelier with it, and it explains more than a share of
+    the discrepancy that is next to nothing."""
+    return bool(gain.clear and not gain.worse and gain.interval[0] > rules.significant)
+
+
+def coefficients(described: Described, seed: int) -> list[dict[str, Any]]:
+    """Coefficients of a law: mean, deviation, quantiles and unit, by the model's normal approximation."""
+    if described.sizes is None:
+        return []
+    fit, target = described.sizes
+    coordinates = target.forward.coordinates
+    draws = fit.draws(np.random.default_rng([seed, 7]), 1000, *coordinates.bounds)
+    values, rows = coordinates.values(draws), []
+    for refit in described.found.terms:
+        column = values[:, coordinates.names.index(refit.term.spec.name)]
+        rows.append(
+            {
+                "port": refit.term.port.name,
+                "feature": refit.term.feature.kind,
+                "coefficient": refit.term.spec.name,
+                "mean": float(column.mean()),
+                "sd": float(column.std()),
+                "q05": float(np.quantile(column, 0.05)),
+                "q95": float(np.quantile(column, 0.95)),
+                "unit": refit.term.spec.unit,
+                "left_out_gain": refit.gain.gain,
+                "left_out_share": refit.gain.share,
+                "score": refit.score,
+            }
+        )
+    return rows

@@ -1,0 +1,397 @@
+"""By what law something acts at a port: terms are chosen by recordings that they are not fitted to, and refitted.
+
+One term at a time: every feature at every port is fitted together with the base parameters, linearly, to all recordings
+but one, and predicts that one. The best are refitted without linearisation. Then the next term is looked for in what is
+left. Choosing several terms before the first refit lets false ones in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.audit.deadline import OutOfTime
+from rfdropo_bayes.audit.fit import Fit, FitTarget, climb
+from rfdropo_bayes.audit.inadequacy import as_measured, fit_with_noise
+from rfdropo_bayes.audit.port_evidence import PortEvidence, evidences
+from rfdropo_bayes.audit.ported import FeatureTable, PlacedTerm, PortedForward, placed
+from rfdropo_bayes.audit.ports import Responses, feature_columns, responses, signal_sizes, with_exact_columns
+from rfdropo_bayes.audit.screen import null_residuals
+from rfdropo_bayes.mechanisms.features import Feature, dictionary
+from rfdropo_bayes.mechanisms.ports import Port, PortMap
+
+GATE = 25.0
+"""Nats by which left-out recordings must be likelier with a term. The most that the best of 48 ports and 60 features
+brought in 200 data sets without discrepancy was 22.9."""
+LEAST = 0.01
+"""Share of what the model leaves beyond the noise that a term must explain in left-out recordings."""
+STOP = 10.0
+"""Log evidence of a port from which on a further term is looked for: without discrepancy the most was 7.4."""
+SURE = 4.0  # deviations from zero that a coefficient must have to stay
+TERMS = 3  # of a law
+BY_EVIDENCE, BY_GAIN = 3, 2  # ports and terms that are refitted
+EXCHANGES = 2  # rounds in which a term may take the place of the one that was chosen
+FRESH = 3  # terms that are refitted in each round
+GLANCE = 4  # steps of a refit that only ranks
+TIED = 10.0  # nats by which a refit must be worse to be told apart from the best
+PIECES = 3  # parts of a single recording, which are left out in turn
+NULLS = 199  # simulated data sets behind the p-values of ports
+COLLINEAR = 1e-6  # share of a column that the base parameters must leave
+
+
+@dataclass(frozen=True)
+class TermGain:
+    """One feature at one port, fitted linearly together with the base parameters.
+
+    Attributes:
+        port, feature: which.
+        gain: of log density of left-out recordings [nat].
+        share: of what is left beyond the noise there.
+        size: of the coefficient; sd: its deviation.
+        typical: root mean square of the feature.
+    """
+
+    port: Port
+    feature: Feature
+    gain: float
+    share: float
+    size: float
+    sd: float
+    typical: float
+
+
+@dataclass(frozen=True)
+class Refit:
+    """A model with one more term, refitted.
+
+    Attributes:
+        term: the last one.
+        target, fit: the model.
+        gain: see `TermGain`.
+        score: nats that the term brings, less what a parameter and the choice among many cost.
+    """
+
+    term: PlacedTerm
+    target: FitTarget
+    fit: Fit
+    gain: TermGain
+    score: float
+
+    @property
+    def square(self) -> float:
+        """Sum of squares that the model leaves, in deviations of the measurement's noise."""
+        left = as_measured(self.target, self.fit).residual
+        return float(left @ left)
+
+
+@dataclass(frozen=True)
+class FoundLaw:
+    """What the search for laws found around one model.
+
+    Attributes:
+        ports: evidence of every port before the first term.
+        left_out: ports that the body cannot carry, with the reason.
+        terms: refits of the law's terms, the last one with all of them; empty where none is worth it.
+        ties: of the first term: what a refit cannot tell from it, as (port, feature, score behind).
+        after: largest log evidence of any port once the law is in the model; None without a law.
+        tried: all refits of the first term.
+        centre: times of the ports' signals [s].
+        gains: of all terms that passed the gate, before the first one.
+    """
+
+    ports: list[PortEvidence]
+    left_out: dict[str, str]
+    terms: list[Refit]
+    ties: list[Refit]
+    after: PortEvidence | None
+    tried: list[Refit]
+    centre: Float[np.ndarray, " spline"]
+    gains: list[TermGain]
+
+    @property
+    def last(self) -> Refit | None:
+        """The model with all terms."""
+        return self.terms[-1] if self.terms else None
+
+    def significant(self, family: float) -> list[PortEvidence]:
+        """Ports where something acts."""
+        return [row for row in self.ports if row.adjusted_p <= family and row.log_evidence > 0.0]
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Inner products of slopes, features and residual, one for each piece of the data."""
+
+    jj: Float[np.ndarray, "piece d d"]
+    jx: Float[np.ndarray, "piece d feature"]
+    xx: Float[np.ndarray, "piece feature"]
+    jy: Float[np.ndarray, "piece d"]
+    xy: Float[np.ndarray, "piece feature"]
+    yy: Float[np.ndarray, " piece"]
+    count: Float[np.ndarray, " piece"]
+
+
+def _pieces(array: Float[np.ndarray, "group value *rest"]) -> Float[np.ndarray, "piece value *rest"]:
+    """Recordings, or parts of a single one."""
+    if len(array) > 1:
+        return array
+    length = array.shape[1] // PIECES
+    return array[0, : PIECES * length].reshape(PIECES, length, *array.shape[2:])
+
+
+def _sums(found: Responses, columns: Float[np.ndarray, "group value feature"]) -> _Sums:
+    j, x, y = _pieces(found.jacobian), _pieces(columns), _pieces(found.residual)
+    return _Sums(
+        np.einsum("pvi,pvk->pik", j, j, optimize=True),
+        np.einsum("pvi,pvf->pif", j, x, optimize=True),
+        np.einsum("pvf,pvf->pf", x, x),
+        np.einsum("pvi,pv->pi", j, y),
+        np.einsum("pvf,pv->pf", x, y, optimize=True),
+        np.sum(y**2, axis=1),
+        np.count_nonzero(y, axis=1).astype(float),
+    )
+
+
+def left_out_gains(
+    sums: _Sums, precision: Float[np.ndarray, "d d"] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Gain [nat], share, size and deviation of every feature, each alone beside the base parameters.
+
+    The prior of the base parameters holds what no data determine; its ``precision`` is one in these columns, unless
+    more is known of them.
+    """
+    before, gain = 0.0, np.zeros(sums.xx.shape[1])
+    held = np.eye(sums.jj.shape[1]) if precision is None else precision
+    for p in range(len(sums.yy)):
+        others = [part.sum(axis=0) - part[p] for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
+        b, u, c, _ = _solved(*others, held)
+        left_j = sums.jy[p] - sums.jj[p] @ b
+        left_x = sums.xy[p] - sums.jx[p].T @ b
+        along = left_x - u.T @ left_j
+        square = sums.xx[p] - 2.0 * np.sum(u * sums.jx[p], axis=0) + np.sum(u * (sums.jj[p] @ u), axis=0)
+        gain += 2.0 * c * along - c**2 * square
+        before += sums.yy[p] - 2.0 * float(b @ sums.jy[p]) + float(b @ sums.jj[p] @ b) - sums.count[p]
+    whole = [part.sum(axis=0) for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
+    _, _, size, sd = _solved(*whole, held)
+    return 0.5 * gain, gain / max(before, 1e-300), size, sd
+
+
+def _solved(
+    jj: np.ndarray, jx: np.ndarray, xx: np.ndarray, jy: np.ndarray, xy: np.ndarray, precision: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Base parameters alone, what they take of every feature, and each feature's coefficient and deviation."""
+    prior = jj + precision
+    b, u = np.linalg.solve(prior, jy), np.linalg.solve(prior, jx)
+    left = xx - np.sum(u * jx, axis=0)
+    seen = left > COLLINEAR * np.maximum(xx, 1e-300)
+    safe = np.where(seen, left, 1.0)
+    c = np.where(seen, (xy - u.T @ jy) / safe, 0.0)
+    return b, u, c, np.where(seen, 1.0 / np.sqrt(safe), np.inf)
+
+
+@dataclass
+class LawSearch:
+    """The search for a law beside a fitted model.
+
+    Attributes:
+        ports: of the simulator.
+        table: features of the commands.
+        units: names of the commands, and their unit.
+        seed: of simulated data sets.
+        family: probability that a port is named where nothing is hidden.
+        report: called with a line of words.
+    """
+
+    ports: PortMap
+    table: FeatureTable
+    units: tuple[tuple[str, ...], str]
+    seed: int
+    family: float
+    report: Callable[[str], None] = lambda line: None
+
+    def find(self, target: FitTarget, fit: Fit) -> FoundLaw:
+        """Where something acts that the model lacks, and by what law.
+
+        Args:
+            target: under which the model was fitted.
+            fit: the model, with residuals and slopes in deviations of the measurement's noise.
+        """
+        known = target.measured
+        found = responses(known, fit, self.ports, self.table, self.report)
+        values = self.table.over(found.levels)
+        where = self._evidences(known, fit, found)
+        first, terms, tried, gains = where, list[Refit](), list[Refit](), list[TermGain]()
+        try:
+            while len(terms) < TERMS and self._acts(where):
+                found = found if terms else self._sharpened(known, fit, found, values, where)
+                ranked = self._ranked(found, values)
+                gains = gains or ranked
+                refits = self._refits(known, terms, fit, where, ranked)
+                if not refits or refits[0].score <= 0.0:
+                    break
+                tried = tried or refits
+                best = self._exchanged(known, terms, found, values, refits[0])
+                if not _sure(best):
+                    break
+                terms.append(best)
+                fit = as_measured(best.target, best.fit)
+                found = _relinearised(known, found, fit)
+                where = self._evidences(known, fit, found)
+                self._say(best, where[0])
+        except OutOfTime:
+            self.report("the time was up before the law was found")
+        ties = [r for r in tried[1:] if r.score > tried[0].score - TIED]
+        last = where[0] if terms else None
+        return FoundLaw(first, dict(self.ports.left_out), terms, ties, last, tried, found.basis.centre, gains)
+
+    def _sharpened(
+        self, known: FitTarget, fit: Fit, found: Responses, values: np.ndarray, where: Sequence[PortEvidence]
+    ) -> Responses:
+        """Responses with exact columns at the ports that lead by evidence or gain, and at all that need no rollouts."""
+        by_gain = dict.fromkeys(row.port for row in self._ranked(found, values))
+        leading = [row.port for row in where[:BY_EVIDENCE]] + list(by_gain)[:BY_GAIN]
+        chosen = [p for p in found.whitened if p.stage == "sensing" or p in leading]
+        sizes = np.maximum(signal_sizes(values), 1e-300)[:, None]
+        return with_exact_columns(known, fit, found, chosen, values / sizes)
+
+    def _acts(self, where: Sequence[PortEvidence]) -> bool:
+        return where[0].log_evidence >= STOP and where[0].adjusted_p <= self.family
+
+    def _say(self, best: Refit, where: PortEvidence) -> None:
+        names = self.units[0]
+        law = f"{best.term.port.name}: {best.term.feature.formula(names)}"
+        self.report(f"law at {law}, score {best.score:.1f}; then {where.port.name} {where.log_evidence:.1f} nats")
+
+    def _evidences(self, known: FitTarget, fit: Fit, found: Responses) -> list[PortEvidence]:
+        rng = np.random.default_rng([self.seed, 6])
+        draws = null_residuals(known.measurements, known.noise, found.base, len(fit.free), rng, NULLS)
+        return evidences(found, draws[:, : found.residual.size])
+
+    def _ranked(
+        self, found: Responses, values: np.ndarray, precision: Float[np.ndarray, "d d"] | None = None
+    ) -> list[TermGain]:
+        """All features at all ports that pass the gate, the largest gain first; see `left_out_gains`."""
+        sizes, rows = signal_sizes(values), []
+        for port in found.whitened:
+            columns = feature_columns(found, port, values / np.maximum(sizes, 1e-300)[:, None])
+            gain, share, size, sd = left_out_gains(_sums(found, columns), precision)
+            for k in np.flatnonzero((gain >= GATE) & (share >= LEAST)):
+                parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
+                rows.append(TermGain(port, self.table.features[k], float(gain[k]), float(share[k]), *parts))
+        return sorted(rows, key=lambda row: -row.gain)
+
+    def _exchanged(
+        self, known: FitTarget, terms: Sequence[Refit], found: Responses, values: np.ndarray, chosen: Refit
+    ) -> Refit:
+        """A term climbed to its end, or another one in its place.
+
+        The base model has made up for a part of what it lacks, and the linear model does not see how far it goes back
+        with a law. With a law in the model the base parameters are nearer to the truth. There the terms are ranked
+        anew, with base parameters held to what is then known of them.
+        """
+        best, tried = self._climbed(chosen), {(chosen.term.port, chosen.term.feature)}
+        for _ in range(EXCHANGES):
+            fit = as_measured(best.target, best.fit)
+            without = fit.x.copy()
+            without[-1] = 0.0
+            residual = best.target.measured.residual(without[None])[0]
+            bare = replace(fit, x=without[:-1], free=fit.free[:-1], residual=residual, jacobian=fit.jacobian[:, :-1],
+                           covariance=fit.covariance[:-1, :-1])  # fmt: skip
+            linear = _relinearised(known, found, bare)
+            ranked = self._ranked(linear, values, _precision(known, bare))
+            fresh = [row for row in ranked if (row.port, row.feature) not in tried][:FRESH]
+            tried |= {(row.port, row.feature) for row in fresh}
+            others = [self._refit(known, terms, bare, row) for row in fresh]
+            better = max(others, key=lambda refit: refit.score, default=best)
+            if better.square >= best.square - 2.0:
+                break
+            self.report(f"instead: {better.term.port.name}: {better.term.feature.formula(self.units[0])}")
+            best = self._climbed(better)
+        before = chosen.square + 2.0 * (chosen.score + self._cost(known))
+        return replace(best, score=0.5 * (before - best.square) - self._cost(known))
+
+    def _cost(self, known: FitTarget) -> float:
+        """Nats that a term costs: its parameter, and the choice among all features at all ports."""
+        count = max(float(np.sum(known.measurements.valid)), 2.0)
+        return float(0.5 * np.log(count) + np.log(len(self.ports.ports) * len(self.table.features)))
+
+    def _refits(
+        self, known: FitTarget, terms: Sequence[Refit], fit: Fit, where: Sequence[PortEvidence], ranked: list[TermGain]
+    ) -> list[Refit]:
+        """The best terms by evidence of their ports and by gain, refitted; the best first."""
+        by_port: dict[Port, TermGain] = {}
+        for row in ranked:
+            by_port.setdefault(row.port, row)
+        chosen = list(by_port.values())[: BY_GAIN + 1]
+        chosen += [by_port[row.port] for row in where[:BY_EVIDENCE] if row.port in by_port]
+        chosen += ranked[:BY_GAIN]
+        refits = []
+        for row in dict.fromkeys(chosen):
+            found = self._refit(known, terms, fit, row)
+            refits.append(found)
+            words = f"{row.port.name}: {row.feature.formula(self.units[0])}"
+            self.report(f"refit with {words}: left-out gain {row.gain:.1f}, score {found.score:.1f}")
+        return sorted(refits, key=lambda refit: -refit.score)
+
+    def _refit(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, row: TermGain) -> Refit:
+        """The model with one more term, climbed a few steps from where the linear model has it."""
+        names, unit = self.units
+        term = placed(row.port, row.feature, row.typical, names, unit)
+        placed_terms = [*(refit.term for refit in terms), term]
+        forward = PortedForward(known.forward, self.ports, self.table, placed_terms)
+        scale = float(term.spec.prior["scale"])
+        start = np.append(fit.x, np.clip(row.size / scale, -FARTHEST, FARTHEST))
+        free = np.append(fit.free, len(start) - 1)
+        target = replace(known, forward=forward)
+        found = climb(target, start, free, evaluations=GLANCE)
+        gained = float(fit.residual @ fit.residual - found.residual @ found.residual)
+        return Refit(term, target, found, row, 0.5 * gained - self._cost(known))
+
+    def _climbed(self, refit: Refit) -> Refit:
+        """The same, climbed to its end."""
+        judge, fit = fit_with_noise(refit.target, refit.fit.x, refit.fit.free)
+        return replace(refit, target=judge, fit=fit)
+
+
+FARTHEST = 100.0  # prior deviations within which a refit starts
+
+
+def _sure(refit: Refit) -> bool:
+    """Whether the last coefficient is clearly not zero."""
+    return bool(abs(refit.fit.x[-1]) > SURE * np.sqrt(refit.fit.covariance[-1, -1]))
+
+
+def _scale(known: FitTarget, fit: Fit) -> Float[np.ndarray, " free"]:
+    """Prior deviations of a fit's parameters; coefficients of laws have their own as a unit."""
+    base = fit.free < len(known.forward.coordinates.names)
+    return np.append(known.forward.coordinates.prior_sd[fit.free[base]], np.ones(np.count_nonzero(~base)))
+
+
+def _precision(known: FitTarget, fit: Fit) -> Float[np.ndarray, "free free"]:
+    """What is known of a fit's parameters, in deviations of their priors."""
+    scale = _scale(known, fit)
+    return np.linalg.inv(fit.covariance / np.outer(scale, scale))
+
+
+def _relinearised(known: FitTarget, found: Responses, fit: Fit) -> Responses:
+    """The same responses beside the residual and the slopes of another fit, the coefficients of laws among them."""
+    groups = found.residual.shape[0]
+    white = known.measurements.series(fit.residual).reshape(groups, -1)
+    slopes = known.measurements.series(fit.jacobian.T).reshape(len(fit.free), groups, -1)
+    scale = _scale(known, fit)
+    return replace(found, residual=white, jacobian=np.moveaxis(slopes * scale[:, None, None], 0, 2))
+
+
+def law_search(
+    target: FitTarget, ports: PortMap, channels: Sequence[str], unit: str, seed: int, family: float,
+    report: Callable[[str], None],
+) -> LawSearch:  # fmt: skip
+    """The search on a simulator with these ports and commands."""
+    commands = target.forward.commands
+    stroke = float(np.ptp(np.concatenate([np.asarray(commands.step), np.asarray(commands.initial)[:, None]], axis=1)))
+    features = dictionary(len(channels), max(stroke, 1e-12))
+    table = FeatureTable(target.forward.lanes, features)
+    return LawSearch(ports, table, (tuple(channels), unit), seed, family, report)

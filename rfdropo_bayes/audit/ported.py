@@ -1,0 +1,225 @@
+"""Rollouts with laws at ports whose coefficients are coordinates beside those of the simulator.
+
+One compiled simulator serves all laws: their signals are computed outside and handed over with the commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.audit.coordinates import Coordinates
+from rfdropo_bayes.audit.forward import Fields, Forward, Lanes, Points
+from rfdropo_bayes.audit.journal import digest
+from rfdropo_bayes.bayes.batches import in_chunks
+from rfdropo_bayes.bayes.space import ParameterSpace, build_space
+from rfdropo_bayes.mechanisms.default_priors import normal
+from rfdropo_bayes.mechanisms.features import Feature
+from rfdropo_bayes.mechanisms.laws import FAR, unit_of
+from rfdropo_bayes.mechanisms.ports import Port, PortMap, sensed
+from rfdropo_bayes.simulators.commands import Commands, observed_at
+from rfdropo_bayes.simulators.extended import ExtendedSimulator
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+
+Signals = Float[np.ndarray, "lane row"]
+STEP = 1e-4
+"""Prior deviations of a one-sided difference: rounding of 1e-13 m then errs by 1e-9 m a deviation."""
+COARSE = 0.03
+"""The same where the engine is in single precision, whose rounding is 1e-5 m, or moves roughly."""
+FINE = 1e-5
+"""Relative steps of an engine's own differences, up to which it counts as smooth."""
+
+
+class PlacedTerm(NamedTuple):
+    """A coefficient of a law: the port, the feature, and the parameter."""
+
+    port: Port
+    feature: Feature
+    spec: ParameterSpec
+
+
+class FeatureTable:
+    """Values of features over the steps of a simulator, compiled once for a whole audit.
+
+    Args:
+        lanes: the simulator.
+        features: all that may be asked for.
+    """
+
+    def __init__(self, lanes: Lanes, features: Sequence[Feature]) -> None:
+        self.lanes, self.features = lanes, tuple(features)
+        simulator: Any = lanes.simulator
+        self.time_step = float(simulator.description["time_step_s"])
+
+    @cached_property
+    def _levels(self) -> Any:
+        simulator = self.lanes.simulator
+
+        def one(theta: jax.Array, commands: Commands) -> jax.Array:
+            initial, command = jnp.asarray(commands.initial), jnp.asarray(commands.step)
+            if isinstance(simulator, ExtendedSimulator):
+                values = dict(zip(self.lanes.physical, theta, strict=True))
+                initial, command = simulator.actuated(values, commands, self.time_step)
+            return jnp.concatenate([initial[None], command])
+
+        return jax.jit(jax.vmap(one))
+
+    @cached_property
+    def _values(self) -> Any:
+        def one(levels: jax.Array) -> jax.Array:
+            return jnp.stack([feature.over(levels, self.time_step) for feature in self.features])
+
+        return jax.jit(jax.vmap(one))
+
+    def levels(self, theta: Float[np.ndarray, "lane physical"], commands: Commands) -> np.ndarray:
+        """Commands that reach the ports, without signals (lane, row, channel)."""
+        plain = commands._replace(signals=None)
+        return np.asarray(in_chunks(lambda own: self._levels(*own), (theta, plain), (self.lanes.width,)))
+
+    def over(self, levels: Float[np.ndarray, "lane row channel"]) -> Float[np.ndarray, "lane feature row"]:
+        """All features."""
+        return np.asarray(in_chunks(lambda own: self._values(*own), (levels,), (self.lanes.width,)))
+
+    def place(self, feature: Feature) -> int:
+        """Where a feature stands in the table."""
+        return self.features.index(feature)
+
+
+@partial(jax.jit, static_argnames=("port", "ports"))
+def _port_signals(ports: PortMap, port: Port, w: jax.Array) -> Any:
+    return jax.vmap(lambda own: ports.signals(port, own))(w)
+
+
+@partial(jax.jit, static_argnames="port")
+def _sensed(port: Port, w: jax.Array, position: jax.Array, time: jax.Array) -> jax.Array:
+    return jax.vmap(lambda *own: sensed(port, *own))(w, position, time)
+
+
+def signals_of(ports: PortMap, acting: Sequence[tuple[Port, Signals]]) -> Any:
+    """Signals at ports of actuation and of the body together; None where there are none."""
+    given = [(port, w) for port, w in acting if port.stage != "sensing"]
+    if not given:
+        return None
+    # Ports are hashable without the mapping of what is left out.
+    plain = ports._replace(left_out=())  # type: ignore[arg-type]
+    found = [_port_signals(plain, port, w) for port, w in given]
+    return jax.tree.map(lambda *parts: np.sum([np.asarray(part) for part in parts], axis=0), *found)
+
+
+def as_sensed(
+    acting: Sequence[tuple[Port, Signals]],
+    position: Float[np.ndarray, "lane time marker 3"],
+    commands: Commands,
+    dt: float,
+) -> np.ndarray:
+    """Positions as they are measured with signals at ports of sensing."""
+    time = np.asarray(observed_at(commands, dt))
+    step, share = np.asarray(commands.sample_step), np.asarray(commands.sample_fraction)
+    for port, w in acting:
+        if port.stage == "sensing":
+            before = np.take_along_axis(w, step, axis=1)
+            after = np.take_along_axis(w, np.minimum(step + 1, w.shape[1] - 1), axis=1)
+            position = np.asarray(_sensed(port, before + share * (after - before), position, time - time[:, :1]))
+    return position
+
+
+class PortedForward(Forward):
+    """`Forward` with laws at ports.
+
+    Args:
+        forward: without them.
+        ports: of the simulator.
+        table: that has the features of the laws.
+        terms: their coefficients, which become the last coordinates.
+    """
+
+    def __init__(self, forward: Forward, ports: PortMap, table: FeatureTable, terms: Sequence[PlacedTerm]) -> None:
+        self.__dict__.update({k: v for k, v in forward.__dict__.items() if k != "identity"})
+        self.plain, self.ports, self.table, self.terms = forward, ports, table, tuple(terms)
+        self.coordinates = with_terms(forward.coordinates, terms)
+        added = np.full((len(forward.slots), len(terms)), -1)
+        self.slots = np.concatenate([forward.slots, added], axis=1)
+
+    @cached_property
+    def identity(self) -> str:
+        """Digest of what rollouts depend on."""
+        own = self.coordinates
+        scale = own.values(np.stack([np.zeros(len(own.names)), np.ones(len(own.names))]))
+        return digest(self.plain.identity, repr([(t.port.name, t.feature, t.spec) for t in self.terms]), scale)
+
+    def instead_of(self, forward: Forward, table: FeatureTable) -> PortedForward:
+        """The same laws on other rollouts, as of other recordings or of a finer simulator."""
+        return PortedForward(forward, self.ports, table, self.terms)
+
+    def with_difference(self, step: float) -> Forward:
+        """See `Forward.with_difference`."""
+        return self.instead_of(self.plain.with_difference(step), self.table)
+
+    def tangents(self, points: Points, directions: Points) -> Fields:
+        """See `Forward.tangents`; one-sided differences."""
+        usual = self.lanes.difference
+        step = STEP if usual is None or usual <= FINE else COARSE
+        here, _ = self.observe(points)
+        ahead, _ = self.observe(points + step * directions)
+        wanted = [*self.lanes.fields, "offset"]
+        found = {name: np.nan_to_num((ahead[name] - here[name]) / step) for name in wanted}
+        return found | self.coordinates.gain_tangents(points, directions)
+
+    def _beside(self, points: Points) -> Float[np.ndarray, "n k"]:
+        return self.coordinates.values(points)[:, len(self.coordinates.names) - len(self.terms) :]
+
+    def _acting(self, theta: np.ndarray, commands: Commands, points: Points) -> list[tuple[Port, Signals]]:
+        """Signals of every lane at each port that has a law."""
+        flat = theta.reshape(-1, theta.shape[-1])
+        values = self.table.over(self.table.levels(flat, commands))
+        sizes = np.repeat(self._beside(points), self.count, axis=0)
+        found: dict[Port, Signals] = {}
+        for k, term in enumerate(self.terms):
+            w = sizes[:, k, None] * values[:, self.table.place(term.feature)]
+            found[term.port] = found.get(term.port, 0.0) + w
+        return list(found.items())
+
+    def _per_lane(self, theta: np.ndarray, points: Points) -> tuple[np.ndarray, np.ndarray, Commands]:
+        flat, start, commands = super()._per_lane(theta, points)
+        return flat, start, commands._replace(signals=signals_of(self.ports, self._acting(theta, commands, points)))
+
+    def _as_seen(self, found: Fields, theta: np.ndarray, points: Points) -> Fields:
+        if all(term.port.stage != "sensing" for term in self.terms):
+            return found
+        commands = self.commands.of(np.tile(np.arange(self.count), len(points)))
+        acting = self._acting(theta, commands, points)
+        shift = self._offset(theta).reshape(-1, 1, 1, 3)  # of the measuring frame, which comes last
+        seen = as_sensed(acting, found["position"] - shift, commands, self.table.time_step)
+        return {**found, "position": seen + shift}
+
+
+def with_terms(coordinates: Coordinates, terms: Sequence[PlacedTerm]) -> Coordinates:
+    """Coordinates with the coefficients of laws after all others; measured from null in prior deviations."""
+    added = build_space([t.spec for t in terms], {t.spec.name: {} for t in terms}, {}, ())
+    space = ParameterSpace((*coordinates.space.parameters, *added.parameters))
+    return replace(coordinates, space=space)
+
+
+def placed(port: Port, feature: Feature, size: float, channels: Sequence[str], unit: str) -> PlacedTerm:
+    """A term whose coefficient has a prior of so many sizes of its port over the feature's own size."""
+    scale = float(f"{SPREAD * port.size / max(size, 1e-300):.3g}")
+    at = f"{port.name} {feature.kind} {' '.join(channels[k] for k in feature.channels)}".strip()
+    shape = "" if feature.shape is None else f"_{feature.shape:.3g}"
+    name = f"law_{at.replace(' ', '_')}{shape}"
+    words = f"of the law at {port.name}: it changes {feature.words(channels)}"
+    return PlacedTerm(
+        port,
+        feature,
+        ParameterSpec(name, unit_of(port.unit, feature, unit), -FAR * scale, FAR * scale, 0.0, normal(scale), words),
+    )
+
+
+SPREAD = 3.0
+"""Scale of a coefficient's prior in sizes of its port: wide, so that data decide."""

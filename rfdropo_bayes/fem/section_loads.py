@@ -1,0 +1,48 @@
+"""What acts on a layered body from step to step beside its weight: forces on sections, factors on its stiffness and
+damping, and a change of gravity."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.fem.blocktridiagonal import multiply
+from rfdropo_bayes.fem.dynamics import Prepared, System, shared
+
+
+class SectionLoads(NamedTuple):
+    """Signals; row 0 acts on the initial equilibrium, row k during the k-th step.
+
+    Attributes:
+        force: on the sections at some stations [N].
+        stiffness, damping: logarithms of factors; of the damping both of Rayleigh's coefficients.
+        gravity: added to gravity [m/s2].
+        station: indices of the stations that forces act on, each once; not batched.
+    """
+
+    force: Float[Any, "*batch row place 3"]
+    stiffness: Float[Any, "*batch row"]
+    damping: Float[Any, "*batch row"]
+    gravity: Float[Any, "*batch row 3"]
+    station: tuple[int, ...]
+
+
+def loaded(
+    system: System, prepared: Prepared, loads: SectionLoads, row: Any
+) -> tuple[Prepared, Float[Array, "nodes 3"]]:
+    """The body under one row of loads, and the forces on its nodes [N]."""
+    stations, nodes = len(system.body.station), system.body.section_nodes
+    force, stiffness, damping, gravity = (jnp.asarray(part)[row] for part in loads[:4])
+    change = jnp.broadcast_to(gravity, (stations, nodes, 3))
+    loss = jnp.exp(damping)
+    changed = prepared._replace(
+        firmness=jnp.exp(stiffness),
+        rayleigh_mass=loss * prepared.rayleigh_mass,
+        rayleigh_stiffness=loss * prepared.rayleigh_stiffness,
+        gravity=prepared.gravity + gravity,
+        weight=prepared.weight + multiply(prepared.mass, change).reshape(-1, 3),
+    )
+    pushed = jnp.zeros((stations, 3)).at[jnp.asarray(loads.station)].set(force)
+    return changed, shared(system, pushed)

@@ -1,0 +1,187 @@
+"""Features: what a law at a port may depend on, each a number at every time step, made of time and commands.
+
+A feature is written as a step with a memory, so that a whole rollout, which scans it, and a session give the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.tables import nearest
+
+REST = 1e-9  # m or rad per step: less is the rounding of a command that is held
+
+
+class Kind(NamedTuple):
+    """A kind of feature.
+
+    Attributes:
+        channels: how many commands it is made of.
+        unit: powers of the command's unit and of seconds.
+        words: in a sentence; the names of its commands and its shape are put in.
+        formula: as a symbol, likewise.
+        shapes: values of its shape that are tried, as shares of the stroke of the commands or in seconds; none without.
+    """
+
+    channels: int
+    unit: tuple[int, int]
+    words: str
+    formula: str
+    shapes: tuple[float, ...] = ()
+
+
+KINDS: Mapping[str, Kind] = {
+    "constant": Kind(0, (0, 0), "always", "1"),
+    "time": Kind(0, (0, 1), "with time", "t"),
+    "command": Kind(1, (1, 0), "in proportion to {0}", "u_{0}"),
+    "product": Kind(2, (2, 0), "with {0} times {1}", "u_{0} u_{1}"),
+    "magnitude": Kind(1, (1, 0), "with the size of {0}, whatever its sign", "|u_{0}|"),
+    "rate": Kind(1, (1, -1), "with the speed of {0}", "du_{0}/dt"),
+    "direction": Kind(1, (0, 0), "by the direction that {0} moved last", "sign(du_{0})"),
+    "low_pass": Kind(1, (1, 0), "with {0} of the last {shape:.2g} s", "lowpass(u_{0}, {shape:.2g} s)", (0.3, 3.0)),
+    "play": Kind(
+        1, (0, 0), "by what {0} did last, as with a play of {shape:.2g}", "play(u_{0}, {shape:.2g})", (0.05, 0.1, 0.2)
+    ),
+    "largest": Kind(1, (1, 0), "with the largest {0} so far", "max|u_{0}|"),
+    "travelled": Kind(1, (1, 0), "with all the travel of {0} so far", "travel(u_{0})"),
+}
+"""Shapes: of a low pass the time constant [s]; of a play half its width, tried as a share of the commands' stroke."""
+
+
+class Feature(NamedTuple):
+    """A feature of some commands.
+
+    Attributes:
+        kind: a key of `KINDS`.
+        channels: indices of its commands.
+        shape: its time constant [s] or width [m or rad]; None without.
+    """
+
+    kind: str
+    channels: tuple[int, ...] = ()
+    shape: float | None = None
+
+    def begin(self, first: Float[Array, " channel"]) -> Any:
+        """Memory before the first step, given the command that was held before it."""
+        own = [first[k] for k in self.channels]
+        zero = jnp.zeros((), first.dtype)
+        memories: dict[str, Any] = {
+            "time": zero,
+            "rate": own,
+            "direction": [*own, zero],
+            "low_pass": own,
+            "play": [*own, zero],
+            "largest": [jnp.abs(u) for u in own],
+            "travelled": [*own, zero],
+        }
+        return memories.get(self.kind, ())
+
+    def at_rest(self, first: Float[Array, " channel"]) -> Float[Array, ""]:
+        """Its value before the first step."""
+        if self.kind in ("command", "low_pass"):
+            return first[self.channels[0]]
+        if self.kind in ("magnitude", "largest"):
+            return jnp.abs(first[self.channels[0]])
+        if self.kind == "product":
+            return first[self.channels[0]] * first[self.channels[1]]
+        return jnp.ones((), first.dtype) if self.kind == "constant" else jnp.zeros((), first.dtype)
+
+    def advance(self, memory: Any, given: Float[Array, " channel"], interval: float) -> tuple[Any, Float[Array, ""]]:
+        """Memory and value at the end of a step of so many seconds, given the command that has been reached."""
+        own = [given[k] for k in self.channels]
+        if self.kind not in ("time", "rate", "direction", "low_pass", "play", "largest", "travelled"):
+            return memory, self.at_rest(given)
+        return self._remembering(memory, own, interval)
+
+    def _remembering(self, memory: Any, own: list[Array], interval: float) -> tuple[Any, Array]:
+        if self.kind == "time":
+            return memory + interval, memory + interval
+        u, before = own[0], memory[0]
+        if self.kind == "rate":
+            return own, (u - before) / interval
+        if self.kind == "low_pass":
+            assert self.shape is not None
+            kept = jnp.exp(-interval / self.shape)
+            slow = u + kept * (before - u)
+            return [slow], slow
+        if self.kind == "largest":
+            most = jnp.maximum(before, jnp.abs(u))
+            return [most], most
+        move = jnp.where(jnp.abs(u - before) > REST, u - before, 0.0)
+        if self.kind == "travelled":
+            way = memory[1] + jnp.abs(move)
+            return [u, way], way
+        if self.kind == "direction":
+            sign = jnp.where(move != 0.0, jnp.sign(move), memory[1])
+            return [u, sign], sign
+        assert self.shape is not None
+        lead = jnp.clip(memory[1] + move / self.shape, -1.0, 1.0)
+        return [u, lead], lead
+
+    def over(self, levels: Float[Array, "row channel"], interval: float) -> Float[Array, " row"]:
+        """Its values over commands; row 0 is before the first step."""
+
+        def one(memory: Any, given: Float[Array, " channel"]) -> tuple[Any, Float[Array, ""]]:
+            return self.advance(memory, given, interval)
+
+        rest = jax.lax.scan(one, self.begin(levels[0]), levels[1:])[1]
+        return jnp.concatenate([self.at_rest(levels[0])[None], rest])
+
+    def unit(self, command_unit: str) -> tuple[tuple[str, int], ...]:
+        """Powers of units."""
+        length, seconds = KINDS[self.kind].unit
+        return tuple((name, power) for name, power in ((command_unit, length), ("s", seconds)) if power)
+
+    def words(self, names: Sequence[str]) -> str:
+        """In a sentence."""
+        return KINDS[self.kind].words.format(*(names[k] for k in self.channels), shape=self.shape or 0.0)
+
+    def formula(self, names: Sequence[str]) -> str:
+        """As a symbol."""
+        return KINDS[self.kind].formula.format(*(names[k] for k in self.channels), shape=self.shape or 0.0)
+
+
+def dictionary(channels: int, stroke: float) -> list[Feature]:
+    """All features of so many commands, whose largest change is ``stroke`` [m or rad]."""
+    found = []
+    for name, kind in KINDS.items():
+        shapes: list[float | None] = [*kind.shapes] or [None]
+        if name == "play":
+            shapes = [share * stroke for share in kind.shapes]
+        places: list[tuple[int, ...]] = [()]
+        if kind.channels == 1:
+            places = [(k,) for k in range(channels)]
+        elif kind.channels == 2:
+            places = [(i, k) for i in range(channels) for k in range(i, channels)]
+        found += [Feature(name, place, shape) for place in places for shape in shapes]
+    return found
+
+
+def feature_named(kind: str, commands: Sequence[str], shape: float | None, names: Sequence[str], where: str) -> Feature:
+    """A feature as a file has it.
+
+    Raises:
+        InputError: an unknown kind or command, or a shape that is missing or has no meaning.
+    """
+    if kind not in KINDS:
+        raise InputError(f"unknown feature {kind!r}", where=where, remedy=nearest(kind, KINDS))
+    for command in commands:
+        if command not in names:
+            raise InputError(f"unknown command {command!r}", where=where, remedy=nearest(command, names))
+    wanted = KINDS[kind]
+    if len(commands) != wanted.channels:
+        raise InputError(
+            f"the feature {kind!r} is made of {wanted.channels} commands, not {len(commands)}",
+            where=where,
+            remedy="name as many in commands = [...]",
+        )
+    if bool(wanted.shapes) != (shape is not None) or (shape is not None and not shape > 0.0):
+        needs = "a positive shape" if wanted.shapes else "no shape"
+        raise InputError(f"the feature {kind!r} takes {needs}", where=where, remedy="see docs/mechanisms.md")
+    return Feature(kind, tuple(names.index(command) for command in commands), shape)

@@ -1,0 +1,234 @@
+"""Laws at ports as mechanisms: ``w(t) = sum of coefficient times feature`` at a port, for effects that no named
+mechanism has. All coefficients are zero at null.
+
+    [[model.laws]]
+    port = "cable left"
+    terms = [{ coefficient = "crosstalk", feature = "product", commands = ["up", "left"], scale = 20.0 }]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms.default_priors import normal
+from rfdropo_bayes.mechanisms.features import KINDS, Feature, feature_named
+from rfdropo_bayes.mechanisms.ports import Port, PortMap, sensed
+from rfdropo_bayes.simulators.commands import sample
+from rfdropo_bayes.simulators.mechanisms import Meanwhile, Mechanism, Values
+from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
+from rfdropo_bayes.simulators.ports import BodySignals, read_late
+
+WHERE = "[[model.laws]]"
+FAR = 1e3  # prior scales to each side of null, where a coefficient's hard bounds are
+
+
+class Term(NamedTuple):
+    """One coefficient of a law, and the feature that it belongs to."""
+
+    feature: Feature
+    spec: ParameterSpec
+
+
+class LawChoice(NamedTuple):
+    """A law as a file has it: a port and tables of terms, which is yet to be made for a robot."""
+
+    port: str
+    terms: tuple[Mapping[str, Any], ...]
+
+
+def unit_of(port_unit: str, feature: Feature, command_unit: str) -> str:
+    """Unit of the coefficient of a feature at a port, such as "1/m" or "m/s"."""
+    powers: dict[str, int] = {} if port_unit == "-" else {port_unit: 1}
+    for name, power in feature.unit(command_unit):
+        powers[name] = powers.get(name, 0) - power
+    above = [_raised(name, power) for name, power in powers.items() if power > 0]
+    below = [_raised(name, -power) for name, power in powers.items() if power < 0]
+    if not above and not below:
+        return "-"
+    return "/".join([" ".join(above) or "1", *below])
+
+
+def _raised(name: str, power: int) -> str:
+    return name if power == 1 else f"{name}{power}"
+
+
+class Law:
+    """What the laws of each stage share.
+
+    Args:
+        port: where it acts.
+        terms: what it is made of.
+        ports: all ports of the robot.
+        formula: in symbols, for its name.
+    """
+
+    stage: str
+
+    def __init__(self, port: Port, terms: Sequence[Term], ports: PortMap, formula: str = "") -> None:
+        self.port, self.terms, self._ports = port, tuple(terms), ports
+        self.name = f"law at {port.name}: {formula}" if formula else f"law at {port.name}"
+        self.parameters = tuple(term.spec for term in terms)
+        self.cause = f"something acts at {port.name} by a law that stands for no mechanism of the library"
+        self.remedy = f"look at {port.look}"
+
+    def signal(self, values: Values, levels: Float[Array, "row channel"], time_step: float) -> Float[Array, " row"]:
+        """w(t), given the commands that reach the port; row 0 is before the first step."""
+        return sum(
+            (values[term.spec.name] * term.feature.over(levels, time_step) for term in self.terms),
+            jnp.zeros(len(levels)),
+        )
+
+    def _begin(self, first: Array) -> tuple[Any, ...]:
+        return tuple(term.feature.begin(first) for term in self.terms)
+
+    def _advance(self, values: Values, memory: tuple[Any, ...], given: Array, interval: Any) -> tuple[tuple, Array]:
+        after, w = [], jnp.zeros(())
+        for term, kept in zip(self.terms, memory, strict=True):
+            kept, value = term.feature.advance(kept, given, interval)
+            after.append(kept)
+            w = w + values[term.spec.name] * value
+        return tuple(after), w
+
+
+class CableLaw(Law):
+    """Adds its signal to what reaches one cable."""
+
+    stage = "actuation"
+    inside_drive = False
+
+    def settle(self, values: Values, held: Float[Array, " channel"]) -> Float[Array, " channel"]:
+        """See `ActuationMechanism`."""
+        w = sum((values[term.spec.name] * term.feature.at_rest(held) for term in self.terms), jnp.zeros(()))
+        return held.at[self.port.number].add(w)
+
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Any, ...]:
+        """See `SteppedMechanism`."""
+        return self._begin(first)
+
+    def advance(
+        self, values: Values, memory: tuple[Any, ...], given: Float[Array, " channel"], now: float
+    ) -> tuple[tuple[Any, ...], Float[Array, " channel"]]:
+        """Add the signal of a step."""
+        memory, w = self._advance(values, memory, given, now)
+        return memory, given.at[self.port.number].add(w)
+
+    def actuate(
+        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
+    ) -> Float[Array, "step channel"]:
+        """See `ActuationMechanism`."""
+        levels = jnp.concatenate([jnp.asarray(initial, command.dtype)[None], command])
+        return command.at[:, self.port.number].add(self.signal(values, levels, time_step)[1:])
+
+
+class DelayLaw(Law):
+    """Commands reach the cables later by its signal [s]; in whole rollouts only."""
+
+    stage = "actuation"
+    inside_drive = True
+
+    def actuate(
+        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
+    ) -> Float[Array, "step channel"]:
+        """See `ActuationMechanism`."""
+        levels = jnp.concatenate([jnp.asarray(initial, command.dtype)[None], command])
+        return read_late(levels, self.signal(values, levels, time_step) / time_step)[1:]
+
+
+class BodyLaw(Law):
+    """Acts on a layered body; in whole rollouts only."""
+
+    stage = "body"
+    bodies = ("layered",)
+
+    def push(self, values: Values, command: Float[Array, "row channel"], time_step: float, places: int) -> BodySignals:
+        """See `PushingMechanism`."""
+        return self._ports.push(self.port, self.signal(values, command, time_step))
+
+
+class SensingLaw(Law):
+    """Acts on the measured markers, by time and commands; in whole rollouts only."""
+
+    stage = "sensing"
+
+    def sense_with_commands(
+        self,
+        values: Values,
+        position: Float[Array, "time marker 3"],
+        time: Float[Array, " time"],
+        meanwhile: Meanwhile,
+    ) -> Float[Array, "time marker 3"]:
+        """See `CommandedSensingMechanism`."""
+        w = sample(self.signal(values, meanwhile.levels, meanwhile.time_step), meanwhile.commands)
+        return sensed(self.port, w, position, time)
+
+
+class ClockedSensingLaw(Law):
+    """Acts on the measured markers by time alone, and so in sessions, too."""
+
+    stage = "sensing"
+
+    def sense_over_time(
+        self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
+    ) -> Float[Array, "time marker 3"]:
+        """See `TimedSensingMechanism`."""
+        return sensed(self.port, self._at(values, time), position, time)
+
+    def begin(self, values: Values, first: Float[Array, "marker 3"], interval: float) -> tuple[()]:
+        """Nothing to remember."""
+        return ()
+
+    def advance(
+        self, values: Values, memory: tuple[()], given: Float[Array, "marker 3"], now: Float[Array, ""]
+    ) -> tuple[tuple[()], Float[Array, "marker 3"]]:
+        """See `SteppedMechanism`."""
+        time = jnp.asarray(now, float)[None]
+        return memory, sensed(self.port, self._at(values, time), given[None], time)[0]
+
+    def _at(self, values: Values, time: Float[Array, " time"]) -> Float[Array, " time"]:
+        own = {"constant": jnp.ones_like(time), "time": time}
+        return sum((values[t.spec.name] * own[t.feature.kind] for t in self.terms), jnp.zeros_like(time))
+
+
+def law_at(port: Port, terms: Sequence[Term], ports: PortMap, formula: str = "") -> Mechanism:
+    """The law of these terms at a port, in the form that its stage has."""
+    if port.kind == "cable":
+        return CableLaw(port, terms, ports, formula)
+    if port.kind == "delay":
+        return DelayLaw(port, terms, ports, formula)
+    if port.stage == "body":
+        return BodyLaw(port, terms, ports, formula)
+    of_time = all(not KINDS[term.feature.kind].channels for term in terms)
+    return (ClockedSensingLaw if of_time and port.kind != "observation" else SensingLaw)(port, terms, ports, formula)
+
+
+def make_law(choice: LawChoice, ports: PortMap, channels: Sequence[str], command_unit: str) -> Mechanism:
+    """A law as a file has it.
+
+    Raises:
+        InputError: an unknown port, feature or command, a coefficient named twice, or a port that the body cannot
+            carry.
+    """
+    port = ports.named(choice.port)
+    if port is None:
+        why = "; ".join(f"{names}: {reason}" for names, reason in ports.left_out.items())
+        remedy = nearest(choice.port, [each.name for each in ports.ports])
+        raise InputError(f"no port {choice.port!r}", where=WHERE, remedy=f"{remedy}. {why}" if why else remedy)
+    where = f"{WHERE} port = {choice.port!r}"
+    terms = []
+    for table in choice.terms:
+        feature = feature_named(table["feature"], table.get("commands", ()), table.get("shape"), channels, where)
+        scale = float(table["scale"])
+        unit = unit_of(port.unit, feature, command_unit)
+        words = f"of the law at {port.name}: it changes {feature.words(channels)}"
+        name = str(table["coefficient"])
+        terms.append(Term(feature, ParameterSpec(name, unit, -FAR * scale, FAR * scale, 0.0, normal(scale), words)))
+    names = [term.spec.name for term in terms]
+    if len(set(names)) < len(names):
+        raise InputError("two terms share a coefficient", where=where, remedy="name each after what it does")
+    formula = " + ".join(f"{term.spec.name} {term.feature.formula(channels)}" for term in terms)
+    return law_at(port, terms, ports, formula)

@@ -1,0 +1,181 @@
+"""Ports by name: the places where an effect may enter a simulated robot, and what a signal does there.
+
+A port of actuation or of the body acts on a rollout (`simulators.ports`); one of sensing is a map of the markers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.mechanisms.sensing import direction_along, read_at
+from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BODIES
+from rfdropo_bayes.simulators.ports import BodySignals, PortSignals
+
+AXES = "xyz"
+PLACES = ("base", "middle", "tip")
+"""Names of the places that forces may act on, as many as the engine has; see `simulators.engine.LOAD_PLACES`."""
+
+
+class Port(NamedTuple):
+    """A place where a signal w(t) may act.
+
+    Attributes:
+        name: as in a file, such as "cable left" or "marker m3 along".
+        stage: "actuation", "body" or "sensing".
+        kind: what it is a port of.
+        number: which one of its kind: a channel, a place or a marker.
+        axis: 0 to 2, and 3 along the body; -1 where there is none.
+        unit: of the signal.
+        size: of an effect that a laboratory might see: the scale of priors and of differences.
+        look: what to look for at the robot.
+    """
+
+    name: str
+    stage: str
+    kind: str
+    number: int
+    axis: int
+    unit: str
+    size: float
+    look: str
+
+
+class PortMap(NamedTuple):
+    """The ports of a robot on an engine, and what signals there are made of.
+
+    Attributes:
+        ports: all of them.
+        left_out: ports that the body cannot carry, with the reason.
+        channels: number of commands; places: number of stations that forces may act on, 0 where none can.
+        gravity: [m/s2].
+    """
+
+    ports: tuple[Port, ...]
+    left_out: dict[str, str]
+    channels: int
+    places: int
+    gravity: tuple[float, float, float]
+
+    def named(self, name: str) -> Port | None:
+        """A port by its name; None where there is none."""
+        return next((port for port in self.ports if port.name == name), None)
+
+    def silent(self, rows: int) -> PortSignals:
+        """Signals of zeros."""
+        return PortSignals(jnp.zeros((rows, self.channels)), jnp.zeros(rows), self.no_push(rows))
+
+    def no_push(self, rows: int) -> BodySignals | None:
+        """Signals of zeros on the body; None where it cannot carry any."""
+        if not self.places:
+            return None
+        return BodySignals(jnp.zeros((rows, self.places, 3)), *(jnp.zeros(rows),) * 2, jnp.zeros((rows, 3)))
+
+    def signals(self, port: Port, w: Float[Array, " row"]) -> PortSignals:
+        """A signal at a port of actuation or of the body, as a rollout takes it."""
+        none = self.silent(len(w))
+        if port.kind == "cable":
+            return none._replace(command=none.command.at[:, port.number].set(w))
+        if port.kind == "delay":
+            return none._replace(delay=w)
+        assert none.body is not None
+        return none._replace(body=self.push(port, w))
+
+    def push(self, port: Port, w: Float[Array, " row"]) -> BodySignals:
+        """A signal at a port of the body."""
+        none = self.no_push(len(w))
+        assert none is not None
+        if port.kind == "stiffness":
+            return none._replace(stiffness=w)
+        if port.kind == "damping":
+            return none._replace(damping=w)
+        if port.kind == "force":
+            return none._replace(force=none.force.at[:, port.number, port.axis].set(w))
+        axis = jnp.eye(3)[port.axis]
+        return none._replace(gravity=w[:, None] * jnp.cross(axis, jnp.asarray(self.gravity)))
+
+
+def sensed(
+    port: Port, w: Float[Array, " time"], position: Float[Array, "time marker 3"], time: Float[Array, " time"]
+) -> Float[Array, "time marker 3"]:
+    """Measured positions [m] with a signal at a port of sensing, given those without."""
+    if port.kind == "observation":
+        return read_at(position, time, time - w)
+    axis, w = jnp.eye(3)[min(max(port.axis, 0), 2)], w[:, None]
+    if port.kind == "marker":
+        moved = w * (direction_along(position)[:, port.number] if port.axis == 3 else axis)
+        return position.at[:, port.number].add(moved)
+    if port.kind == "camera":
+        return position + w[:, None] * axis
+    if port.kind == "turn":
+        return position + w[:, None] * jnp.cross(axis, position)
+    return position * (1.0 + w[:, None])
+
+
+def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
+    """The ports of a simulator, of whose markers some are measured.
+
+    A simulator that does not take signals has those of sensing only.
+    """
+    left_out: dict[str, str] = {}
+    ports: list[Port] = []
+    channels = tuple(simulator.channel_names)
+    engine, robot = getattr(simulator, "engine", None), getattr(simulator, "robot", None)
+    if robot is None:
+        left_out["cables, command delay"] = "the simulator takes no signals"
+    else:
+        ports += _of_actuation(channels, getattr(simulator, "command_unit", "m"))
+    gravity, places = (0.0, 0.0, 0.0), 0
+    if engine is not None and robot is not None and engine.carries_loads:
+        places = len(engine.load_stations)
+        gravity = (float(robot.gravity[0]), float(robot.gravity[1]), float(robot.gravity[2]))
+        ports += _of_body(places, gravity)
+    else:
+        body = BLACK_BOX if engine is None else f"a body of {BODIES[1]}, or one before a cube,"
+        left_out["forces, stiffness, damping, base tilt"] = f"{body} takes no signals"
+    ports += _of_sensing(markers)
+    return PortMap(tuple(ports), left_out, len(channels), places, gravity)
+
+
+def _of_actuation(channels: Sequence[str], unit: str) -> list[Port]:
+    size = 1e-3 if unit == "m" else 0.05
+    look = "guide, spool and tension of cable {0}, and what it shares with other cables"
+    found = [
+        Port(f"cable {name}", "actuation", "cable", k, -1, unit, size, look.format(name))
+        for k, name in enumerate(channels)
+    ]
+    look = "the way of commands to the drives: queues, buses, and clocks"
+    return [*found, Port("command delay", "actuation", "delay", 0, -1, "s", 0.02, look)]
+
+
+def _of_body(places: int, gravity: tuple[float, float, float]) -> list[Port]:
+    look = "what pulls, pushes or touches the body near its {0}"
+    found = [
+        Port(f"force {AXES[i]} at the {name}", "body", "force", k, i, "N", 0.05, look.format(name))
+        for k, name in enumerate(PLACES[3 - places :] if places <= 3 else PLACES)
+        for i in range(3)
+    ]
+    found.append(Port("stiffness", "body", "stiffness", 0, -1, "-", 0.1, "warmth, use and age of the body's material"))
+    found.append(Port("damping", "body", "damping", 0, -1, "-", 0.3, "what rubs or flows in the body and along it"))
+    for i in range(3):
+        if any(abs(g) > 0.0 for k, g in enumerate(gravity) if k != i):
+            found.append(Port(f"base tilt {AXES[i]}", "body", "tilt", 0, i, "rad", 0.05, "whether the base moves"))
+    return found
+
+
+def _of_sensing(markers: Sequence[str]) -> list[Port]:
+    found: list[Port] = []
+    for k, name in enumerate(markers):
+        look = f"whether marker {name} slides, comes loose or is taken for another one"
+        ends = [*enumerate(AXES), (3, "along the body")] if len(markers) > 1 else list(enumerate(AXES))
+        found += [Port(f"marker {name} {way}", "sensing", "marker", k, i, "m", 1e-3, look) for i, way in ends]
+    look = "whether the cameras move against the base"
+    found += [Port(f"camera {a}", "sensing", "camera", 0, i, "m", 1e-3, look) for i, a in enumerate(AXES)]
+    found += [Port(f"camera turn {a}", "sensing", "turn", 0, i, "rad", 0.01, look) for i, a in enumerate(AXES)]
+    look = "the cameras' calibration of lengths"
+    found.append(Port("camera scale", "sensing", "scale", 0, -1, "-", 0.01, look))
+    look = "the cameras' clock against that of the drives"
+    return [*found, Port("observation delay", "sensing", "observation", 0, -1, "s", 0.02, look)]

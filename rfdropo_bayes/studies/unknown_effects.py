@@ -1,0 +1,324 @@
+"""Effects that no mechanism of the library has, hidden in recordings of an arm: where, and by what law, does the audit
+say that they act? Each is written here as a law, in code that the audit never sees.
+
+Three repeats of one random command and three recordings of others are fitted, four more are untouched. Data come from a
+finer mesh and time step than the audit's own. Sizes are rho, see `hidden_effects`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.audit.fit import FitTarget
+from rfdropo_bayes.audit.problem import measurements_of, simulated
+from rfdropo_bayes.audit.score import project_out, span
+from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
+from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
+from rfdropo_bayes.files import output_folder
+from rfdropo_bayes.model.assembly import build_simulator
+from rfdropo_bayes.model.experiment import AuditTable, SimulatorTable
+from rfdropo_bayes.model.experiment_file import describe
+from rfdropo_bayes.model.model_spec import spec_of
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
+from rfdropo_bayes.simulators.ports import BodySignals, PortSignals
+from rfdropo_bayes.studies.hidden_effects import NOISE, Setting, experiment_tables, noisy
+from rfdropo_bayes.verbs.audit import Workshop, build_problem
+from rfdropo_bayes.verbs.random_commands import random_walk
+
+REPEATS, OTHERS, UNTOUCHED = 3, 3, 4
+MOTIONS = 4  # rollouts after which a law of the motion has the motion that it makes
+AMPLITUDES = np.geomspace(0.02, 5.0, 12)  # of an effect, in its usual size, among which rho is looked for
+
+
+class Scene(NamedTuple):
+    """What an effect may depend on: commands at all steps [m], the tip's path [m] as it was in the rollout before, and
+    the time of the steps [s]."""
+
+    levels: Float[Any, "row channel"]
+    tip: Float[Any, "row 3"]
+    time: Float[Any, " row"]
+
+
+class Effect(NamedTuple):
+    """An effect that the library lacks.
+
+    Attributes:
+        ports: names of the ports where it may rightly be found.
+        leading: kinds of feature that say its law rightly.
+        acts: size and scene to signals by name: "command", "delay", "force", "stiffness", "damping".
+        sees: size, positions (row, marker, 3) and time of observations, and commands then, to positions; None where
+            cameras are right.
+        moves: whether it depends on the motion.
+    """
+
+    ports: tuple[str, ...]
+    leading: tuple[str, ...]
+    acts: Callable[[float, Scene], dict[str, Any]] | None = None
+    sees: Callable[[float, Any, Any, Any], Any] | None = None
+    moves: bool = False
+
+
+def _channel(k: int, w: Any) -> Any:
+    return jnp.zeros((len(w), 4)).at[:, k].set(w)
+
+
+def _at_tip(force: Any) -> Any:
+    return jnp.zeros((len(force), 3, 3)).at[:, 2].set(force)
+
+
+def _bouc_wen(u: Any, time: Any) -> Any:
+    """Hysteresis z' = (a - |sign(u') z + z| / 2 ...) u' of Bouc and Wen with n = 1, saturated at 1 m^-1 times 3 mm."""
+
+    def one(z: Any, move: Any) -> tuple[Any, Any]:
+        z = jnp.clip(z + (move - 0.5 * jnp.abs(move) * z - 0.5 * move * jnp.abs(z)) / 1.5e-3 * 1.0, -1.0, 1.0)
+        return z, z
+
+    moves = jnp.diff(u, prepend=u[:1])
+    return jax.lax.scan(one, jnp.zeros(()), moves)[1]
+
+
+def _clock(size: float, position: Any, time: Any, command: Any) -> Any:
+    """Seen at t what happened at t (1 - .02 size)."""
+    at = time * (1.0 - 0.02 * size)
+    flat = position.reshape(len(time), -1)
+    return jnp.stack([jnp.interp(at, time, flat[:, k]) for k in range(flat.shape[1])], axis=1).reshape(position.shape)
+
+
+def _slide(size: float, position: Any, time: Any, command: Any) -> Any:
+    """Marker m3 slides towards the tip by 4 mm in the whole recording."""
+    chord = position[:, 3] - position[:, 1]
+    chord = chord / jnp.linalg.norm(chord, axis=1, keepdims=True)
+    return position.at[:, 2].add(4e-3 * size * (time / time[-1])[:, None] * chord)
+
+
+def _twisted_mount(size: float, position: Any, time: Any, command: Any) -> Any:
+    """The cameras' mount turns about z as cable left pulls."""
+    turn = 5.0 * size * command[:, 1]
+    return position + turn[:, None, None] * jnp.cross(jnp.array([0.0, 0.0, 1.0]), position)
+
+
+def _zoom(size: float, position: Any, time: Any, command: Any) -> Any:
+    """Lengths grow by half a per cent in the whole recording."""
+    return position * (1.0 + 0.01 * size * time / time[-1])[:, None, None]
+
+
+def _magnet(size: float, scene: Scene) -> dict[str, Any]:
+    """A pull of the tip towards a point, which falls with the distance."""
+    way = jnp.array([0.06, 0.04, 0.19]) - scene.tip
+    square = jnp.sum(way**2, axis=1, keepdims=True)
+    return {"force": _at_tip(0.1 * size * way / jnp.sqrt(square) * 0.03**2 / (0.03**2 + square))}
+
+
+EFFECTS: dict[str, Effect] = {
+    "crosstalk": Effect(
+        ("cable left",), ("product",), lambda a, s: {"command": _channel(1, 15.0 * a * s.levels[:, 0] * s.levels[:, 1])}
+    ),
+    "bouc_wen": Effect(
+        ("cable up",),
+        ("play", "direction"),
+        lambda a, s: {"command": _channel(0, -8e-4 * a * _bouc_wen(s.levels[:, 0], s.time))},
+    ),
+    "slipping_cable": Effect(
+        ("cable right",),
+        ("travelled",),
+        lambda a, s: {
+            "command": _channel(3, -0.05 * a * jnp.cumsum(jnp.abs(jnp.diff(s.levels[:, 3], prepend=s.levels[:1, 3]))))
+        },
+    ),
+    "one_lagging_cable": Effect(
+        ("cable down",),
+        ("rate",),
+        lambda a, s: {"command": _channel(2, -0.04 * a * jnp.gradient(s.levels[:, 2], s.time))},
+    ),
+    "slow_queue": Effect(("command delay",), ("time",), lambda a, s: {"delay": 0.02 * a * s.time}),
+    "magnet": Effect(
+        ("force x at the tip", "force y at the tip"), ("command", "product", "magnitude"), _magnet, moves=True
+    ),
+    "rising_wind": Effect(
+        ("force x at the tip", "force x at the middle"),
+        ("time",),
+        lambda a, s: {"force": _at_tip(jnp.outer(0.01 * a * s.time, jnp.array([1.0, 0.0, 0.0])))},
+    ),
+    "softening_by_use": Effect(
+        ("stiffness",),
+        ("largest", "travelled", "time"),
+        lambda a, s: {"stiffness": -10.0 * a * jax.lax.cummax(jnp.linalg.norm(s.tip[:, :2] - s.tip[:1, :2], axis=1))},
+        moves=True,
+    ),
+    "sliding_marker": Effect(("marker m3 along the body", "marker m3 z"), ("time",), sees=_slide),
+    "slow_clock": Effect(("observation delay",), ("time",), sees=_clock),
+    "twisted_mount": Effect(("camera turn z",), ("command",), sees=_twisted_mount),
+    "zooming_camera": Effect(("camera scale",), ("time",), sees=_zoom),
+}
+"""Of drives, body, surroundings, sensing and clocks."""
+
+
+class Concealed(NamedTuple):
+    """What is in a data set: the effect, its size in usual sizes and as rho, the experiment, and the untouched
+    recordings without noise [m]."""
+
+    effect: str
+    size: float
+    rho: float
+    experiment: Path
+    clean: Float[np.ndarray, "trajectory time marker 3"]
+
+
+@dataclass(frozen=True)
+class EffectSimulator:
+    """A simulator with an effect in it.
+
+    Attributes:
+        simulator: without it.
+        effect: None for nothing.
+        values: of its parameters.
+    """
+
+    simulator: Any
+    effect: Effect | None
+    values: dict[str, float]
+
+    def positions(self, commands: Commands, size: float) -> Float[np.ndarray, "recording time marker 3"]:
+        """What every recording shows with an effect of a size."""
+        return np.asarray(self._shown(commands, jnp.asarray(size)))
+
+    @cached_property
+    def _shown(self) -> Any:
+        given = {name: jnp.asarray(v) for name, v in self.values.items()}
+        effect, step = self.effect, self.simulator.time_step
+
+        def one(own: Commands, size: Any) -> Any:
+            levels = jnp.concatenate([jnp.asarray(own.initial)[None], own.step])
+            time = step * jnp.arange(len(levels))
+            every = own._replace(
+                sample_step=jnp.arange(len(levels)), sample_fraction=jnp.zeros(len(levels)), signals=None
+            )
+            tip = jnp.zeros((len(levels), 3))
+            if effect is not None and effect.moves:
+                tip = self.simulator.rollout(given, every).position[:, -1]
+                for _ in range(MOTIONS - 1):
+                    acted = every._replace(signals=_signals(effect, size, Scene(levels, tip, time)))
+                    tip = self.simulator.rollout(given, acted).position[:, -1]
+            if effect is not None and effect.acts is not None:
+                own = own._replace(signals=_signals(effect, size, Scene(levels, tip, time)))
+            position = self.simulator.rollout(given, own).position
+            if effect is not None and effect.sees is not None:
+                seen = observed_at(own, step)
+                position = effect.sees(size, position, seen - seen[0], sample(levels, own))
+            return position
+
+        return jax.jit(jax.vmap(one, in_axes=(0, None)))
+
+
+def _signals(effect: Effect, size: Any, scene: Scene) -> PortSignals:
+    assert effect.acts is not None
+    rows, given = len(scene.time), effect.acts(size, scene)
+    none = BodySignals(jnp.zeros((rows, 3, 3)), *(jnp.zeros(rows),) * 2, jnp.zeros((rows, 3)))
+    body = none._replace(**{name: part for name, part in given.items() if name in BodySignals._fields})
+    acts = any(name in given for name in BodySignals._fields)
+    return PortSignals(
+        given.get("command", jnp.zeros((rows, 4))), given.get("delay", jnp.zeros(rows)), body if acts else None
+    )
+
+
+def conceal(
+    name: str, rho: float, seed: int, out: Path, *, setting: Setting | None = None, workshop: Workshop | None = None
+) -> Concealed | None:
+    """Write a data set with an effect of size ``rho`` in it; with none where the name is empty.
+
+    Returns:
+        what is hidden; None where no size of the effect reaches rho.
+    """
+    setting, rng, out = setting or Setting(), np.random.default_rng([seed, 42]), output_folder(out)
+    effect = EFFECTS[name] if name else None
+    tables = experiment_tables(setting, fit=["fit_*.nc"])
+    blank = _blank(setting, rng)
+    fitted, untouched = blank[: REPEATS + OTHERS], blank[REPEATS + OTHERS :]
+    spec = spec_of(tables, out)
+    problem = build_problem(spec, AuditTable(), fitted, untouched, seed, workshop=workshop)
+    coordinates = problem.coordinates
+    truth = coordinates.null.copy()
+    base = slice(0, coordinates.base)
+    truth[base] += setting.spread * coordinates.prior_sd[base] * rng.standard_normal(coordinates.base)
+    values = dict(zip(coordinates.names[base], coordinates.values(truth[None])[0, base].tolist(), strict=True))
+    size, found = 0.0, 0.0
+    if effect is not None:
+        own = EffectSimulator(build_simulator(spec), effect, values)
+        sized = _sized(own, problem, truth, rho, fitted)
+        if sized is None:
+            return None
+        size, found = sized
+    made = build_simulator(replace(spec, simulator=SimulatorTable.model_validate(dict(setting.made))))
+    commands = gather_recordings(made, blank).commands
+    position = EffectSimulator(made, effect, values).positions(commands, size)
+    for index, (recording, clean) in enumerate(zip(blank, position, strict=True)):
+        noisy(recording, clean, jax.random.fold_in(jax.random.key(seed), index), setting).save(
+            out / f"{recording.name}.nc"
+        )
+    written = tables.model_dump(exclude_none=True, exclude_defaults=True) | {"seed": seed}
+    (out / "audit.toml").write_text(describe(written), encoding="utf-8")
+    return Concealed(name, size, found, out / "audit.toml", position[REPEATS + OTHERS :])
+
+
+def _sized(
+    own: EffectSimulator, problem: Any, truth: np.ndarray, rho: float, fitted: Sequence[Trajectory]
+) -> tuple[float, float] | None:
+    """Size at which a refit of the base model cannot absorb ``rho`` noise deviations, and the rho that was reached."""
+    measurements = measurements_of(problem, range(len(fitted)), fitted)
+    forward = simulated(problem, False, measurements, [group[0] for group in measurements.members])
+    widths = [channel.valid.shape[-1] for channel in measurements.channels]
+    white = Stacked(tuple(Autoregression(np.full(n, NOISE), np.ones(1), STATED, np.inf) for n in widths))
+    target = FitTarget(forward, replace(measurements, count=measurements.valid.astype(float)), white)
+    base = span(target.jacobian(truth, np.arange(problem.coordinates.base)))
+    still = own.positions(forward.commands, 0.0)
+
+    def reached(size: float) -> float:
+        effect = (own.positions(forward.commands, size) - still).reshape(-1) / NOISE
+        return float(np.sqrt(np.mean(project_out(base, effect[:, None]) ** 2)))
+
+    found = [reached(size) for size in AMPLITUDES]
+    above = [k for k, value in enumerate(found) if value >= rho]
+    if not above or above[0] == 0 or not np.isfinite(found[above[0]]):
+        return None
+    k = above[0]
+    share = np.log(rho / found[k - 1]) / np.log(found[k] / found[k - 1])
+    size = float(np.exp(np.log(AMPLITUDES[k - 1]) + share * np.log(AMPLITUDES[k] / AMPLITUDES[k - 1])))
+    return size, reached(size)
+
+
+def _blank(setting: Setting, rng: np.random.Generator) -> list[Trajectory]:
+    """Commands and times of all recordings; their positions are still those at rest."""
+    robot, table = Robot.load(setting.robot), setting.commands
+    sequences = [random_walk(table, len(robot.channel_names), rng) for _ in range(1 + OTHERS + UNTOUCHED)]
+    names = [f"fit_{k + 1}" for k in range(REPEATS + OTHERS)] + [f"test_{k + 1}" for k in range(UNTOUCHED)]
+    order = [*([0] * REPEATS), *range(1, 1 + OTHERS + UNTOUCHED)]
+    time = table.sample_time * np.arange(round(table.duration / table.sample_time) + 1)
+    return [
+        Trajectory.build(
+            Origin(name=name, robot=robot.name, format="netcdf", synthetic=True),
+            SentCommands(
+                command_time=sequences[k][0],
+                command=sequences[k][1],
+                command_unit=robot.command_unit,
+                cable_names=robot.channel_names,
+            ),
+            Measured(
+                time=time,
+                position=np.tile(robot.marker_points(), (len(time), 1, 1)),
+                marker_names=robot.marker_names,
+            ),
+        )
+        for name, k in zip(names, order, strict=True)
+    ]

@@ -1,0 +1,122 @@
+"""Laws at ports: features against their formulas, null values that change nothing, files that say what laws are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms.features import KINDS, Feature, dictionary
+from rfdropo_bayes.model.assembly import build_robot_simulator
+from rfdropo_bayes.model.experiment import Experiment
+from rfdropo_bayes.model.model_spec import spec_of
+from rfdropo_bayes.tables import parse_table
+
+STEP = 0.01
+LEVELS = np.cumsum(np.random.default_rng(0).normal(size=(40, 2)), axis=0) * 1e-3
+
+
+def spec(*laws, **simulator):
+    tables = {"robot": "smooth_arm", "model": {"laws": list(laws)}, "simulator": {"time_step": STEP, **simulator}}
+    return spec_of(parse_table(Experiment, tables, where="test"), Path())
+
+
+def law(port, feature="time", **term):
+    return {"port": port, "terms": [{"coefficient": "c", "feature": feature, "scale": 1.0, **term}]}
+
+
+def commands(simulator):
+    value = np.random.default_rng(1).uniform(0.0, 0.008, (5, 4))
+    return simulator.commands(0.1 * np.arange(5), value, np.zeros(4), 0.05 * np.arange(10))
+
+
+def test_features_are_what_their_formulas_say():
+    u, v = LEVELS.T
+    move = np.diff(u)
+    slow, lead, play = [u[0]], 0.0, [0.0]
+    for k in range(1, len(u)):
+        slow.append(u[k] + np.exp(-STEP / 0.3) * (slow[-1] - u[k]))
+        lead = np.clip(lead + move[k - 1] / 2e-3, -1.0, 1.0)
+        play.append(lead)
+    truth = {
+        "constant": np.ones(len(u)),
+        "time": STEP * np.arange(len(u)),
+        "command": u,
+        "product": u * v,
+        "magnitude": np.abs(u),
+        "rate": np.append(0.0, move / STEP),
+        "direction": np.append(0.0, np.sign(move)),
+        "low_pass": np.array(slow),
+        "play": np.array(play),
+        "largest": np.maximum.accumulate(np.abs(u)),
+        "travelled": np.append(0.0, np.cumsum(np.abs(move))),
+    }
+    assert set(truth) == set(KINDS)
+    shapes = {"low_pass": 0.3, "play": 2e-3}
+    for name, kind in KINDS.items():
+        feature = Feature(name, (0, 1)[: kind.channels], shapes.get(name))
+        assert np.allclose(feature.over(jnp.asarray(LEVELS), STEP), truth[name]), name
+    assert len(dictionary(4, 0.01)) == 2 + 4 * 7 + 10 + 4 * 2 + 4 * 3 - 4
+
+
+PORTS = ["cable left", "command delay", "force x at the tip", "stiffness", "damping", "base tilt z", "marker m3 x",
+         "marker m3 along the body", "camera y", "camera turn z", "camera scale", "observation delay"]  # fmt: skip
+
+
+@pytest.mark.parametrize("port", PORTS)
+def test_a_law_of_zero_changes_no_bit_and_another_one_acts(port):
+    plain, acting = (
+        build_robot_simulator(spec()),
+        build_robot_simulator(spec(law(port, "magnitude", commands=["left"]))),
+    )
+    given = commands(plain)
+    still = plain.rollout({}, given)
+    null = acting.rollout({"c": jnp.asarray(0.0)}, given)
+    assert np.array_equal(still.position, null.position)
+    moved = acting.rollout({"c": jnp.asarray(3.0)}, given)
+    assert np.abs(moved.position - still.position).max() > 1e-6
+
+
+def test_a_law_at_a_cable_is_a_change_of_its_command_in_rollouts_and_in_sessions():
+    acting, plain = build_robot_simulator(spec(law("cable left", "product", commands=["up", "left"]))), None
+    plain = build_robot_simulator(spec())
+    given = commands(plain)
+    values = {"c": jnp.asarray(15.0)}
+    step = np.array(given.step)
+    step[:, 1] += 15.0 * step[:, 0] * step[:, 1]
+    known = plain.rollout({}, given._replace(step=step))
+    assert np.abs(acting.rollout(values, given).position - known.position).max() < 1e-12
+    lanes = acting.session(1, 0.1)
+    lanes.reset(np.array([0]), {"c": np.array([15.0])})
+    value = np.random.default_rng(1).uniform(0.0, 0.008, (5, 4))
+    seen = [np.asarray(lanes.act(row[None]).position)[0] for row in value[:3]]
+    whole = acting.rollout(values, acting.commands(0.1 * np.arange(3), value[:3], np.zeros(4), 0.1 * np.arange(4)))
+    assert np.abs(np.stack(seen) - whole.position[1:]).max() < 1e-12
+
+
+def test_what_a_law_cannot_be_is_said():
+    for wrong, match in (
+        (law("cable top"), "no port 'cable top'"),
+        (law("cable left", "speed"), "unknown feature"),
+        (law("cable left", "product", commands=["up"]), "made of 2 commands"),
+        (law("cable left", "command", commands=["top"]), "unknown command"),
+        (law("cable left", "low_pass", commands=["up"]), "takes a positive shape"),
+    ):
+        with pytest.raises(InputError, match=match):
+            build_robot_simulator(spec(wrong))
+    body = build_robot_simulator(spec(law("stiffness")))
+    with pytest.raises(InputError, match="whole rollout"):
+        body.session(1, 0.1)
+
+
+def test_a_model_says_its_laws_as_a_file_has_them():
+    given = law("cable left", "play", commands=["up"], shape=1e-3)
+    tables = spec(given).tables()
+    assert tables["model"]["laws"] == [given]
+    assert tables["model"]["mechanisms"] == []
+    simulator = build_robot_simulator(spec(given))
+    (own,) = [each for each in simulator.parameters if each.name == "c"]
+    assert (own.unit, own.nominal, own.prior) == ("m", 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 1.0})
