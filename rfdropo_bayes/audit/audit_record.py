@@ -10,7 +10,7 @@ import numpy as np
 from rfdropo_bayes.audit.candidates import spoken
 from rfdropo_bayes.audit.extension import DISCRETISATION, Added
 from rfdropo_bayes.audit.gain import LEVELS, noise_distance
-from rfdropo_bayes.audit.law_words import law_record, ports_record
+from rfdropo_bayes.audit.law_words import unknown_record
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.prequential import in_words, prequential
 from rfdropo_bayes.audit.score import likeness
@@ -73,15 +73,10 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         "noise": _noise(answer),
         "channels": list(answer.target.measurements.names_of_channels),
         "residual_in_noise_deviations": base_rms,
-        "remainder": {
-            "amplitude_mm": MILLIMETRES * answer.remainder.amplitude,
-            "length_scale_s": answer.remainder.memory,
-            "log_likelihood_ratio": answer.remainder.log_likelihood_ratio,
-        },
+        "remainder": _remainder(answer),
         "where": _where(answer),
         "base_parameters": _parameters(answer, answer.base.free, answer.base.x),
-        "ports": ports_record(answer),
-        "law": law_record(answer),
+        **unknown_record(answer),
         "next_experiment": next_experiment,
         "rollouts": answer.cost.rollouts,
         "seconds": round(answer.cost.seconds, 2),
@@ -90,6 +85,14 @@ def record(answer: Answer, *, versions: dict[str, str], data_sha256: str, next_e
         "versions": versions,
         "data_sha256": data_sha256,
         "schema_version": SCHEMA_VERSION,
+    }
+
+
+def _remainder(answer: Answer) -> dict[str, Any]:
+    return {
+        "amplitude_mm": MILLIMETRES * answer.remainder.amplitude,
+        "length_scale_s": answer.remainder.memory,
+        "log_likelihood_ratio": answer.remainder.log_likelihood_ratio,
     }
 
 

@@ -7,7 +7,7 @@ stands in for the law, and is not adopted as a cause.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from rfdropo_bayes.audit.deadline import OutOfTime
-from rfdropo_bayes.audit.extension import DISCRETISATION, Added, Rules
+from rfdropo_bayes.audit.extension import Added, Rules
 from rfdropo_bayes.audit.fit import Fit, FitTarget, widened
 from rfdropo_bayes.audit.gain import Gain
-from rfdropo_bayes.audit.held_out import HeldOut, predicted, stages_of
+from rfdropo_bayes.audit.held_out import HeldOut, Stage, predicted, stages_of
 from rfdropo_bayes.audit.inadequacy import as_measured
 from rfdropo_bayes.audit.laws import FoundLaw, Refit, law_search
 from rfdropo_bayes.audit.problem import AuditProblem
@@ -61,18 +61,26 @@ class Described:
 
 @dataclass(frozen=True)
 class Model:
-    """A model that a law may stand beside: the target it was fitted under, its fit, and the steps that led to it."""
+    """The base model with what the library named.
+
+    Attributes:
+        judge, base: the target under which the base model was fitted, and its fit under that.
+        steps: likewise.
+    """
 
     judge: FitTarget
-    fit: Fit
+    base: Fit
     steps: tuple[Added, ...] = ()
+
+    @property
+    def last(self) -> tuple[FitTarget, Fit]:
+        """Target and fit with all steps."""
+        return (self.steps[-1].judge, self.steps[-1].fit) if self.steps else (self.judge, self.base)
 
 
 def describe(
     problem: AuditProblem,
-    judge: FitTarget,
-    base: Fit,
-    steps: Sequence[Added],
+    model: Model,
     held_out: HeldOut | None,
     report: Callable[[str], None] = lambda line: None,
 ) -> Described | None:
@@ -80,46 +88,42 @@ def describe(
 
     Args:
         problem: with the ports of its simulator.
-        judge, base: the base model.
-        steps: what the library named.
+        model: the base model, and what the library named.
         held_out: predictions of unseen recordings by the base model and after each step; None without steps.
         report: called with a line of words now and then.
     """
     if problem.ports is None or problem.groups is not None:
         return None
     answer: Described | None = None
-    clock = judge.forward.deadline
+    clock = model.judge.forward.deadline
     with clock.stage("ports and laws"), clock.reserve(), suppress(OutOfTime):
-        plain = Model(judge, base)
-        answer = _beside(problem, plain, judge, base, report)
-        if not steps:
+        answer = _beside(problem, replace(model, steps=()), report)
+        if not model.steps:
             return answer
-        names = tuple(step.name for step in steps)
+        names = tuple(step.name for step in model.steps)
         seen = answer.held_out if answer.holds else None
-        if held_out is not None and seen is not None and seen.beside(held_out.after(len(steps))).clear:
+        if held_out is not None and seen is not None and seen.beside(held_out.after(len(names))).clear:
+            report(f"the law takes the place of {' and '.join(names)}")
             return replace(answer, stand_ins=names)
-        further = _beside(problem, Model(steps[-1].judge, steps[-1].fit, tuple(steps)), judge, base, report)
-        return replace(further, beside=names) if further.holds else replace(answer, holds=False, beside=())
+        further = _beside(problem, model, report)
+        answer = replace(further, beside=names) if further.holds else replace(answer, holds=False)
     return answer
 
 
-def _beside(
-    problem: AuditProblem, model: Model, judge: FitTarget, base: Fit, report: Callable[[str], None]
-) -> Described:
-    """The law beside one model, and what it is worth on unseen recordings."""
+def _beside(problem: AuditProblem, model: Model, report: Callable[[str], None]) -> Described:
+    """The law beside a model, and what it is worth on unseen recordings."""
     simulator: Any = problem.lanes.simulator
     assert problem.ports is not None
     channels, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
-    target = model.judge
+    target, fit = model.last
     options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report)
-    found = law_search(target.measured, *options).find(target, as_measured(target, model.fit))
+    found = law_search(target.measured, *options).find(target, as_measured(target, fit))
     last = found.last
     if last is None:
         return Described(found)
-    stages = stages_of(judge, base, model.steps)
-    finer = bool(model.steps) and any(step.name == DISCRETISATION for step in model.steps)
-    stages.append(type(stages[0])(last.target, last.fit, finer))
-    held_out = predicted(problem, judge.measured, stages)
+    stages = stages_of(model.judge, model.base, model.steps)
+    stages.append(Stage(last.target, last.fit, stages[-1].finer))
+    held_out = predicted(problem, model.judge.measured, stages)
     gain, overall = held_out.gain(len(stages) - 2, len(stages) - 1), held_out.gain(0, len(stages) - 1)
     return Described(found, (), (), gain, overall, held_out, holds_on(problem.rules, gain))
 

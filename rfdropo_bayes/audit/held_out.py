@@ -15,6 +15,7 @@ from rfdropo_bayes.audit.fit import Fit, FitTarget, climb
 from rfdropo_bayes.audit.gain import Gain, Unseen, UnseenErrors, measure_gain
 from rfdropo_bayes.audit.inadequacy import as_measured, spread
 from rfdropo_bayes.audit.measurements import Measurements
+from rfdropo_bayes.audit.ported import FeatureTable, PortedForward
 from rfdropo_bayes.audit.problem import AuditProblem, measurements_of, simulated
 from rfdropo_bayes.audit.screen import Screen
 from rfdropo_bayes.bayes.noise.stacked import Stacked

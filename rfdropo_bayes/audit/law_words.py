@@ -23,6 +23,11 @@ def channels_of(answer: Answer) -> tuple[str, ...]:
     return tuple(simulator.channel_names)
 
 
+def unknown_record(answer: Answer) -> dict[str, Any]:
+    """What audit.json says of unknown causes."""
+    return {"ports": ports_record(answer), "law": law_record(answer)}
+
+
 def law_record(answer: Answer) -> dict[str, Any] | None:
     """The law that was found, whether it holds or not; None without one."""
     described = answer.causes.described

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.audit.deadline import Deadline, OutOfTime, about
-from rfdropo_bayes.audit.described import Described, describe
+from rfdropo_bayes.audit.described import Described, Model, describe
 from rfdropo_bayes.audit.extension import DISCRETISATION, Added, ExtensionSearch, numerical_shift
 from rfdropo_bayes.audit.fit import (
     WITHIN,
@@ -178,6 +178,22 @@ def _leaves_something(verdict: str, base: Fit) -> bool:
     return verdict in (PARTLY, UNEXPLAINED) or (verdict == NO_VERDICT and not base.converged)
 
 
+def _remainder(target: FitTarget, extended: Fit, described: Described | None) -> Remainder:
+    """What the last model leaves, a law that holds being in it."""
+    left = extended.residual
+    if described is not None and described.holds and described.last is not None:
+        left = as_measured(described.last.target, described.last.fit).residual
+    return describe_remainder(target.measurements, left, target.noise.first)
+
+
+def _weighed_up(
+    problem: AuditProblem, verdict: str, target: FitTarget, remainder: Remainder, shown: float | None
+) -> str:
+    """The verdict, or `NEGLIGIBLE` where what is left is too small to matter."""
+    size, noise = float(np.sqrt(3.0) * remainder.amplitude), noise_distance(target.noise.first)
+    return NEGLIGIBLE if negligible(problem.rules, size, noise, shown) else verdict
+
+
 def _described_validation(described: Described) -> Validation:
     """What unseen recordings say of the base model with a law alone."""
     held = described.held_out
@@ -218,6 +234,7 @@ def audit(
     judge = judge if judge.known is not None else search.target.on(judge.forward)
     asked = [step.name for step in steps]
     steps, last, held_out = supported_steps(problem, judge, search, base, steps, last)
+    under = Model(judge, base, tuple(steps))
     base, steps = as_measured(judge, base), [replace(s, fit=as_measured(s.judge, s.fit)) for s in steps]
     unsupported = [name for name in asked if name not in [step.name for step in steps]]
     if unsupported:
@@ -229,26 +246,19 @@ def audit(
     screens = [*(step.before for step in steps), last]
     validation = _validation(held_out, len(steps))
     verdict, suspected = _verdict(replace(search, target=judge), base, steps, screens, validation.gain, deadline)
-    described = None
-    if fitted and not deadline.reached and _leaves_something(verdict, base):
-        described = describe(problem, judge, base, steps, held_out, report)
+    asks = fitted and not deadline.reached and _leaves_something(verdict, base)
+    described = describe(problem, under, held_out, report) if asks else None
     if described is not None and described.holds:
         verdict, suspected = DESCRIBED, None
-        if described.stand_ins:
-            report(f"the law takes the place of {' and '.join(described.stand_ins)}")
-            steps, screens, validation = [], screens[:1], _described_validation(described)
-            extended = base
+        if not described.beside:
+            steps, screens, extended, validation = [], screens[:1], base, _described_validation(described)
     stopped = deadline.reached
     deadline.lift()  # what is left are single rollouts, for the report
     sizes = widened(extended, problem.coordinates)
     shown = None if DISCRETISATION in asked or finer is None else numerical_shift(target, finer, extended)
-    left = extended.residual
-    if described is not None and described.holds and described.last is not None:
-        left = as_measured(described.last.target, described.last.fit).residual
-    remainder = describe_remainder(target.measurements, left, target.noise.first)
-    if verdict in (PARTLY, UNEXPLAINED) and not steps and (described is None or not described.holds):
-        size, noise = float(np.sqrt(3.0) * remainder.amplitude), noise_distance(target.noise.first)
-        verdict = NEGLIGIBLE if negligible(problem.rules, size, noise, shown) else verdict
+    remainder = _remainder(target, extended, described)
+    if verdict in (PARTLY, UNEXPLAINED) and not steps:
+        verdict = _weighed_up(problem, verdict, target, remainder, shown)
     return Answer(
         verdict,
         problem,

@@ -223,16 +223,18 @@ def build_problem(
         candidates,
         _stated(spec, model, fitted[0]),
         start,
-        Rules(
-            bootstraps=table.bootstraps,
-            minutes=table.minutes,
-            matters=None if table.matters_mm is None else 1e-3 * table.matters_mm,
-        ),
+        _rules(table),
         seed,
         {name: why for name, why in left_out.items() if name not in table.exclude},
         groups,
         port_map(simulator, model.recordings.markers) if library and table.ports else None,
     )
+
+
+def _rules(table: AuditTable) -> Rules:
+    """What [audit] says of the rules."""
+    matters = None if table.matters_mm is None else 1e-3 * table.matters_mm
+    return Rules(bootstraps=table.bootstraps, minutes=table.minutes, matters=matters)
 
 
 def _named(
