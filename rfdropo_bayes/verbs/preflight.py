@@ -377,7 +377,7 @@ def _further(model: Model, coordinates: _Coordinates, tension: np.ndarray) -> di
         weight = np.zeros((len(coordinates.names),) * 2)
         size = 1.0 if coordinates.logarithmic[k] else max(abs(coordinates.mean[k]), coordinates.sd[k])
         weight[k, k] = (coordinates.sd[k] / (KNOWN * size)) ** 2
-        word = "weighed" if units.get(name) == "kg" or "mass" in name else "measured by itself"
+        word = "weighed" if units.get(name.partition("@")[0]) == "kg" else "measured by itself"
         found[f"{name} {word} (to {100 * KNOWN:g} %)"] = weight
     return found
 

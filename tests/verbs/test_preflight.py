@@ -77,9 +77,9 @@ def test_the_scale_of_stiffness_and_mass_is_the_ridge_and_a_force_or_a_balance_e
     assert any("tensions" in what for what in ends)
     assert any("mass weighed" in what for what in ends)
     assert not any("ratio" in what for what in ends)
-    # sd along the ridge is sqrt(2) 0.5 / 0.01 times less than the prior's, where the mass is known to 1 %
+    # only the ratio is known: the mass keeps s_k / sqrt(s_k^2 + s_m^2) of its prior spread
     shares = found.parameters["kept"]
-    assert shares["mass"] == pytest.approx(np.sqrt(0.5), rel=0.02)
+    assert shares["mass"] == pytest.approx(np.sqrt(0.5), rel=0.05)  # the sd of 2000 draws is known to 1.6 %
     assert shares["ratio"] < 0.1
 
 
