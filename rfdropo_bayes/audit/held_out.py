@@ -12,6 +12,7 @@ import numpy as np
 from rfdropo_bayes.audit.deadline import OutOfTime
 from rfdropo_bayes.audit.extension import DISCRETISATION, Added, ExtensionSearch
 from rfdropo_bayes.audit.fit import Fit, FitTarget, climb
+from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.gain import Gain, Unseen, UnseenErrors, measure_gain
 from rfdropo_bayes.audit.inadequacy import as_measured, spread
 from rfdropo_bayes.audit.measurements import Measurements

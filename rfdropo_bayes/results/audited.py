@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
+import xarray as xr
 
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.files import write_json, write_text
+from rfdropo_bayes.files import whole, write_json, write_text
 from rfdropo_bayes.model.experiment import Experiment
 from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.model import Model
@@ -27,7 +28,7 @@ from rfdropo_bayes.tables import nearest, parse_table
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-AUDIT, EXTENDED, REPORT = "audit.json", "extended.toml", "report.html"
+AUDIT, EXTENDED, REPORT, RESIDUALS = "audit.json", "extended.toml", "report.html", "residuals.nc"
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Audit:
         folder: that it was written to, if any.
         shown: what its figures show; None where it was read from files.
         answer: with its fits; None where it was read from files.
+        residuals: of the base model and of the last one, and signals at ports; None where it was read from files.
     """
 
     content: Mapping[str, Any]
@@ -53,6 +55,7 @@ class Audit:
     folder: Path | None = None
     shown: Shown | None = None
     answer: Answer | None = None
+    residuals: xr.Dataset | None = None
 
     @property
     def verdict(self) -> str:
@@ -164,11 +167,14 @@ class Audit:
         return Path(path)
 
     def save(self, folder: Path | str) -> Path:
-        """Write audit.json, extended.toml and report.html; return the path of the report."""
+        """Write audit.json, extended.toml, residuals.nc and report.html; return the path of the report."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / AUDIT, self.content, finite=True)
         write_text(folder / EXTENDED, describe(self.tables))
+        if self.residuals is not None:
+            with whole(folder / RESIDUALS) as partial:
+                self.residuals.to_netcdf(partial, engine="h5netcdf")
         return self.report(folder / REPORT)
 
     def _repr_html_(self) -> str:

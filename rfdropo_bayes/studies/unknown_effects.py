@@ -140,7 +140,7 @@ EFFECTS: dict[str, Effect] = {
     "one_lagging_cable": Effect(
         ("cable down",),
         ("rate",),
-        lambda a, s: {"command": _channel(2, -0.04 * a * jnp.gradient(s.levels[:, 2], s.time))},
+        lambda a, s: {"command": _channel(2, -0.04 * a * jnp.asarray(jnp.gradient(s.levels[:, 2], s.time)))},
     ),
     "slow_queue": Effect(("command delay",), ("time",), lambda a, s: {"delay": 0.02 * a * s.time}),
     "magnet": Effect(

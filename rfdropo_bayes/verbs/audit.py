@@ -52,6 +52,7 @@ from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.audit_page import render_audit, shown
+from rfdropo_bayes.report.residual_file import residual_dataset
 from rfdropo_bayes.report.run_files import SUMMARY
 from rfdropo_bayes.report.summary import combined_hash, read_summary
 from rfdropo_bayes.results.audited import Audit
@@ -149,7 +150,8 @@ def _audited(answer: Answer, model: Model, tables: Mapping[str, Any], data_sha25
     page = render_audit(seen, content, model.title, describe(tables), shape)
     extended = extended_tables(dict(tables), answer, model.folder, out)
     made = None if model.spec.named else model.robot
-    return Audit(content, extended, page, made, out or model.folder, out, seen, answer)
+    left = residual_dataset(answer) if answer.fitted else None
+    return Audit(content, extended, page, made, out or model.folder, out, seen, answer, left)
 
 
 def _asked(model: Model, noise: Mapping[str, float] | None, options: Mapping[str, Any]) -> Model:

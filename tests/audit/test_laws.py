@@ -14,6 +14,7 @@ from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.report.audit_page import render_audit, shown
+from rfdropo_bayes.report.residual_file import residual_dataset
 
 from .toys import Toy, problem, recordings
 
@@ -58,6 +59,9 @@ def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
     (table,) = law_tables(answer)
     assert table["port"] == "marker m3 x"
     assert table["terms"][0]["commands"] == ["a", "b"]
+    left = residual_dataset(answer)
+    assert float((left.residual_last**2).mean()) < float((left.residual_base**2).mean())
+    assert left.signal.sel(port="marker m3 x").shape == (2, left.sizes["signal_time"])
     assert "What acts, and where" in render_audit(shown(answer), content, "toy", "")
 
 

@@ -1,0 +1,38 @@
+"""What models leave of the fitted recordings, and the signals at ports, as a dataset: the content of residuals.nc."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from rfdropo_bayes.audit.pipeline import Answer
+
+
+def residual_dataset(answer: Answer) -> xr.Dataset:
+    """Measured less simulated marker positions [m] of every group of repeats, by the base model and by the last one; mean
+    and deviation of the signal at every port where one was looked for [unit of the port]."""
+    measured, markers = answer.target.measurements, answer.problem.model.recordings.markers
+    models = {"base": (answer.target, answer.base.x), "last": (answer.target, answer.extended.x)}
+    if answer.causes.steps:
+        models["last"] = (answer.causes.steps[-1].judge, answer.extended.x)
+    if answer.law is not None and answer.law.last is not None:
+        models["last"] = (answer.law.last.target, answer.law.last.fit.x)
+    valid = measured.valid[..., : measured.markers]
+    shape = (*valid.shape[:2], len(markers), 3)
+    left = {
+        name: np.where(valid, target.errors(x)[..., : measured.markers], np.nan).reshape(shape)
+        for name, (target, x) in models.items()
+    }
+    along = ("recording", "row", "marker", "axis")
+    variables = {f"residual_{name}": (along, part, {"units": "m"}) for name, part in left.items()}
+    variables["time"] = (("recording", "row"), np.asarray(measured.time), {"units": "s"})
+    coordinates = {"recording": list(measured.names), "marker": list(markers), "axis": list("xyz")}
+    described = answer.causes.described
+    if described is not None:
+        rows = described.found.ports
+        coordinates |= {"port": [row.port.name for row in rows], "signal_time": described.found.centre}
+        coordinates |= {"unit": ("port", [row.port.unit for row in rows])}
+        across = ("port", "recording", "signal_time")
+        variables["signal"] = (across, np.stack([row.mean for row in rows]), {})
+        variables["signal_sd"] = (across, np.stack([row.sd for row in rows]), {})
+    return xr.Dataset(variables, coordinates)
