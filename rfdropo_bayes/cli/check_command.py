@@ -19,10 +19,11 @@ def check(
     ] = None,
     overrides: Overrides = None,
 ) -> None:
-    """Say in words what was read (robot, markers, commands, units, rows, masks, model) and draw every recording."""
+    """Say in words what was read (robot, markers, commands, units, rows, masks, model), what time step and mesh move
+    the markers by, and draw every recording."""
     from rfdropo_bayes.verbs.check import run_check
 
-    found = run_check(experiment, out or Path("reports") / f"{experiment.stem}-check", overrides or [])
+    found = run_check(experiment, out or Path("reports") / f"{experiment.stem}-check", overrides or [], numerics=True)
     width = max(len(label) for label, _ in found.lines)
     for label, text in found.lines:
         typer.echo(f"{label:<{width}}  {text}")

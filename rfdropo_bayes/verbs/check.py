@@ -31,6 +31,7 @@ from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.calibrate import inference_options
+from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
 from rfdropo_bayes.verbs.placement import far_from_rest, placement_hints
 
 MILLIMETRES = 1e3
@@ -58,13 +59,14 @@ class Check:
     files: list[Path] = field(default_factory=list)
 
 
-def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
+def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, numerics: bool = False) -> Check:
     """Read everything that an experiment names, and say what was read.
 
     Args:
         path: the experiment file.
         out: folder for the pictures, ``NAME.png`` for each recording.
         overrides: assignments that replace entries of the file.
+        numerics: measure what the time step and the mesh move the markers by, in a few short simulations.
 
     Raises:
         InputError: the experiment file or the robot cannot be read; whatever else is wrong is among the problems.
@@ -83,6 +85,9 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = ()) -> Check:
     found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
     _say_repeats(found, [*recordings["fit"], *recordings["test"]])
     _say_model(found, experiment, folder, recordings["fit"])
+    if numerics and recordings["fit"] and not found.problems:
+        spec = spec_of(experiment, folder)
+        found.lines += _try(found, partial(numerical_error_lines, spec, recordings["fit"][0])) or []
     if any(recordings.values()):
         out = output_folder(out)
     rest = robot_shape(robot)
