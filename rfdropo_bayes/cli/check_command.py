@@ -23,7 +23,7 @@ def check(
     ] = False,
 ) -> None:
     """Say in words what was read (robot, markers, commands, units, rows, masks, model), draw every recording, and say
-    what a fit could determine, and at what cost."""
+    what time step and mesh move the markers by, and what a fit could determine, and at what cost."""
     from rfdropo_bayes.verbs.check import run_check
 
     found = run_check(experiment, out or Path("reports") / f"{experiment.stem}-check", overrides or [], ahead=not quick)

@@ -60,6 +60,7 @@ def make_episodes(
     randomisation: Randomisation | None = None,
     precision: Literal["float32", "float64"] = "float64",
     threads: int | None = None,
+    integrator: Integrator = "euler",
     **settings: Any,
 ) -> Episodes:
     """Lanes of a task.
@@ -69,7 +70,7 @@ def make_episodes(
         lanes: how many.
         simulator: to use as it is; made from the next arguments by default.
         robot: name, file or description; the task's own by default.
-        mechanisms, precision, threads: see `trunk_simulator`.
+        mechanisms, precision, threads, integrator: see `trunk_simulator`.
         parameters: fixed values; the others are nominal.
         randomisation: of parameters; instead of ``parameters``.
         settings: see `Settings`.
@@ -80,9 +81,8 @@ def make_episodes(
     chosen = task_named(task)
     if simulator is None:
         described = robot if isinstance(robot, Robot) else Robot.load(robot or chosen.robot)
-        simulator = trunk_simulator(
-            described, push=chosen.push, mechanisms=mechanisms, precision=precision, threads=threads
-        )
+        options: dict[str, Any] = {"precision": precision, "threads": threads, "integrator": integrator}
+        simulator = trunk_simulator(described, push=chosen.push, mechanisms=mechanisms, **options)
     if randomisation is not None and parameters:
         raise InputError("fixed parameters beside a randomisation", where=task, remedy="give one of the two")
     known = set(Settings.__dataclass_fields__)

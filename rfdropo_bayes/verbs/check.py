@@ -32,6 +32,7 @@ from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.calibrate import inference_options
+from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
 from rfdropo_bayes.verbs.placement import far_from_rest, placement_hints
 from rfdropo_bayes.verbs.preflight import Preflight, preflight
 
@@ -84,7 +85,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
         path: the experiment file.
         out: folder for the pictures, ``NAME.png`` for each recording, and check.json.
         overrides: assignments that replace entries of the file.
-        ahead: also say what a fit could determine, see `check`.
+        ahead: also say what time step and mesh move the markers by, and what a fit could determine, see `check`.
 
     Raises:
         InputError: the experiment file or the robot cannot be read; whatever else is wrong is among the problems.
@@ -106,6 +107,9 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
     _say_repeats(found, [*recordings["fit"], *recordings["test"]])
     _say_model(found, experiment, folder, recordings["fit"])
     if ahead and recordings["fit"] and not found.problems:
+        if isinstance(robot, Robot):
+            spec = spec_of(experiment, folder)
+            found.lines += _try(found, partial(numerical_error_lines, spec, recordings["fit"][0])) or []
         _say_ahead(found, experiment, folder, recordings["fit"])
     if any(recordings.values()):
         out = output_folder(out)

@@ -10,8 +10,11 @@ import pytest
 from PIL import Image
 
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.model.experiment import SimulatorTable
+from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.check import Check, run_check
+from rfdropo_bayes.verbs.numerical_error import NumericalError, measure_numerical_error, numerical_error_lines
 from rfdropo_bayes.verbs.placement import placement_hints
 
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo" / "demo_1.nc"
@@ -46,6 +49,14 @@ def checked(
     path = tmp_path / "own.toml"
     path.write_text(EXPERIMENT.format(commands=commands, more=more, priors=priors))
     return run_check(path, tmp_path / "pictures")
+
+
+def demo_spec(integrator: str) -> ModelSpec:
+    return ModelSpec(Robot.load("smooth_arm"), simulator=SimulatorTable(integrator=integrator))
+
+
+def demo_error(integrator: str) -> NumericalError:
+    return measure_numerical_error(demo_spec(integrator), Trajectory.load(DEMO))
 
 
 def text_of(found: Check) -> str:
@@ -164,3 +175,16 @@ def test_stamps_of_arrival_and_a_clock_that_jumps_are_notes(tmp_path):
     assert not arrival.problems
     jump = checked(tmp_path, time=0.05 * ROWS + 600.0 * (ROWS > 29))
     assert any("run: the clock jumps by 600 s before row 30" in note for note in jump.notes)
+
+
+def test_the_numerical_error_of_step_and_mesh_is_said():
+    """On the demo's own slow commands a quarter of Euler's step moves the markers by 0.4 mm, of SDIRK2's by under a
+    fifth of that, and twice the layers by 0.2 mm."""
+    found = {name: demo_error(name) for name in ("euler", "sdirk2")}
+    assert 0.2 < found["euler"].time_step < 0.6
+    assert found["sdirk2"].time_step < 0.2 * found["euler"].time_step
+    assert 0.1 < found["euler"].mesh < 0.4
+    lines = numerical_error_lines(demo_spec("euler"), Trajectory.load(DEMO))
+    assert lines[0][0] == "numerics"
+    assert "a quarter of the time step (10 ms, euler)" in lines[0][1]
+    assert lines[1][1].startswith("twice the layers:")

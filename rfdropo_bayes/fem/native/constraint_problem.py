@@ -410,6 +410,27 @@ def _residual(p, lines, n, token):
 
 
 @kernel
+def _doubt(p, lines, n, rounding, settled, each, token):
+    """Slope along the change that rounded velocities would make: all of them by the ``rounding`` of the largest one, or
+    ``each`` by that of its own size.
+
+    Cables that hang loose at 3 m/s say nothing of a cube at rest, whose contacts go from sticking to sliding within
+    1 um/s: in single precision 19 of 512 prior draws of TrunkPush come to no end in steps of SDIRK2 with the largest, 4
+    with each. With the largest it is 3 in implicit Euler, on whose digits recordings and policies rest.
+    """
+    zero, total = fill(0.0, p.free, token), fill(0.0, p.free, token)
+    for i in range(n):
+        change = magnitude(load(p.moving, i, token), zero)
+        if each:
+            size, other = magnitude(load(p.free, i, token), zero), magnitude(load(p.velocity, i, token), zero)
+            size = where_greater(other, size, other, size)
+            other = magnitude(load(p.matrix, i * n + i, token) * load(p.impulse, i, token), zero)
+            change = change * where_greater(other, size, other, size) * (ROUNDING * settled)
+        total = fma(change, _firmness(p, i, lines, token), total)
+    return total if each else total * rounding
+
+
+@kernel
 def _search_share(p, cables, lines, contacts, going, doubt, token):
     """All of the change, or where its slope vanishes before; slopes up to ``doubt`` are rounding."""
     zero, one = fill(0.0, p.free, token), fill(1.0, p.free, token)
@@ -425,9 +446,9 @@ def _search_share(p, cables, lines, contacts, going, doubt, token):
 
 
 @kernel
-def solve_problem(p, cables, runs, contacts, settled, token):
+def solve_problem(p, cables, runs, contacts, settled, each, token):
     """Find ``impulse`` from where it is, and the ``velocity`` that follows; ``going`` is left at 1 where it was not
-    found."""
+    found. ``each``: see `_doubt`."""
     zero, lines = fill(0.0, p.free, token), cables + runs
     n, going = lines + 3 * contacts, fill(1.0, p.free, token)
     for iteration in range(ITERATIONS):
@@ -446,10 +467,7 @@ def solve_problem(p, cables, runs, contacts, settled, token):
         if not any_greater(going, zero):
             break
         _change(p, lines, n, m, token)
-        doubt = zero
-        for i in range(n):
-            doubt = fma(magnitude(load(p.moving, i, token), zero), _firmness(p, i, lines, token), doubt)
-        doubt = doubt * rounding
+        doubt = _doubt(p, lines, n, rounding, settled, each, token)
         share = _search_share(p, cables, lines, contacts, going, doubt, token)
         for i in range(n):
             impulse = fma(share, load(p.left, i, token), load(p.impulse, i, token))

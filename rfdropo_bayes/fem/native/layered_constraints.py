@@ -158,7 +158,7 @@ def _hold(
             wide, narrow = load(factors.wide, 0, token), load(factors.narrow, 0, token)
             add_cube(touch, p, lines, contacts, length, wide, narrow, token)
     soften(p, cables, slips, contacts, length, schedule.softness, token)
-    solve_problem(p, cables, slips, contacts, schedule.settled, token)
+    solve_problem(p, cables, slips, contacts, schedule.settled, schedule.stages[0].predicted, token)
     weigh_border(cables, work, p, token)
     weigh_rows(tables, work, token)
     if panels > 0:

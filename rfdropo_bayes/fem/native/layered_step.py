@@ -214,7 +214,7 @@ def solve_statics(tables, samples, factors, work, p, schedule, token):
     condense_increment(tables, samples, factors, work, EULER, token)
     start_problem(tables, factors, work, p, tables.cables, 1.0, token)
     soften(p, tables.cables, 0, 0, 1.0, schedule.softness, token)
-    solve_problem(p, tables.cables, 0, 0, schedule.settled, token)
+    solve_problem(p, tables.cables, 0, 0, schedule.settled, False, token)
     weigh_border(tables.cables, work, p, token)
     take_tensions(tables.cables, factors, work, 1.0, token)
     weigh_rows(tables, work, token)

@@ -158,7 +158,7 @@ def hold(pattern, scene, samples, touch, work, rows, p, reached, cables, free, s
             _condense(pattern, touch, work, rows, p, n, reached, cables, contacts, free, token)
         add_cube(touch, p, cables, contacts, time_step, wide, narrow, token)
     soften(p, cables, 0, contacts, time_step, schedule.softness, token)
-    solve_problem(p, cables, 0, contacts, schedule.settled, token)
+    solve_problem(p, cables, 0, contacts, schedule.settled, False, token)
     _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, time_step, token)
     if scene is not None:
         stop_cube(touch, p, cables, contacts, token)
@@ -239,7 +239,7 @@ def hold_again(pattern, scene, touch, work, rows, p, reached, cables, contacts, 
             value = fnma(load(p.matrix, i * n + j, token), load(p.impulse, j, token), value)
         store(p.free, i, value)
         store(p.before, i, load(p.impulse, i, token))
-    solve_problem(p, cables, 0, contacts, schedule.settled, token)
+    solve_problem(p, cables, 0, contacts, schedule.settled, False, token)
     _weigh(pattern, scene, touch, work, rows, p, reached, cables, contacts, free, stage.length, token)
     if scene is not None:
         stop_cube(touch, p, cables, contacts, token)
