@@ -22,8 +22,8 @@ DAY_ERROR = "day_error"  # among the attributes of a posterior
 # The prior of `times`, in force where no day was left out, and worth FREEDOM days where some were. docs/days.md has the
 # days of two robots that it rests on.
 TIMES, FREEDOM = 0.8, 3.0
-CONSTANT = 0.6  # share of the variance that lasts for a whole recording
-CORRELATION_TIME = 1.0  # [s] of the rest
+CONSTANT = 0.6  # share of the variance that lasts for a whole recording: 0.5 to 0.66 in 8 recordings left out
+CORRELATION_TIME = 1.0  # [s] of the rest: bands do not depend on it
 SMALLEST_REACH = 1e-6  # [m]
 
 
