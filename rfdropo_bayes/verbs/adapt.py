@@ -57,7 +57,6 @@ from rfdropo_bayes.verbs.calibrate import gather_facts, with_ratios
 from rfdropo_bayes.verbs.predict import fitted_parts, model_of
 
 DRAWS = 100
-WORSE = 1.05  # times the error from the first row: two seeds differ by less
 MUCH_WORSE = 2.0**0.5  # from here on more than half of the squared error is not what the model left of the fitted days
 
 
@@ -149,7 +148,7 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
     checks = _checks(before, adapted.predictions)
     cautions = []
     check = checks.get(asked.rest)
-    if check and check["adapted"]["error_mm"] > WORSE * check["from_first_row"]["error_mm"]:
+    if check and check["adapted"]["error_mm"] > check["from_first_row"]["error_mm"]:
         cautions.append(_kept_caution(check))
         adapted = _fitted(asked._replace(head=_first_row(asked.head)), draws, fit_key, show)
         checks = _checks(before, adapted.predictions)

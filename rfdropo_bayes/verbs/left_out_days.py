@@ -48,7 +48,7 @@ def error_of_unseen_days(days: Days, key: jax.Array, *, show: bool | None = None
 
     Each day's recordings are left out of the fit once. The parameters climb anew, from where all days put them, and
     predict the day from its commands and first rows. With one day alone it is the prior (`prior_day_error`); a day
-    that the others cannot be fitted without is not counted.
+    that the others cannot be fitted without is named as missed.
 
     Args:
         days: of the fit.
@@ -65,11 +65,11 @@ def error_of_unseen_days(days: Days, key: jax.Array, *, show: bool | None = None
     found: dict[str, list[RecordingPrediction]] = {}
     with Progress("days left out", show=show) as progress:
         for number, (group, members) in enumerate(groups.items()):
-            # The fit is done and must not be lost: a day that the others cannot be fitted without is not counted.
+            # The fit is done and must not be lost.
             with suppress(InputError, np.linalg.LinAlgError):
                 found[group] = _without(days, members, jax.random.fold_in(key, number))
             progress.stage((number + 1) / len(groups))
-    return day_error(prior, found)
+    return day_error(prior, found)._replace(missed=tuple(group for group in groups if group not in found))
 
 
 def _without(days: Days, members: Sequence[str], key: jax.Array) -> list[RecordingPrediction]:
