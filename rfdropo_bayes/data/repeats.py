@@ -33,11 +33,11 @@ def group_repeats(trajectories: Sequence[Trajectory]) -> list[list[int]]:
     return list(groups.values())
 
 
-FIRST_OPENING = 8  # commands
+FIRST_OPENING = 4  # commands
 
 
 def command_openings(trajectory: Trajectory) -> dict[str, str]:
-    """Hashes of the first 8, 16, 32 ... commands of a recording, and of all, by their number."""
+    """Hashes of the first 4, 8, 16 ... commands of a recording, and of all, by their number."""
     command = np.round(np.concatenate([trajectory.initial_command[None], trajectory.command]), 9)
     counts = {len(command)}
     count = FIRST_OPENING

@@ -22,8 +22,8 @@ DAY_ERROR = "day_error"  # among the attributes of a posterior
 # The prior of `times`, in force where no day was left out, and worth FREEDOM days where some were. docs/days.md has the
 # days of two robots that it rests on.
 TIMES, FREEDOM = 0.8, 3.0
-CONSTANT = 0.6  # share of the variance that lasts for a whole recording
-CORRELATION_TIME = 1.0  # [s] of the rest
+CONSTANT = 0.6  # share of the variance that lasts for a whole recording: 0.5 to 0.66 in 8 recordings left out
+CORRELATION_TIME = 1.0  # [s] of the rest: bands do not depend on it
 SMALLEST_REACH = 1e-6  # [m]
 
 
@@ -43,6 +43,7 @@ class DayError(NamedTuple):
         held: share of the coordinates of these days in the 90 % bands, each day's widened by the others; None without.
         shown: how far each marker went in a recording of the day that was fitted [m]: only what goes beyond counts;
             empty where no recording of the day was seen.
+        missed: days that could not be left out, because the others could not be fitted without them.
     """
 
     markers: tuple[str, ...]
@@ -55,6 +56,7 @@ class DayError(NamedTuple):
     days: Mapping[str, float] = {}
     held: float | None = None
     shown: tuple[float, ...] = ()
+    missed: tuple[str, ...] = ()
 
     def unit(
         self, path: Float[np.ndarray, "time marker 3"], markers: Sequence[str]
@@ -98,7 +100,8 @@ class DayError(NamedTuple):
     @classmethod
     def from_dict(cls, given: Mapping[str, Any]) -> DayError:
         """From plain values."""
-        return cls(**{**given, **{name: tuple(given[name]) for name in ("markers", "left", "reach", "shown")}})
+        tuples = {name: tuple(given[name]) for name in ("markers", "left", "reach", "shown", "missed")}
+        return cls(**{**given, **tuples})
 
 
 def reach_of(path: Float[np.ndarray, "time marker 3"]) -> Float[np.ndarray, "time marker"]:
@@ -210,9 +213,10 @@ def day_sentence(error: DayError) -> str:
 
 def left_out_sentence(error: DayError) -> str:
     """How far the model was off on days left out of the fit, and what its bands held; empty without one."""
+    missed = f" It could not be fitted without {', '.join(error.missed)}." if error.missed else ""
     if not error.days:
-        return ""
+        return missed.lstrip()
     low, high = 1e3 * min(error.days.values()), 1e3 * max(error.days.values())
     far = f"{low:.2g}" if len(error.days) == 1 else f"{low:.2g} to {high:.2g}"
     held = "" if error.held is None else f"; its 90 % bands held {100.0 * error.held:.0f} %"
-    return f"On days left out this model was {far} mm off{held}."
+    return f"On days left out this model was {far} mm off{held}.{missed}"

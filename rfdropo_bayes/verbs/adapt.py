@@ -57,7 +57,6 @@ from rfdropo_bayes.verbs.calibrate import gather_facts, with_ratios
 from rfdropo_bayes.verbs.predict import fitted_parts, model_of
 
 DRAWS = 100
-WORSE = 1.05  # times the error from the first row: two seeds differ by less
 MUCH_WORSE = 2.0**0.5  # from here on more than half of the squared error is not what the model left of the fitted days
 
 
@@ -149,10 +148,9 @@ def _adapt(asked: Day, draws: int, seed: int, show: bool | None, out: Path | Non
     checks = _checks(before, adapted.predictions)
     cautions = []
     check = checks.get(asked.rest)
-    if check and check["adapted"]["error_mm"] > WORSE * check["from_first_row"]["error_mm"]:
+    if check and check["adapted"]["error_mm"] > check["from_first_row"]["error_mm"]:
         cautions.append(_kept_caution(check))
-        head = asked.head.slice_rows(0, 1).with_attributes(name=asked.head.name)
-        adapted = _fitted(asked._replace(head=head), draws, fit_key, show)
+        adapted = _fitted(asked._replace(head=_first_row(asked.head)), draws, fit_key, show)
         checks = _checks(before, adapted.predictions)
     found = adapted.found
     result = InferenceResult(
@@ -269,11 +267,23 @@ def _from_first_rows(asked: Day, draws: int, key: jax.Array) -> list[RecordingPr
     ).recordings
 
 
+def _first_row(head: Trajectory) -> Trajectory:
+    """Two rows, the fewest that a recording has, of which the first alone counts where it was measured."""
+    rows = head.slice_rows(0, 1).with_attributes(name=head.name)
+    mask = rows.position_mask.copy()
+    mask[1] &= not mask[0].any()
+    return _masked(rows, mask)
+
+
 def _with_first_row(rest: Trajectory, head: Trajectory) -> Trajectory:
     """The rest of a recording with the first row of what was looked at."""
     mask = rest.position_mask.copy()
     mask[0] = head.position_mask[0]
-    dataset = rest.dataset.copy()
+    return _masked(rest, mask)
+
+
+def _masked(recording: Trajectory, mask: np.ndarray) -> Trajectory:
+    dataset = recording.dataset.copy()
     dataset["position_mask"] = dataset["position_mask"].copy(data=mask)
     return Trajectory(dataset)
 
@@ -542,6 +552,6 @@ def _kept_caution(check: Mapping[str, Mapping[str, float]]) -> Caution:
     before, after = check["from_first_row"]["error_mm"], check["adapted"]["error_mm"]
     sentence = (
         f"what was shown of the day makes the rest of the recording worse: {after:.3g} mm off, from the first row "
-        f"alone {before:.3g} mm; the day has what its first rows say of it, and the rest has served to see that"
+        f"alone {before:.3g} mm; the day has what its first row says of it, and the rest has served to see that"
     )
     return Caution(Code.DAY_UNMATCHED, sentence)

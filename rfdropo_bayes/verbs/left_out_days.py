@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import jax
+import numpy as np
 
 from rfdropo_bayes.data import Trajectory, command_openings, same_opening
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups, group_of, whole
 from rfdropo_bayes.inference.methods import run
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig
@@ -44,7 +47,8 @@ def error_of_unseen_days(days: Days, key: jax.Array, *, show: bool | None = None
     """The slow error of a day that no fit has seen; None for a model without days.
 
     Each day's recordings are left out of the fit once. The parameters climb anew, from where all days put them, and
-    predict the day from its commands and first rows. With one day alone it is the prior (`prior_day_error`).
+    predict the day from its commands and first rows. With one day alone it is the prior (`prior_day_error`); a day
+    that the others cannot be fitted without is named as missed.
 
     Args:
         days: of the fit.
@@ -61,9 +65,11 @@ def error_of_unseen_days(days: Days, key: jax.Array, *, show: bool | None = None
     found: dict[str, list[RecordingPrediction]] = {}
     with Progress("days left out", show=show) as progress:
         for number, (group, members) in enumerate(groups.items()):
-            found[group] = _without(days, members, jax.random.fold_in(key, number))
+            # The fit is done and must not be lost.
+            with suppress(InputError, np.linalg.LinAlgError):
+                found[group] = _without(days, members, jax.random.fold_in(key, number))
             progress.stage((number + 1) / len(groups))
-    return day_error(prior, found)
+    return day_error(prior, found)._replace(missed=tuple(group for group in groups if group not in found))
 
 
 def _without(days: Days, members: Sequence[str], key: jax.Array) -> list[RecordingPrediction]:

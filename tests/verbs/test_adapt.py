@@ -21,6 +21,7 @@ from rfdropo_bayes.prediction.model_error import MODEL_ERROR
 from rfdropo_bayes.prediction.predictive import FITTED, NOISE
 from rfdropo_bayes.verbs import adapt as adaptation
 from rfdropo_bayes.verbs import design_day as day_design
+from rfdropo_bayes.verbs.left_out_days import of_unseen_days, openings_of
 
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo" / "demo_1.nc"
 STEP, SIGMA, SPREAD = 0.02, 2e-4, 0.01
@@ -240,6 +241,40 @@ def test_a_first_row_that_nothing_explains_has_a_caution(known, zeros):
     assert caution.code == Code.FIRST_ROW_FAR
     times = float(caution.sentence.removeprefix("the first row of b is ").partition(" ")[0])
     assert times == pytest.approx(25.0 / np.sqrt(3.0), rel=0.1)  # a row's noise is 4 % of it
+
+
+def test_an_error_of_the_first_seconds_leaves_the_rest_no_worse(known, zeros):
+    """A bump of 10 mm that is over after the seconds that are shown moves the zero; the first row knows nothing of
+    it."""
+    run = recorded(["b"], zeros[1:2], 51)[0]
+    bump = 0.01 * np.sin(np.pi * np.minimum(run.time / 0.5, 1.0))
+    along = xr.DataArray(bump, dims="time") * xr.DataArray([1.0, 0.0, 0.0], dims="axis")
+    off = rb.Trajectory(run.dataset.assign(position=run.dataset["position"] + along))
+    found = rb.adapt(known, off, seconds=0.5, show=False)
+    check = found.content["details"]["checks"]["b"]
+    assert check["adapted"]["error_mm"] < check["from_first_row"]["error_mm"] + 1e3 * SIGMA
+    assert [c for c in found.cautions if "makes the rest of the recording worse" in c.sentence]
+    (sentence,) = found.content["details"]["compared"]
+    assert sentence.startswith("b, as far as it was not shown: from the first row ")
+    assert "mm off, its 90 % bands held" in sentence
+
+
+def test_a_run_without_days_left_out_has_the_prior_of_their_error(known, zeros):
+    """Of a new day, and says so; a fitted day has none."""
+    new, old = (recorded([name], zeros[1:2], 51)[0] for name in ("b", "day_0_b"))
+    found = rb.predict(known, new)
+    assert found.unseen.startswith("No recording of this day was seen. This run has no days that were left out")
+    assert rb.predict(known, old).unseen == ""
+
+
+def test_fitted_days_under_other_commands_are_unseen(zeros):
+    fitted = recorded(["day_0_a", "day_1_a"], zeros[:2], 0)
+    openings = openings_of([run.slice_rows(0, 45) for run in fitted])
+    repeat, new = (fitted[0].with_attributes(name=name) for name in ("day_0_b", "new"))
+    other = recorded(["day_0_c"], zeros[:1], 77)[0]
+    days = ["day_0", "day_1"]
+    assert of_unseen_days([repeat, other, new, fitted[0]], DAYS, days, openings) == ["day_0_c", "new"]
+    assert of_unseen_days([repeat, other, new], DAYS, days, None) == ["new"]
 
 
 def test_what_is_masked_after_the_first_seconds_is_no_rest(known, zeros):
