@@ -167,7 +167,7 @@ def left_out_gains(
     held = np.eye(sums.jj.shape[1]) if precision is None else precision
     for p in range(len(sums.yy)):
         others = [part.sum(axis=0) - part[p] for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
-        b, u, c, _ = _solved(*others, held)
+        b, u, c, _ = _solved(others, held)
         left_j = sums.jy[p] - sums.jj[p] @ b
         left_x = sums.xy[p] - sums.jx[p].T @ b
         along = left_x - u.T @ left_j
@@ -175,14 +175,13 @@ def left_out_gains(
         gain += 2.0 * c * along - c**2 * square
         before += sums.yy[p] - 2.0 * float(b @ sums.jy[p]) + float(b @ sums.jj[p] @ b) - sums.count[p]
     whole = [part.sum(axis=0) for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
-    _, _, size, sd = _solved(*whole, held)
+    _, _, size, sd = _solved(whole, held)
     return 0.5 * gain, gain / max(before, 1e-300), size, sd
 
 
-def _solved(
-    jj: np.ndarray, jx: np.ndarray, xx: np.ndarray, jy: np.ndarray, xy: np.ndarray, precision: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _solved(sums: Sequence[np.ndarray], precision: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Base parameters alone, what they take of every feature, and each feature's coefficient and deviation."""
+    jj, jx, xx, jy, xy = sums
     prior = jj + precision
     b, u = np.linalg.solve(prior, jy), np.linalg.solve(prior, jx)
     left = xx - np.sum(u * jx, axis=0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 
@@ -9,10 +11,10 @@ from rfdropo_bayes.audit.pipeline import Answer
 
 
 def residual_dataset(answer: Answer) -> xr.Dataset:
-    """Measured less simulated marker positions [m] of every group of repeats, by the base model and by the last one; mean
-    and deviation of the signal at every port where one was looked for [unit of the port]."""
+    """Measured less simulated positions [m] of every group of repeats, by the base model and by the last one; mean and
+    deviation of the signal at every port where one was looked for [unit of the port]."""
     measured, markers = answer.target.measurements, answer.problem.model.recordings.markers
-    models = {"base": (answer.target, answer.base.x), "last": (answer.target, answer.extended.x)}
+    models: dict[str, Any] = {"base": (answer.target, answer.base.x), "last": (answer.target, answer.extended.x)}
     if answer.causes.steps:
         models["last"] = (answer.causes.steps[-1].judge, answer.extended.x)
     if answer.law is not None and answer.law.last is not None:
@@ -24,9 +26,9 @@ def residual_dataset(answer: Answer) -> xr.Dataset:
         for name, (target, x) in models.items()
     }
     along = ("recording", "row", "marker", "axis")
-    variables = {f"residual_{name}": (along, part, {"units": "m"}) for name, part in left.items()}
+    variables: dict[str, Any] = {f"residual_{name}": (along, part, {"units": "m"}) for name, part in left.items()}
     variables["time"] = (("recording", "row"), np.asarray(measured.time), {"units": "s"})
-    coordinates = {"recording": list(measured.names), "marker": list(markers), "axis": list("xyz")}
+    coordinates: dict[str, Any] = {"recording": list(measured.names), "marker": list(markers), "axis": list("xyz")}
     described = answer.causes.described
     if described is not None:
         rows = described.found.ports

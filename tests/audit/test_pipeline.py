@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rfdropo_bayes.audit import held_out as held_out_module
 from rfdropo_bayes.audit import pipeline
 from rfdropo_bayes.audit.audit_record import _doubt, next_experiment, record
 from rfdropo_bayes.audit.candidates import lead
@@ -35,7 +36,6 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.audit_page import render_audit, shown
 from rfdropo_bayes.report.page import p_value
-from rfdropo_bayes.simulators.commands import Commands
 
 from .toys import CANDIDATES, NOISE, ROWS, STEP, Toy, problem, recordings
 
@@ -236,7 +236,7 @@ def test_commands_that_excite_only_one_of_two_effects_separate_them():
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
     screen, _ = search.screened(base)
     hypotheses = [Hypothesis(name, search.refit(base, screen.row(name))) for name in ("play", "delay")]
-    like = Commands(*(np.asarray(part)[0] for part in asked.model.recordings.commands))
+    like = asked.model.recordings.commands.of(0)
     still = like._replace(step=np.zeros_like(like.step))
     moving, resting = outlooks(target, base, hypotheses, [like, still])
     now = at_hand(target, hypotheses)[("play", "delay")]
@@ -544,10 +544,10 @@ def test_a_step_that_a_later_one_carries_is_not_adopted():
         Added("creep", ("creep",), screen, first, 0.0, {}, target),
         Added("play", ("play",), screen, both, 9.0, {}, target),
     ]
-    held_out = pipeline._held_out(asked, target, search, base, steps)
+    held_out = held_out_module._held_out(asked, target, search, base, steps)
     assert held_out.supported() == 2
     assert not held_out.gain(0, 1).clear
-    kept, measured = pipeline._without_carried(asked, target, search, base, steps, held_out)
+    kept, measured = held_out_module._without_carried(asked, target, search, base, steps, held_out)
     assert [step.name for step in kept] == ["play"]
     assert set(kept[0].fit.free) == {*base.free, *play.indices}
     assert measured.gain(0, 1).clear
@@ -555,7 +555,7 @@ def test_a_step_that_a_later_one_carries_is_not_adopted():
     swapped = [replace(steps[0], name="play", fit=climb(target, base.x, np.array([*base.free, *play.indices])))]
     pair = [*swapped, replace(steps[1], name="creep")]
     always = replace(held_out, predictions=[held_out.predictions[k] for k in (0, 0, 2)])
-    stayed, _ = pipeline._without_carried(asked, target, search, base, pair, always)
+    stayed, _ = held_out_module._without_carried(asked, target, search, base, pair, always)
     assert [step.name for step in stayed] == ["play", "creep"]
 
 
