@@ -23,6 +23,7 @@ def answered(candidate: Candidate, x: list[float]) -> Any:
     names = tuple(spec.name for spec in creep.parameters)
     coordinates = Coordinates(space, 0, names, {spec.name: spec.nominal for spec in creep.parameters}, {})
     return SimpleNamespace(
+        law=None,
         adopted=[SimpleNamespace(name=candidate.name)],
         extended=SimpleNamespace(x=np.array(x), free=np.arange(2)),
         problem=SimpleNamespace(candidates=[candidate], candidate=lambda name: candidate, coordinates=coordinates),
