@@ -24,7 +24,7 @@ from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators import Commands
-from rfdropo_bayes.simulators.engine import cube_arrays
+from rfdropo_bayes.simulators.body_engine import cube_arrays
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 
 PERIOD, PERIODS, MOVE, FARTHEST = 0.05, 100, 0.005, 0.04

@@ -37,11 +37,11 @@ import peers
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.model.assembly import build_robot_simulator
-from rfdropo_bayes.model.engines import backend
+from rfdropo_bayes.model.compute_backend import backend
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.engine import Engine
+from rfdropo_bayes.simulators.body_engine import Engine
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.trunk import Assembly
 

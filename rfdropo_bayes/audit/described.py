@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from rfdropo_bayes.audit.audit_problem import AuditProblem
 from rfdropo_bayes.audit.deadline import OutOfTime
 from rfdropo_bayes.audit.extension import Added, Rules
 from rfdropo_bayes.audit.fit import Fit, FitTarget, widened
 from rfdropo_bayes.audit.gain import Gain
 from rfdropo_bayes.audit.held_out import HeldOut, Stage, predicted, stages_of
 from rfdropo_bayes.audit.inadequacy import as_measured
-from rfdropo_bayes.audit.laws import FoundLaw, Refit, law_search
-from rfdropo_bayes.audit.problem import AuditProblem
+from rfdropo_bayes.audit.law_search import FoundLaw, Refit, law_search
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rfdropo_bayes.audit.audit_problem import AuditProblem, measurements_of, simulated
 from rfdropo_bayes.audit.deadline import OutOfTime
 from rfdropo_bayes.audit.extension import DISCRETISATION, Added, ExtensionSearch
 from rfdropo_bayes.audit.fit import Fit, FitTarget, climb
@@ -16,8 +17,7 @@ from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.gain import Gain, Unseen, UnseenErrors, measure_gain
 from rfdropo_bayes.audit.inadequacy import as_measured, spread
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.ported import FeatureTable, PortedForward
-from rfdropo_bayes.audit.problem import AuditProblem, measurements_of, simulated
+from rfdropo_bayes.audit.port_rollouts import FeatureTable, PortedForward
 from rfdropo_bayes.audit.screen import Screen
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 

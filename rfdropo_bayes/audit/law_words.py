@@ -9,7 +9,7 @@ import numpy as np
 
 from rfdropo_bayes.audit.described import Described, coefficients
 from rfdropo_bayes.audit.gain import noise_distance
-from rfdropo_bayes.audit.laws import Refit
+from rfdropo_bayes.audit.law_search import Refit
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.port_evidence import PortEvidence
 

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from rfdropo_bayes.audit.audit_problem import AuditProblem, measurements_of, simulated
 from rfdropo_bayes.audit.deadline import Deadline, OutOfTime, about
 from rfdropo_bayes.audit.described import Described, Model, describe
 from rfdropo_bayes.audit.extension import DISCRETISATION, Added, ExtensionSearch, numerical_shift
@@ -33,7 +34,6 @@ from rfdropo_bayes.audit.held_out import HeldOut, supported_steps
 from rfdropo_bayes.audit.inadequacy import as_measured, fit_with_noise, spread
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.problem import AuditProblem, measurements_of, simulated
 from rfdropo_bayes.audit.remainder import Remainder, describe_remainder
 from rfdropo_bayes.audit.screen import Screen, p_in_words, screen
 from rfdropo_bayes.audit.verdict import DESCRIBED, NEGLIGIBLE, NO_VERDICT, PARTLY, UNEXPLAINED, decide, negligible

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.ports import Responses
+from rfdropo_bayes.audit.port_responses import Responses
 from rfdropo_bayes.audit.score import project_out
 from rfdropo_bayes.audit.screen import tail
 from rfdropo_bayes.mechanisms.ports import Port

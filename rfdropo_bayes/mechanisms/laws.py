@@ -21,7 +21,7 @@ from rfdropo_bayes.mechanisms.ports import Port, PortMap, sensed
 from rfdropo_bayes.simulators.commands import sample
 from rfdropo_bayes.simulators.mechanisms import Meanwhile, Mechanism, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
-from rfdropo_bayes.simulators.ports import BodySignals, read_late
+from rfdropo_bayes.simulators.port_signals import BodySignals, read_late
 
 WHERE = "[[model.laws]]"
 FAR = 1e3  # prior scales to each side of null, where a coefficient's hard bounds are

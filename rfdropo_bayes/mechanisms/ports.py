@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from rfdropo_bayes.mechanisms.sensing import direction_along, read_at
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BODIES
-from rfdropo_bayes.simulators.ports import BodySignals, PortSignals
+from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals
 
 AXES = "xyz"
 PLACES = ("base", "middle", "tip")

@@ -40,13 +40,13 @@ from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.mechanisms.laws import LawChoice, make_law
 from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.mechanisms.registry import REGISTRY
-from rfdropo_bayes.model.engines import backend
+from rfdropo_bayes.model.compute_backend import backend
 from rfdropo_bayes.model.experiment import matching
 from rfdropo_bayes.model.model_spec import DataChannels, ModelSpec
 from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
-from rfdropo_bayes.simulators.engine import Engine
+from rfdropo_bayes.simulators.body_engine import Engine
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, assemble_mesh
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value

@@ -12,7 +12,7 @@ from rfdropo_bayes.policies.episodes import Episodes, Settings
 from rfdropo_bayes.policies.randomisation import Point, Randomisation
 from rfdropo_bayes.policies.tasks import task_named
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.engine import Backend, Engine, Integrator
+from rfdropo_bayes.simulators.body_engine import Backend, Engine, Integrator
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 

@@ -20,7 +20,7 @@ from rfdropo_bayes.fem.native.layered_session import LayeredSession
 from rfdropo_bayes.fem.pushing import PushGeometry, smallest_gap
 from rfdropo_bayes.fem.rigid_body import Cube
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.simulators.engine import CubeInputs, Engine, cube_arrays
+from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine, cube_arrays
 
 TOUCHING = 0.001
 """[m] A body that overlaps the cube by less starts in contact. The first step then moves the cube by as much."""

@@ -15,7 +15,7 @@ from rfdropo_bayes.fem.pushing import PushGeometry, layered_spheres, mesh_sphere
 from rfdropo_bayes.fem.rigid_body import Cube, cube_at, solid_gyration_radius
 from rfdropo_bayes.fem.tetrahedra import TetrahedralBody
 from rfdropo_bayes.robots import PushScene, Robot
-from rfdropo_bayes.simulators.engine import CubeInputs
+from rfdropo_bayes.simulators.body_engine import CubeInputs
 
 
 def push_table(robot: Robot) -> PushScene:

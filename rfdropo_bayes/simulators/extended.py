@@ -23,7 +23,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     settled,
 )
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
-from rfdropo_bayes.simulators.ports import reached
+from rfdropo_bayes.simulators.port_signals import reached
 
 
 class ExtendedSimulator:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.parameters import ParameterSpec
-from rfdropo_bayes.simulators.ports import BodySignals
+from rfdropo_bayes.simulators.port_signals import BodySignals
 
 Values = Mapping[str, Float[Array, ""]]
 

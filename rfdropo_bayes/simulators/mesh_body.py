@@ -32,8 +32,8 @@ from rfdropo_bayes.fem.tetrahedra import (
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem, tetrahedral_system
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import TetrahedralMesh
+from rfdropo_bayes.simulators.body_engine import Engine
 from rfdropo_bayes.simulators.commands import Commands, animated_on_grid
-from rfdropo_bayes.simulators.engine import Engine
 from rfdropo_bayes.simulators.mechanisms import Mechanism, Values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import refined_body

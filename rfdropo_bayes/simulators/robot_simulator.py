@@ -19,9 +19,9 @@ from rfdropo_bayes.fem.balance import Balance
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.body_engine import Backend, CubeInputs, Engine
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
 from rfdropo_bayes.simulators.cube import cube_at_measured, cube_inputs, push_table, scene_of
-from rfdropo_bayes.simulators.engine import Backend, CubeInputs, Engine
 from rfdropo_bayes.simulators.extended import ExtendedSimulator
 from rfdropo_bayes.simulators.mechanisms import (
     BodyMechanism,
@@ -33,7 +33,7 @@ from rfdropo_bayes.simulators.mechanisms import (
     code_of,
 )
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
-from rfdropo_bayes.simulators.ports import BodySignals
+from rfdropo_bayes.simulators.port_signals import BodySignals
 from rfdropo_bayes.simulators.protocol import Observation, Result
 
 EQUILIBRIUM_TOLERANCE = 1e-3

@@ -14,9 +14,9 @@ from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, c
 from rfdropo_bayes.fem.balance import Balance, layered_balance
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.body_engine import Engine
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.control_session import Session
-from rfdropo_bayes.simulators.engine import Engine
 from rfdropo_bayes.simulators.mechanisms import Mechanism, Values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 

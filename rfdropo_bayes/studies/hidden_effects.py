@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from rfdropo_bayes.audit.audit_problem import measurements_of, simulated
 from rfdropo_bayes.audit.fit import FitTarget, climb
-from rfdropo_bayes.audit.problem import measurements_of, simulated
 from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.bayes.channels.tension import reading_size
 from rfdropo_bayes.bayes.noise import Noise, draw_noise

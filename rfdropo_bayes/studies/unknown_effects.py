@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from rfdropo_bayes.audit.audit_problem import measurements_of, simulated
 from rfdropo_bayes.audit.fit import FitTarget
-from rfdropo_bayes.audit.problem import measurements_of, simulated
 from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
@@ -32,7 +32,7 @@ from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
-from rfdropo_bayes.simulators.ports import BodySignals, PortSignals
+from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals
 from rfdropo_bayes.studies.hidden_effects import NOISE, Setting, experiment_tables, noisy
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
 from rfdropo_bayes.verbs.random_commands import random_walk

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from rfdropo_bayes.audit.audit_problem import AuditProblem
 from rfdropo_bayes.audit.audit_record import next_experiment, record
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
@@ -24,7 +25,6 @@ from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.law_words import law_tables
 from rfdropo_bayes.audit.pipeline import Answer
 from rfdropo_bayes.audit.pipeline import audit as ask
-from rfdropo_bayes.audit.problem import AuditProblem
 from rfdropo_bayes.bayes.channels import Series
 from rfdropo_bayes.bayes.channels.tension import TENSION_GAIN
 from rfdropo_bayes.bayes.noise.stacked import Stacked

@@ -14,12 +14,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from rfdropo_bayes.audit.audit_problem import AuditProblem
 from rfdropo_bayes.audit.deadline import Deadline, OutOfTime
 from rfdropo_bayes.audit.experiment_design import DesignOutlook, Hypothesis, at_hand, best, outlooks
 from rfdropo_bayes.audit.extension import DISCRETISATION, ExtensionSearch
 from rfdropo_bayes.audit.fit import Fit, FitTarget
 from rfdropo_bayes.audit.pipeline import base_model
-from rfdropo_bayes.audit.problem import AuditProblem
 from rfdropo_bayes.bayes.recordings import commands_after
 from rfdropo_bayes.data import DataSpec, Trajectory, asl_csv
 from rfdropo_bayes.data.asl_csv import FORMAT as ASL

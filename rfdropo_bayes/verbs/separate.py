@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from rfdropo_bayes.audit.audit_problem import AuditProblem
 from rfdropo_bayes.audit.fit import Fit
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.pipeline import first_target
-from rfdropo_bayes.audit.problem import AuditProblem
 from rfdropo_bayes.audit.separation import Separation, separate
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json, write_text

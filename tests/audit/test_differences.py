@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rfdropo_bayes.audit.audit_problem import AuditProblem
 from rfdropo_bayes.audit.audit_record import next_experiment, record
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.differences import Groups, with_differences
 from rfdropo_bayes.audit.fixed_quantities import families
 from rfdropo_bayes.audit.journal import Journal
 from rfdropo_bayes.audit.pipeline import audit, first_target
-from rfdropo_bayes.audit.problem import AuditProblem
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel

@@ -8,12 +8,12 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
+from rfdropo_bayes.audit.audit_problem import AuditProblem
 from rfdropo_bayes.audit.candidates import Candidate
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.extension import Rules
 from rfdropo_bayes.audit.forward import Lanes
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.problem import AuditProblem
 from rfdropo_bayes.bayes.channels import Markers, MotorAngle, Tension, Weighed, WeighedParts
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.repeat_noise import mean_of, spread

@@ -10,7 +10,7 @@ import pytest
 from rfdropo_bayes.fem import Material
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.engine import Backend, Engine
+from rfdropo_bayes.simulators.body_engine import Backend, Engine
 from rfdropo_bayes.simulators.mechanisms import BodyMechanism
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 

@@ -12,7 +12,7 @@ import pytest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
-from rfdropo_bayes.simulators.engine import Backend, Engine
+from rfdropo_bayes.simulators.body_engine import Backend, Engine
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, TetrahedraTable, assemble_mesh
 from rfdropo_bayes.simulators.robot_simulator import every_node
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble

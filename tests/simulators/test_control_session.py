@@ -11,8 +11,8 @@ import pytest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.robots import DriveTravel, Robot
+from rfdropo_bayes.simulators.body_engine import Backend, Engine, Integrator
 from rfdropo_bayes.simulators.control_session import Session
-from rfdropo_bayes.simulators.engine import Backend, Engine, Integrator
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 

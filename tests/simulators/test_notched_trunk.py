@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 from rfdropo_bayes import fem
 from rfdropo_bayes.fem import corotational
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.engine import Backend, Engine
+from rfdropo_bayes.simulators.body_engine import Backend, Engine
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 
 # Linear sag [m] at the last notch-free station under gravity across the axis, and the first two bending modes [Hz], of

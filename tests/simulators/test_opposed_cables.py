@@ -10,8 +10,8 @@ import pytest
 from rfdropo_bayes.model.assembly import build_robot_simulator
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.body_engine import Backend, Engine
 from rfdropo_bayes.simulators.control_session import Session
-from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 

@@ -14,13 +14,13 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.constraints import NORMAL_SOFTNESS
 from rfdropo_bayes.fem.pushing import find_contacts, trunk_rows
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.model.engines import backend
+from rfdropo_bayes.model.compute_backend import backend
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators import Result, Simulator
+from rfdropo_bayes.simulators.body_engine import Backend, Engine
 from rfdropo_bayes.simulators.cube import push_table
-from rfdropo_bayes.simulators.engine import Backend, Engine
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, TetrahedraTable, assemble_mesh
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble

@@ -15,7 +15,7 @@ from rfdropo_bayes.data import Trajectory, load_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment import load_experiment
 from rfdropo_bayes.verbs.column_names import guess_columns
-from tests.data.test_mapped_formats import check_motion
+from tests.data.test_motive_rosbag_lerobot import check_motion
 from tests.data.written import Motion, commands_csv, lerobot, motive_csv, rosbag, swaying
 
 DEMO = Path(__file__).resolve().parents[2] / "experiments" / "demo"

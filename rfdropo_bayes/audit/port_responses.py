@@ -19,7 +19,7 @@ from scipy.interpolate import BSpline
 from rfdropo_bayes.audit.deadline import about
 from rfdropo_bayes.audit.fit import Fit, FitTarget
 from rfdropo_bayes.audit.forward import Fields
-from rfdropo_bayes.audit.ported import COARSE, FINE, STEP, FeatureTable, as_sensed, signals_of
+from rfdropo_bayes.audit.port_rollouts import COARSE, FINE, STEP, FeatureTable, as_sensed, signals_of
 from rfdropo_bayes.audit.score import span
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
 

@@ -14,7 +14,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import build_robot_simulator
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec, find_robot
-from rfdropo_bayes.simulators.ports import BodySignals, PortSignals, read_late
+from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals, read_late
 
 STEP = 0.01
 

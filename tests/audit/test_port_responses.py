@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.audit.extension import Rules
-from rfdropo_bayes.audit.laws import PIECES, _pieces, _sums, left_out_gains
+from rfdropo_bayes.audit.law_search import PIECES, _pieces, _sums, left_out_gains
 from rfdropo_bayes.audit.port_evidence import MEMORIES, SIZES, evidences
-from rfdropo_bayes.audit.ports import Responses, feature_columns, on_splines, splines
+from rfdropo_bayes.audit.port_responses import Responses, feature_columns, on_splines, splines
 from rfdropo_bayes.audit.verdict import SMALL, negligible
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
 

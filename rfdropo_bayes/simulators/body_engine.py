@@ -49,7 +49,7 @@ from rfdropo_bayes.simulators.finite_differences import (
     incompressibility_margin,
     with_differences,
 )
-from rfdropo_bayes.simulators.ports import BodySignals
+from rfdropo_bayes.simulators.port_signals import BodySignals
 
 EFFECT_SIZES = BodyEffects(
     bending=BendingLaw(0.2, 0.2, 0.1, 0.1, 0.1),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 
 from rfdropo_bayes.model.experiment import SimulatorTable
-from rfdropo_bayes.simulators.engine import Backend
+from rfdropo_bayes.simulators.body_engine import Backend
 
 
 def backend(table: SimulatorTable, layered: bool) -> Backend:

@@ -17,8 +17,8 @@ from rfdropo_bayes.audit.deadline import OutOfTime
 from rfdropo_bayes.audit.fit import Fit, FitTarget, climb
 from rfdropo_bayes.audit.inadequacy import as_measured, fit_with_noise
 from rfdropo_bayes.audit.port_evidence import PortEvidence, evidences
-from rfdropo_bayes.audit.ported import FeatureTable, PlacedTerm, PortedForward, placed
-from rfdropo_bayes.audit.ports import Responses, feature_columns, responses, signal_sizes, with_exact_columns
+from rfdropo_bayes.audit.port_responses import Responses, feature_columns, responses, signal_sizes, with_exact_columns
+from rfdropo_bayes.audit.port_rollouts import FeatureTable, PlacedTerm, PortedForward, placed
 from rfdropo_bayes.audit.screen import null_residuals
 from rfdropo_bayes.mechanisms.features import Feature, dictionary
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
