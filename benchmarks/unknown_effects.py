@@ -3,9 +3,9 @@
     python benchmarks/unknown_effects.py [--out reports/unknown_effects] [--effects crosstalk,bouc_wen] [--seeds 0,1]
                                          [--rho 1.0] [--null 0]
 
-Effects are those of `rfdropo_bayes/studies/unknown_effects.py`, hidden in recordings of the layered arm; ``--null`` is the
-number of data sets with nothing hidden. A line of the ledger for each data set: verdict, port, law, unseen errors, and
-seconds. A data set in the ledger is not run again. One takes one to four minutes on two cores.
+Effects are those of `rfdropo_bayes/studies/unknown_effects.py`, hidden in recordings of the layered arm; ``--null`` is
+the number of data sets with nothing hidden. A line of the ledger for each data set: verdict, port, law, unseen errors,
+and seconds. A data set in the ledger is not run again. One takes one to four minutes on two cores.
 """
 
 from __future__ import annotations
