@@ -29,7 +29,8 @@ brought in 200 data sets without discrepancy was 22.9, in the prototype of this 
 LEAST = 0.01
 """Share of what the model leaves beyond the noise that a term must explain in left-out recordings."""
 STOP = 10.0
-"""Log evidence of a port from which on a further term is looked for: without discrepancy the most was 7.4, in the prototype."""
+"""Log evidence of a port from which on a further term is looked for. The most without discrepancy was 7.4, in the
+prototype."""
 SURE = 4.0  # deviations from zero that a coefficient must have to stay
 TERMS = 3  # of a law
 BY_EVIDENCE, BY_GAIN = 3, 2  # ports and terms that are refitted
