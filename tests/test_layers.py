@@ -52,6 +52,7 @@ MORE_ARGUMENTS_FOR_A_REASON: dict[str, str] = {
     "data/in_memory.py:from_arrays": "a user's way in: every array, its names and its unit by name",
     "verbs/audit.py:audit": "a user's way in: what an audit may be told, by name",
     "simulators/adapters/mujoco_model.py:MuJoCo": "a user's way in: parts of a MuJoCo model by name",
+    "fem/rollouts.py:simulate": "the reference engine: state, commands and loads, each traced by itself",
     "fem/native/contact_geometry.py:_list": "three vectors by component, as SIMD lanes have them",
     "fem/native/layered_constraints.py:_hold": KERNEL,
     "fem/native/layered_constraints.py:constrained_stage": KERNEL,

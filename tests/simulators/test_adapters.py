@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_bvp
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.model.experiment_file import self_contained
+from rfdropo_bayes.model.experiment_file import read_tables, self_contained
 from rfdropo_bayes.simulators.adapters import adapted
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -39,13 +39,13 @@ def test_the_example_of_the_document_is_a_simulator_of_forty_lines(tmp_path):
     assert code.count("\n") <= LINES
     (tmp_path / "engine.py").write_text(code)
     (tmp_path / "experiment.toml").write_text(block("toml", "engine.py"))
-    model, tables = rb.Model.read(tmp_path / "experiment.toml")
+    model = rb.Model.read(tmp_path / "experiment.toml")
     assert model.parameters.loc["stiffness", "prior"] is not None
     assert {spec.name: spec.nominal for spec in model.simulator.parameters}["stiffness"] == 30.0
     (run,) = rb.simulate(model, {**WALK, "recordings": ["a"]})
     assert np.ptp(run.position[:, 0, 0]) > 0.005
     (tmp_path / "run").mkdir()
-    placed = self_contained(tables, tmp_path, tmp_path / "run")
+    placed = self_contained(read_tables(tmp_path / "experiment.toml"), tmp_path, tmp_path / "run")
     assert (placed["robot"], (tmp_path / "run" / "engine.py").read_text()) == ("engine.py:arm", code)
     assert model.tables()["adapter"] == {"stiffness": 30.0}
 

@@ -67,8 +67,8 @@ def rollouts(model, parameters, commands):
         model.commands(PERIOD * np.arange(PERIODS), taken, np.zeros(8), PERIOD * np.arange(PERIODS + 1))
         for taken in (model.taken("", np.zeros(8), sent) for sent in commands)
     ]
-    stacked = type(grid[0])(*(np.stack(parts) for parts in zip(*grid, strict=True)))
-    return jax.jit(jax.vmap(lambda p, *c: model.rollout(p, type(grid[0])(*c))))(parameters, *stacked)
+    stacked = jax.tree.map(lambda *parts: np.stack(parts), *grid)
+    return jax.jit(jax.vmap(model.rollout))(parameters, stacked)
 
 
 def run(model, parameters, commands, late=(1, 3)):

@@ -239,7 +239,7 @@ class Standing(NamedTuple):
     def describe(self) -> dict:
         return {"engine": "none"}
 
-    def motion(self, material, start, displacement, steps, cube) -> Motion:
+    def motion(self, material, start, displacement, steps, cube, loads=None) -> Motion:
         rows = len(displacement) + 1
         pose = jnp.concatenate([cube.start.position, cube.start.orientation])
         ending = {"diverged": False, "converged": True, "imbalance": 0.0} | self.ending
