@@ -135,6 +135,7 @@ def cubes(*rows: dict) -> tuple[np.ndarray, np.ndarray]:
     return np.array(states), np.array(values)
 
 
+@pytest.mark.slow
 def test_both_engines_give_the_same_numbers_with_a_cube():
     """The bar falls and is pulled onto cubes that lie, slide and fall."""
     system, points, scene = bar()
@@ -163,6 +164,7 @@ def test_both_engines_give_the_same_numbers_with_a_cube():
     np.testing.assert_allclose(found.pose[:, 1:], reference.pose, rtol=0.0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_both_engines_give_the_same_numbers_for_a_mesh():
     """A block of five tetrahedra with a cable, and single precision beside it."""
     corner = np.array([[x, y, z] for z in (0.0, 0.03) for y in (0.0, 0.01) for x in (0.0, 0.01)])
