@@ -1,8 +1,8 @@
-"""A moving picture of one recording: measured, and predicted by two calibrations from its commands and its first row.
+"""A moving picture of one recording: measured, and simulated before and after a calibration.
 
-    python tools/moving_picture.py BASE_DIR EXTENDED_DIR RECORDING --out docs/images/before_after.gif
+    python tools/moving_picture.py DIR RECORDING --out docs/images/before_after.gif
 
-RECORDING is the name of one of the test recordings of EXTENDED_DIR, which neither calibration may have fitted.
+DIR is the folder of a calibration, RECORDING the name of one of its test recordings. Before: nominal parameters.
 """
 
 from __future__ import annotations
@@ -24,19 +24,18 @@ FRAMES, FRAMES_A_SECOND = 60, 12
 def main() -> None:
     """Predict, and draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("base", type=Path)
-    parser.add_argument("extended", type=Path)
+    parser.add_argument("run", type=Path)
     parser.add_argument("recording")
     parser.add_argument("--out", type=Path, required=True)
     asked = parser.parse_args()
-    fits = [rb.load(asked.base), rb.load(asked.extended)]
-    model = rb.Model.read(asked.extended / "config.toml")
+    model = rb.Model.read(asked.run / "config.toml")
     measured = next(run for run in model.recordings("test") if run.name == asked.recording)
+    after = next(p for p in rb.load(asked.run).record.recordings if p.name == asked.recording)
+    before = rb.simulate(model, [measured])[0].position
     rotation = upright(model.robot.gravity)
     seen = np.where(measured.position_mask[..., None], measured.position, np.nan) @ rotation.T
-    found = [rb.predict(fit, measured).drawn.central @ rotation.T for fit in fits]
-    rest = model.robot.marker_points()[:, 2]
-    draw(measured.time, seen, found, rest, asked.out)
+    found = [before @ rotation.T, after.central @ rotation.T]
+    draw(measured.time, seen, found, model.robot.marker_points()[:, 2], asked.out)
 
 
 def draw(time: np.ndarray, seen: np.ndarray, found: list[np.ndarray], rest: np.ndarray, out: Path) -> None:
@@ -50,7 +49,7 @@ def draw(time: np.ndarray, seen: np.ndarray, found: list[np.ndarray], rest: np.n
         smooth_line(np.concatenate([np.zeros((len(path), 1, 3)), path], axis=1), np.r_[0.0, rest])[0] for path in found
     ]
     artists = []
-    for axes, words, colour in zip(panels, ("before the audit", "after the audit"), (TEST, POSTERIOR), strict=True):
+    for axes, words, colour in zip(panels, ("before calibration", "after calibration"), (TEST, POSTERIOR), strict=True):
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
         axes.set_box_aspect(np.maximum(high - low, 1.0))
         axes.set_axis_off()
@@ -70,12 +69,12 @@ def draw(time: np.ndarray, seen: np.ndarray, found: list[np.ndarray], rest: np.n
             trail.set_data_3d(*(1e3 * seen[: row + 1, -1].T))
             dots.set_data_3d(*(1e3 * seen[row].T))
         caption.set_text(
-            f"dots: measured by motion capture; body: predicted from the commands alone; {time[row] - time[0]:.1f} s"
+            f"dots: measured by motion capture; body: simulated from the commands alone; {time[row] - time[0]:.1f} s"
         )
         return []
 
     out.parent.mkdir(parents=True, exist_ok=True)
-    FuncAnimation(figure, frame, len(rows)).save(out, PillowWriter(fps=FRAMES_A_SECOND), dpi=72)
+    FuncAnimation(figure, frame, len(rows)).save(out, PillowWriter(fps=FRAMES_A_SECOND), dpi=96)
     print(f"{out}: {out.stat().st_size / 1e6:.1f} MB; tip off by {errors[0]:.1f} and {errors[1]:.1f} mm")
 
 
