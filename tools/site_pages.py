@@ -23,7 +23,7 @@ PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGEL
 """Pages of the site by their path in the repository; those of docs/ keep their names."""
 GROUPS = ("reports/**/README.md", "models/**/README.md", "notebooks/*.ipynb")
 LINK = re.compile(r"(?<!\\)(!?\[(?:[^\[\]]|\[[^\]]*\])*\]\()([^)\s#]+)?(#[^)\s]*)?(\))")
-CODE = re.compile(r"(```.*?```|`[^`\n]*`)", re.DOTALL)
+CODE = re.compile(r"(```.*?```)", re.DOTALL)
 
 
 def site_path(path: str) -> str | None:
