@@ -19,7 +19,7 @@ from rfdropo_bayes.audit.deadline import OutOfTime
 from rfdropo_bayes.audit.extension import Added, Rules
 from rfdropo_bayes.audit.fit import Fit, FitTarget, widened
 from rfdropo_bayes.audit.gain import Gain
-from rfdropo_bayes.audit.held_out import HeldOut, Stage, predicted, stages_of
+from rfdropo_bayes.audit.held_out import HeldOut, JudgedModel, predicted, stages_of
 from rfdropo_bayes.audit.inadequacy import as_measured
 from rfdropo_bayes.audit.law_search import FoundLaw, Refit, law_search
 
@@ -60,7 +60,7 @@ class Described:
 
 
 @dataclass(frozen=True)
-class Model:
+class NamedModel:
     """The base model with what the library named.
 
     Attributes:
@@ -80,7 +80,7 @@ class Model:
 
 def describe(
     problem: AuditProblem,
-    model: Model,
+    model: NamedModel,
     held_out: HeldOut | None,
     report: Callable[[str], None] = lambda line: None,
 ) -> Described | None:
@@ -110,7 +110,7 @@ def describe(
     return answer
 
 
-def _beside(problem: AuditProblem, model: Model, report: Callable[[str], None]) -> Described:
+def _beside(problem: AuditProblem, model: NamedModel, report: Callable[[str], None]) -> Described:
     """The law beside a model, and what it is worth on unseen recordings."""
     simulator: Any = problem.lanes.simulator
     assert problem.ports is not None
@@ -122,7 +122,7 @@ def _beside(problem: AuditProblem, model: Model, report: Callable[[str], None]) 
     if last is None:
         return Described(found)
     stages = stages_of(model.judge, model.base, model.steps)
-    stages.append(Stage(last.target, last.fit, stages[-1].finer))
+    stages.append(JudgedModel(last.target, last.fit, stages[-1].finer))
     held_out = predicted(problem, model.judge.measured, stages)
     gain, overall = held_out.gain(len(stages) - 2, len(stages) - 1), held_out.gain(0, len(stages) - 1)
     return Described(found, (), (), gain, overall, held_out, holds_on(problem.rules, gain))

@@ -122,7 +122,7 @@ def _held_out(
     return None
 
 
-class Stage(NamedTuple):
+class JudgedModel(NamedTuple):
     """A model that predicts recordings which it has not seen.
 
     Attributes:
@@ -143,14 +143,14 @@ def _predicted(
     return predicted(problem, search.target.measured, stages_of(judge, base, steps))
 
 
-def stages_of(judge: FitTarget, base: Fit, steps: Sequence[Added]) -> list[Stage]:
+def stages_of(judge: FitTarget, base: Fit, steps: Sequence[Added]) -> list[JudgedModel]:
     """The base model, and the model after each step."""
     names = [step.name for step in steps]
-    after = [Stage(step.judge, step.fit, DISCRETISATION in names[: k + 1]) for k, step in enumerate(steps)]
-    return [Stage(judge, base, False), *after]
+    after = [JudgedModel(step.judge, step.fit, DISCRETISATION in names[: k + 1]) for k, step in enumerate(steps)]
+    return [JudgedModel(judge, base, False), *after]
 
 
-def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[Stage]) -> HeldOut:
+def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[JudgedModel]) -> HeldOut:
     """Predictions of models; ``target`` has the measurement's noise."""
     count, every = len(problem.trajectories), len(problem.model.recordings.names)
     fits, judges = [stage.fit for stage in stages], [stage.judge for stage in stages]

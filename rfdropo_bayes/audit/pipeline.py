@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.audit.audit_problem import AuditProblem, measurements_of, simulated
 from rfdropo_bayes.audit.deadline import Deadline, OutOfTime, about
-from rfdropo_bayes.audit.described import Described, Model, describe
+from rfdropo_bayes.audit.described import Described, NamedModel, describe
 from rfdropo_bayes.audit.extension import DISCRETISATION, Added, ExtensionSearch, numerical_shift
 from rfdropo_bayes.audit.fit import (
     WITHIN,
@@ -234,7 +234,7 @@ def audit(
     judge = judge if judge.known is not None else search.target.on(judge.forward)
     asked = [step.name for step in steps]
     steps, last, held_out = supported_steps(problem, judge, search, base, steps, last)
-    under = Model(judge, base, tuple(steps))
+    under = NamedModel(judge, base, tuple(steps))
     base, steps = as_measured(judge, base), [replace(s, fit=as_measured(s.judge, s.fit)) for s in steps]
     unsupported = [name for name in asked if name not in [step.name for step in steps]]
     if unsupported:

@@ -126,7 +126,8 @@ def hide(
     rng = np.random.default_rng(seed)
     out = output_folder(out)
     experiment = experiment_tables(setting, exclude)
-    blank = _blank_recordings(setting, rng)
+    names = [*(f"fit_{k + 1}" for k in range(REPEATS)), "screen", *(f"test_{k + 1}" for k in range(UNTOUCHED))]
+    blank = blank_recordings(setting, rng, names, [*([0] * REPEATS), *range(1, 2 + UNTOUCHED)])
     fitted, untouched = blank[: REPEATS + 1], blank[REPEATS + 1 :]
     problem = build_problem(spec_of(experiment, out), AuditTable(), fitted, untouched, seed, workshop=workshop)
     coordinates = problem.coordinates
@@ -185,13 +186,19 @@ def experiment_tables(
     )
 
 
-def _blank_recordings(setting: Setting, rng: np.random.Generator) -> list[Trajectory]:
-    """Commands and times of all recordings; their positions are still those at rest."""
-    robot = Robot.load(setting.robot)
-    table = setting.commands
-    sequences = [random_walk(table, len(robot.channel_names), rng) for _ in range(2 + UNTOUCHED)]
-    names = [*(f"fit_{k + 1}" for k in range(REPEATS)), "screen", *(f"test_{k + 1}" for k in range(UNTOUCHED))]
-    order = [*([0] * REPEATS), *range(1, 2 + UNTOUCHED)]
+def blank_recordings(
+    setting: Setting, rng: np.random.Generator, names: Sequence[str], order: Sequence[int]
+) -> list[Trajectory]:
+    """Commands and times of all recordings; their positions are still those at rest.
+
+    Args:
+        setting: what is recorded.
+        rng: of the command sequences.
+        names: of the recordings.
+        order: the number of the command sequence of each of them; repeats have the same one.
+    """
+    robot, table = Robot.load(setting.robot), setting.commands
+    sequences = [random_walk(table, len(robot.channel_names), rng) for _ in range(1 + max(order))]
     time = table.sample_time * np.arange(round(table.duration / table.sample_time) + 1)
     return [
         Trajectory.build(

@@ -24,18 +24,16 @@ from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
+from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import AuditTable, SimulatorTable
 from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.model_spec import spec_of
-from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
 from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals
-from rfdropo_bayes.studies.hidden_effects import NOISE, Setting, experiment_tables, noisy
+from rfdropo_bayes.studies.hidden_effects import NOISE, Setting, blank_recordings, experiment_tables, noisy
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
-from rfdropo_bayes.verbs.random_commands import random_walk
 
 REPEATS, OTHERS, UNTOUCHED = 3, 3, 4
 MOTIONS = 4  # rollouts after which a law of the motion has the motion that it makes
@@ -244,7 +242,8 @@ def conceal(
     setting, rng, out = setting or Setting(), np.random.default_rng([seed, 42]), output_folder(out)
     effect = EFFECTS[name] if name else None
     tables = experiment_tables(setting, fit=["fit_*.nc"])
-    blank = _blank(setting, rng)
+    names = [f"fit_{k + 1}" for k in range(REPEATS + OTHERS)] + [f"test_{k + 1}" for k in range(UNTOUCHED)]
+    blank = blank_recordings(setting, rng, names, [*([0] * REPEATS), *range(1, 1 + OTHERS + UNTOUCHED)])
     fitted, untouched = blank[: REPEATS + OTHERS], blank[REPEATS + OTHERS :]
     spec = spec_of(tables, out)
     problem = build_problem(spec, AuditTable(), fitted, untouched, seed, workshop=workshop)
@@ -296,29 +295,3 @@ def _sized(
     share = np.log(rho / found[k - 1]) / np.log(found[k] / found[k - 1])
     size = float(np.exp(np.log(AMPLITUDES[k - 1]) + share * np.log(AMPLITUDES[k] / AMPLITUDES[k - 1])))
     return size, reached(size)
-
-
-def _blank(setting: Setting, rng: np.random.Generator) -> list[Trajectory]:
-    """Commands and times of all recordings; their positions are still those at rest."""
-    robot, table = Robot.load(setting.robot), setting.commands
-    sequences = [random_walk(table, len(robot.channel_names), rng) for _ in range(1 + OTHERS + UNTOUCHED)]
-    names = [f"fit_{k + 1}" for k in range(REPEATS + OTHERS)] + [f"test_{k + 1}" for k in range(UNTOUCHED)]
-    order = [*([0] * REPEATS), *range(1, 1 + OTHERS + UNTOUCHED)]
-    time = table.sample_time * np.arange(round(table.duration / table.sample_time) + 1)
-    return [
-        Trajectory.build(
-            Origin(name=name, robot=robot.name, format="netcdf", synthetic=True),
-            SentCommands(
-                command_time=sequences[k][0],
-                command=sequences[k][1],
-                command_unit=robot.command_unit,
-                cable_names=robot.channel_names,
-            ),
-            Measured(
-                time=time,
-                position=np.tile(robot.marker_points(), (len(time), 1, 1)),
-                marker_names=robot.marker_names,
-            ),
-        )
-        for name, k in zip(names, order, strict=True)
-    ]
