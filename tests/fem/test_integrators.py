@@ -100,6 +100,7 @@ def wandering(batch: int, steps: int, cables: int, seed: int = 0) -> np.ndarray:
     return np.cumsum(3e-4 * np.random.default_rng(seed).normal(size=(batch, steps, cables)), axis=1)
 
 
+@pytest.mark.slow
 def test_both_engines_give_the_same_numbers_with_all_effects():
     """Material with every effect, cables that rub, from an equilibrium under pulled cables."""
     system, points, _ = bar()

@@ -80,6 +80,7 @@ def test_a_law_of_zero_changes_no_bit_and_another_one_acts(port):
     assert np.abs(moved.position - still.position).max() > 1e-6
 
 
+@pytest.mark.slow
 def test_a_law_at_a_cable_is_a_change_of_its_command_in_rollouts_and_in_sessions():
     acting, plain = build_robot_simulator(spec(law("cable left", "product", commands=["up", "left"]))), None
     plain = build_robot_simulator(spec())
