@@ -21,6 +21,8 @@ PredictedGroup = Annotated[
     typer.Option("--group", help="the day or robot; by default that of adapt, or else as [model.groups] has it"),
 ]
 
+Episode = Annotated[int | None, typer.Option("--episode", help="number of the episode, of a LeRobotDataset")]
+
 
 def predict(
     experiment: Annotated[
@@ -36,6 +38,7 @@ def predict(
         str | None, typer.Option("--start", help="file whose first row is the start pose, where it is another file")
     ] = None,
     rows: Annotated[str | None, typer.Option("--rows", help="FIRST:LAST observation rows, both included")] = None,
+    episode: Episode = None,
     seed: Annotated[int | None, typer.Option(help="seed of the draws; that of the experiment by default")] = None,
     group: PredictedGroup = None,
     overwrite: Overwrite = False,
@@ -61,6 +64,7 @@ def predict(
         out,
         start=None if start is None else _from_here(start),
         rows=_window(rows),
+        episode=episode,
         seed=seed,
         group=group,
         overwrite=overwrite,
@@ -75,6 +79,7 @@ def adapt(
     commands: Annotated[
         str | None, typer.Option("--commands", help="file of its commands, where the format has one of their own")
     ] = None,
+    episode: Episode = None,
     seconds: Annotated[float | None, typer.Option(help="look at so much of its beginning; all by default")] = None,
     group: Group = None,
     experiment: Annotated[
@@ -89,14 +94,19 @@ def adapt(
     """Move what a day changes to one short recording of it; the body keeps its posterior."""
     see_calibration(run, "DIR")
     check_folder(out, "adapt", overwrite=overwrite)
+    from rfdropo_bayes.data import RecordingEntry
     from rfdropo_bayes.verbs.adapt import fitted_model, run_adaptation
 
+    entry = RecordingEntry(
+        observations=_from_here(recording),
+        commands=None if commands is None else _from_here(commands),
+        episodes=None if episode is None else [episode],
+    )
     found = run_adaptation(
         run,
         fitted_model(run, experiment, overrides),
-        _from_here(recording),
+        entry,
         out,
-        commands=None if commands is None else _from_here(commands),
         seconds=seconds,
         group=group,
         seed=seed,

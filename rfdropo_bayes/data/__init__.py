@@ -13,7 +13,7 @@ from rfdropo_bayes.data.repeats import command_openings, group_repeats, noise_fl
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, load_recordings
 from rfdropo_bayes.data.trajectory import Trajectory
-from rfdropo_bayes.data.unseen import first_row_only, load_unseen, start_is_known
+from rfdropo_bayes.data.unseen import first_row_only, load_unseen, one_at_a_time, start_is_known
 from rfdropo_bayes.files import DATA_VARIABLE
 
 __all__ = [
@@ -37,6 +37,7 @@ __all__ = [
     "load_recordings",
     "load_unseen",
     "noise_floor",
+    "one_at_a_time",
     "read_asl_csv",
     "read_optitrack_csv",
     "read_plain_csv",

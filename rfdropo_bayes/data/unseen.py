@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from rfdropo_bayes.data import lerobot
 from rfdropo_bayes.data.asl_csv import read_asl_start
 from rfdropo_bayes.data.first_command import MEASURED, UNTOLD, angle_at_first, begun_from
 from rfdropo_bayes.data.mapped_formats import FOLDERS, observed_table, recognised_format
@@ -30,6 +31,7 @@ def load_unseen(
     start: str | None = None,
     rows: tuple[int, int] | None = None,
     begun: str | None = None,
+    episode: int | None = None,
 ) -> Trajectory:
     """The commands of a file in the format of an experiment, and its start pose.
 
@@ -45,9 +47,11 @@ def load_unseen(
         rows: keep observation rows first to last, both included; the start pose is then that of row ``first``.
         begun: how the fitted recordings begin, "zero" or "first" (`common_beginning`), where all begin alike: so do
             these commands, unless [data] or the file says otherwise.
+        episode: number of the episode that is meant, where the file of observations is a LeRobotDataset.
 
     Raises:
-        InputError: a file that is missing or bad, or a start where the format has it in the same file.
+        InputError: a file that is missing or bad, a start where the format has it in the same file, or a dataset of
+            which no episode is named.
     """
     if spec.format == "asl-csv":
         observations = None if start is None else find_data_file(start, base)
@@ -57,12 +61,13 @@ def load_unseen(
         path = find_files(commands, base, folders=spec.format in FOLDERS)[0]
         if recognised_format(path) == CSV and holds_commands_alone(path, spec.columns):
             observations = None if start is None else find_files(start, base, folders=spec.format in FOLDERS)[0]
-            known = None if observations is None else observed_table(spec.format, observations, spec.columns)
+            known = None if observations is None else observed_table(spec.format, observations, spec.columns, episode)
             columns = spec.columns if known is None else known.columns
             whole = read_csv_start(path, columns, None if known is None else known.table, rows[0] if rows else 0)
             return spec.piece(_begun(whole, spec, begun), rows)
+    episodes = None if episode is None else [episode]
     if spec.columns is not None and start is not None:
-        entry = RecordingEntry(observations=start, commands=commands)
+        entry = RecordingEntry(observations=start, commands=commands, episodes=episodes)
     elif start is not None:
         raise InputError(
             f"format {spec.format!r} keeps commands and observations in one file",
@@ -70,14 +75,21 @@ def load_unseen(
             remedy="leave --start out: the first row of the command file is the start",
         )
     else:
-        entry = RecordingEntry(observations=commands)
+        entry = RecordingEntry(observations=commands, episodes=episodes)
     changes: dict[str, Any] = {"fit": [entry], "test": [], "resample": None, "missing": "mask"}
     if spec.initial_command is None and spec.format in UNTOLD:
         changes["initial_command"] = "first"  # not recognised: later rows would have a say
     recordings = load_recordings(changed(spec, where="[data]", **changes), base)
     if len(recordings) > 1:
-        raise InputError(f"names {len(recordings)} files", where=commands, remedy="predict one at a time")
+        raise one_at_a_time(spec, commands, len(recordings), "predict")
     return first_row_only(spec.piece(_begun(recordings[0], spec, begun), rows))
+
+
+def one_at_a_time(spec: DataSpec, name: str, number: int, verb: str) -> InputError:
+    """The error of a verb that takes one recording and was given several."""
+    if spec.format == lerobot.FORMAT:
+        return InputError(f"has {number} episodes", where=name, remedy=f"name the one to {verb}, e.g. --episode 0")
+    return InputError(f"names {number} files", where=name, remedy=f"{verb} one at a time")
 
 
 def _begun(whole: Trajectory, spec: DataSpec, begun: str | None) -> Trajectory:

@@ -21,9 +21,8 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.space import SEPARATOR, InferredParameter, ParameterSpace, deviations, spread_of
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution, Code
-from rfdropo_bayes.data import DataSpec, Trajectory, load_recordings
+from rfdropo_bayes.data import DataSpec, RecordingEntry, Trajectory, load_recordings, one_at_a_time
 from rfdropo_bayes.data.sample_times import sample_time
-from rfdropo_bayes.data.spec import RecordingEntry
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import group_of, in_group
 from rfdropo_bayes.inference.progress import Progress
@@ -313,10 +312,9 @@ def _own_of_day(fit: PosteriorRecord, space: ParameterSpace, recording: str, day
 def run_adaptation(
     run: Path,
     model: Model,
-    recording: str,
+    entry: RecordingEntry,
     out: Path,
     *,
-    commands: str | None = None,
     seconds: float | None = None,
     group: str | None = None,
     seed: int | None = None,
@@ -328,7 +326,7 @@ def run_adaptation(
     Args:
         run: folder of a calibration, or of an earlier adaptation.
         model: that was fitted, with the [data] of its experiment, see `fitted_model`.
-        recording: file of observations; ``commands``: that of the commands, where the format has one of its own.
+        entry: names the file of observations, that of the commands where the format has one, and the episode.
         out, seconds, group, seed, overwrite, show: see `adapt`.
 
     Raises:
@@ -338,10 +336,9 @@ def run_adaptation(
     if read.data is None:
         where = model.name if model.file is None else str(model.file.path)
         raise InputError("the experiment has no [data]", where=where, remedy="say in which format recordings are")
-    entry = RecordingEntry(observations=recording, commands=commands)
     found = load_recordings(_alone(read.data, entry), model.folder)
     if len(found) > 1:
-        raise InputError(f"names {len(found)} files", where=recording, remedy="adapt to one at a time")
+        raise one_at_a_time(read.data, entry.observations, len(found), "adapt to")
     fit = Calibration.of_posterior(run, model)
     fit = replace(fit, model=Model.of(model.spec, replace(read, data=_alone(read.data, entry))))
     chosen = read.seed if seed is None else seed

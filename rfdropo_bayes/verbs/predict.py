@@ -191,6 +191,7 @@ def run_prediction(
     *,
     start: str | None = None,
     rows: tuple[int, int] | None = None,
+    episode: int | None = None,
     seed: int | None = None,
     group: str | None = None,
     overwrite: bool = False,
@@ -207,6 +208,7 @@ def run_prediction(
         commands, start: see `data.load_unseen`.
         out: folder to write to.
         rows: predict observation rows first to last only; the pose of the first is then that of row ``first``.
+        episode: of a LeRobotDataset.
         seed: of the draws; that of the experiment by default.
         group: see `predict`.
         overwrite: write whatever ``out`` holds.
@@ -219,11 +221,11 @@ def run_prediction(
     if read.data is None:
         raise InputError("the experiment has no [data]", where=path, remedy="say in which format the commands are")
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
-    unseen = load_unseen(read.data, folder, commands, start, rows, record.attrs.get(BEGUN))
+    unseen = load_unseen(read.data, folder, commands, start, rows, record.attrs.get(BEGUN), episode)
     fit = Calibration(record, {}, "", model)
     found = predict(fit, unseen, seed=read.seed if seed is None else seed, group=group)
     options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
-    options["group"] = group
+    options |= {"group": group, "episode": episode}
     settings: dict[str, Any] = {
         "tables": model.tables(),
         "folder": folder,
@@ -236,6 +238,7 @@ def run_prediction(
             "experiment": path,
             "posterior": str(posterior),
             "commands": commands,
+            "episode": episode,
             "start_pose_known": start_is_known(unseen),
             "first_command": unseen.first_command,
             "group": found.group,

@@ -381,3 +381,20 @@ def test_commands_alone_start_from_the_first_row_of_a_recording(tmp_path):
     unseen = load_unseen(spec, tmp_path, "run")
     np.testing.assert_allclose(unseen.position[0], MOTION.position[0])
     np.testing.assert_allclose(unseen.command, MOTION.command)
+
+
+def test_an_episode_is_predicted_by_its_number(tmp_path):
+    lerobot(EPISODES, tmp_path / "arm")
+    spec = DataSpec.parse(
+        {"format": "lerobot", "fit": [{"observations": "arm", "episodes": [0]}], "columns": dataset_columns()}
+    )
+    with fails("has 3 episodes.*name the one to predict, e.g. --episode 0"):
+        load_unseen(spec, tmp_path, "arm")
+    unseen = load_unseen(spec, tmp_path, "arm", episode=2)
+    np.testing.assert_allclose(unseen.position[0], EPISODES[2].position[0], atol=1e-7)
+    assert len(unseen.time) == 50
+    assert not unseen.position_mask[1:].any()
+    sent = {name: EPISODES[1].command[:, channel] for channel, name in enumerate(dataset_columns()["commands"])}
+    pd.DataFrame({"timestamp": EPISODES[1].command_time, **sent}).to_csv(tmp_path / "next.csv", index=False)
+    started = load_unseen(spec, tmp_path, "next.csv", "arm", episode=1)
+    np.testing.assert_allclose(started.position[0], EPISODES[1].position[0], atol=1e-7)

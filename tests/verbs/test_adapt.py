@@ -16,6 +16,7 @@ import rfdropo_bayes as rb
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.cli.terminal_summary import show_calibration, show_prediction
+from rfdropo_bayes.data import RecordingEntry
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR
 from rfdropo_bayes.prediction.predictive import FITTED, NOISE
@@ -295,8 +296,9 @@ def test_lost_markers_are_left_out(known, tmp_path, monkeypatch):
 
     monkeypatch.setattr(adaptation, "load_recordings", read)
     (tmp_path / "config.toml").write_text('robot = "smooth_arm"\n[data]\nformat = "netcdf"\nfit = ["a.nc"]\n')
+    entry = RecordingEntry(observations="b.nc")
     with pytest.raises(rb.InputError, match="read"):
-        adaptation.run_adaptation(tmp_path, adaptation.fitted_model(tmp_path), "b.nc", tmp_path / "out")
+        adaptation.run_adaptation(tmp_path, adaptation.fitted_model(tmp_path), entry, tmp_path / "out")
     assert asked["missing"] == "mask"
 
 
