@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.cli.main import app
-from rfdropo_bayes.verbs.preflight import preflight
+from rfdropo_bayes.verbs.preflight import _covariance, preflight
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.02
@@ -35,13 +35,14 @@ def spring(parameters, command):
     return {"position": np.concatenate([place, 0.0 * place, 0.1 + 0.0 * place], axis=-1)[:, :, None], "tension": pull}
 
 
-def wide(median):
-    prior = {"distribution": "LogNormal", "median": median, "sigma": 0.5}
+def wide(median, sigma=0.5):
+    prior = {"distribution": "LogNormal", "median": median, "sigma": sigma}
     return {"low": 1e-3 * median, "high": 1e3 * median, "nominal": median, "prior": prior}
 
 
-def model(*, tension=False, cables=("end",), **more):
-    parameters = {"stiffness": {**wide(20.0), "unit": "N/m"}, "mass": {**wide(0.5), "unit": "kg"}, "ratio": wide(0.2)}
+def model(*, tension=False, cables=("end",), sigma=0.5, **more):
+    mass = {**wide(0.5, sigma), "unit": "kg"}
+    parameters = {"stiffness": {**wide(20.0), "unit": "N/m"}, "mass": mass, "ratio": wide(0.2)}
     box = rb.BlackBox(
         spring,
         parameters=parameters,
@@ -81,6 +82,22 @@ def test_the_scale_of_stiffness_and_mass_is_the_ridge_and_a_force_or_a_balance_e
     shares = found.parameters["kept"]
     assert shares["mass"] == pytest.approx(np.sqrt(0.5), rel=0.05)  # the sd of 2000 draws is known to 1.6 %
     assert shares["ratio"] < 0.1
+
+
+def test_a_ridge_is_named_whole_where_one_of_its_parameters_is_known_far_better():
+    """In prior standard deviations the stiffness takes a tenth of the step that the mass takes."""
+    (direction,) = rb.check(model(sigma=0.05), [recording()]).directions
+    assert direction.sentence.startswith("the common scale of stiffness and mass")
+
+
+def test_a_draw_that_snaps_hides_no_ridge():
+    """One draw of eight whose slopes are those of a jump, along a direction that the others do not show at all."""
+    information = np.zeros((8, 2, 2))
+    information[:, 0, 0] = 1e4
+    information[3] = [[1e8, 1e8], [1e8, 1e8]]
+    kept = np.sqrt(np.diag(_covariance(information)))
+    assert kept[0] < 0.3
+    assert kept[1] == pytest.approx(np.sqrt(7.5 / 8.0), rel=1e-3)  # half of its variance is left at the draw that snaps
 
 
 def test_what_is_measured_leaves_no_ridge():
