@@ -9,13 +9,33 @@ from typing import Annotated
 
 import typer
 
-from rfdropo_bayes.cli.options import AsJson, ExperimentFile, OutFolder, Overrides, Overwrite, Quiet, Resume, folder_for
+from rfdropo_bayes.cli.options import (
+    AsJson,
+    ExperimentFile,
+    OutFolder,
+    Overrides,
+    Overwrite,
+    Quiet,
+    Resume,
+    folder_for,
+    see_calibration,
+)
 from rfdropo_bayes.cli.terminal_summary import say
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.run_folder import check_folder
 
 
 def train(
-    experiment: ExperimentFile,
+    experiment: Annotated[
+        Path | None, typer.Argument(metavar="EXPERIMENT.toml", help="the experiment file; not beside --from")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option("--from", help="folder of a calibration: its model, under draws of its posterior")
+    ] = None,
+    task: Annotated[str | None, typer.Option("--task", help="reach or push; that of the experiment by default")] = None,
+    goal: Annotated[
+        str | None, typer.Option("--goal", help="X,Y,Z [m] in the frame of the base; by default those of the task")
+    ] = None,
     out: OutFolder = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -23,19 +43,49 @@ def train(
     as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
-    """Train a policy under the experiment's randomisation: writes policy.onnx, its card, and how it learnt."""
+    """Train a policy and play it: writes report.html, policy.onnx, its card, and how it learnt."""
+    if (experiment is None) == (calibration is None):
+        raise InputError("takes an experiment file or --from DIR", where="train", remedy="give one of them")
+    see_calibration(calibration, "--from")
+    if calibration is not None:
+        experiment, out = calibration / "config.toml", out or calibration.with_name(f"{calibration.name}_train")
+    assert experiment is not None
+    overrides = [*(overrides or []), *_task_and_goal(task, goal)]
     folder = folder_for("train", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
-    from rfdropo_bayes.verbs.train import CARD, POLICY
+    from rfdropo_bayes.verbs.make_vec import with_training
+    from rfdropo_bayes.verbs.train import PAGE, POLICY
     from rfdropo_bayes.verbs.train import train as learn
 
-    found = learn(Model.read(experiment, overrides), folder, resume=resume, overwrite=overwrite)
+    model = Model.read(experiment, overrides)
+    if calibration is not None:
+        model = with_training(model, {"randomisation": "posterior"})
+    found = learn(model, folder, posterior=calibration, resume=resume, overwrite=overwrite)
     last = found["evaluation"]
     learnt = (
         f"half of the episodes end within {1e3 * last['distance_median']:.2f} mm of the goal, 95 % within "
         f"{1e3 * last['distance_q95']:.2f} mm, after {found['steps']} steps in {found['seconds']:.0f} s"
     )
-    say(found, learnt, f"policy: {folder / POLICY}", f"card: {folder / CARD}", quiet=quiet, as_json=as_json)
+    say(found, learnt, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", quiet=quiet, as_json=as_json)
+
+
+def _task_and_goal(task: str | None, goal: str | None) -> list[str]:
+    """The overrides of an experiment file that the options --task and --goal stand for."""
+    found = []
+    if task is not None:
+        if task not in TASKS:
+            raise InputError(f"unknown task {task!r}", where="--task", remedy=f"use {' or '.join(TASKS)}")
+        found.append(f'training.task="{TASKS[task]}"')
+    if goal is not None:
+        parts = goal.split(",")
+        try:
+            place = [float(part) for part in parts]
+        except ValueError:
+            place = []
+        if len(place) != 3:
+            raise InputError(f"{goal!r} is not X,Y,Z", where="--goal", remedy="e.g. --goal 0.02,-0.03,0.13, in metres")
+        found.append(f"training.goals={[place, place]}")
+    return found
 
 
 def evaluate(
@@ -62,6 +112,7 @@ def evaluate(
     say(found, evaluation_table(found), f"table: {folder / TABLE}", quiet=quiet, as_json=as_json)
 
 
+TASKS = {"reach": "TrunkReach-v0", "push": "TrunkPush-v0"}
 VIRTUAL = Path("experiments/virtual")
 
 

@@ -52,6 +52,22 @@ def success_figure(policies: Mapping[str, Sequence[Episode]], thresholds: Sequen
     return figure
 
 
+@styled
+def draws_figure(parameters: Mapping[str, np.ndarray], distances: np.ndarray) -> Figure:
+    """Final distance [m] of episodes against every parameter that differs between them."""
+    columns = min(3, len(parameters))
+    rows = -(-len(parameters) // columns)
+    figure = Figure(figsize=(WIDTH, 2.4 * rows))
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, (name, values) in zip(panels, parameters.items(), strict=False):
+        axes.plot(values, MILLIMETRES * distances, ".", markersize=4)
+        axes.set(xlabel=name, ylabel="final distance [mm]", yscale="log")
+    for axes in panels[len(parameters) :]:
+        axes.set_visible(False)
+    return figure
+
+
 def save_animation(frames: Sequence[np.ndarray], path: Path, period: float) -> Path:
     """Write pictures, one every ``period`` [s], as a GIF in real time."""
     pictures: list[Any] = [Image.fromarray(frame).convert("P", palette=Image.Palette.ADAPTIVE) for frame in frames]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -82,6 +83,27 @@ def picture(episodes: Episodes, lane: int) -> UInt8[np.ndarray, "height width 3"
     _draw_goal_line(draw, view, goal, floor)
     _caption(draw, episodes, lane)
     return np.asarray(image.resize((WIDTH, HEIGHT), Image.Resampling.LANCZOS))
+
+
+def frames_of(
+    episodes: Episodes,
+    actions: Float[np.ndarray, "action size"],
+    parameters: Mapping[str, float],
+    goal: Sequence[float],
+) -> list[UInt8[np.ndarray, "height width 3"]]:
+    """An episode again, a picture before every action and one at its end.
+
+    Args:
+        episodes: lanes of the same task; all of them are reset.
+        actions: that were taken; ``parameters`` [SI] and ``goal`` [m]: what the episode started from.
+    """
+    option = {"parameters": dict(parameters), "goal": list(goal)}
+    episodes.reset(np.arange(episodes.lanes), [option] * episodes.lanes)
+    frames = [picture(episodes, 0)]
+    for action in actions:
+        episodes.act(np.repeat(np.asarray(action)[None], episodes.lanes, axis=0))
+        frames.append(picture(episodes, 0))
+    return frames
 
 
 def _body(episodes: Episodes, lane: int) -> tuple[Float[np.ndarray, "point 3"], Float[np.ndarray, " point"]]:

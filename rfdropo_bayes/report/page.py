@@ -71,7 +71,7 @@ def render(template: str, **content: Any) -> str:
     environment.filters |= {"bootstrap_p": bootstrap_p, "p_value": p_value}
     environment.globals["interval"] = interval
     assets = {}
-    for name, file in (("stylesheet", "page.css"), ("script", "replay.js")):
+    for name, file in (("stylesheet", "page.css"), ("script", "replay.js"), ("sort", "sort.js")):
         assets[name] = Markup(environment.loader.get_source(environment, file)[0]) if environment.loader else ""
     return environment.get_template(template).render(**assets, **content)
 

@@ -14,6 +14,8 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import run_folder
 from rfdropo_bayes.policies.episodes import Episodes, Settings
 from rfdropo_bayes.policies.evaluation import (
+    EVALUATION_SEED,
+    THRESHOLDS,
     Case,
     Episode,
     draw_cases,
@@ -28,7 +30,7 @@ from rfdropo_bayes.policies.policy_figures import save_animation, success_figure
 from rfdropo_bayes.policies.randomisation import (
     Randomisation,
 )
-from rfdropo_bayes.policies.rendering import picture
+from rfdropo_bayes.policies.rendering import frames_of
 from rfdropo_bayes.policies.tasks import Task, observed_of
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
@@ -39,8 +41,6 @@ from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of, with_tra
 from rfdropo_bayes.verbs.train import POLICY
 
 EVALUATION, TABLE, CSV, FIGURE = "evaluation.json", "evaluation.md", "episodes.csv", "success.png"
-THRESHOLDS = (0.005, 0.01, 0.01525, 0.02157, 0.030)  # m; the last three are the paper's
-EVALUATION_SEED = 2_000_003  # none of the seeds that training or its evaluations use
 SCHEMA_VERSION = 1
 
 
@@ -146,12 +146,7 @@ def _film(batch: Episodes, episodes: Sequence[Episode], cases: Sequence[Case], p
     """The median episode again, as an animation."""
     episode = median_episode(episodes)
     case = cases[episode.case]
-    option = {"parameters": dict(case.parameters), "goal": list(case.goal)}
-    batch.reset(np.arange(batch.lanes), [option] * batch.lanes)
-    frames = [picture(batch, 0)]
-    for action in episode.actions:
-        batch.act(np.repeat(np.asarray(action)[None], batch.lanes, axis=0))
-        frames.append(picture(batch, 0))
+    frames = frames_of(batch, episode.actions, case.parameters, case.goal)
     save_animation(frames, path, batch.layout.period_s)
 
 

@@ -16,18 +16,21 @@ from rfdropo_bayes.policies.episodes import Episodes
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy, latency
 from rfdropo_bayes.policies.parity import difference, observations
 from rfdropo_bayes.policies.policy_figures import curve_figure
+from rfdropo_bayes.policies.policy_page import play_policy, render_policy
 from rfdropo_bayes.policies.training import Trained
 from rfdropo_bayes.policies.training import train as learn
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.facts import LEARNING
+from rfdropo_bayes.report.run_files import CONFIG
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
 from rfdropo_bayes.verbs.make_vec import episode_settings, randomisation_of, training_of, with_training
 
-POLICY, CARD, SUMMARY, CURVE = "policy.onnx", "card.md", "summary.json", "curve.png"
+POLICY, CARD, SUMMARY, CURVE, PAGE = "policy.onnx", "card.md", "summary.json", "curve.png", "report.html"
 SCHEMA_VERSION = 1
+PLAYED = 64  # lanes in which the policy that is kept is played
 
 
 def train(
@@ -45,8 +48,8 @@ def train(
 
     Args:
         model: that is simulated; its fixed values hold.
-        out: folder to write to: policy.onnx, card.md, summary.json, curve.png, episodes.jsonl, TensorBoard's files and
-            checkpoints.
+        out: folder to write to: report.html, policy.onnx, card.md, summary.json, curve.png, episodes.jsonl,
+            TensorBoard's files and checkpoints.
         posterior: whose draws the episodes' parameters are, or its folder.
         seed: of all that is random; that of the model's experiment by default.
         resume: go on from the checkpoint of an interrupted run in ``out``; overwrite: start anew whatever it holds.
@@ -88,6 +91,9 @@ def train(
         summary = _summary(table, found, policy, facts)
         curve_figure(found.curve).savefig(out / CURVE, dpi=150)
         write_text(out / CARD, policy_card(summary, layout))
+        played = play_policy(policy, Episodes(simulator, task, PLAYED, randomisation, settings), seed)
+        text = (out / CONFIG).read_text(encoding="utf-8")
+        write_text(out / PAGE, render_policy(summary, played, str(tables.get("title", task.name)), text))
         write_json(out / SUMMARY, summary)
     return summary
 

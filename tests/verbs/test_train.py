@@ -40,7 +40,8 @@ def test_a_policy_is_trained_exported_and_evaluated(tmp_path, task) -> None:
     settings = [part for entry in [*QUICK, f'training.task="{task}"'] for part in ("--set", entry)]
     rfdropo("train", REACH, "--out", tmp_path / "policy", *settings)
     assert {path.name for path in (tmp_path / "policy").iterdir()} >= {
-        "policy.onnx", "card.md", "summary.json", "curve.png", "episodes.jsonl", "config.toml", "run.json"
+        "policy.onnx", "card.md", "summary.json", "curve.png", "report.html", "episodes.jsonl", "config.toml",
+        "run.json",
     }  # fmt: skip
     summary = json.loads((tmp_path / "policy" / "summary.json").read_text())
     assert (summary["status"], summary["task"]) == ("done", task)
@@ -52,6 +53,37 @@ def test_a_policy_is_trained_exported_and_evaluated(tmp_path, task) -> None:
     assert len(table) == 8
     assert table["distance"].gt(0.0).all()
     assert (tmp_path / "test" / "policy.gif").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_a_policy_is_trained_under_a_calibration_with_one_command(tmp_path) -> None:
+    runs = rb.read("virtual/reach_1.nc", folder=REPOSITORY / "experiments")
+    model = rb.Model("virtual_trunk", priors={"young_modulus": {}}, noise="white", simulator=SINGLE)
+    rb.calibrate(
+        model, runs, rb.Laplace(starts=1, screen=4, max_steps=3, draws=16), seed=0, show=False, out=tmp_path / "fit"
+    )
+    settings = [part for entry in QUICK for part in ("--set", entry)]
+    rfdropo("train", "--from", tmp_path / "fit", "--task", "reach", "--goal", "0.01,-0.03,0.13", *settings)
+    summary = json.loads((tmp_path / "fit_train" / "summary.json").read_text())
+    assert summary["randomisation"] == "posterior"
+    assert summary["settings"]["goals"] == [[0.01, -0.03, 0.13]] * 2
+    page = (tmp_path / "fit_train" / "report.html").read_text()
+    assert "parameters of every episode: posterior" in page
+    assert "young_<wbr>modulus" in page
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ([], "takes an experiment file or --from DIR"),
+        ([REACH, "--task", "lift"], "use reach or push"),
+        ([REACH, "--goal", "1,2"], "is not X,Y,Z"),
+    ],
+)
+def test_what_a_training_cannot_take_is_said(words, told) -> None:
+    result = CliRunner().invoke(app, ["train", *map(str, words)])
+    assert result.exit_code != 0
+    assert told in " ".join((result.output + str(result.exception)).split())
 
 
 @pytest.mark.slow

@@ -1,0 +1,100 @@
+"""The page of a training: what it advises has a ground, and its tables sort in a browser."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rfdropo_bayes.policies.evaluation import Case, Episode
+from rfdropo_bayes.policies.policy_page import Played, next_steps, render_policy
+
+BROWSER = next(
+    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
+)
+
+
+def curve(*medians: float) -> list[dict]:
+    row = {"reward": 1.0, "distance_q05": 0.001, "distance_q95": 0.05}
+    return [{**row, "steps": 1000 * k, "distance_median": median} for k, median in enumerate(medians, 1)]
+
+
+def played(slope: float = 0.0, failed: int = 0, count: int = 100) -> Played:
+    """Episodes that end farther from the goal the stiffer the trunk is, by ``slope``, the first few of which fail."""
+    stiffness = np.linspace(1.0, 2.0, count)
+    mass = np.random.default_rng(0).uniform(0.3, 0.4, count)
+    rest = np.random.default_rng(1).uniform(0.004, 0.006, count)
+    cases = [
+        Case({"young_modulus": e, "trunk_mass": m, "poisson_ratio": 0.45}, (0.0, 0.0, 0.1))
+        for e, m in zip(stiffness, mass, strict=True)
+    ]
+    ends = rest + slope * (stiffness - 1.0)
+    episodes = [Episode(k, np.array([0.1, end]), 1.0, k < failed, np.zeros((2, 8))) for k, end in enumerate(ends)]
+    return Played(cases, episodes, {"the median episode": b"GIF89a"})
+
+
+SUMMARY = {
+    "task": "TrunkReach-v0",
+    "algorithm": "PPO",
+    "steps": 6000,
+    "seconds": 12.0,
+    "randomisation": "uniform",
+    "seed": "0",
+    "evaluation": {"steps": 6000},
+    "curve": curve(0.03, 0.02, 0.01),
+    "versions": {"numpy": "2"},
+}
+
+
+def test_a_training_that_still_rose_is_told_to_go_on():
+    (still, _) = next_steps({"curve": curve(0.04, 0.03, 0.02, 0.02, 0.01, 0.005)}, played())
+    assert "fell from 20.0 to 5.0 mm" in still
+    assert len(next_steps({"curve": curve(0.04, 0.01, 0.01, 0.01, 0.01, 0.0095)}, played())) == 1
+
+
+def test_a_parameter_that_the_policy_does_not_cope_with_is_named_and_no_other():
+    told = next_steps({"curve": curve(0.01, 0.01)}, played(slope=0.01))
+    assert "where young_modulus is large" in told[0]
+    assert not any("trunk_mass" in sentence for sentence in told)
+    assert not any("poisson_ratio" in sentence for sentence in told)  # the same in every episode
+
+
+def test_failed_simulations_are_counted():
+    told = next_steps({"curve": curve(0.01, 0.01)}, played(failed=3))
+    assert told[0].startswith("3 of 100 simulations failed")
+
+
+def test_the_page_says_how_often_the_policy_succeeds():
+    page = render_policy(SUMMARY, played(failed=3), "My arm", "seed = 0")
+    assert "97 %" in page
+    assert "data:image/gif;base64,R0lGODlh" in page
+    assert page.count('<td class="n">failed</td>') == 3
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_its_tables_sort_in_a_browser(tmp_path: Path):
+    page = render_policy(SUMMARY, played(slope=0.01), "My arm", "")
+    clicks = "const heads = document.querySelectorAll('#draws th.sorts'); heads[3].click();"
+    path = tmp_path / "report.html"
+    path.write_text(page.replace("</body>", f"<script>{clicks}</script></body>"))
+    done = subprocess.run(
+        [
+            *(str(BROWSER), "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run"),
+            *(f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--v=0"),
+            *("--virtual-time-budget=1000", "--dump-dom", path.as_uri()),
+        ],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert "CONSOLE" not in done.stderr
+    table = done.stdout[done.stdout.index("The worst episodes") :]
+    masses = [float(re.findall(r'<td class="n">([^<]*)</td>', row)[-1]) for row in table.split("<tr>")[2:10]]
+    assert masses == sorted(masses)
+    assert 'aria-sort="ascending"' in table
