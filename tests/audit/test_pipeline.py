@@ -262,7 +262,9 @@ class Hurried(Deadline):
         super().check()
 
 
-@pytest.mark.parametrize("share", [0.1, 0.4, 0.7, 0.95])
+@pytest.mark.parametrize(
+    "share", [0.1, pytest.param(0.4, marks=pytest.mark.slow), pytest.param(0.7, marks=pytest.mark.slow), 0.95]
+)
 def test_an_audit_whose_time_is_up_finishes_with_what_it_knows(monkeypatch, share):
     """Play of ten times the size that is sure, and the time is up between the base fit and the end."""
     asked = problem({**TRUTH, "play": 1.0}, 1)
@@ -312,7 +314,7 @@ def test_a_base_model_without_the_time_for_its_fit_is_refused():
         base_model(asked, asked.seed, deadline=Deadline(1e-6))
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
+@pytest.mark.parametrize("share", [0.0, 0.5, pytest.param(0.95, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("stated", [True, False])
 def test_an_audit_without_the_time_for_a_base_fit_has_no_verdict_and_goes_on(tmp_path, share, stated):
     """The time is up at the start, in the search and in the last climb; with and without a noise that is known."""

@@ -50,6 +50,7 @@ def held(states: fem.State) -> fem.State:
     return jax.tree.map(lambda value: jnp.broadcast_to(value, (ROWS - 1, *value.shape)), states)
 
 
+@pytest.mark.slow
 def test_the_base_carries_the_weight(trunk, settle, balance, prepare):
     """At rest: against the weight, and with a moment that holds it at its centre of mass."""
     material = fem.material(trunk, **SILICONE, gravity=GRAVITY)

@@ -260,6 +260,7 @@ def test_cubes_fall_without_a_rebound_and_rest():
     assert np.abs(np.diff(pose[:, -10:], axis=1)).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_cubes_stick_and_slide_on_a_slope():
     """Below the angle of friction it stays; above it has the acceleration of the closed form."""
     critical = np.arctan(0.3)
@@ -303,6 +304,7 @@ def test_a_session_is_a_rollout_taken_apart():
     np.testing.assert_array_equal(np.concatenate(parts, axis=1), whole.position[:, 1:])
 
 
+@pytest.mark.slow
 def test_derivatives_agree_with_differences_of_the_compiled_engine():
     """Forward mode through both stages, by the logarithm of the modulus."""
     system, points, _ = bar()

@@ -28,7 +28,11 @@ def samples(effects: BodyEffects) -> tuple[fem.Material, np.ndarray]:
 
 
 @pytest.mark.parametrize("precision", [pytest.param("float64", marks=pytest.mark.slow), "float32"])
-@pytest.mark.parametrize("effects", [PLAIN, random_effects(7), RUBBING], ids=["plain", "effects", "friction"])
+@pytest.mark.parametrize(
+    "effects",
+    [PLAIN, random_effects(7), pytest.param(RUBBING, marks=pytest.mark.slow)],
+    ids=["plain", "effects", "friction"],
+)
 def test_periods_with_partial_resets_are_whole_rollouts(precision, effects):
     """Lanes that start at different times from equilibrium, more than one block of them, on two threads."""
     engine = native(precision, threads=2)

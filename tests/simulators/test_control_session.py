@@ -92,9 +92,9 @@ def run(model, parameters, commands, late=(1, 3)):
         yield session, seen
 
 
-@pytest.mark.parametrize("integrator", ["euler", "sdirk2"])
+@pytest.mark.parametrize("integrator", [pytest.param("euler", marks=pytest.mark.slow), "sdirk2"])
 @pytest.mark.parametrize("precision", ["float64", "float32"])
-@pytest.mark.parametrize("state", ["rest", "equilibrium"])
+@pytest.mark.parametrize("state", ["rest", pytest.param("equilibrium", marks=pytest.mark.slow)])
 def test_a_session_is_a_rollout_bit_for_bit(precision, state, integrator):
     model = simulator("numba", precision, (), state, integrator)
     parameters, commands = drawn({})

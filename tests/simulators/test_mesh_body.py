@@ -63,6 +63,7 @@ def test_it_is_a_simulator_with_the_robots_parameters(sofa):
         sofa.rollout({"young_modolus": jnp.asarray(4e6)}, pulls(sofa))
 
 
+@pytest.mark.slow
 def test_markers_start_at_the_mean_of_the_guides_and_the_first_stays(sofa):
     observation = sofa.rollout({}, pulls(sofa))
     guides = np.mean(sofa.robot.guides()[:4], axis=0)

@@ -49,7 +49,7 @@ def signals(simulator, given, size=1.0, seed=1):
 @pytest.mark.parametrize(
     ("integrator", "settled", "mechanisms"),
     [
-        ("euler", True, ()),
+        pytest.param("euler", True, (), marks=pytest.mark.slow),
         ("sdirk2", False, ("viscoelasticity", "bending_stiffening", "softening")),
     ],
 )
