@@ -26,6 +26,7 @@ from rfdropo_bayes.verbs.evaluate import _otherwise_trained
 from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of
 from rfdropo_bayes.verbs.predict import model_of
 
+EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 OF_SOFA = {"trunk_sofa", "trunk_sofa_mesh"}
 EXPERIMENT = 'robot = "smooth_arm"\n[simulator]\nrefine = 1\n'
 
@@ -52,6 +53,13 @@ def test_an_experiment_may_choose_another_integrator_than_the_robot(name, asked)
     spec = ModelSpec(robot, simulator=SimulatorTable(integrator=asked))
     assert integrator_of(spec) == build_robot_simulator(spec).engine.integrator == (asked or robot.integrator)
     assert trunk_simulator(robot, integrator=asked).engine.integrator == (asked or robot.integrator)
+
+
+@pytest.mark.parametrize("name", ["demo", "virtual/push", "virtual/reach", "virtual/audit", "virtual/extended"])
+def test_simulated_recordings_are_fitted_with_the_integrator_that_made_them(name):
+    model = rb.Model.read(EXPERIMENTS / f"{name}.toml")
+    for recording in (*model.recordings("fit"), *model.recordings("test")):
+        assert recording.settings["simulator"].get(INTEGRATOR, "euler") == integrator_of(model.spec)
 
 
 def test_a_run_states_its_integrator(tmp_path):
