@@ -1,6 +1,6 @@
 """How near the motion comes to the converged one, for implicit Euler and SDIRK2, and what a millimetre costs.
 
-    python benchmarks/convergence.py [--layers] [--robots NAME [NAME ...]] [--motions N] [--seconds S] [--json FILE]
+    python benchmarks/convergence.py [--layers | --prior N] [--robots NAME [NAME ...]] [--motions N] [--seconds S]
 
 Every robot is pulled about at random: one command moves its cable by 5 mm every 50 ms, within its range. The error is
 the root mean square over motions and time of the tip's distance from the converged motion, that of SDIRK2 with the
@@ -10,6 +10,9 @@ points of error against time, in logarithms.
 
 With `--layers` the mesh is refined instead, every layer cut into 1, 2 and 4, with SDIRK2 at 10 ms: distances from the
 motion of 8 times the layers, in mm and in percent of the tip's root mean square way from its mean place.
+
+With `--prior N` parameters are drawn N times from the robot's default priors, each with a motion of its own: the median
+and the 90 % quantile of the draws' errors, and how many lie beyond half a millimetre.
 """
 
 from __future__ import annotations
@@ -25,12 +28,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float
+from prior_draws import drawn
 
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators import Commands
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 
 ROBOTS = ("trunk_sofa", "trunk_physical", "smooth_arm", "asl_trunk", "motor_trunk")
@@ -46,6 +49,8 @@ REFINED, FINEST = (1, 2, 4), 8
 """Layers for each of the robot's own; the finest stands for the converged mesh."""
 LAYERS_MS = 10.0
 REPEATS = 3
+PRIOR_MS, PRIOR_CONVERGED_MS = (20.0, 10.0, 5.0), 1.25
+WANTED = 0.5  # [mm]
 
 
 class Row(NamedTuple):
@@ -104,7 +109,7 @@ def inputs(robot: str, step_ms: float, motions: int, seconds: float, refine: int
     grid = [
         model.commands(clock[:-1], rows, np.zeros(rows.shape[1]), clock) for rows in walk(model.robot, motions, seconds)
     ]
-    stacked = Commands(*(np.stack(parts) for parts in zip(*grid, strict=True)))
+    stacked = jax.tree.map(lambda *parts: np.stack(parts), *grid)
     material, start, displacement = jax.jit(jax.vmap(lambda c: model.inputs(values, c)))(stacked)
     return jax.tree.map(np.asarray, (material, start, displacement))
 
@@ -187,6 +192,35 @@ def print_meshes(robots: list[str], motions: int, seconds: float) -> list[MeshRo
     return rows
 
 
+def drawn_tip(model: TrunkSimulator, values: dict[str, np.ndarray], seconds: float) -> Float[np.ndarray, "draw time 3"]:
+    """Path of the tip [m] of every draw; not a number where a draw was lost."""
+    draws, clock = len(next(iter(values.values()))), PERIOD * np.arange(round(seconds / PERIOD) + 1)
+    grid = [model.commands(clock[:-1], row, np.zeros(row.shape[1]), clock) for row in walk(model.robot, draws, seconds)]
+    stacked = jax.tree.map(lambda *parts: np.stack(parts), *grid)
+    material, start, displacement = jax.tree.map(np.asarray, jax.jit(jax.vmap(model.inputs))(values, stacked))
+    begin = {"start" if model.engine.from_equilibrium else "before": start}
+    stride = round(OBSERVED / model.time_step)
+    found = model.engine.native.rollout(material, displacement, **begin, stride=stride)
+    return np.where(found.diverged[:, None, None], np.nan, found.position[:, :, -1])
+
+
+def print_priors(robots: list[str], draws: int, seconds: float) -> None:
+    """Print the table of errors over a robot's prior."""
+    print("| robot | " + " | ".join(f"{step:g} ms: median, 90 %, beyond {WANTED} mm" for step in PRIOR_MS) + " |")
+    print("|" + "---|" * (1 + len(PRIOR_MS)))
+    for name in robots:
+        robot = Robot.load(name)
+        values = drawn(simulator(robot, "sdirk2", PRIOR_CONVERGED_MS), draws)
+        converged = drawn_tip(simulator(robot, "sdirk2", PRIOR_CONVERGED_MS), values, seconds)
+        cells = [name]
+        for step in PRIOR_MS:
+            path = drawn_tip(simulator(robot, "sdirk2", step), values, seconds)
+            away = 1e3 * np.sqrt(np.mean(np.sum((path - converged) ** 2, axis=-1), axis=1))
+            middle, high = np.nanquantile(away, [0.5, 0.9])
+            cells.append(f"{middle:.2f}, {high:.2f}, {np.mean(~(away <= WANTED)):.0%}")
+        print("| " + " | ".join(cells) + " |", flush=True)
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -194,8 +228,11 @@ def main() -> None:
     parser.add_argument("--motions", type=int, default=4)
     parser.add_argument("--seconds", type=float, default=3.0, help="of every motion")
     parser.add_argument("--layers", action="store_true", help="refine the mesh instead of the time step")
+    parser.add_argument("--prior", type=int, metavar="N", help="draw so many times from the robot's default priors")
     parser.add_argument("--json", type=Path, help="also write the rows here")
     chosen = parser.parse_args()
+    if chosen.prior:
+        return print_priors(chosen.robots, chosen.prior, chosen.seconds)
     if chosen.layers:
         meshes = print_meshes(chosen.robots, chosen.motions, chosen.seconds)
         if chosen.json:

@@ -23,7 +23,6 @@ from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators import Commands
 from rfdropo_bayes.simulators.body_engine import cube_arrays
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 
@@ -91,7 +90,7 @@ def inputs(model: TrunkSimulator, task: str, draws: int) -> Any:
     values, clock = drawn(model, draws), PERIOD * np.arange(PERIODS + 1)
     channels = len(model.robot.channel_names)
     grid = [model.commands(clock[:-1], rows, np.zeros(channels), clock) for rows in walk(task, channels, draws)]
-    stacked = Commands(*(np.stack(parts) for parts in zip(*grid, strict=True)))
+    stacked = jax.tree.map(lambda *parts: np.stack(parts), *grid)
     made = jax.jit(jax.vmap(lambda v, c: (*model.inputs(v, c), model.body_inputs(v)[1])))
     return jax.tree.map(np.asarray, made(values, stacked))
 

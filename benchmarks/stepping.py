@@ -26,7 +26,6 @@ from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators import Commands
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 
 ROBOT, PERIOD, SOLVES, ACTIONS = "trunk_sofa", 0.05, 5, 20
@@ -99,7 +98,7 @@ def whole(model: TrunkSimulator, lanes: int, seconds: float) -> tuple[float, flo
     values, commands = drawn(lanes, model.pushes)
     clock = PERIOD * np.arange(ACTIONS + 1)
     grid = [model.commands(clock[:-1], rows, np.zeros(8), clock) for rows in commands]
-    stacked = Commands(*(np.stack(parts) for parts in zip(*grid, strict=True)))
+    stacked = jax.tree.map(lambda *parts: np.stack(parts), *grid)
     rollout = jax.jit(jax.vmap(lambda v, c: model.rollout(v, c).position))
     return rate(lambda: np.asarray(rollout(values, stacked)), lanes * ACTIONS * SOLVES, seconds)
 

@@ -65,7 +65,7 @@ class CalibrationProblem:
         digest = hashlib.sha256()
         recordings = self.model.recordings
         data = self.measured.values()
-        for array in (*data, recordings.time, *recordings.line, *recordings.commands):
+        for array in (*data, recordings.time, *jax.tree.leaves((recordings.line, recordings.commands))):
             digest.update(np.ascontiguousarray(array).tobytes())
         priors = [(p.name, sorted((p.table or {}).items())) for p in self.model.space.parameters]
         rest = (

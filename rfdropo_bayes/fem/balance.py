@@ -108,7 +108,7 @@ def check_effects(effects: BodyEffects) -> None:
             )
 
 
-def _pull(
+def cable_force(
     layout: CableLayout,
     guides: Float[Array, "cables guides nodes"],
     position: Float[Array, "nodes 3"],
@@ -182,7 +182,7 @@ def layered_balance(
         memory = within(system, prepared, state, time_step)
         linear = linearised(system, prepared, state._replace(memory=memory), time_step)
         change = (moving - state.velocity).reshape(stations, -1, 1)
-        cable = _pull(system.cables, prepared.guides, state.position, pulling)
+        cable = cable_force(system.cables, prepared.guides, state.position, pulling)
         residual = (multiply(linear.matrix, change).reshape(-1, 3) - linear.right) / time_step - cable
         frame, local = frames_and_displacements(system, prepared, state.position)
         tangent = corotational.tangent(resistance(prepared, local)[1], frame)
@@ -218,7 +218,7 @@ def tetrahedral_balance(
         before, slower, after, moving, pulling = at
         turn = element_rotations(body, before)
         viscous = nodal_force(body, turn, moving, 0.0, lame)
-        cable = _pull(system.cables, guides, before, pulling)
+        cable = cable_force(system.cables, guides, before, pulling)
         inertia = mass * ((moving - slower) / time_step - material.gravity + material.rayleigh_mass * moving)
         lookahead = time_step + material.rayleigh_stiffness
         elastic = nodal_force(body, turn, before, jnp.asarray(body.rest), lame) + lookahead * viscous

@@ -28,7 +28,7 @@ from rfdropo_bayes.fem.blocktridiagonal import BlockTridiagonal, at_stations, mu
 from rfdropo_bayes.fem.cable_friction import slip_problem, slipped, start_slip
 from rfdropo_bayes.fem.cable_strings import crossing_weights, string_stiffness
 from rfdropo_bayes.fem.cables import CableLayout, guide_matrix, lengths_and_jacobian
-from rfdropo_bayes.fem.constrained_step import ConstrainedStep, Pull, Solve, constrained_step, meet
+from rfdropo_bayes.fem.constrained_step import ConstrainedStep, Pull, Push, Solve, constrained_step, meet
 from rfdropo_bayes.fem.effects import BodyEffects, Memory, Scalar
 from rfdropo_bayes.fem.integrators import EULER, STAGES, Integrator, Stage
 from rfdropo_bayes.fem.layered import LayeredBody
@@ -417,7 +417,7 @@ def step(
     tension, and says so: a batch goes on. Where there is a scene, the material has effects with a memory, or a step has
     several stages, the state comes from ``remembering``.
     """
-    take = partial(_take_stage, system, prepared, time_step=time_step, external=external_force, scene=scene, cube=cube)
+    take = partial(take_stage, system, prepared, time_step=time_step, external=external_force, scene=scene, cube=cube)
     return in_stages(take, state, displacement, STAGES[integrator])
 
 
@@ -440,20 +440,28 @@ def in_stages(
     return here._replace(commanded=displacement), codes
 
 
-def _take_stage(
+class StageBegun(NamedTuple):
+    """What a stage solves, before its constraints."""
+
+    at: State  # where forces are taken, with the memory of the stage
+    push: Push | None
+    stage: Stage  # made longer by impacts
+    linear: Linear
+
+
+def begin_stage(
     system: System,
     prepared: Prepared,
     state: State,
-    displacement: Float[Array, " cables"],
     stage: Stage,
     carried: Carried | None,
     *,
     time_step: Scalar,
-    external: Float[Array, "nodes 3"] | float,
-    scene: PushGeometry | None,
-    cube: Cube | None,
-) -> tuple[State, StepInfo, Carried | None]:
-    """One stage of a step, see ``fem.integrators``."""
+    external: Float[Array, "nodes 3"] | float = 0.0,
+    scene: PushGeometry | None = None,
+    cube: Cube | None = None,
+) -> StageBegun:
+    """Linearise a stage that starts from a state; ``carried`` is of the stage before."""
     at = state._replace(memory=within(system, prepared, state, time_step, stage))
     if stage.predicted:
         at = at._replace(position=state.position + stage.elapsed * time_step * state.velocity)
@@ -463,12 +471,30 @@ def _take_stage(
         change = None if carried is None else carried.twist
         place = at.position, at.velocity, around
         push, stage = meet(scene, cube, state.cube, state.touch, *place, stage, time_step, change)
-    length = stage.span * time_step
-    matrix, right = linearised(system, prepared, at, time_step, external, stage)
+    linear = linearised(system, prepared, at, time_step, external, stage)
     if carried is not None:
         going = mass_times(system, prepared, carried.velocity) - carried.sudden
-        right = right + stage.going * going
-    slip = None
+        linear = linear._replace(right=linear.right + stage.going * going)
+    return StageBegun(at, push, stage, linear)
+
+
+def take_stage(
+    system: System,
+    prepared: Prepared,
+    state: State,
+    displacement: Float[Array, " cables"],
+    stage: Stage,
+    carried: Carried | None,
+    *,
+    time_step: Scalar,
+    external: Float[Array, "nodes 3"] | float = 0.0,
+    scene: PushGeometry | None = None,
+    cube: Cube | None = None,
+) -> tuple[State, StepInfo, Carried | None]:
+    """One stage of a step, see ``fem.integrators``."""
+    around: dict[str, Any] = {"time_step": time_step, "external": external, "scene": scene, "cube": cube}
+    at, push, stage, (matrix, right) = begin_stage(system, prepared, state, stage, carried, **around)
+    length, slip = stage.span * time_step, None
     mobilised, segment = state.memory.slip, state.memory.segment
     if mobilised is not None and segment is not None:
         if carried is not None and carried.slip is not None:

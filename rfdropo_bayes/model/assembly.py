@@ -46,7 +46,7 @@ from rfdropo_bayes.model.model_spec import DataChannels, ModelSpec
 from rfdropo_bayes.robots import DriveTravel, Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
-from rfdropo_bayes.simulators.body_engine import Engine
+from rfdropo_bayes.simulators.body_engine import Engine, Integrator
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, assemble_mesh
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
@@ -76,6 +76,11 @@ def robot_of(spec: ModelSpec) -> Robot:
     return spec.robot
 
 
+def integrator_of(spec: ModelSpec) -> Integrator | None:
+    """How time steps are taken: as [simulator] says, or else the robot; None for a black box."""
+    return None if isinstance(spec.robot, BlackBox) else spec.simulator.integrator or spec.robot.integrator
+
+
 def build_simulator(spec: ModelSpec) -> AnySimulator:
     """The simulator of a model, mechanisms included."""
     if isinstance(spec.robot, BlackBox):
@@ -92,19 +97,19 @@ def build_robot_simulator(spec: ModelSpec) -> RobotSimulator:
     table, robot = spec.simulator, with_drives(robot_of(spec), spec.drives, spec.groups)
     if table.drives == "direct":
         robot = robot.without_command_timing()
-    time_step = table.time_step or robot.time_step_s
+    time_step, integrator = table.time_step or robot.time_step_s, table.integrator or robot.integrator
     trunk: TrunkSimulator | MeshTrunkSimulator
     if table.body == "tetrahedra" and table.tetrahedra is not None:
         options = table.tetrahedra
         mesh = read_tetrahedra(find_data_file(options.mesh, spec.folder), options.unit)
         bound = assemble_mesh(robot, mesh, options)
-        engine = Engine(bound, time_step, backend(table, False), integrator=table.integrator)
+        engine = Engine(bound, time_step, backend(table, False), integrator=integrator)
         trunk = MeshTrunkSimulator(robot, engine, bound, options, time_step)
     else:
         discretisation = Discretisation(time_step, table.nodes_across, table.refine)
         assembly = assemble(robot, discretisation)
         settled = robot.initial_state == "equilibrium"
-        engine = Engine(assembly, time_step, backend(table, True), settled, integrator=table.integrator)
+        engine = Engine(assembly, time_step, backend(table, True), settled, integrator=integrator)
         trunk = TrunkSimulator(robot, engine, assembly, discretisation)
     return _with_mechanisms(trunk.pushing() if table.push else trunk, spec)
 

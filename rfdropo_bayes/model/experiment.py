@@ -143,10 +143,10 @@ class SimulatorTable(ExperimentTable):
         description="of the compiled engine; stiff bodies lose their answer in float32",
     )
     time_step: float | None = Field(default=None, gt=0.0, le=0.1, description="time step [s]; the robot's by default")
-    integrator: Literal["euler", "sdirk2"] = Field(
-        default="euler",
-        description='"euler" takes one solve a step, as SOFA does; "sdirk2", of second order, takes two and comes '
-        "about ten times nearer to the converged motion",
+    integrator: Literal["euler", "sdirk2"] | None = Field(
+        default=None,
+        description='"sdirk2", of second order, takes two solves a step and comes about ten times nearer to the '
+        'converged motion than "euler", which takes one, as SOFA does; the robot\'s by default',
     )
     nodes_across: Literal[2, 3] = Field(default=2, description="nodes along a side of a layer")
     refine: int = Field(default=1, ge=1, le=16, description="each layer is cut into so many")

@@ -19,10 +19,13 @@ ROBOT_COPY = "robot.toml"
 MODEL_FILES = (".toml", ".xml", ".urdf")
 FILE_KEYS = ("observations", "commands")
 NO_COMMANDS = "none"  # stands for zero commands where a file of them could be named
+WRITTEN_BY_RUNS = ("config.toml", "extended.toml")
+RESULTS_OF_RUNS = ("run.json", "summary.json", "audit.json")
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """Tables of a TOML file.
+    """Tables of a TOML file. One that a run wrote states its integrator; where an earlier version wrote it, it says
+    nothing, and is read as ``"euler"``, which that version had alone.
 
     Raises:
         InputError: no such file, or not TOML.
@@ -36,9 +39,14 @@ def read_tables(path: Path) -> dict[str, Any]:
             f"cannot read the experiment file: {reason}", where=str(path), remedy="check the path"
         ) from None
     try:
-        return tomllib.loads(text)
+        tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"not valid TOML: {error}", where=str(path), remedy="mend the syntax there") from None
+    if path.name in WRITTEN_BY_RUNS and any((path.parent / name).is_file() for name in RESULTS_OF_RUNS):
+        stated = tables.setdefault("simulator", {})
+        if isinstance(stated, dict):
+            stated.setdefault("integrator", "euler")
+    return tables
 
 
 def override(tables: dict[str, Any], assignment: str, fields: Container[str]) -> None:

@@ -20,6 +20,7 @@ from rfdropo_bayes.model.assembly import (
     build_simulator,
     expand_groups,
     fixed_values,
+    integrator_of,
     load_data,
     measurement_specs,
     model_specs,
@@ -218,11 +219,17 @@ class Model:
         return {**self.tables(), **(meant if self.file is None else {}), **stated}
 
     def tables(self) -> dict[str, Any]:
-        """The tables of the file it was read from, or of one that says the same, as far as a file can."""
+        """The tables of the file it was read from, or of one that says the same, as far as a file can; the integrator
+        is stated, so that another default does not change what they mean."""
         if self.file is not None:
-            return dict(self.file.tables)
-        robot = ROBOT_COPY if self.texts() else self.spec.named or self.name
-        return {"robot": robot, **self.settings.tables(), **self.spec.tables()}
+            found = dict(self.file.tables)
+        else:
+            robot = ROBOT_COPY if self.texts() else self.spec.named or self.name
+            found = {"robot": robot, **self.settings.tables(), **self.spec.tables()}
+        integrator = integrator_of(self.spec)
+        if integrator is not None:
+            found["simulator"] = {**found.get("simulator", {}), "integrator": integrator}
+        return found
 
     def texts(self) -> dict[str, str]:
         """Files that the tables name and no folder holds: the description of a robot that was made in Python."""

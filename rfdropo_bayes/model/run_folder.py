@@ -29,6 +29,10 @@ FREE_TO_CHANGE = (
 )
 
 
+# What runs of earlier versions meant where their settings say nothing.
+MEANT_EARLIER = {"experiment.simulator.integrator": "euler"}
+
+
 class RunKind(NamedTuple):
     """What a command writes: the first of ``results`` says that it has ended; and whether it can be resumed."""
 
@@ -198,6 +202,7 @@ def check_folder(out: Path, command: str, *, resume: bool = False, overwrite: bo
 def _check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     """Raise InputError where the run began with other settings; names the first few."""
     old, new = dict(_flat(before)), dict(_flat(json.loads(json.dumps(now, default=str))))
+    old = {name: value for name, value in MEANT_EARLIER.items() if name in new} | old
     differing = [name for name in {**old, **new} if name not in FREE_TO_CHANGE and old.get(name) != new.get(name)]
     if not differing:
         return

@@ -25,7 +25,7 @@ def trunk_simulator(
     precision: Literal["float32", "float64"] = "float64",
     threads: int | None = None,
     time_step: float | None = None,
-    integrator: Integrator = "euler",
+    integrator: Integrator | None = None,
     folder: Path = Path(),
 ) -> RobotSimulator:
     """The layered trunk on the compiled engine, as episodes want it.
@@ -37,13 +37,13 @@ def trunk_simulator(
             tip by 0.01 mm.
         threads: that the engine may use; all processors by default.
         time_step: [s]; the robot's own by default.
-        integrator: how a time step is taken.
+        integrator: how a time step is taken; as the robot says by default.
     """
     discretisation = Discretisation(time_step or robot.time_step_s)
     assembly = assemble(robot, discretisation)
     backend = Backend("numba", precision, threads)
     settled = robot.initial_state == "equilibrium"
-    engine = Engine(assembly, discretisation.time_step, backend, settled, integrator=integrator)
+    engine = Engine(assembly, discretisation.time_step, backend, settled, integrator=integrator or robot.integrator)
     found = mechanisms_named(list(mechanisms), robot, folder=folder)
     trunk = TrunkSimulator(robot, engine, assembly, discretisation, found)
     return trunk.pushing() if push else trunk
@@ -60,7 +60,7 @@ def make_episodes(
     randomisation: Randomisation | None = None,
     precision: Literal["float32", "float64"] = "float64",
     threads: int | None = None,
-    integrator: Integrator = "euler",
+    integrator: Integrator | None = None,
     **settings: Any,
 ) -> Episodes:
     """Lanes of a task.

@@ -20,7 +20,6 @@ from rfdropo_bayes.fem import LayeredBody
 from rfdropo_bayes.fem.balance import Balance, tetrahedral_balance
 from rfdropo_bayes.fem.cable_drive import DriveLimits
 from rfdropo_bayes.fem.layered import PointMap, joined
-from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.tetrahedra import (
     TetrahedralBody,
     locate,
@@ -32,7 +31,7 @@ from rfdropo_bayes.fem.tetrahedra import (
 from rfdropo_bayes.fem.tetrahedral_dynamics import TetrahedralMaterial, TetrahedralSystem, tetrahedral_system
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import TetrahedralMesh
-from rfdropo_bayes.simulators.body_engine import Engine
+from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine
 from rfdropo_bayes.simulators.commands import Commands, animated_on_grid
 from rfdropo_bayes.simulators.mechanisms import Mechanism, Values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -201,9 +200,20 @@ class MeshTrunkSimulator(RobotSimulator):
         displacement = self.displacements(values, commands)
         return self.material(values), jnp.zeros_like(displacement[0]), displacement
 
-    def balance_of(self, material: TetrahedralMaterial, motion: Motion) -> Balance:
-        """See `RobotSimulator`; the energies are those of the body."""
-        return tetrahedral_balance(self.assembly.system, material, motion.position, motion.tension, self.time_step)
+    def balance_of(self, inputs: tuple[TetrahedralMaterial, Array, Array], cube: CubeInputs | None) -> Balance:
+        """See `RobotSimulator`; the energies are those of the body.
+
+        Raises:
+            InputError: another integrator than implicit Euler, whose states alone tell the velocities.
+        """
+        if self.engine.integrator != "euler":
+            raise InputError(
+                f"forces and energies of a mesh are not available with integrator {self.engine.integrator!r}",
+                where="balance",
+                remedy='use integrator = "euler" under [simulator], with shorter steps',
+            )
+        motion = self.motion_of_nodes(inputs, cube)
+        return tetrahedral_balance(self.assembly.system, inputs[0], motion.position, motion.tension, self.time_step)
 
     def displacements(self, values: Values, commands: Commands) -> Float[Array, "step cable"]:
         """Commanded cable displacements [m] at the end of every step; SOFA's limits are those of the engine."""

@@ -12,9 +12,9 @@ from jaxtyping import Array
 
 from rfdropo_bayes.fem import LayeredBody, Material, PointMap, System, attach, cable_layout, prepare, profile_body
 from rfdropo_bayes.fem.balance import Balance, layered_balance
-from rfdropo_bayes.fem.rollouts import Motion
+from rfdropo_bayes.fem.stage_balance import stepped_balance
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.body_engine import Engine
+from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.control_session import Session
 from rfdropo_bayes.simulators.mechanisms import Mechanism, Values
@@ -99,10 +99,18 @@ class TrunkSimulator(RobotSimulator):
         """See `RobotSimulator`."""
         return self.material(values), *self.wound(values, commands, self.time_step)
 
-    def balance_of(self, material: Material, motion: Motion) -> Balance:
+    def balance_of(self, inputs: tuple[Material, Array, Array], cube: CubeInputs | None) -> Balance:
         """See `RobotSimulator`; the energies are those of the body."""
-        system = self.assembly.system
-        return layered_balance(system, prepare(system, material), motion.position, motion.tension, self.time_step)
+        system, engine = self.assembly.system, self.engine
+        if engine.integrator == "euler":
+            motion, prepared = self.motion_of_nodes(inputs, cube), prepare(system, inputs[0])
+            return layered_balance(system, prepared, motion.position, motion.tension, self.time_step)
+        material, start, displacement = inputs
+        prepared, state, _ = engine.initial(material, start)
+        around = () if cube is None else (engine.scene, cube.cube)
+        if cube is not None:
+            state = state._replace(cube=cube.start)
+        return stepped_balance(system, prepared, state, displacement, self.time_step, engine.integrator, *around)
 
     def material(self, values: Values) -> Material:
         """See `RobotSimulator`."""

@@ -27,7 +27,7 @@ from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import CommandsTable
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.studies.fits import Job, run_fits
-from rfdropo_bayes.studies.hidden_effects import Hidden, Setting, hide
+from rfdropo_bayes.studies.hidden_effects import EARLIER, Hidden, Setting, hide
 from rfdropo_bayes.verbs.audit import JOURNAL, Workshop, audit
 
 RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
@@ -89,7 +89,7 @@ class Condition:
         if self.effects:
             return Setting()
         audited, made = {"refine": 4, "time_step": 0.005}, {"refine": 5, "time_step": 0.05 / 11}
-        return Setting(audited=audited, made=made, shared=SHARED if self.shared else 0.0)
+        return Setting(audited=EARLIER | audited, made=EARLIER | made, shared=SHARED if self.shared else 0.0)
 
 
 CONDITIONS = (

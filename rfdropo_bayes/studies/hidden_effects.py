@@ -40,6 +40,7 @@ from rfdropo_bayes.verbs.random_commands import random_walk
 NOISE, MEMORY = 5e-4, 0.6  # standard deviation [m] and correlation from row to row
 TENSION_NOISE = 0.02  # of a tension reading
 REPEATS, UNTOUCHED = 3, 6
+EARLIER = {"integrator": "euler"}  # the ledgers in reports/audit_power and reports/unknown_effects were begun with it
 SIZES = np.geomspace(1e-4, 60.0, 40)  # multiples of the prior's scale among which a size is looked for
 
 
@@ -62,8 +63,8 @@ class Setting:
             duration=5.0, interval=0.2, step=0.0025, low=0.0, high=0.01, sample_time=0.05, recordings=["any"]
         )
     )
-    audited: Mapping[str, Any] = field(default_factory=lambda: {"refine": 2, "time_step": 0.005})
-    made: Mapping[str, Any] = field(default_factory=lambda: {"refine": 3, "time_step": 0.05 / 12})
+    audited: Mapping[str, Any] = field(default_factory=lambda: {**EARLIER, "refine": 2, "time_step": 0.005})
+    made: Mapping[str, Any] = field(default_factory=lambda: {**EARLIER, "refine": 3, "time_step": 0.05 / 12})
     spread: float = 0.3
     priors: Mapping[str, Mapping[str, Any]] = field(
         default_factory=lambda: {

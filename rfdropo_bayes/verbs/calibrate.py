@@ -21,8 +21,10 @@ from rfdropo_bayes.groups import gather_groups
 from rfdropo_bayes.inference.methods import make_config, method_named, method_of, run
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.inference.result import InferenceResult
+from rfdropo_bayes.model.assembly import integrator_of
 from rfdropo_bayes.model.experiment import InferenceTable
 from rfdropo_bayes.model.experiment_file import describe
+from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers, RecordingPrediction
@@ -133,7 +135,7 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
         problem = problem.telling(progress.spend)
         result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
     problem = problem.holding(result.held)
-    attributes = {**_attributes(model.name, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
+    attributes = {**_attributes(model, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
     record, unmatched = record_posterior(asked, problem, result, predicting, attributes, show=show)
     facts = gather_facts(model.title, seed, problem, result, runs, test, record, unmatched)
     return Calibration(record, build_summary(record, facts), text, model, out)
@@ -361,10 +363,12 @@ def known_noise(problem: CalibrationProblem) -> dict[str, Any]:
     return {} if known is None else {KNOWN_NOISE: {"markers": list(markers), **known.as_dict()}}
 
 
-def _attributes(robot: str, seed: int, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
+def _attributes(model: Model, seed: int, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
+    integrator = integrator_of(model.spec)
     return {
         "seed": seed,
-        "robot": robot,
+        "robot": model.name,
         "data_sha256": [trajectory.sha256 for trajectory in trajectories],
         "versions": software_versions(),
+        **({} if integrator is None else {INTEGRATOR: integrator}),
     }

@@ -10,6 +10,7 @@ import numpy as np
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_json, write_text
+from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import run_folder
 from rfdropo_bayes.policies.episodes import Episodes, Settings
@@ -102,6 +103,7 @@ def evaluate(
             if film:
                 _film(batch, found[name], cases, out / f"{name}.gif")
         content = _judged(found, cases, seed)
+        content["otherwise_trained"] = _otherwise_trained(loaded, simulator.engine.integrator)
         with whole(out / CSV) as partial:
             episode_table(found, cases).to_csv(partial, index=False)
         success_figure(found, THRESHOLDS).savefig(out / FIGURE, dpi=150)
@@ -130,6 +132,16 @@ def _episodes_for(
     batch = Episodes(simulator, task, lanes, randomisation, settings)
     batch.layout.require(layout, where=name)
     return batch
+
+
+def _otherwise_trained(policies: Mapping[str, ExportedPolicy], integrator: str) -> list[str]:
+    """Sentences on policies that were trained with another integrator; one that says nothing was with Euler's."""
+    trained = {name: policy.facts.get(INTEGRATOR, "euler") for name, policy in policies.items()}
+    return [
+        f"{name} was trained with integrator {given!r}, and is evaluated with {integrator!r}."
+        for name, given in trained.items()
+        if given != integrator
+    ]
 
 
 def _names(policies: Sequence[Path]) -> list[str]:
@@ -195,4 +207,4 @@ def evaluation_table(content: Mapping[str, Any]) -> str:
             str(row["diverged"]),
         ]
         lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *(f"\n{sentence}" for sentence in content.get("otherwise_trained", []))]) + "\n"

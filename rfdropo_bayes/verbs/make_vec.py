@@ -9,6 +9,7 @@ from typing import Any
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import build_robot_simulator, physical_values
+from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.policies.episodes import Episodes, Settings
@@ -24,6 +25,8 @@ from rfdropo_bayes.policies.randomisation import (
 from rfdropo_bayes.policies.tasks import Task, task_named
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
+from rfdropo_bayes.posteriors import PosteriorRecord
+from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import OBJECT
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -89,7 +92,8 @@ def randomisation_of(
     A task without a cube has no use for what the experiment says of one.
 
     Raises:
-        InputError: a posterior beside another ``randomisation`` of [training]: one of the two is not meant.
+        InputError: a posterior beside another ``randomisation`` of [training]: one of the two is not meant; or one that
+            was fitted with another integrator.
     """
     stated = table.randomisation if "randomisation" in table.model_fields_set else None
     if posterior is not None and stated not in (None, "posterior"):
@@ -102,9 +106,11 @@ def randomisation_of(
     held = replace(spec, fixed={name: value for name, value in spec.fixed.items() if name not in absent})
     parts: list[Randomisation] = [Point(physical_values(held, simulator))]
     if isinstance(posterior, Calibration):
+        fitted = fitted_integrator(posterior.record.attrs, posterior.folder)
+        check_fitted_integrator(fitted, simulator.engine.integrator, where="posterior")
         parts.append(drawn_rows(posterior.record, simulator.parameters, robot=simulator.robot))
     elif posterior is not None:
-        parts.append(read_posterior(Path(posterior), simulator.parameters, simulator.robot))
+        parts.append(_of_run(Path(posterior), simulator))
     elif table.randomisation != "none":
         parts.append(_randomised(table, simulator, spec.folder))
     kind = parts[-1].kind
@@ -128,6 +134,18 @@ def _randomised(table: TrainingTable, simulator: RobotSimulator, folder: Path) -
         )
     beside = folder / table.source
     source = beside if beside.exists() else Path(table.source)
-    if table.randomisation == "phi":
-        return read_phi(source, simulator.parameters, simulator.robot)
-    return read_posterior(source, simulator.parameters, simulator.robot)
+    return _of_run(source, simulator, phi=table.randomisation == "phi")
+
+
+def _of_run(source: Path, simulator: RobotSimulator, *, phi: bool = False) -> Randomisation:
+    """The posterior, or phi, of a run's folder or file, of which parameters are drawn.
+
+    Raises:
+        InputError: it was fitted with another integrator than the simulator's.
+    """
+    found = (read_phi if phi else read_posterior)(source, simulator.parameters, simulator.robot)
+    folder = source if source.is_dir() else source.parent
+    attributes = {} if phi else PosteriorRecord.load(source / POSTERIOR if source.is_dir() else source).attrs
+    fitted = fitted_integrator(attributes, folder)
+    check_fitted_integrator(fitted, simulator.engine.integrator, where=str(source))
+    return found

@@ -33,7 +33,8 @@ from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json
 from rfdropo_bayes.groups import Patterns, group_of, in_group
-from rfdropo_bayes.model.assembly import KNOWN, fixed_values, model_specs, with_groups
+from rfdropo_bayes.model.assembly import KNOWN, fixed_values, integrator_of, model_specs, with_groups
+from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.posteriors import SPREAD, PosteriorRecord, RecordingPrediction
@@ -147,9 +148,11 @@ def model_of(fit: Calibration) -> Model:
     """The model of a calibration.
 
     Raises:
-        InputError: it was read from files that do not say which.
+        InputError: it was read from files that do not say which, or the model has another integrator than the fit.
     """
     if fit.model is not None:
+        fitted = fitted_integrator(fit.record.attrs, fit.folder)
+        check_fitted_integrator(fitted, integrator_of(fit.model.spec), where=f"posterior of {fit.model.name}")
         return fit.model
     why = "no config.toml says which"
     if fit.folder is not None and (fit.folder / CONFIG).is_file():
@@ -222,7 +225,7 @@ def run_prediction(
         raise InputError("the experiment has no [data]", where=path, remedy="say in which format the commands are")
     record = PosteriorRecord.load(Path(posterior) / POSTERIOR)
     unseen = load_unseen(read.data, folder, commands, start, rows, record.attrs.get(BEGUN), episode)
-    fit = Calibration(record, {}, "", model)
+    fit = Calibration(record, {}, "", model, Path(posterior))
     found = predict(fit, unseen, seed=read.seed if seed is None else seed, group=group)
     options: dict[str, Any] = {"posterior": posterior, "commands": commands, "start": start, "rows": rows, "seed": seed}
     options |= {"group": group, "episode": episode}

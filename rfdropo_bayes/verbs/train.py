@@ -10,6 +10,7 @@ import numpy as np
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json, write_text
+from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import run_folder
 from rfdropo_bayes.policies.episodes import Episodes
@@ -84,6 +85,8 @@ def train(
             "randomisation": randomisation.kind,
             "posterior_sha256": randomisation.sha256,
             "simulator_sha256": str(known["simulator"]),
+            INTEGRATOR: simulator.engine.integrator,
+            "time_step_s": f"{simulator.time_step:g}",
             "seed": str(seed),
         }
         policy = ExportedPolicy(export_policy(found.model, found.normalisation, layout, out / POLICY, facts))
@@ -143,6 +146,7 @@ def policy_card(summary: Mapping[str, Any], layout: PolicyLayout) -> str:
     return f"""# A policy for {summary["task"]}
 
 Trained in simulation by {summary["algorithm"]}: {summary["steps"]} steps in {summary["seconds"]:.0f} s, seed {seed}.
+Time steps: {summary["integrator"]}, {1e3 * float(summary["time_step_s"]):g} ms.
 Parameters of every episode: {summary["randomisation"]}, SHA-256 {summary["posterior_sha256"][:16]}.
 
 This is the policy after {best["steps"]} steps, the best evaluated: half of {episodes} episodes end within

@@ -21,7 +21,7 @@ TABLES = {
     "title": "all keys",
     "data": {"format": "netcdf", "fit": [{"observations": "one.nc"}]},
     "noise": {"standard_deviation": 1e-3},
-    "simulator": {"refine": 2},
+    "simulator": {"refine": 2, "integrator": "sdirk2"},
     "inference": {"method": "laplace", "rollouts": 700, "starts": 2},
     "audit": {"exclude": ["payload"]},
     "model": {

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.assembly import build_robot_simulator
+from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
 from rfdropo_bayes.simulators.body_engine import Backend, Engine
@@ -97,8 +99,28 @@ def test_both_engines_balance_alike():
     assert np.abs(one.base_force).max() > 0.1
 
 
-def test_only_the_states_of_implicit_euler_tell_the_velocities(trunk):
+def test_only_the_states_of_implicit_euler_tell_the_velocities_of_a_mesh(trunk):
     """Another integrator is refused rather than taken for it."""
     other = replace(trunk, engine=replace(trunk.engine, integrator="sdirk2"))
-    with pytest.raises(InputError, match="integrator 'sdirk2'"):
+    with pytest.raises(InputError, match="of a mesh are not available with integrator 'sdirk2'"):
         other.balance({}, every_step(trunk, 5))
+
+
+@pytest.mark.slow
+def test_an_arm_that_hangs_still_is_carried_by_its_base_under_sdirk2():
+    """And one that is pulled gets its energy from the cables: another integrator tells nearly the same."""
+    robot = Robot.load("smooth_arm").with_changes(initial_state="equilibrium")
+    arm = build_robot_simulator(ModelSpec(robot))
+    assert arm.engine.integrator == "sdirk2"
+    rows, channels = 20, len(robot.channel_names)
+    value = np.zeros((rows, channels))
+    value[10:, 1] = 2e-3
+    commands = arm.commands(0.05 * np.arange(rows), value, np.zeros(channels), 0.05 * np.arange(rows + 1))
+    found = jax.jit(arm.balance)({}, commands)
+    weight = robot.nominal()["trunk_mass"] * robot.gravity
+    np.testing.assert_allclose(found.base_force[:10], np.tile(-weight, (10, 1)), atol=1e-3 * np.linalg.norm(weight))
+    euler = replace(arm, engine=replace(arm.engine, integrator="euler"))
+    other = jax.jit(euler.balance)({}, commands)
+    worked = float(found.cable_work[-1])
+    assert worked == pytest.approx(float(other.cable_work[-1]), rel=0.1)
+    assert abs(float(found.other_loss[-1])) < 0.3 * abs(float(other.other_loss[-1]))

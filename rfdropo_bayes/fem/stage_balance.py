@@ -1,0 +1,151 @@
+"""Forces and energies of rollouts whose states do not tell what the stages of a step did: they are simulated again.
+
+Over a step of two stages the momentum changes by all impulses of the second and by those of the first times
+1 + going (``fem.integrators``), without the share of its impacts that is not carried on. With the same weights the
+velocities at the ends of the stages add up to the way, so that work is summed by stages.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from rfdropo_bayes.fem import corotational
+from rfdropo_bayes.fem.balance import Balance, Energies, cable_force, check_effects, energies
+from rfdropo_bayes.fem.blocktridiagonal import multiply
+from rfdropo_bayes.fem.dynamics import (
+    Prepared,
+    StageBegun,
+    State,
+    System,
+    begin_stage,
+    frames_and_displacements,
+    linearised,
+    mass_times,
+    remembering,
+    resistance,
+    take_stage,
+)
+from rfdropo_bayes.fem.effects import Scalar
+from rfdropo_bayes.fem.integrators import STAGES, Integrator
+from rfdropo_bayes.fem.pushing import PushGeometry
+from rfdropo_bayes.fem.rigid_body import Cube
+
+
+class _Done(NamedTuple):
+    """Impulses [N s] and work [J] of a stage, or of a step."""
+
+    residual: Float[Array, "nodes 3"]  # of what holds and touches the body
+    held: Float[Array, ""]  # its work
+    pulled: Float[Array, ""]  # work of the cables
+    lost: Float[Array, ""]  # to Rayleigh damping
+
+
+class _Reached(NamedTuple):
+    """Where a step ends, and what it did."""
+
+    position: Float[Array, "nodes 3"]
+    done: _Done
+    stored: Energies
+
+
+def _done(system: System, prepared: Prepared, before: State, after: State, begun: StageBegun, length: Scalar) -> _Done:
+    """What a stage did, of this length [s]."""
+    at, stations, velocity = begun.at, len(system.body.station), after.velocity
+    cable = length * cable_force(system.cables, prepared.guides, at.position, after.tension)
+    change = (velocity - before.velocity).reshape(stations, -1, 1)
+    residual = multiply(begun.linear.matrix, change).reshape(-1, 3) - begun.linear.right - cable
+    frame, local = frames_and_displacements(system, prepared, at.position)
+    tangent = corotational.tangent(resistance(prepared, local)[1], frame)
+    strained = multiply(tangent, velocity.reshape(stations, -1, 1)).reshape(-1, 3)
+    dragged = prepared.rayleigh_mass * mass_times(system, prepared, velocity)
+    lost = length * jnp.sum(velocity * (dragged + prepared.rayleigh_stiffness * strained))
+    return _Done(residual, jnp.sum(residual * velocity), jnp.sum(cable * velocity), lost)
+
+
+def _step(
+    system: System,
+    prepared: Prepared,
+    before: State,
+    displacement: Float[Array, " cables"],
+    integrator: Integrator,
+    around: dict[str, Any],
+) -> tuple[State, _Reached]:
+    """One step to the commanded cable displacements [m]."""
+    start = displacement if before.commanded is None else before.commanded
+    here, elapsed, carried, done = before, 0.0, None, None
+    for stage in STAGES[integrator]:
+        elapsed += stage.elapsed
+        begun = begin_stage(system, prepared, here, stage, carried, **around)
+        if carried is not None and done is not None:
+            going = begun.stage.going
+            impact, velocity = going * carried.sudden, here.velocity
+            done = jax.tree.map(lambda part, share=1.0 + going: share * part, done)
+            done = done._replace(residual=done.residual - impact, held=done.held - jnp.sum(impact * velocity))
+        given = start + elapsed * (displacement - start)
+        after, _, following = take_stage(system, prepared, here, given, stage, carried, **around)
+        own = _done(system, prepared, here, after, begun, begun.stage.span * around["time_step"])
+        done = own if done is None else jax.tree.map(jnp.add, done, own)
+        here, carried = after, following
+    if before.commanded is not None:
+        here = here._replace(commanded=displacement)
+    assert done is not None
+    return here, _Reached(here.position, done, energies(system, prepared, here))
+
+
+def stepped_balance(
+    system: System,
+    prepared: Prepared,
+    state: State,
+    displacement: Float[Array, "steps cables"],
+    time_step: Scalar,
+    integrator: Integrator,
+    scene: PushGeometry | None = None,
+    cube: Cube | None = None,
+) -> Balance:
+    """Forces and energies of a rollout of a layered body.
+
+    Args:
+        state: where it starts, with the commanded displacements before the first step.
+        displacement: commanded at the end of every step [m].
+        integrator: how a step is taken.
+        scene, cube: what the body touches.
+
+    Raises:
+        InputError: cables with friction.
+    """
+    check_effects(prepared.effects)
+    around: dict[str, Any] = {"time_step": time_step, "scene": scene, "cube": cube}
+    first = remembering(system, prepared, state, scene, integrator)
+    reached = lax.scan(lambda before, to: _step(system, prepared, before, to, integrator, around), first, displacement)[
+        1
+    ]
+    pulled = cable_force(system.cables, prepared.guides, first.position, first.tension)
+    still = -linearised(system, prepared, first, time_step).right / time_step - pulled
+    held = (jnp.arange(len(still)) < system.clamped_stations * system.body.section_nodes)[:, None]
+    acting = jnp.concatenate([still[None], reached.done.residual / time_step])
+    clamp = jnp.where(held, acting, 0.0)
+    touch = (acting - clamp).at[0].set(0.0)  # no step leads to the initial state: it may be about to fall
+    stored = jax.tree.map(
+        lambda row, rows: jnp.concatenate([row[None], rows]), energies(system, prepared, first), reached.stored
+    )
+
+    def summed(work: Float[Array, " steps"]) -> Float[Array, " rows"]:
+        return jnp.concatenate([jnp.zeros(1), jnp.cumsum(work)])
+
+    position = jnp.concatenate([first.position[None], reached.position])
+    return Balance(
+        base_force=clamp.sum(axis=1),
+        base_moment=jnp.cross(position, clamp).sum(axis=1),
+        contact_force=touch.sum(axis=1),
+        kinetic_energy=stored.kinetic,
+        elastic_energy=stored.elastic,
+        gravitational_energy=stored.gravitational,
+        cable_work=summed(reached.done.pulled),
+        contact_work=summed(reached.done.held),
+        damping_loss=summed(reached.done.lost),
+    )
