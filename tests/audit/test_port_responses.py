@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -121,8 +123,14 @@ def test_gains_on_what_is_left_out_are_those_of_refits(groups):
     gain, _, size, sd = left_out_gains(_sums(found, columns))
     assert len(_pieces(found.residual)) == (PIECES if groups == 1 else groups)
     for k in range(2):
-        assert gain[k] == pytest.approx(brute(found, columns[:, :, k]), rel=1e-6)
+        assert gain[k, 0] == pytest.approx(brute(found, columns[:, :, k]), rel=1e-6)
     assert abs(size[0] - 0.3) < 4.0 * sd[0]
+    null = np.random.default_rng(6).normal(size=(groups, VALUES, 2))
+    drawn = left_out_gains(_sums(found, columns, null))[0]
+    assert np.allclose(drawn[:, 0], gain[:, 0])
+    for draw in range(2):
+        alone = replace(found, residual=null[:, :, draw])
+        assert np.allclose(drawn[:, 1 + draw], left_out_gains(_sums(alone, columns))[0][:, 0])
 
 
 def test_splines_sum_to_one_and_follow_smooth_series():
