@@ -90,11 +90,10 @@ class FoundLaw:
         ports: evidence of every port before the first term.
         left_out: ports that the body cannot carry, with the reason.
         terms: refits of the law's terms, the last one with all of them; empty where none is worth it.
-        ties: of the first term: what a refit cannot tell from it, as (port, feature, score behind).
+        ties: refits of other terms in place of the first one that leave as little, within `TIED`; the best first.
         after: largest log evidence of any port once the law is in the model; None without a law.
-        tried: all refits of the first term.
         centre: times of the ports' signals [s].
-        gains: of all terms that passed the gate, before the first one.
+        gate: gain [nat] that a first term had to bring to left-out recordings; None where no port is significant.
     """
 
     ports: list[PortEvidence]
@@ -102,14 +101,18 @@ class FoundLaw:
     terms: list[Refit]
     ties: list[Refit]
     after: PortEvidence | None
-    tried: list[Refit]
     centre: Float[np.ndarray, " spline"]
-    gains: list[TermGain]
+    gate: float | None
 
     @property
     def last(self) -> Refit | None:
         """The model with all terms."""
         return self.terms[-1] if self.terms else None
+
+    @property
+    def rivals(self) -> list[Refit]:
+        """The first term, and what is tied with it; empty without a law."""
+        return [*self.terms[:1], *self.ties]
 
     def significant(self, family: float) -> list[PortEvidence]:
         """Ports where something acts."""
@@ -207,6 +210,7 @@ class LawSearch:
         seed: of simulated data sets.
         family: probability that a port is named where nothing is hidden.
         report: called with a line of words.
+        most: terms that a law may have.
     """
 
     ports: PortMap
@@ -215,6 +219,7 @@ class LawSearch:
     seed: int
     family: float
     report: Callable[[str], None] = lambda line: None
+    most: int = TERMS
 
     def find(self, target: FitTarget, fit: Fit) -> FoundLaw:
         """Where something acts that the model lacks, and by what law.
@@ -228,20 +233,19 @@ class LawSearch:
         values = self.table.over(found.levels)
         null = self._null(known, fit, found)
         where = evidences(found, null)
-        first, terms, tried, gains = where, list[Refit](), list[Refit](), list[TermGain]()
+        first, terms, ties, gates = where, list[Refit](), list[Refit](), list[float]()
         try:
-            while len(terms) < TERMS and where[0].adjusted_p <= self.family:
+            while len(terms) < self.most and where[0].adjusted_p <= self.family:
                 found = found if terms else self._sharpened(known, fit, found, values, where)
-                gate = self._gate(found, values, null)
-                ranked = self._ranked(found, values, gate)
-                gains = gains or ranked
+                gates.append(self._gate(found, values, null))
+                ranked = self._ranked(found, values, gates[-1])
                 refits = self._refits(known, terms, fit, where, ranked)
                 if not refits or refits[0].score <= 0.0:
                     break
-                tried = tried or refits
-                best = self._exchanged(known, terms, found, values, refits[0], gate)
+                best, others = self._exchanged(known, terms, found, values, refits, gates[-1])
                 if not _sure(best):
                     break
+                ties = ties if terms else _tied(best, others)
                 terms.append(best)
                 fit = as_measured(best.target, best.fit)
                 found = _relinearised(known, found, fit)
@@ -250,9 +254,8 @@ class LawSearch:
                 self._say(best, where[0])
         except OutOfTime:
             self.report("the time was up before the law was found")
-        ties = [r for r in tried[1:] if r.score > tried[0].score - TIED]
-        last = where[0] if terms else None
-        return FoundLaw(first, dict(self.ports.left_out), terms, ties, last, tried, found.basis.centre, gains)
+        last, gate = where[0] if terms else None, next(iter(gates), None)
+        return FoundLaw(first, dict(self.ports.left_out), terms, ties, last, found.basis.centre, gate)
 
     def _sharpened(
         self, known: FitTarget, fit: Fit, found: Responses, values: np.ndarray, where: Sequence[PortEvidence]
@@ -300,15 +303,16 @@ class LawSearch:
         return sorted(rows, key=lambda row: -row.gain)
 
     def _exchanged(
-        self, known: FitTarget, terms: Sequence[Refit], found: Responses, values: np.ndarray, chosen: Refit,
+        self, known: FitTarget, terms: Sequence[Refit], found: Responses, values: np.ndarray, refits: Sequence[Refit],
         gate: float,
-    ) -> Refit:  # fmt: skip
-        """A term climbed to its end, or another one in its place.
+    ) -> tuple[Refit, list[Refit]]:  # fmt: skip
+        """The best term climbed to its end, or another one in its place; and all others that were refitted.
 
         The base model has made up for a part of what it lacks, and the linear model does not see how far it goes back
         with a law. With a law in the model the base parameters are nearer to the truth. There the terms are ranked
         anew, with base parameters held to what is then known of them.
         """
+        chosen, every = refits[0], list(refits)
         best, tried = self._climbed(chosen), {(chosen.term.port, chosen.term.feature)}
         for _ in range(EXCHANGES):
             fit = as_measured(best.target, best.fit)
@@ -322,13 +326,15 @@ class LawSearch:
             fresh = [row for row in ranked if (row.port, row.feature) not in tried][:FRESH]
             tried |= {(row.port, row.feature) for row in fresh}
             others = [self._refit(known, terms, bare, row) for row in fresh]
+            every += others
             better = max(others, key=lambda refit: refit.score, default=best)
             if better.square >= best.square - 2.0:
                 break
             self.report(f"instead: {better.term.port.name}: {better.term.feature.formula(self.units[0])}")
             best = self._climbed(better)
         before = chosen.square + 2.0 * (chosen.score + self._cost(known))
-        return replace(best, score=0.5 * (before - best.square) - self._cost(known))
+        best, *every = (replace(r, score=0.5 * (before - r.square) - self._cost(known)) for r in (best, *every))
+        return best, every
 
     def _cost(self, known: FitTarget) -> float:
         """Nats that a term costs: its parameter, and the choice among all features at all ports."""
@@ -374,6 +380,15 @@ class LawSearch:
 
 
 FARTHEST = 100.0  # prior deviations within which a refit starts
+
+
+def _tied(best: Refit, others: Sequence[Refit]) -> list[Refit]:
+    """Refits of other terms that leave as little as the best one, within `TIED`; each term once, the best first."""
+    found: dict[tuple[Port, Feature], Refit] = {}
+    for refit in sorted(others, key=lambda refit: -refit.score):
+        found.setdefault((refit.term.port, refit.term.feature), refit)
+    found.pop((best.term.port, best.term.feature), None)
+    return [refit for refit in found.values() if refit.score > best.score - TIED]
 
 
 def _sure(refit: Refit) -> bool:

@@ -202,6 +202,14 @@ class PortedForward(Forward):
         return {**found, "position": seen + shift}
 
 
+def with_laws_of(own: Forward, forward: Forward) -> Forward:
+    """Rollouts of other recordings, with the laws that a model's own rollouts have."""
+    if not isinstance(own, PortedForward):
+        return forward
+    table = own.table if forward.lanes is own.table.lanes else FeatureTable(forward.lanes, own.table.features)
+    return own.instead_of(forward, table)
+
+
 def with_terms(coordinates: Coordinates, terms: Sequence[PlacedTerm]) -> Coordinates:
     """Coordinates with the coefficients of laws after all others; measured from null in prior deviations."""
     added = build_space([t.spec for t in terms], {t.spec.name: {} for t in terms}, {}, ())
