@@ -41,6 +41,7 @@ def one(name: str, rho: float, seed: int, folder: Path, workshop: Workshop) -> d
     line |= {"law": found.content["law"], "findings": [row["mechanism"] for row in found.content["findings"]]}
     line |= {"seconds": round(time.monotonic() - began, 1), "cpu_seconds": round(time.process_time() - used, 1)}
     line |= {"profile": found.content["profile"], "ports": leading_ports(found.content["ports"])}
+    line |= {"gate_nats": (found.content["ports"] or {}).get("gate_nats")}
     return line | judged(line, name, noise_of(unseen, hidden.clean))
 
 
