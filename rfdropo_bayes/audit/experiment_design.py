@@ -17,15 +17,18 @@ from scipy.stats import norm
 
 from rfdropo_bayes.audit.fit import Fit, FitTarget
 from rfdropo_bayes.audit.forward import Forward
+from rfdropo_bayes.audit.port_rollouts import with_laws_of
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """An explanation and its fit to the recordings at hand."""
+    """An explanation and its fit to the recordings at hand; ``forward`` has its law at a port, and is None where it is
+    none."""
 
     name: str
     fit: Fit
+    forward: Forward | None = None
 
 
 @dataclass(frozen=True)
@@ -69,10 +72,11 @@ def outlooks(
         measurements=replace(target.measurements, channels=channels, count=valid.astype(float), members=()),
     )
     models = [base, *(h.fit for h in hypotheses)]
-    predicted = [-fresh.errors(fit.x) for fit in models]
+    owns = [fresh, *(fresh.on(with_laws_of(h.forward or forward, fresh.forward)) for h in hypotheses)]
+    predicted = [-own.errors(fit.x) for own, fit in zip(owns, models, strict=True)]
     slopes = [
-        -fresh.error_slopes(np.repeat(fit.x[None], len(fit.free), axis=0), np.eye(len(fit.x))[fit.free])[0]
-        for fit in models
+        -own.error_slopes(np.repeat(fit.x[None], len(fit.free), axis=0), np.eye(len(fit.x))[fit.free])[0]
+        for own, fit in zip(owns, models, strict=True)
     ]
     found = []
     for k in range(len(sequences)):

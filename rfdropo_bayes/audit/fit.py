@@ -168,9 +168,13 @@ class FitTarget:
         """
         return np.asarray(self._errors(self.forward.observe_one(x))[0])
 
-    def shown_errors(self, shown: Fields) -> Float[np.ndarray, "group time column"]:
-        """Measured less simulated readings, given what one point shows."""
-        return np.asarray(self._errors(shown)[0])
+    def shown_errors(self, shown: Fields, several: Sequence[str] = ()) -> Float[np.ndarray, "*many group time column"]:
+        """Measured less simulated readings, given what one point shows; of fields that have ``several`` values, each
+        in turn."""
+        if not several:
+            return np.asarray(self._errors(shown)[0])
+        axes = {name: 0 if name in several else None for name in shown}
+        return np.asarray(jax.vmap(lambda own: self._errors(own)[0], in_axes=(axes,))(shown))
 
     def error_slopes(
         self, points: Float[np.ndarray, "k d"], directions: Float[np.ndarray, "k d"]

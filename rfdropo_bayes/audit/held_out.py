@@ -13,11 +13,10 @@ from rfdropo_bayes.audit.audit_problem import AuditProblem, measurements_of, sim
 from rfdropo_bayes.audit.deadline import OutOfTime
 from rfdropo_bayes.audit.extension import DISCRETISATION, Added, ExtensionSearch
 from rfdropo_bayes.audit.fit import Fit, FitTarget, climb
-from rfdropo_bayes.audit.forward import Forward
 from rfdropo_bayes.audit.gain import Gain, Unseen, UnseenErrors, measure_gain
 from rfdropo_bayes.audit.inadequacy import as_measured, spread
 from rfdropo_bayes.audit.measurements import Measurements
-from rfdropo_bayes.audit.port_rollouts import FeatureTable, PortedForward
+from rfdropo_bayes.audit.port_rollouts import with_laws_of
 from rfdropo_bayes.audit.screen import Screen
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 
@@ -160,22 +159,13 @@ def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[JudgedM
         unseen = _unseen(tested, tested.valid, problem.model.recordings.names[count:])
         predictions = []
         for judge, fit, finer in stages:
-            forward = _as_in(judge, simulated(problem, finer, tested, range(count, every)))
+            forward = with_laws_of(judge.forward, simulated(problem, finer, tested, range(count, every)))
             predictions.append(_predict(replace(target, forward=forward, measurements=tested), fit, [problem.seed, 3]))
     else:
         which, unseen, predictions = _left_out(problem, judges, target, fits)
     patterns = [target.measurements.series(as_measured(judge, fit).residual) for judge, fit, _ in stages]
     spreads, noises = [spread(judge, fit) for judge, fit, _ in stages], [judge.noise for judge in judges]
     return HeldOut(which, unseen, predictions, patterns, target.noise, noises, spreads, problem.seed)
-
-
-def _as_in(judge: FitTarget, forward: Forward) -> Forward:
-    """Rollouts of other recordings, with the laws that a model has."""
-    own = judge.forward
-    if not isinstance(own, PortedForward):
-        return forward
-    table = own.table if forward.lanes is own.table.lanes else FeatureTable(forward.lanes, own.table.features)
-    return own.instead_of(forward, table)
 
 
 def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) -> Unseen:

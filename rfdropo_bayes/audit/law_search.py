@@ -23,14 +23,8 @@ from rfdropo_bayes.audit.screen import null_residuals
 from rfdropo_bayes.mechanisms.features import Feature, dictionary
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
 
-GATE = 25.0
-"""Nats by which left-out recordings must be likelier with a term. The most that the best of 48 ports and 60 features
-brought in 200 data sets without discrepancy was 22.9, in the prototype of this search."""
 LEAST = 0.01
 """Share of what the model leaves beyond the noise that a term must explain in left-out recordings."""
-STOP = 10.0
-"""Log evidence of a port from which on a further term is looked for. The most without discrepancy was 7.4, in the
-prototype."""
 SURE = 4.0  # deviations from zero that a coefficient must have to stay
 TERMS = 3  # of a law
 BY_EVIDENCE, BY_GAIN = 3, 2  # ports and terms that are refitted
@@ -96,11 +90,10 @@ class FoundLaw:
         ports: evidence of every port before the first term.
         left_out: ports that the body cannot carry, with the reason.
         terms: refits of the law's terms, the last one with all of them; empty where none is worth it.
-        ties: of the first term: what a refit cannot tell from it, as (port, feature, score behind).
+        ties: refits of other terms in place of the first one that leave as little, within `TIED`; the best first.
         after: largest log evidence of any port once the law is in the model; None without a law.
-        tried: all refits of the first term.
         centre: times of the ports' signals [s].
-        gains: of all terms that passed the gate, before the first one.
+        gate: gain [nat] that a first term had to bring to left-out recordings; None where no port is significant.
     """
 
     ports: list[PortEvidence]
@@ -108,14 +101,18 @@ class FoundLaw:
     terms: list[Refit]
     ties: list[Refit]
     after: PortEvidence | None
-    tried: list[Refit]
     centre: Float[np.ndarray, " spline"]
-    gains: list[TermGain]
+    gate: float | None
 
     @property
     def last(self) -> Refit | None:
         """The model with all terms."""
         return self.terms[-1] if self.terms else None
+
+    @property
+    def rivals(self) -> list[Refit]:
+        """The first term, and what is tied with it; empty without a law."""
+        return [*self.terms[:1], *self.ties]
 
     def significant(self, family: float) -> list[PortEvidence]:
         """Ports where something acts."""
@@ -124,14 +121,14 @@ class FoundLaw:
 
 @dataclass(frozen=True)
 class _Sums:
-    """Inner products of slopes, features and residual, one for each piece of the data."""
+    """Inner products of slopes, features and residuals of one or more data sets, one for each piece of the data."""
 
     jj: Float[np.ndarray, "piece d d"]
     jx: Float[np.ndarray, "piece d feature"]
     xx: Float[np.ndarray, "piece feature"]
-    jy: Float[np.ndarray, "piece d"]
-    xy: Float[np.ndarray, "piece feature"]
-    yy: Float[np.ndarray, " piece"]
+    jy: Float[np.ndarray, "piece d data"]
+    xy: Float[np.ndarray, "piece feature data"]
+    yy: Float[np.ndarray, "piece data"]
     count: Float[np.ndarray, " piece"]
 
 
@@ -143,28 +140,37 @@ def _pieces(array: Float[np.ndarray, "group value *rest"]) -> Float[np.ndarray, 
     return array[0, : PIECES * length].reshape(PIECES, length, *array.shape[2:])
 
 
-def _sums(found: Responses, columns: Float[np.ndarray, "group value feature"]) -> _Sums:
-    j, x, y = _pieces(found.jacobian), _pieces(columns), _pieces(found.residual)
+def _sums(
+    found: Responses,
+    columns: Float[np.ndarray, "group value feature"],
+    null: Float[np.ndarray, "group value draw"] | None = None,
+) -> _Sums:
+    """Of the residual, and after it of simulated ones."""
+    j, x, y = _pieces(found.jacobian), _pieces(columns), _pieces(found.residual)[..., None]
+    count = np.count_nonzero(y[..., 0], axis=1).astype(float)
+    if null is not None:
+        y = np.concatenate([y, _pieces(null)], axis=-1)
     return _Sums(
-        np.einsum("pvi,pvk->pik", j, j, optimize=True),
-        np.einsum("pvi,pvf->pif", j, x, optimize=True),
+        np.swapaxes(j, 1, 2) @ j,
+        np.swapaxes(j, 1, 2) @ x,
         np.einsum("pvf,pvf->pf", x, x),
-        np.einsum("pvi,pv->pi", j, y),
-        np.einsum("pvf,pv->pf", x, y, optimize=True),
+        np.swapaxes(j, 1, 2) @ y,
+        np.swapaxes(x, 1, 2) @ y,
         np.sum(y**2, axis=1),
-        np.count_nonzero(y, axis=1).astype(float),
+        count,
     )
 
 
 def left_out_gains(
     sums: _Sums, precision: Float[np.ndarray, "d d"] | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gain [nat], share, size and deviation of every feature, each alone beside the base parameters.
+) -> tuple[Float[np.ndarray, "feature data"], np.ndarray, np.ndarray, np.ndarray]:
+    """Gain [nat] of every feature in every data set, each alone beside the base parameters; of the first data set also
+    share, size and deviation.
 
     The prior of the base parameters holds what no data determine; its ``precision`` is one in these columns, unless
     more is known of them.
     """
-    before, gain = 0.0, np.zeros(sums.xx.shape[1])
+    before, gain = 0.0, np.zeros(sums.xy.shape[1:])
     held = np.eye(sums.jj.shape[1]) if precision is None else precision
     for p in range(len(sums.yy)):
         others = [part.sum(axis=0) - part[p] for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
@@ -173,22 +179,23 @@ def left_out_gains(
         left_x = sums.xy[p] - sums.jx[p].T @ b
         along = left_x - u.T @ left_j
         square = sums.xx[p] - 2.0 * np.sum(u * sums.jx[p], axis=0) + np.sum(u * (sums.jj[p] @ u), axis=0)
-        gain += 2.0 * c * along - c**2 * square
-        before += sums.yy[p] - 2.0 * float(b @ sums.jy[p]) + float(b @ sums.jj[p] @ b) - sums.count[p]
+        gain += 2.0 * c * along - c**2 * square[:, None]
+        own, b = sums.jy[p, :, 0], b[:, 0]
+        before += sums.yy[p, 0] - 2.0 * float(b @ own) + float(b @ sums.jj[p] @ b) - sums.count[p]
     whole = [part.sum(axis=0) for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
     _, _, size, sd = _solved(whole, held)
-    return 0.5 * gain, gain / max(before, 1e-300), size, sd
+    return 0.5 * gain, gain[:, 0] / max(before, 1e-300), size[:, 0], sd
 
 
 def _solved(sums: Sequence[np.ndarray], precision: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Base parameters alone, what they take of every feature, and each feature's coefficient and deviation."""
+    """Base parameters alone, what they take of every feature, and each feature's coefficients and deviation."""
     jj, jx, xx, jy, xy = sums
     prior = jj + precision
     b, u = np.linalg.solve(prior, jy), np.linalg.solve(prior, jx)
     left = xx - np.sum(u * jx, axis=0)
     seen = left > COLLINEAR * np.maximum(xx, 1e-300)
     safe = np.where(seen, left, 1.0)
-    c = np.where(seen, (xy - u.T @ jy) / safe, 0.0)
+    c = np.where(seen[:, None], (xy - u.T @ jy) / safe[:, None], 0.0)
     return b, u, c, np.where(seen, 1.0 / np.sqrt(safe), np.inf)
 
 
@@ -203,6 +210,7 @@ class LawSearch:
         seed: of simulated data sets.
         family: probability that a port is named where nothing is hidden.
         report: called with a line of words.
+        most: terms that a law may have.
     """
 
     ports: PortMap
@@ -211,6 +219,7 @@ class LawSearch:
     seed: int
     family: float
     report: Callable[[str], None] = lambda line: None
+    most: int = TERMS
 
     def find(self, target: FitTarget, fit: Fit) -> FoundLaw:
         """Where something acts that the model lacks, and by what law.
@@ -222,76 +231,88 @@ class LawSearch:
         known = target.measured
         found = responses(known, fit, self.ports, self.table, self.report)
         values = self.table.over(found.levels)
-        where = self._evidences(known, fit, found)
-        first, terms, tried, gains = where, list[Refit](), list[Refit](), list[TermGain]()
+        null = self._null(known, fit, found)
+        where = evidences(found, null)
+        first, terms, ties, gates = where, list[Refit](), list[Refit](), list[float]()
         try:
-            while len(terms) < TERMS and self._acts(where):
+            while len(terms) < self.most and where[0].adjusted_p <= self.family:
                 found = found if terms else self._sharpened(known, fit, found, values, where)
-                ranked = self._ranked(found, values)
-                gains = gains or ranked
+                gates.append(self._gate(found, values, null))
+                ranked = self._ranked(found, values, gates[-1])
                 refits = self._refits(known, terms, fit, where, ranked)
                 if not refits or refits[0].score <= 0.0:
                     break
-                tried = tried or refits
-                best = self._exchanged(known, terms, found, values, refits[0])
+                best, others = self._exchanged(known, terms, found, values, refits, gates[-1])
                 if not _sure(best):
                     break
+                ties = ties if terms else _tied(best, others)
                 terms.append(best)
                 fit = as_measured(best.target, best.fit)
                 found = _relinearised(known, found, fit)
-                where = self._evidences(known, fit, found)
+                null = self._null(known, fit, found)
+                where = evidences(found, null)
                 self._say(best, where[0])
         except OutOfTime:
             self.report("the time was up before the law was found")
-        ties = [r for r in tried[1:] if r.score > tried[0].score - TIED]
-        last = where[0] if terms else None
-        return FoundLaw(first, dict(self.ports.left_out), terms, ties, last, tried, found.basis.centre, gains)
+        last, gate = where[0] if terms else None, next(iter(gates), None)
+        return FoundLaw(first, dict(self.ports.left_out), terms, ties, last, found.basis.centre, gate)
 
     def _sharpened(
         self, known: FitTarget, fit: Fit, found: Responses, values: np.ndarray, where: Sequence[PortEvidence]
     ) -> Responses:
         """Responses with exact columns at the ports that lead by evidence or gain, and at all that need no rollouts."""
-        by_gain = dict.fromkeys(row.port for row in self._ranked(found, values))
+        by_gain = dict.fromkeys(row.port for row in self._ranked(found, values, 0.0))
         leading = [row.port for row in where[:BY_EVIDENCE]] + list(by_gain)[:BY_GAIN]
         chosen = [p for p in found.whitened if p.stage == "sensing" or p in leading]
         sizes = np.maximum(signal_sizes(values), 1e-300)[:, None]
         return with_exact_columns(known, fit, found, chosen, values / sizes)
-
-    def _acts(self, where: Sequence[PortEvidence]) -> bool:
-        return where[0].log_evidence >= STOP and where[0].adjusted_p <= self.family
 
     def _say(self, best: Refit, where: PortEvidence) -> None:
         names = self.units[0]
         law = f"{best.term.port.name}: {best.term.feature.formula(names)}"
         self.report(f"law at {law}, score {best.score:.1f}; then {where.port.name} {where.log_evidence:.1f} nats")
 
-    def _evidences(self, known: FitTarget, fit: Fit, found: Responses) -> list[PortEvidence]:
+    def _null(self, known: FitTarget, fit: Fit, found: Responses) -> Float[np.ndarray, "draw n"]:
+        """Whitened residuals of simulated data sets that lack nothing."""
         rng = np.random.default_rng([self.seed, 6])
         draws = null_residuals(known.measurements, known.noise, found.base, len(fit.free), rng, NULLS)
-        return evidences(found, draws[:, : found.residual.size])
+        return draws[:, : found.residual.size]
+
+    def _gate(self, found: Responses, values: np.ndarray, null: Float[np.ndarray, "draw n"]) -> float:
+        """Gain [nat] that the best of all features at all ports has in a share `family` of data sets that lack
+        nothing."""
+        series = np.moveaxis(null.reshape(-1, *found.residual.shape), 0, 2)
+        most = np.full(len(null), -np.inf)
+        for port in found.whitened:
+            columns = feature_columns(found, port, values / np.maximum(signal_sizes(values), 1e-300)[:, None])
+            most = np.maximum(most, left_out_gains(_sums(found, columns, series))[0][:, 1:].max(axis=0))
+        return float(np.quantile(most, 1.0 - self.family, method="higher"))
 
     def _ranked(
-        self, found: Responses, values: np.ndarray, precision: Float[np.ndarray, "d d"] | None = None
+        self, found: Responses, values: np.ndarray, gate: float, precision: Float[np.ndarray, "d d"] | None = None
     ) -> list[TermGain]:
         """All features at all ports that pass the gate, the largest gain first; see `left_out_gains`."""
         sizes, rows = signal_sizes(values), []
         for port in found.whitened:
             columns = feature_columns(found, port, values / np.maximum(sizes, 1e-300)[:, None])
-            gain, share, size, sd = left_out_gains(_sums(found, columns), precision)
-            for k in np.flatnonzero((gain >= GATE) & (share >= LEAST)):
+            gains, share, size, sd = left_out_gains(_sums(found, columns), precision)
+            gain = gains[:, 0]
+            for k in np.flatnonzero((gain > gate) & (share >= LEAST)):
                 parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
                 rows.append(TermGain(port, self.table.features[k], float(gain[k]), float(share[k]), *parts))
         return sorted(rows, key=lambda row: -row.gain)
 
     def _exchanged(
-        self, known: FitTarget, terms: Sequence[Refit], found: Responses, values: np.ndarray, chosen: Refit
-    ) -> Refit:
-        """A term climbed to its end, or another one in its place.
+        self, known: FitTarget, terms: Sequence[Refit], found: Responses, values: np.ndarray, refits: Sequence[Refit],
+        gate: float,
+    ) -> tuple[Refit, list[Refit]]:  # fmt: skip
+        """The best term climbed to its end, or another one in its place; and all others that were refitted.
 
         The base model has made up for a part of what it lacks, and the linear model does not see how far it goes back
         with a law. With a law in the model the base parameters are nearer to the truth. There the terms are ranked
         anew, with base parameters held to what is then known of them.
         """
+        chosen, every = refits[0], list(refits)
         best, tried = self._climbed(chosen), {(chosen.term.port, chosen.term.feature)}
         for _ in range(EXCHANGES):
             fit = as_measured(best.target, best.fit)
@@ -301,17 +322,19 @@ class LawSearch:
             bare = replace(fit, x=without[:-1], free=fit.free[:-1], residual=residual, jacobian=fit.jacobian[:, :-1],
                            covariance=fit.covariance[:-1, :-1])  # fmt: skip
             linear = _relinearised(known, found, bare)
-            ranked = self._ranked(linear, values, _precision(known, bare))
+            ranked = self._ranked(linear, values, gate, _precision(known, bare))
             fresh = [row for row in ranked if (row.port, row.feature) not in tried][:FRESH]
             tried |= {(row.port, row.feature) for row in fresh}
             others = [self._refit(known, terms, bare, row) for row in fresh]
+            every += others
             better = max(others, key=lambda refit: refit.score, default=best)
             if better.square >= best.square - 2.0:
                 break
             self.report(f"instead: {better.term.port.name}: {better.term.feature.formula(self.units[0])}")
             best = self._climbed(better)
         before = chosen.square + 2.0 * (chosen.score + self._cost(known))
-        return replace(best, score=0.5 * (before - best.square) - self._cost(known))
+        best, *every = (replace(r, score=0.5 * (before - r.square) - self._cost(known)) for r in (best, *every))
+        return best, every
 
     def _cost(self, known: FitTarget) -> float:
         """Nats that a term costs: its parameter, and the choice among all features at all ports."""
@@ -357,6 +380,15 @@ class LawSearch:
 
 
 FARTHEST = 100.0  # prior deviations within which a refit starts
+
+
+def _tied(best: Refit, others: Sequence[Refit]) -> list[Refit]:
+    """Refits of other terms that leave as little as the best one, within `TIED`; each term once, the best first."""
+    found: dict[tuple[Port, Feature], Refit] = {}
+    for refit in sorted(others, key=lambda refit: -refit.score):
+        found.setdefault((refit.term.port, refit.term.feature), refit)
+    found.pop((best.term.port, best.term.feature), None)
+    return [refit for refit in found.values() if refit.score > best.score - TIED]
 
 
 def _sure(refit: Refit) -> bool:

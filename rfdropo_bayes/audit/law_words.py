@@ -60,6 +60,7 @@ def ports_record(answer: Answer) -> dict[str, Any] | None:
         "ports": [_port(row) for row in described.found.ports],
         "left_out": dict(described.found.left_out),
         "time_s": described.found.centre.tolist(),
+        "gate_nats": described.found.gate,
     }
 
 

@@ -141,7 +141,7 @@ def _response(
         w = step * signals.reshape(-1, signals.shape[2])
         commands = forward.commands.of(lane)
         if port.stage == "sensing":
-            shift = forward.observe(fit.x[None])[0]["offset"][0][lane][:, None, None]
+            shift = shown["offset"][lane][:, None, None]
             still = shown["position"][lane] - shift
             parts = {"position": as_sensed([(port, w)], still, commands, _time_step(forward)) + shift}
         else:
@@ -150,8 +150,7 @@ def _response(
             parts, _ = forward.lanes.roll(theta[lane], forward.start[lane], commands, forward.deadline.check)
             forward.rollouts += len(lane)
         named = {name: part.reshape(count, forward.count, *part.shape[1:]) for name, part in parts.items()}
-        before = target.shown_errors(shown)
-        moved = np.stack([target.shown_errors({**shown, **{k: v[i] for k, v in named.items()}}) for i in range(count)])
+        before, moved = target.shown_errors(shown), target.shown_errors({**shown, **named}, tuple(named))
         white = target.measurements.whiten(np.nan_to_num(before - moved) / step, target.noise)
         series = target.measurements.series(white).reshape(count, forward.count, -1)
         return {"response": np.moveaxis(series, 0, 2)}

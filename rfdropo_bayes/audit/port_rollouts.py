@@ -18,12 +18,13 @@ from jaxtyping import Float
 from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.forward import Fields, Forward, Lanes, Points
 from rfdropo_bayes.audit.journal import digest
-from rfdropo_bayes.bayes.batches import in_chunks
+from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks
 from rfdropo_bayes.bayes.space import ParameterSpace, build_space
 from rfdropo_bayes.mechanisms.default_priors import normal
 from rfdropo_bayes.mechanisms.features import Feature
 from rfdropo_bayes.mechanisms.laws import FAR, unit_of
 from rfdropo_bayes.mechanisms.ports import Port, PortMap, sensed
+from rfdropo_bayes.simulators.callbacks import distinct
 from rfdropo_bayes.simulators.commands import Commands, observed_at
 from rfdropo_bayes.simulators.extended import ExtendedSimulator
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -83,13 +84,14 @@ class FeatureTable:
         plain = commands._replace(signals=None)
         return np.asarray(in_chunks(lambda own: self._levels(*own), (theta, plain), (self.lanes.width,)))
 
-    def over(self, levels: Float[np.ndarray, "lane row channel"]) -> Float[np.ndarray, "lane feature row"]:
-        """All features."""
-        return np.asarray(in_chunks(lambda own: self._values(*own), (levels,), (self.lanes.width,)))
-
-    def place(self, feature: Feature) -> int:
-        """Where a feature stands in the table."""
-        return self.features.index(feature)
+    def over(
+        self, levels: Float[np.ndarray, "lane row channel"], chosen: Sequence[Feature] | None = None
+    ) -> Float[np.ndarray, "lane feature row"]:
+        """Features, all by default; those of lanes with the same commands are computed once."""
+        once, again = distinct([levels])
+        found = in_chunks(lambda own: self._values(*own), (levels[once],), chunk_sizes(self.lanes.width))
+        places = slice(None) if chosen is None else [self.features.index(feature) for feature in chosen]
+        return np.asarray(found)[:, places][again]
 
 
 @partial(jax.jit, static_argnames=("port", "ports"))
@@ -178,11 +180,11 @@ class PortedForward(Forward):
     def _acting(self, theta: np.ndarray, commands: Commands, points: Points) -> list[tuple[Port, Signals]]:
         """Signals of every lane at each port that has a law."""
         flat = theta.reshape(-1, theta.shape[-1])
-        values = self.table.over(self.table.levels(flat, commands))
+        values = self.table.over(self.table.levels(flat, commands), [term.feature for term in self.terms])
         sizes = np.repeat(self._beside(points), self.count, axis=0)
         found: dict[Port, Signals] = {}
         for k, term in enumerate(self.terms):
-            w = sizes[:, k, None] * values[:, self.table.place(term.feature)]
+            w = sizes[:, k, None] * values[:, k]
             found[term.port] = found.get(term.port, 0.0) + w
         return list(found.items())
 
@@ -198,6 +200,14 @@ class PortedForward(Forward):
         shift = self._offset(theta).reshape(-1, 1, 1, 3)  # of the measuring frame, which comes last
         seen = as_sensed(acting, found["position"] - shift, commands, self.table.time_step)
         return {**found, "position": seen + shift}
+
+
+def with_laws_of(own: Forward, forward: Forward) -> Forward:
+    """Rollouts of other recordings, with the laws that a model's own rollouts have."""
+    if not isinstance(own, PortedForward):
+        return forward
+    table = own.table if forward.lanes is own.table.lanes else FeatureTable(forward.lanes, own.table.features)
+    return own.instead_of(forward, table)
 
 
 def with_terms(coordinates: Coordinates, terms: Sequence[PlacedTerm]) -> Coordinates:

@@ -6,10 +6,14 @@ import json
 from dataclasses import replace
 
 import jax.numpy as jnp
+import numpy as np
 
 from rfdropo_bayes.audit.audit_record import next_experiment, record
+from rfdropo_bayes.audit.experiment_design import Hypothesis, outlooks
+from rfdropo_bayes.audit.inadequacy import as_measured
+from rfdropo_bayes.audit.law_search import law_search
 from rfdropo_bayes.audit.law_words import law_tables
-from rfdropo_bayes.audit.pipeline import audit
+from rfdropo_bayes.audit.pipeline import audit, base_model
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.mechanisms.ports import port_map
@@ -31,9 +35,9 @@ class Pushed(Toy):
         return seen._replace(position=seen.position.at[:, 2, 0].add(SIZE * level[:, 0] * level[:, 1]))
 
 
-def asked(seed, toy=None):
+def asked(seed, toy=None, alike=False):
     """The audit of the plain toy on recordings of another one."""
-    plain, trajectories = problem({}, seed), recordings(TRUTH, seed, toy)
+    plain, trajectories = problem({}, seed), recordings(TRUTH, seed, toy, alike=alike)
     gathered = gather_recordings(Toy(), trajectories)
     model = replace(plain.model, recordings=gathered, channels=(Markers.gather(gathered, "repeats"),))
     return replace(
@@ -69,3 +73,22 @@ def test_nothing_is_described_where_nothing_is_hidden():
     answer = audit(asked(101))
     assert answer.verdict == "no_discrepancy"
     assert answer.causes.described is None
+
+
+def test_commands_tell_laws_apart_that_recordings_do_not():
+    """Both channels have moved alike, so that the product of both is the square of either."""
+    given = asked(5, Pushed(), alike=True)
+    target, base = base_model(given, 5)
+    search = law_search(target.measured, given.ports, ("a", "b"), "rad", 5, 0.02, lambda line: None)
+    found = replace(search, most=1).find(target.measured, as_measured(target, base))
+    tied = {refit.term.feature.formula("ab"): refit for refit in found.rivals if refit.term.port.name == "marker m3 x"}
+    assert {"u_a u_a", "u_a u_b", "u_b u_b"} <= set(tied)
+    hypotheses = [
+        Hypothesis(name, as_measured(refit.target, refit.fit), refit.target.forward) for name, refit in tied.items()
+    ]
+    like = given.model.recordings.commands.of(0)
+    opposed = like._replace(step=like.step * np.array([1.0, -1.0]))
+    now, then = outlooks(target.measured, base, hypotheses, [like, opposed])
+    pair = next(pair for pair in now.pairs if set(pair) == {"u_a u_a", "u_a u_b"})
+    assert now.pairs[pair] < 1.0
+    assert then.pairs[pair] > 100.0

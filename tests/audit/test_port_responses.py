@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from rfdropo_bayes.audit.extension import Rules
-from rfdropo_bayes.audit.law_search import PIECES, _pieces, _sums, left_out_gains
+from rfdropo_bayes.audit.law_search import PIECES, LawSearch, _pieces, _sums, left_out_gains
 from rfdropo_bayes.audit.port_evidence import MEMORIES, SIZES, evidences
 from rfdropo_bayes.audit.port_responses import Responses, feature_columns, on_splines, splines
 from rfdropo_bayes.audit.verdict import SMALL, negligible
+from rfdropo_bayes.mechanisms.features import Feature
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
 
 GROUPS, VALUES, ROWS, STEP = 3, 50, 61, 0.01
@@ -83,6 +87,20 @@ def test_ports_of_null_data_are_named_as_seldom_as_is_said():
     assert small < 14
 
 
+def test_terms_of_null_data_pass_the_gate_as_seldom_as_is_said():
+    """At a family of .1 of 60 data sets about 6 have a term that passes; 14 by chance in one of a thousand series."""
+    found, time, rng = responses(3), STEP * np.arange(ROWS), np.random.default_rng(4)
+    values = np.stack([np.sin(k * time) for k in range(1, 30)])[None].repeat(GROUPS, axis=0)
+    table = SimpleNamespace(features=[Feature("time")] * 29)
+    search = LawSearch(found.ports, table, ((), "m"), 0, 0.1)
+    gate = search._gate(found, values, rng.normal(size=(199, GROUPS * VALUES)))
+    small = 0
+    for _ in range(60):
+        drawn = replace(found, residual=rng.normal(size=(GROUPS, VALUES)))
+        small += bool(search._ranked(drawn, values, gate))
+    assert 0 < small < 14
+
+
 def brute(found: Responses, column: np.ndarray) -> float:
     """Gain on pieces left out, each predicted from a fit to the others."""
     j, y, x = _pieces(found.jacobian), _pieces(found.residual), _pieces(column)
@@ -121,8 +139,14 @@ def test_gains_on_what_is_left_out_are_those_of_refits(groups):
     gain, _, size, sd = left_out_gains(_sums(found, columns))
     assert len(_pieces(found.residual)) == (PIECES if groups == 1 else groups)
     for k in range(2):
-        assert gain[k] == pytest.approx(brute(found, columns[:, :, k]), rel=1e-6)
+        assert gain[k, 0] == pytest.approx(brute(found, columns[:, :, k]), rel=1e-6)
     assert abs(size[0] - 0.3) < 4.0 * sd[0]
+    null = np.random.default_rng(6).normal(size=(groups, VALUES, 2))
+    drawn = left_out_gains(_sums(found, columns, null))[0]
+    assert np.allclose(drawn[:, 0], gain[:, 0])
+    for draw in range(2):
+        alone = replace(found, residual=null[:, :, draw])
+        assert np.allclose(drawn[:, 1 + draw], left_out_gains(_sums(alone, columns))[0][:, 0])
 
 
 def test_splines_sum_to_one_and_follow_smooth_series():

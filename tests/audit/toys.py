@@ -143,11 +143,13 @@ class Geared(Toy):
 EVERY_CANDIDATE = {**CANDIDATES, "drag": (Pulling.parameters[-1],), **Opposed.added, **Geared.added}
 
 
-def recordings(truth: dict, seed: int, toy: Toy | None = None) -> list[Trajectory]:
-    """Three repeats of one command, one of another, six untouched; AR(1) noise, and tensions read to 2 %."""
+def recordings(truth: dict, seed: int, toy: Toy | None = None, *, alike: bool = False) -> list[Trajectory]:
+    """Three repeats of one command, one of another, six untouched; AR(1) noise, and tensions read to 2 %. Both channels
+    move alike where that is asked for."""
     rng, pulls = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     toy, time = toy or Toy(), STEP * np.arange(ROWS)
     sequences = [rng.uniform(-1, 1, (ROWS // 5, 2)) for _ in range(8)]
+    sequences = [s[:, :1].repeat(2, axis=1) for s in sequences] if alike else sequences
     order = [0, 0, 0, *range(1, 8)]
     found = []
     for index, k in enumerate(order):
