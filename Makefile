@@ -18,7 +18,7 @@ SITE    = $(VENV)/site.stamp
 export OPENBLAS_NUM_THREADS = 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-portable test-compiler test-all matrix lint format bench validate notebooks notebook-outputs reference site demo-data clean
+.PHONY: help demo test test-portable test-compiler test-all matrix lint format bench validate notebooks notebook-outputs gallery reference site demo-data clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' Makefile | awk -F'|' '{ printf "  %-20s%s\n", $$1, $$2 }'
@@ -64,6 +64,9 @@ notebooks: $(DEV) ## run every notebook from top to bottom
 
 site: $(SITE) ## the documentation as pages, in site/; needs no network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
+
+gallery: $(DEV) ## run the examples, and draw docs/gallery.md of them (minutes)
+	$(BIN)/python tools/gallery.py
 
 reference: $(CORE) ## write docs/reference from the code
 	$(BIN)/python tools/reference.py

@@ -38,3 +38,12 @@ def test_an_example_is_short(name: str) -> None:
 def test_the_list_names_every_example() -> None:
     listed = (EXAMPLES / "README.md").read_text()
     assert [name for name in NAMES if f"]({name}.py)" not in listed] == []
+
+
+def test_the_gallery_shows_every_example() -> None:
+    gallery = (EXAMPLES.parent / "docs" / "gallery.md").read_text()
+    shown = [name for name in NAMES if f"(../examples/{name}.py)" in gallery]
+    assert sorted({*shown, *ALONE}) == NAMES
+    for name in shown:
+        with Image.open(EXAMPLES.parent / "docs" / "images" / "gallery" / f"{name}.png") as drawn:
+            assert drawn.width >= 400

@@ -3,14 +3,15 @@
 from rfdropo_bayes.posteriors.bounds import contradiction, contradicts, piled_at
 from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
 from rfdropo_bayes.posteriors.inference_data import (
+    InferenceData,
     central_interval,
     load_posterior,
     save_posterior,
     summarise,
-    to_inference_data,
+    to_tree,
 )
 from rfdropo_bayes.posteriors.parameter_info import SPREAD, ParameterInfo
-from rfdropo_bayes.posteriors.record import InferenceData, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors.record import PosteriorRecord, RecordingPrediction
 
 __all__ = [
     "SPREAD",
@@ -27,5 +28,5 @@ __all__ = [
     "piled_at",
     "save_posterior",
     "summarise",
-    "to_inference_data",
+    "to_tree",
 ]

@@ -1,4 +1,4 @@
-"""InferenceData in NetCDF: groups, units, bounds and priors; every call that depends on ArviZ's version is here."""
+"""Posteriors as trees of datasets, in NetCDF and as ArviZ has them; what depends on ArviZ's version is here."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -16,16 +16,22 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole
 from rfdropo_bayes.posteriors.parameter_info import ParameterInfo
 
-with warnings.catch_warnings():  # 0.23 announces its successor on import; pyproject.toml keeps us on the old one
+with warnings.catch_warnings():  # 0.23 announces its successor on import
     warnings.simplefilter("ignore", FutureWarning)
     import arviz
+
+TREES = not arviz.__version__.startswith("0.")  # from 1.0 on ArviZ takes trees as they are
+if TYPE_CHECKING or not TREES:
+    from arviz import InferenceData
+else:
+    InferenceData = xr.DataTree
 
 SCHEMA = "rfdropo_bayes.posterior/1"
 
 Draws = Mapping[str, Float[np.ndarray, "chain draw"]]
 
 
-def to_inference_data(
+def to_tree(
     posterior: Draws,
     *,
     prior: Mapping[str, Float[np.ndarray, " draw"]] | None = None,
@@ -36,7 +42,7 @@ def to_inference_data(
     log_likelihood: Float[np.ndarray, "chain draw row"] | None = None,
     parameters: Sequence[ParameterInfo] = (),
     attrs: Mapping[str, Any] | None = None,
-) -> arviz.InferenceData:
+) -> xr.DataTree:
     """Put draws and what belongs to them into ArviZ's layout.
 
     Args:
@@ -86,7 +92,18 @@ def to_inference_data(
         groups["log_likelihood"] = xr.Dataset({"row": (("chain", "draw", "row_index"), np.asarray(log_likelihood))})
     stored = {"schema": SCHEMA, **{key: _attribute(value) for key, value in (attrs or {}).items()}}
     present: dict[str, Any] = {name: group for name, group in groups.items() if group is not None}
-    return arviz.InferenceData(attrs=stored, **present)
+    tree = xr.DataTree.from_dict(present)
+    tree.attrs = stored
+    return tree
+
+
+def in_arviz(tree: xr.DataTree) -> InferenceData:
+    """What ArviZ calls a posterior: InferenceData, and from 1.0 on the tree itself."""
+    found: Any = tree
+    if not TREES:
+        groups: dict[str, Any] = {name: child.to_dataset() for name, child in tree.children.items()}
+        found = arviz.InferenceData(attrs=dict(tree.attrs), **groups)
+    return found
 
 
 def variable_key(name: str) -> str:
@@ -104,17 +121,18 @@ def _attribute(value: Any) -> str | int | float:
     return value if isinstance(value, str | int | float) and not isinstance(value, bool) else json.dumps(value)
 
 
-def save_posterior(data: arviz.InferenceData, path: Path) -> None:
+def save_posterior(tree: xr.DataTree, path: Path) -> None:
     """Write NetCDF; an interrupted call leaves what was there before.
 
     Raises:
         InputError: if the file cannot be written.
     """
     with whole(path) as partial:
-        data.to_netcdf(str(partial), engine="h5netcdf", compress=True)
+        packed = {f"/{name}": {v: {"zlib": True} for v in child.data_vars} for name, child in tree.children.items()}
+        tree.to_netcdf(str(partial), engine="h5netcdf", encoding=packed)
 
 
-def load_posterior(path: Path) -> arviz.InferenceData:
+def load_posterior(path: Path) -> xr.DataTree:
     """Read what `save_posterior` wrote, all of it into memory.
 
     Raises:
@@ -124,19 +142,19 @@ def load_posterior(path: Path) -> arviz.InferenceData:
     if not path.is_file():
         raise InputError("no such file", where=str(path), remedy="give the folder of a finished calibration")
     try:
-        with arviz.rc_context({"data.load": "eager"}):
-            data = arviz.from_netcdf(str(path), engine="h5netcdf")
+        with xr.open_datatree(str(path), engine="h5netcdf") as opened:
+            tree = opened.load()
     except Exception as error:  # the HDF5 stack raises many types on damaged files, none of them ours
         raise InputError(
             f"is not a readable NetCDF file ({type(error).__name__})", where=str(path), remedy="calibrate again"
         ) from None
-    if data.attrs.get("schema") != SCHEMA or "posterior" not in data.groups():
+    if tree.attrs.get("schema") != SCHEMA or "posterior" not in tree.children:
         raise InputError(
             f"is a NetCDF file, but not a posterior of ours (attribute schema = {SCHEMA!r} is missing)",
             where=str(path),
             remedy="give posterior.nc of a calibration",
         )
-    return data
+    return tree
 
 
 def summarise(posterior: Draws) -> dict[str, dict[str, float]]:
@@ -149,7 +167,7 @@ def summarise(posterior: Draws) -> dict[str, dict[str, float]]:
     if draws < 4:
         nothing = dict.fromkeys(("ess_bulk", "ess_tail", "mcse_mean", "r_hat"), float("nan"))
         return {name: dict(nothing) for name in posterior}
-    data = arviz.InferenceData(posterior=_draws_dataset(posterior))
+    data = in_arviz(xr.DataTree.from_dict({"posterior": _draws_dataset(posterior)}))
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         bulk, tail = arviz.ess(data, method="bulk"), arviz.ess(data, method="tail")

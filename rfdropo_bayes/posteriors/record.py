@@ -11,15 +11,16 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from arviz import InferenceData
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
 from rfdropo_bayes.posteriors.inference_data import (
+    InferenceData,
+    in_arviz,
     load_posterior,
     save_posterior,
-    to_inference_data,
+    to_tree,
     variable_key,
 )
 from rfdropo_bayes.posteriors.parameter_info import ParameterInfo
@@ -136,11 +137,15 @@ class PosteriorRecord:
 
     def inference_data(self) -> InferenceData:
         """The same in ArviZ's layout."""
+        return in_arviz(self.tree())
+
+    def tree(self) -> xr.DataTree:
+        """The same as a tree of datasets, one for each of ArviZ's groups."""
         products = [
             {"name": p.name, "unit": p.unit, "powers": dict(p.powers), "description": p.description}
             for p in self.derived
         ]
-        return to_inference_data(
+        return to_tree(
             self.posterior,
             prior=self.prior,
             posterior_predictive=_predictions(self.recordings),
@@ -158,7 +163,7 @@ class PosteriorRecord:
         Raises:
             InputError: if the file cannot be written.
         """
-        save_posterior(self.inference_data(), path)
+        save_posterior(self.tree(), path)
 
     @classmethod
     def load(cls, path: Path) -> PosteriorRecord:
@@ -167,18 +172,19 @@ class PosteriorRecord:
         Raises:
             InputError: if the file is missing, damaged, or not one of ours.
         """
-        data = load_posterior(path)
+        tree = load_posterior(path)
         try:
-            return _from_groups(data)
+            return _from_groups(tree)
         except (KeyError, AttributeError, json.JSONDecodeError) as error:
             raise InputError(
                 f"lacks part of a posterior of ours ({error})", where=str(path), remedy="calibrate again"
             ) from None
 
 
-def _from_groups(data: Any) -> PosteriorRecord:
-    names = json.loads(data.attrs["names"])
-    variables = [data.posterior[variable_key(name)] for name in names]
+def _from_groups(tree: xr.DataTree) -> PosteriorRecord:
+    data = {name: child.to_dataset() for name, child in tree.children.items()}
+    names = json.loads(tree.attrs["names"])
+    variables = [data["posterior"][variable_key(name)] for name in names]
     parameters = tuple(
         ParameterInfo(
             name,
@@ -190,19 +196,17 @@ def _from_groups(data: Any) -> PosteriorRecord:
         )
         for name, v in zip(names, variables, strict=True)
     )
-    groups = data.groups()
-    prior = data.prior if "prior" in groups else xr.Dataset()
-    stats = data.sample_stats if "sample_stats" in groups else xr.Dataset()
+    prior, stats = data.get("prior", xr.Dataset()), data.get("sample_stats", xr.Dataset())
     return PosteriorRecord(
         parameters,
         {name: v.values for name, v in zip(names, variables, strict=True)},
         {name: prior[variable_key(name)].values[0] for name in names if variable_key(name) in prior},
-        _recordings(data) if "observed_data" in groups else (),
-        tuple(ProductOfPowers(**product) for product in json.loads(data.attrs["derived"])),
+        _recordings(data) if "observed_data" in data else (),
+        tuple(ProductOfPowers(**product) for product in json.loads(tree.attrs["derived"])),
         _rows(stats, "stage"),
         _rows(stats, "block"),
-        data.log_likelihood["row"].values if "log_likelihood" in groups else None,
-        json.loads(data.attrs["attributes"]),
+        data["log_likelihood"]["row"].values if "log_likelihood" in data else None,
+        json.loads(tree.attrs["attributes"]),
     )
 
 
@@ -239,9 +243,9 @@ def _observations(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | Non
     return xr.Dataset(data, coords=coords, attrs={"recordings": len(recordings)}) if recordings else None
 
 
-def _recordings(data: Any) -> tuple[RecordingPrediction, ...]:
-    observed, predicted = data.observed_data, data.posterior_predictive
-    before = data.prior_predictive if "prior_predictive" in data.groups() else xr.Dataset()
+def _recordings(data: Mapping[str, xr.Dataset]) -> tuple[RecordingPrediction, ...]:
+    observed, predicted = data["observed_data"], data["posterior_predictive"]
+    before = data.get("prior_predictive", xr.Dataset())
     return tuple(
         RecordingPrediction(
             observed[f"position_{i}"].attrs["name"],
