@@ -23,7 +23,7 @@ arm = rb.Robot.outline(
     mass=0.04,
     young_modulus=8e5,
 )
-model = rb.Model(arm, priors={name: {} for name in TRUTH}, simulator={"time_step": 0.01})
+model = rb.Model(arm, priors={name: {} for name in TRUTH}, simulator={"time_step": 0.02})
 
 # In the place of a measurement: a simulated one with 0.3 mm of noise, as a CSV file in millimetres.
 walk = {"duration": 4.0, "interval": 0.25, "step": 0.003, "low": 0.0, "high": 0.012, "sample_time": 0.05}

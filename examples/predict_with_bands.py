@@ -17,7 +17,7 @@ priors = {
     "trunk_mass": {"distribution": "LogNormal", "median": 0.09, "sigma": 0.5},
     "rayleigh_stiffness": {"distribution": "LogNormal", "median": 0.05, "sigma": 0.7},
 }
-model = rb.Model("smooth_arm", priors=priors, simulator={"refine": 1, "time_step": 0.01, "precision": "float32"})
+model = rb.Model("smooth_arm", priors=priors, simulator={"refine": 1, "time_step": 0.02, "precision": "float32"})
 fit = rb.calibrate(model, runs, rb.Laplace(), seed=0, show=False)
 
 # Of the recording only the commands and the first row are looked at.

@@ -15,7 +15,7 @@ priors = {
     "trunk_mass": {"distribution": "LogNormal", "median": 0.09, "sigma": 0.5},
     "rayleigh_stiffness": {"distribution": "LogNormal", "median": 0.05, "sigma": 0.7},
 }
-coarse = {"refine": 1, "time_step": 0.01, "precision": "float32"}
+coarse = {"refine": 1, "time_step": 0.02, "precision": "float32"}
 model = rb.Model("smooth_arm", priors=priors, simulator=coarse)
 weighed = runs[0].settings["parameters"]["trunk_mass"]  # as a scale would show it, to 1 %
 known = {"distribution": "LogNormal", "median": weighed, "sigma": 0.01}

@@ -130,9 +130,21 @@ def benchmark_audit(
         list[str] | None, typer.Option(help="mechanism to leave out; may be given several times")
     ] = None,
     cluster: Annotated[str | None, typer.Option(help="local, or HOST:PORT of a Dask scheduler")] = None,
+    truth: Annotated[
+        str, typer.Option("--truth", help="engine that moves the arm: own, or mujoco, with effects by its own means")
+    ] = "own",
     out: Annotated[Path, typer.Option("--out", help="folder to write to")] = Path("reports/audit_power"),
 ) -> None:
     """Hide effects in recordings, audit them, and count hits, misses and confusions; goes on where it was stopped."""
+    if truth not in ("own", "mujoco"):
+        raise InputError(f"unknown engine {truth!r}", where="--truth", remedy="own or mujoco")
+    if truth == "mujoco":
+        from rfdropo_bayes.studies.engine_study import TABLE as ENGINES
+        from rfdropo_bayes.studies.engine_study import run_engine_study
+
+        run_engine_study(out, datasets, seed, effects=hide or [])
+        typer.echo((out / ENGINES).read_text(encoding="utf-8"))
+        return
     from rfdropo_bayes.studies.audit_study import TABLE, run_study
 
     chosen = {"conditions": condition or [], "mechanisms": hide or [], "exclude": exclude or []}

@@ -1,0 +1,200 @@
+"""``rfdropo benchmark audit --truth mujoco``: effects in an arm that MuJoCo moves, audited with our layered body.
+
+The two engines differ where nothing is hidden, too. That difference is audited once, on recordings of its own, and what
+the audit finds is adopted: the model that it extends is the base of all audits that follow. Three repeats of one random
+command and three recordings of others are fitted, four more are untouched.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.stats import binomtest
+
+from rfdropo_bayes.audit.audit_problem import measurements_of, simulated
+from rfdropo_bayes.audit.fit import FitTarget
+from rfdropo_bayes.audit.score import project_out, span
+from rfdropo_bayes.audit.verdict import DESCRIBED, EQUIVALENT, EXPLAINED, NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT
+from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
+from rfdropo_bayes.bayes.noise.stacked import Stacked
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.files import output_folder, read_lines, write_text
+from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.model.experiment import AuditTable, Experiment
+from rfdropo_bayes.model.experiment_file import describe
+from rfdropo_bayes.model.model import Model
+from rfdropo_bayes.model.model_spec import spec_of
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.studies.fits import Job, run_fits
+from rfdropo_bayes.studies.hidden_effects import NOISE, Setting, blank_recordings, experiment_tables, noisy
+from rfdropo_bayes.studies.mujoco_truth import ENGINE_EFFECTS, EngineEffect, MuJoCoArm
+from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.verbs.audit import Workshop, audit, build_problem
+
+REPEATS, OTHERS, UNTOUCHED = 3, 3, 4
+FITTED = REPEATS + OTHERS
+LEDGER, TABLE, BASE = "engines.jsonl", "engines.md", "engine_difference"
+NOTHING = "nothing"
+STEPS = 3  # of the search for a size: rho is proportional to it but for large effects
+SETTING = Setting(audited={"refine": 2, "time_step": 0.005})
+CENTRE = {"young_modulus": 2e6, "trunk_mass": 0.0911, "rayleigh_stiffness": 0.05}
+
+_WORKSHOP: Workshop = {}  # of this process
+
+
+def run_engine_study(
+    out: Path, datasets: int, seed: int, *, rho: float = 0.5, effects: Sequence[str] = ()
+) -> list[dict[str, Any]]:
+    """Hide, audit and count; a data set that is in the ledger is not run again.
+
+    Args:
+        out: folder for ledger, table and the audit of the engines' difference.
+        datasets: of every effect, and of nothing.
+        seed: of the study.
+        rho: see `hidden_effects`.
+        effects: names of `ENGINE_EFFECTS`; all, and nothing, by default.
+
+    Raises:
+        InputError: an unknown effect.
+    """
+    known = [NOTHING, *ENGINE_EFFECTS]
+    unknown = [name for name in effects if name not in known]
+    if unknown:
+        raise InputError(f"unknown effect {unknown[0]!r}", where="--hide", remedy=f"one of {', '.join(known)}")
+    out = output_folder(out)
+    base = _adopted(out, seed)
+    jobs = [
+        {"effect": name, "rho": 0.0 if name == NOTHING else rho, "index": k, "seed": seed}
+        for k in range(datasets)
+        for name in effects or known
+    ]
+    with Progress("audits", show=None) as progress:
+        found = run_fits(jobs, partial(_one, base=base, folder=out), out / LEDGER, resume=True, progress=progress)
+    write_text(out / TABLE, as_table([{**row["job"], **row["result"]} for row in read_lines(out / LEDGER)]))
+    return found
+
+
+def _adopted(out: Path, seed: int) -> dict[str, Any]:
+    """The experiment that what the engines differ by has extended, as its tables; audited if that was not done yet."""
+    stored = out / BASE / "extended.json"
+    if not stored.exists():
+        own = experiment_tables(SETTING, fit=["fit_*.nc"]).model_dump(exclude_none=True, exclude_defaults=True)
+        place = _recorded(own, None, 0.0, [seed, 0], out / BASE / "data")
+        assert place is not None
+        found = audit(Model.read(place / "audit.toml"), out=out / BASE / "audit", workshop=_WORKSHOP, overwrite=True)
+        tables = dict(found.tables) if found.findings.size or found.content.get("law") else own
+        kept = {key: tables[key] for key in ("robot", "model", "simulator") if key in tables}
+        stored.write_text(json.dumps({**own, **kept}), encoding="utf-8")
+        (out / BASE / "sentence.txt").write_text(found.sentence + "\n", encoding="utf-8")
+    return dict(json.loads(stored.read_text(encoding="utf-8")))
+
+
+def _one(job: Job, base: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """One data set: hidden, audited, judged."""
+    began, processor = time.monotonic(), time.process_time()
+    name = str(job["effect"])
+    effect = ENGINE_EFFECTS.get(name)
+    number = [int(job["seed"]), 1 + [NOTHING, *ENGINE_EFFECTS].index(name), int(job["index"])]
+    place = folder / "data" / f"{name.replace(' ', '_')}_{job['index']}"
+    hidden = _recorded(base, effect, float(job["rho"]), number, place)
+    if hidden is None:
+        return {"verdict": "no size reaches this rho"}
+    found = audit(Model.read(hidden / "audit.toml"), out=place / "audit", workshop=_WORKSHOP, overwrite=True)
+    classes = [row["equivalence_class"] for row in found.content["findings"]]
+    right = set(effect.right) if effect else set()
+    return {
+        **json.loads((hidden / "hidden.json").read_text(encoding="utf-8")),
+        "verdict": found.verdict,
+        "named": [row["mechanism"] for row in found.content["findings"]],
+        "law": (found.content.get("law") or {}).get("formula"),
+        "named_rightly": any(right & set(each) for each in classes),
+        "sentence": found.sentence,
+        "seconds": round(time.monotonic() - began, 1),
+        "core_seconds": round(time.process_time() - processor, 1),
+    }
+
+
+def _recorded(
+    base: Mapping[str, Any], effect: EngineEffect | None, rho: float, seed: Sequence[int], out: Path
+) -> Path | None:
+    """Write a data set; None where no size of the effect reaches rho."""
+    out = output_folder(out)
+    rng = np.random.default_rng(list(seed))
+    spread = np.exp(0.2 * rng.standard_normal(len(CENTRE)))
+    values = {name: float(v * s) for (name, v), s in zip(CENTRE.items(), spread, strict=True)}
+    names = [*(f"fit_{k + 1}" for k in range(FITTED)), *(f"test_{k + 1}" for k in range(UNTOUCHED))]
+    blank = blank_recordings(SETTING, rng, names, [*([0] * REPEATS), *range(1, 1 + OTHERS + UNTOUCHED)])
+    arm = MuJoCoArm(Robot.load(SETTING.robot), values, effect)
+    size = 0.0
+    if effect is not None:
+        reached = _size(base, arm, effect, rho, blank, out)
+        if reached is None:
+            return None
+        size = reached
+    key = jax.random.key(int(np.random.SeedSequence(list(seed)).generate_state(1)[0]))
+    for index, (recording, clean) in enumerate(zip(blank, arm.positions(blank, size), strict=True)):
+        noisy(recording, clean, jax.random.fold_in(key, index), SETTING).save(out / f"{recording.name}.nc")
+    tables = {**base, "seed": int(seed[-1])}
+    (out / "audit.toml").write_text(describe(tables), encoding="utf-8")
+    told = {"size": size, "unit": effect.unit if effect else "-", "values": values}
+    (out / "hidden.json").write_text(json.dumps(told), encoding="utf-8")
+    return out
+
+
+def _size(
+    base: Mapping[str, Any], arm: MuJoCoArm, effect: EngineEffect, rho: float, blank: Sequence[Any], out: Path
+) -> float | None:
+    """The size of an effect that a refit of the base model cannot absorb, ``rho`` deviations of the noise of it."""
+    fitted = list(blank[:FITTED])
+    spec = spec_of(parse_table(Experiment, base, where=BASE), out)
+    problem = build_problem(spec, AuditTable(), fitted, list(blank[FITTED:]), 0, workshop=_WORKSHOP)
+    measured = measurements_of(problem, range(FITTED), fitted)
+    forward = simulated(problem, False, measured, [group[0] for group in measured.members])
+    widths = [channel.valid.shape[-1] for channel in measured.channels]
+    white = Stacked(tuple(Autoregression(np.full(n, NOISE), np.ones(1), STATED, np.inf) for n in widths))
+    target = FitTarget(forward, replace(measured, count=measured.valid.astype(float)), white)
+    count = problem.coordinates.base
+    absorbed = span(target.jacobian(problem.coordinates.null, np.arange(count)))
+    first = [fitted[group[0]] for group in measured.members]
+    still = arm.positions(first, 0.0)
+    size = effect.usual
+    for _ in range(STEPS):
+        try:
+            moved = (arm.positions(first, size) - still).reshape(-1) / NOISE
+        except InputError:
+            return None
+        found = float(np.sqrt(np.mean(project_out(absorbed, moved[:, None]) ** 2)))
+        if found == 0.0:
+            return None
+        size *= rho / found
+    return size
+
+
+def as_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The study as a Markdown table."""
+    lines = ["| hidden | data sets | named rightly | described | silent | verdicts |", "|---|---|---|---|---|---|"]
+    silent = (NO_DISCREPANCY, NEGLIGIBLE)
+    for name in dict.fromkeys(row["effect"] for row in rows):
+        own = [row for row in rows if row["effect"] == name and "named" in row]
+        verdicts = ", ".join(sorted({str(row["verdict"]) for row in own}))
+        counts = [sum(bool(row["named_rightly"]) for row in own)]
+        counts += [sum(row["verdict"] == DESCRIBED for row in own), sum(row["verdict"] in silent for row in own)]
+        lines.append(f"| {name} | {len(own)} | {' | '.join(map(str, counts))} | {verdicts} |")
+    hidden = [row for row in rows if row["effect"] != NOTHING and "named" in row]
+    found = sum(bool(row["named_rightly"]) or row["verdict"] == DESCRIBED for row in hidden)
+    wrong = sum(row["verdict"] in (EXPLAINED, EQUIVALENT) and not row["named_rightly"] for row in hidden)
+    unsaid = sum(row["verdict"] == NO_VERDICT for row in hidden)
+    if hidden:
+        interval = binomtest(found, len(hidden)).proportion_ci(0.95, "exact")
+        share = f"[{100 * interval.low:.0f}, {100 * interval.high:.0f}] %"
+        told = f"Named rightly or described: {found} of {len(hidden)} {share} (exact 95 % interval)"
+        lines += ["", f"{told}; explained by another cause: {wrong}; no verdict: {unsaid}."]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,289 @@
+"""A robot made anew in MuJoCo, a truth that this package's engine did not make: springs and links, tendons for cables.
+
+Links are rigid. Between their middles lie joints that stretch along the axis and bend in two planes, with the section's
+stiffness over a link's length. Cables are tendons through the guides' places, each drawn in by a stiff servo that can
+only pull. What is hidden is hidden by means of that engine: masses, gravity, dry friction, tendons, gains, sites.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.commands import commands_on_grid
+
+LINKS = 20  # 40 move the tip of smooth_arm by 0.07 mm, root mean square, where it moves by 56 mm
+STEP = 1e-4  # [s]: springs along the axis are explicit, and the stiffest turns a link's mass within 6 of them
+CONTROL = 1e-3  # [s] for which a command is held
+CABLE = 5e4  # [N/m] of a servo
+CABLE_DAMPING = 5.0  # [N s/m]
+
+
+@dataclass(frozen=True)
+class EngineEffect:
+    """An effect by means of MuJoCo.
+
+    Attributes:
+        right: mechanisms of the library that name it rightly.
+        usual: a size of it, in ``unit``.
+        model: changes a model for a size.
+        command: changes cable displacements [m] for a size, and the time [s] between them.
+        seen: later [s], for a size, the cameras see what was.
+    """
+
+    right: tuple[str, ...]
+    usual: float
+    unit: str
+    model: Callable[[Any, float], None] | None = None
+    command: Callable[[np.ndarray, float], np.ndarray] | None = None
+    seen: Callable[[float], float] | None = None
+
+
+def _payload(model: Any, size: float) -> None:
+    last = model.nbody - 1
+    own = model.body_mass[last]
+    model.body_mass[last] = own + size
+    model.body_ipos[last] = model.body_ipos[last] * own / (own + size) + model.site("tip").pos * size / (own + size)
+
+
+def _tilt(model: Any, size: float) -> None:
+    x, y, z = model.opt.gravity
+    model.opt.gravity[:] = [x * np.cos(size) - y * np.sin(size), x * np.sin(size) + y * np.cos(size), z]
+
+
+def _friction(model: Any, size: float) -> None:
+    bends = np.flatnonzero(model.jnt_type == 3)  # hinges
+    model.dof_frictionloss[model.jnt_dofadr[bends]] = size * model.jnt_stiffness[bends]
+    # As it comes, friction is so soft a constraint that it creeps within 20 ms and moves nothing here by 0.05 mm.
+    model.dof_solref[:], model.dof_solimp[:, :2] = [5.0 * STEP, 1.0], [0.99, 0.999]
+
+
+def _soft_cables(model: Any, size: float) -> None:
+    kept = 1.0 / (1.0 + size * CABLE)
+    model.actuator_gainprm[:, 0] *= kept
+    model.actuator_biasprm[:, 1] *= kept
+
+
+def _moved_marker(model: Any, size: float) -> None:
+    model.site("m3").pos[0] += size
+
+
+def _softer_base(model: Any, size: float) -> None:
+    joints = np.arange(model.njnt)
+    share = 1.0 - joints / joints[-1]  # 1 at the base, 0 at the tip
+    model.jnt_stiffness[:] *= 1.0 - size * share
+    model.dof_damping[:] *= 1.0 - size * share
+
+
+def _one_gain(levels: np.ndarray, size: float) -> np.ndarray:
+    return levels * np.array([1.0 + size, *[1.0] * (levels.shape[1] - 1)])
+
+
+def _lag(levels: np.ndarray, size: float) -> np.ndarray:
+    """A drive of first order, ``size`` [s] its time constant."""
+    kept, found = np.exp(-CONTROL / size), [levels[0]]
+    for row in levels[1:]:
+        found.append(kept * found[-1] + (1.0 - kept) * row)
+    return np.array(found)
+
+
+ENGINE_EFFECTS: dict[str, EngineEffect] = {
+    "payload at the tip": EngineEffect(("payload",), 0.005, "kg", model=_payload),
+    "gravity tilted": EngineEffect(("base_tilt",), 0.05, "rad", model=_tilt),
+    "joint frictionloss": EngineEffect(("coulomb_friction",), 0.001, "rad", model=_friction),
+    "soft tendons": EngineEffect(("cable_compliance",), 1e-4, "m/N", model=_soft_cables),
+    "site moved": EngineEffect(("marker_offset",), 2e-3, "m", model=_moved_marker),
+    "softer base": EngineEffect(("stiffness_gradient",), 0.3, "-", model=_softer_base),
+    "gain of one actuator": EngineEffect(("cable_gain",), 0.1, "-", command=_one_gain),
+    "actuators of first order": EngineEffect(("actuator_lag",), 0.05, "s", command=_lag),
+    "late camera": EngineEffect(("clock_offset",), 0.03, "s", seen=lambda size: size),
+}
+"""By name; which mechanism of the library each is."""
+
+
+class _Section(NamedTuple):
+    """A joint in the middle of a piece of the body, and the link from there to the next."""
+
+    at: float
+    stretch: float
+    bend: tuple[float, float]
+    mass: float
+
+
+def arm_xml(robot: Robot, values: Mapping[str, float], links: int = LINKS) -> str:
+    """MJCF of a robot with a body of layers, cables at guides, and markers on its axis.
+
+    Args:
+        robot: its file.
+        values: ``young_modulus`` [Pa], ``trunk_mass`` [kg] and ``rayleigh_stiffness`` [s].
+        links: pieces of the body.
+    """
+    root = ElementTree.Element("mujoco")
+    gravity = " ".join(map(str, robot.gravity_m_s2))
+    ElementTree.SubElement(
+        root, "option", timestep=str(STEP), gravity=gravity, integrator="implicitfast", solver="Newton"
+    )
+    ElementTree.SubElement(root, "size", memory="64M")
+    body, low = ElementTree.SubElement(root, "worldbody"), 0.0
+    sections = _sections(robot, values, links)
+    guides = sorted(_guides(robot), key=lambda each: each[1][2])
+    marks = sorted(
+        (*((m.name, m.point_m) for m in robot.markers), ("tip", robot.markers[-1].point_m)), key=lambda m: m[1][2]
+    )
+    for number, section in enumerate([None, *sections]):
+        if section is not None:
+            body = ElementTree.SubElement(body, "body", name=f"link{number}", pos=f"0 0 {section.at - low:.9g}")
+            low = section.at
+            _link(body, section, values["rayleigh_stiffness"], robot.body.station_m[-1] / links)
+        high = sections[number].at if number < len(sections) else np.inf
+        for name, (x, y, z) in (*guides, *marks):
+            if (low <= z < high) or (section is None and z < high):
+                ElementTree.SubElement(body, "site", name=name, pos=f"{x:.9g} {y:.9g} {z - low:.9g}", size="0.001")
+    tendons, actuators = ElementTree.SubElement(root, "tendon"), ElementTree.SubElement(root, "actuator")
+    for cable in robot.cables:
+        path = ElementTree.SubElement(tendons, "spatial", name=cable.name)
+        for k in range(1 + len(cable.guide_z_m)):
+            ElementTree.SubElement(path, "site", site=f"{cable.name}{k}")
+        ElementTree.SubElement(
+            actuators,
+            "general",
+            name=cable.name,
+            tendon=cable.name,
+            gainprm=f"{CABLE}",
+            biastype="affine",
+            biasprm=f"0 {-CABLE} {-CABLE_DAMPING}",
+            forcelimited="true",
+            forcerange="-1e5 0",
+        )
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _sections(robot: Robot, values: Mapping[str, float], links: int) -> list[_Section]:
+    """Joints and links from base to tip."""
+    shape, modulus = robot.body, values["young_modulus"]
+    station = np.asarray(shape.station_m)
+    length = station[-1] / links
+    middle = 0.5 * (station[1:] + station[:-1])
+    area, moment = np.asarray(shape.axial_area_m2), np.asarray(shape.bending_moment_area_m4)
+    mass = np.asarray(shape.mass_area_m2)
+    density = values["trunk_mass"] / float(np.sum(mass * np.diff(station)))
+    found = []
+    for k in range(links):
+        at = (k + 0.5) * length
+        extent = length if k < links - 1 else 0.5 * length
+        centre = at + 0.5 * extent
+        # The layer's plane x bends by forces along x, that is about y.
+        bends = [modulus * float(np.interp(at, middle, moment[:, axis])) / length for axis in (1, 0)]
+        stretch = modulus * float(np.interp(at, middle, area)) / length
+        found.append(
+            _Section(at, stretch, (bends[0], bends[1]), density * float(np.interp(centre, middle, mass)) * extent)
+        )
+    return found
+
+
+def _link(body: Any, section: _Section, damping: float, length: float) -> None:
+    """Joints and inertia of a link."""
+    kinds = (
+        ("slide", "0 0 1", section.stretch),
+        ("hinge", "1 0 0", section.bend[0]),
+        ("hinge", "0 1 0", section.bend[1]),
+    )
+    for kind, axis, stiffness in kinds:
+        given = {"type": kind, "axis": axis, "stiffness": f"{stiffness:.9g}", "damping": f"{damping * stiffness:.9g}"}
+        ElementTree.SubElement(body, "joint", given)
+    turn = section.mass * length**2 / 6.0  # of a disk as thick as it is wide
+    about = {"mass": f"{section.mass:.9g}", "diaginertia": " ".join([f"{turn:.9g}"] * 3)}
+    ElementTree.SubElement(body, "inertial", {"pos": f"0 0 {0.5 * length:.9g}", **about})
+
+
+def _guides(robot: Robot) -> list[tuple[str, tuple[float, float, float]]]:
+    """Names and places of anchors and guides of all cables."""
+    found = []
+    for cable in robot.cables:
+        turn = np.deg2rad(cable.azimuth_deg)
+        heights = (cable.anchor_z_m, *cable.guide_z_m)
+        radii = (cable.anchor_radius_m, *cable.guide_radius_m)
+        for k, (height, radius) in enumerate(zip(heights, radii, strict=True)):
+            found.append((f"{cable.name}{k}", (radius * np.cos(turn), radius * np.sin(turn), height)))
+    return found
+
+
+@dataclass(frozen=True)
+class MuJoCoArm:
+    """The robot in MuJoCo with an effect, as it is recorded.
+
+    Attributes:
+        robot: its file.
+        values: see `arm_xml`.
+        effect: None for nothing.
+        links: see `arm_xml`.
+    """
+
+    robot: Robot
+    values: Mapping[str, float]
+    effect: EngineEffect | None = None
+    links: int = LINKS
+    _seen: dict[Any, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
+
+    def positions(self, recordings: Sequence[Trajectory], size: float) -> Float[np.ndarray, "recording time marker 3"]:
+        """Noise-free positions [m] of recordings of one length under their commands, for a size of the effect.
+
+        Raises:
+            InputError: MuJoCo is not installed, or warns of the motion.
+        """
+        found = []
+        for recording in recordings:
+            key = (recording.command.tobytes(), recording.time.tobytes(), size)
+            if key not in self._seen:
+                self._seen[key] = self._recorded(recording, size)
+            found.append(self._seen[key])
+        return np.stack(found)
+
+    def _recorded(self, recording: Trajectory, size: float) -> Float[np.ndarray, "time marker 3"]:
+        try:
+            import mujoco
+        except ImportError:
+            remedy = 'install it: pip install "rfdropo_bayes[mujoco]"'
+            raise InputError("MuJoCo is not installed", where="--truth mujoco", remedy=remedy) from None
+        model = mujoco.MjModel.from_xml_string(arm_xml(self.robot, self.values, self.links))
+        effect = self.effect
+        if effect is not None and effect.model is not None:
+            effect.model(model, size)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        rest = data.ten_length.copy()
+        late = 0.0 if effect is None or effect.seen is None else effect.seen(size)
+        clock = np.arange(0.0, recording.time[-1] + 0.5 * CONTROL, CONTROL)
+        grid = commands_on_grid(
+            recording.command_time,
+            recording.command,
+            recording.initial_command,
+            clock,
+            time_step=CONTROL,
+            ramp=self.robot.command.ramp_s,
+            dead_time=self.robot.command.dead_time_s,
+        )
+        levels = np.concatenate([grid.initial[None], grid.step])[: len(clock)]
+        if effect is not None and effect.command is not None:
+            levels = effect.command(levels, size)
+        markers = [model.site(name).id for name in self.robot.marker_names]
+        path = np.empty((len(clock), len(markers), 3))
+        for row, level in enumerate(levels):
+            mujoco.mj_kinematics(model, data)
+            path[row] = data.site_xpos[markers]
+            data.ctrl[:] = rest - level
+            mujoco.mj_step(model, data, nstep=round(CONTROL / STEP))
+        if any(warning.number for warning in data.warning) or not np.isfinite(path).all():
+            raise InputError("MuJoCo warns of the motion", where=recording.name, remedy="make the effect smaller")
+        flat = path.reshape(len(clock), -1)
+        at = np.clip(recording.time - recording.time[0] - late, 0.0, None)
+        seen = np.stack([np.interp(at, clock, column) for column in flat.T], axis=1)
+        return seen.reshape(len(at), len(markers), 3)
