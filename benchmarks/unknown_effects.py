@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.audit.verdict import DESCRIBED
@@ -31,6 +32,7 @@ from rfdropo_bayes.studies.unknown_effects import EFFECTS, conceal
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
 
 ALL, NONE = "all", "none"
+WITHIN = 1.15  # of the noise, an unseen error counts as explained
 
 
 def one(name: str, rho: float, seed: int, library: str, folder: Path, workshop: Workshop) -> dict[str, Any]:
@@ -110,13 +112,31 @@ def main() -> None:
             lines.append(one(*case, given.out / "data", workshop))
             append_line(ledger, json.dumps(lines[-1]))
             print(f"{case[0] or 'nothing'} {case[2]}: {lines[-1]['verdict']}", flush=True)
-    print("| hidden | seed | library | verdict | port right | law right | unseen over noise | CPU s |")
-    print("|---|---|---|---|---|---|---|---|")
+    for library in (ALL, NONE):
+        show(library, [line for line in lines if line["library"] == library])
+
+
+def show(library: str, lines: Sequence[dict[str, Any]]) -> None:
+    """A table of the data sets, and rates with exact 95 % intervals (Clopper and Pearson)."""
+    print(f"\nlibrary: {library}\n\n| hidden | seed | verdict | port right | law right | unseen over noise | CPU s |")
+    print("|---|---|---|---|---|---|---|")
     for line in lines:
         marks = [{True: "yes", False: "no", None: "-"}[line.get(key)] for key in ("port_right", "law_right")]
         numbers = [line.get(key, "-") for key in ("unseen_over_noise", "cpu_seconds")]
-        words = [line["effect"] or "nothing", line["seed"], line["library"], line["verdict"], *marks, *numbers]
+        words = [line["effect"] or "nothing", line["seed"], line["verdict"], *marks, *numbers]
         print("| " + " | ".join(map(str, words)) + " |")
+    hidden, nothing = [line for line in lines if line["effect"]], [line for line in lines if not line["effect"]]
+    rate("port right", [line.get("port_right", False) for line in hidden])
+    rate("law right", [line.get("law_right", False) for line in hidden])
+    rate("unseen error within 15 % of the noise", [line.get("unseen_over_noise", np.inf) <= WITHIN for line in hidden])
+    rate("described where nothing is hidden", [line["verdict"] == DESCRIBED for line in nothing])
+
+
+def rate(words: str, marks: Sequence[bool]) -> None:
+    """A rate in words."""
+    if marks:
+        ends = binomtest(sum(marks), len(marks)).proportion_ci(0.95, method="exact")
+        print(f"{words}: {sum(marks)} of {len(marks)} [{100 * ends.low:.0f}, {100 * ends.high:.0f}] %")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ coordinate would be infinite; a parameter that means nothing at null (a time con
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -52,6 +52,18 @@ class Coordinates:
     def names(self) -> tuple[str, ...]:
         """Names, in the order of the vector."""
         return self.space.names
+
+    def with_further(self, added: ParameterSpace) -> Coordinates:
+        """The same with parameters after all others, which are measured from their null values.
+
+        What was computed of the others is kept: to sample and to compile it anew takes as long as a refit's rollouts.
+        """
+        found = replace(self, space=ParameterSpace((*self.space.parameters, *added.parameters)))
+        assert found.affine[len(self.names) :].all()
+        fresh = added.sample(jax.random.key(len(self.names)), PRIOR_DRAWS)
+        kept = {"_draws": self._draws | {name: np.asarray(values, dtype=float) for name, values in fresh.items()}}
+        found.__dict__.update(kept, _moved=self._moved)
+        return found
 
     @cached_property
     def affine(self) -> np.ndarray:

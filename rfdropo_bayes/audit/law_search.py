@@ -25,7 +25,6 @@ from rfdropo_bayes.mechanisms.ports import Port, PortMap
 
 LEAST = 0.01
 """Share of what the model leaves beyond the noise that a term must explain in left-out recordings."""
-SURE = 4.0  # deviations from zero that a coefficient must have to stay
 TERMS = 3  # of a law
 BY_EVIDENCE, BY_GAIN = 3, 2  # ports and terms that are refitted
 EXCHANGES = 2  # rounds in which a term may take the place of the one that was chosen
@@ -66,7 +65,9 @@ class Refit:
         term: the last one.
         target, fit: the model.
         gain: see `TermGain`.
-        score: nats that the term brings, less what a parameter and the choice among many cost.
+        score: nats that the term brings, less what a parameter and the choice among many cost. It says whether the term
+            is needed; its coefficient over its deviation does not: cables leave the common scale of stiffness and
+            forces free, so that every force is as uncertain as Young's modulus, however large its effect.
     """
 
     term: PlacedTerm
@@ -243,7 +244,7 @@ class LawSearch:
                 if not refits or refits[0].score <= 0.0:
                     break
                 best, others = self._exchanged(known, terms, found, values, refits, gates[-1])
-                if not _sure(best):
+                if best.score <= 0.0:
                     break
                 ties = ties if terms else _tied(best, others)
                 terms.append(best)
@@ -389,11 +390,6 @@ def _tied(best: Refit, others: Sequence[Refit]) -> list[Refit]:
         found.setdefault((refit.term.port, refit.term.feature), refit)
     found.pop((best.term.port, best.term.feature), None)
     return [refit for refit in found.values() if refit.score > best.score - TIED]
-
-
-def _sure(refit: Refit) -> bool:
-    """Whether the last coefficient is clearly not zero."""
-    return bool(abs(refit.fit.x[-1]) > SURE * np.sqrt(refit.fit.covariance[-1, -1]))
 
 
 def _scale(known: FitTarget, fit: Fit) -> Float[np.ndarray, " free"]:

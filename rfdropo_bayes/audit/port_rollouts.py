@@ -6,7 +6,6 @@ One compiled simulator serves all laws: their signals are computed outside and h
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -19,7 +18,7 @@ from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.forward import Fields, Forward, Lanes, Points
 from rfdropo_bayes.audit.journal import digest
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks
-from rfdropo_bayes.bayes.space import ParameterSpace, build_space
+from rfdropo_bayes.bayes.space import build_space
 from rfdropo_bayes.mechanisms.default_priors import normal
 from rfdropo_bayes.mechanisms.features import Feature
 from rfdropo_bayes.mechanisms.laws import FAR, unit_of
@@ -213,8 +212,7 @@ def with_laws_of(own: Forward, forward: Forward) -> Forward:
 def with_terms(coordinates: Coordinates, terms: Sequence[PlacedTerm]) -> Coordinates:
     """Coordinates with the coefficients of laws after all others; measured from null in prior deviations."""
     added = build_space([t.spec for t in terms], {t.spec.name: {} for t in terms}, {}, ())
-    space = ParameterSpace((*coordinates.space.parameters, *added.parameters))
-    return replace(coordinates, space=space)
+    return coordinates.with_further(added)
 
 
 def placed(port: Port, feature: Feature, size: float, channels: Sequence[str], unit: str) -> PlacedTerm:
