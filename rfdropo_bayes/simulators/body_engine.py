@@ -233,7 +233,7 @@ class Engine:
         system: Any = self.body.system
         prepared, state, residual = prepare(system, material), state_at_rest(system), jnp.zeros(())
         if self.from_equilibrium:
-            under, force = prepared, jnp.zeros(())
+            under, force = prepared, jnp.zeros((len(state.position), 3))
             if loads is not None:
                 under, force = loaded(system, prepared, self._section_loads(loads), 0)
             state, found = find_equilibrium(system, under, start, force)

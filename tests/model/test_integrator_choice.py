@@ -59,7 +59,7 @@ def test_an_experiment_may_choose_another_integrator_than_the_robot(name, asked)
 def test_simulated_recordings_are_fitted_with_the_integrator_that_made_them(name):
     model = rb.Model.read(EXPERIMENTS / f"{name}.toml")
     for recording in (*model.recordings("fit"), *model.recordings("test")):
-        assert recording.settings["simulator"].get(INTEGRATOR, "euler") == integrator_of(model.spec)
+        assert recording.settings.get("simulator", {}).get(INTEGRATOR, "euler") == integrator_of(model.spec)
 
 
 def test_a_run_states_its_integrator(tmp_path):

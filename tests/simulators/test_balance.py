@@ -113,9 +113,10 @@ def test_an_arm_that_hangs_still_is_carried_by_its_base_under_sdirk2():
     arm = build_robot_simulator(ModelSpec(robot))
     assert arm.engine.integrator == "sdirk2"
     rows, channels = 20, len(robot.channel_names)
-    value = np.zeros((rows, channels))
+    slack = np.full(channels, -5e-3)
+    value = np.tile(slack, (rows, 1))
     value[10:, 1] = 2e-3
-    commands = arm.commands(0.05 * np.arange(rows), value, np.zeros(channels), 0.05 * np.arange(rows + 1))
+    commands = arm.commands(0.05 * np.arange(rows), value, slack, 0.05 * np.arange(rows + 1))
     found = jax.jit(arm.balance)({}, commands)
     weight = robot.nominal()["trunk_mass"] * robot.gravity
     np.testing.assert_allclose(found.base_force[:10], np.tile(-weight, (10, 1)), atol=1e-3 * np.linalg.norm(weight))

@@ -83,7 +83,7 @@ def test_a_prediction_holds_every_draw_of_the_cube_in_the_measuring_frame(simula
         ParameterInfo("observation_noise", "m", 1e-6, 0.2, {"distribution": "LogNormal", "median": 1e-3, "sigma": 1.0})
     ]
     draws = {"offset_x": rng.normal(0, 0.005, (1, 8)), "observation_noise": np.full((1, 8), 1e-3)}
-    PosteriorRecord(tuple(infos), draws).save(tmp_path / "posterior.nc")
+    PosteriorRecord(tuple(infos), draws, attrs={"integrator": "sdirk2"}).save(tmp_path / "posterior.nc")
     changes = ["simulator.push=true", "simulator.time_step=0.02", "data.format='netcdf'"]
     run_prediction(
         Model.read(EXPERIMENTS / "sim2real_trunk.toml", changes),

@@ -23,6 +23,7 @@ from rfdropo_bayes.groups import gather_groups
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.model.assembly import pooling
 from rfdropo_bayes.model.experiment import Experiment
+from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
@@ -34,6 +35,7 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.verbs.predict import run_prediction
 from rfdropo_bayes.verbs.simulate import simulate_all
 
+FITTED_WITH = {INTEGRATOR: "sdirk2"}
 EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 COMMANDS = "demo/demo_3.nc"
 SHIFT = np.array([0.004, -0.003, 0.002])  # [m]
@@ -55,7 +57,7 @@ def posterior(tmp_path_factory) -> Path:
             name = f"offset_{axis}@{recording}"
             infos.append(ParameterInfo(name, "m", -0.05, 0.05, {"distribution": "Normal", "loc": 0.0, "scale": 0.005}))
             draws[name] = rng.normal(0.0, 0.003, (1, 40))
-    PosteriorRecord(tuple(infos), draws).save(folder / "posterior.nc")
+    PosteriorRecord(tuple(infos), draws, attrs=FITTED_WITH).save(folder / "posterior.nc")
     return folder
 
 
@@ -104,7 +106,9 @@ def test_the_marker_that_the_model_knows_best_sets_the_frame(posterior, tmp_path
 def test_another_noise_than_the_fitted_one_is_refused(posterior, tmp_path):
     record = PosteriorRecord.load(posterior / "posterior.nc")
     (tmp_path / "auto").mkdir()
-    PosteriorRecord(record.parameters, record.posterior, attrs={NOISE: "auto"}).save(tmp_path / "auto" / "posterior.nc")
+    PosteriorRecord(record.parameters, record.posterior, attrs=FITTED_WITH | {NOISE: "auto"}).save(
+        tmp_path / "auto" / "posterior.nc"
+    )
     with pytest.raises(InputError, match=r"fitted with noise = 'auto', the experiment says 'white'.*model\.noise=auto"):
         predict(tmp_path / "auto", COMMANDS, tmp_path / "a")
 
@@ -116,7 +120,7 @@ def test_a_piece_of_a_fitted_recording_keeps_its_frame(posterior, tmp_path):
     infos = tuple(replace(info, name=name) for info, name in zip(record.parameters, renamed, strict=True))
     draws = {name: record.posterior[info.name] for name, info in zip(renamed, record.parameters, strict=True)}
     (tmp_path / "same").mkdir()
-    PosteriorRecord(infos, draws).save(tmp_path / "same" / "posterior.nc")
+    PosteriorRecord(infos, draws, attrs=FITTED_WITH).save(tmp_path / "same" / "posterior.nc")
     whole = Trajectory.load(EXPERIMENTS / COMMANDS)
     moved = whole.dataset.assign(position=whole.dataset["position"] + xr.DataArray(SHIFT, dims="axis"))
     Trajectory(moved).save(tmp_path / "moved.nc")
@@ -191,7 +195,7 @@ def test_wrong_requests_are_named(posterior, tmp_path):
     infos = (*stranger.parameters, ParameterInfo("delay", "s", 0.0, 1.0, prior_of(0.1)))
     draws = {**stranger.posterior, "delay": np.full((1, 40), 0.1)}
     (tmp_path / "other").mkdir()
-    PosteriorRecord(infos, draws).save(tmp_path / "other" / "posterior.nc")
+    PosteriorRecord(infos, draws, attrs=FITTED_WITH).save(tmp_path / "other" / "posterior.nc")
     with pytest.raises(InputError, match="the experiment's model lacks"):
         predict(tmp_path / "other", COMMANDS, tmp_path)
 
@@ -353,7 +357,7 @@ def test_a_simulated_recording_is_predicted_from_its_first_row(name, sign, tmp_p
     infos = [ParameterInfo(n, "-", -np.inf, np.inf, priors[n]) for n in fixed]
     infos += [ParameterInfo(n, "m", -0.5, 0.5, {"distribution": "Normal", "loc": 0.0, "scale": 0.01}) for n in offset]
     draws = {n: np.full((1, 4), v) for n, v in fixed.items()} | offset
-    PosteriorRecord(tuple(infos), draws).save(tmp_path / "posterior.nc")
+    PosteriorRecord(tuple(infos), draws, attrs=FITTED_WITH).save(tmp_path / "posterior.nc")
     run_prediction(Model.read(tmp_path / "own.toml"), tmp_path, "trajectory.nc", tmp_path / "out")
     with xr.open_dataset(tmp_path / "out" / "prediction.nc") as opened:
         predicted = opened["mean"].values
