@@ -4,7 +4,9 @@
 
 The settings name experiments, patterns of recordings that are left out together, such as those of a day, and the
 seconds of the first of them that each fit is then adapted to. Recordings are predicted whole, also where the experiment
-fits some rows of them; after an adaptation the first one as far as it was not shown.
+fits some rows of them; after an adaptation the first one as far as it was not shown. Climbs start from the prior, or
+where a study has `start`, the folder of a calibration, from its optimum: a day that is left out has chosen the basin
+then, and nothing else.
 
 Every figure is a line of DIR/ledger.jsonl: how far the last marker is off [mm], and which share of the measured
 coordinates lies in the 90 % bands: of all markers, of the last, and of rows whose last marker is inside in all three.
@@ -60,7 +62,7 @@ def whole_recordings(model: rb.Model, pattern: str) -> list[rb.Trajectory]:
     return [run for run in every if fnmatchcase(run.name, pattern)]
 
 
-def left_out(model: rb.Model, pattern: str, out: Path) -> rb.Calibration:
+def left_out(model: rb.Model, pattern: str, out: Path, start: Path | None) -> rb.Calibration:
     """A fit that has not seen the recordings that a pattern stands for, and predicts them."""
     if (out / "posterior.nc").exists():
         return rb.load(out)
@@ -71,6 +73,7 @@ def left_out(model: rb.Model, pattern: str, out: Path) -> rb.Calibration:
         make_config(table.method, inference_options(table)),
         test=whole_recordings(model, pattern),
         seed=model.settings.seed,
+        start=start,
         out=out,
         overwrite=True,
     )
@@ -96,12 +99,12 @@ def figures(prediction: RecordingPrediction) -> dict[str, float]:
 def cases(study: dict[str, Any], out: Path, known: set[tuple[str, str, float]]) -> Iterator[dict[str, Any]]:
     """Lines of the ledger that are not known, each as soon as it is there; 0 seconds shown are the first row alone."""
     experiment = Path(study["experiment"])
-    model = rb.Model.read(experiment)
+    model, start = rb.Model.read(experiment), Path(study["start"]) if "start" in study else None
     for pattern in study["left_out"]:
         waiting = [seconds for seconds in (0.0, *study["adapt"]) if (experiment.stem, pattern, seconds) not in known]
         if not waiting:
             continue
-        found = left_out(model, pattern, out / experiment.stem / pattern.replace("*", ""))
+        found = left_out(model, pattern, out / experiment.stem / pattern.replace("*", ""), start)
         first, *others = whole_recordings(model, pattern)
         for seconds in waiting:
             fit = found

@@ -57,6 +57,8 @@ def fit_day(
     own: Sequence[InferredParameter],
     key: PRNGKeyArray,
     report: Callable[[int, float], None] = lambda step, share: None,
+    *,
+    share: float = 1.0,
 ) -> DayFit:
     """Draws of a day's parameters, and of the body, given one recording of the day.
 
@@ -67,6 +69,7 @@ def fit_day(
         own: the day's: deviations of its group, and parameters of the recording.
         key: of draws from the priors, perturbations of the data, and the choice of the body's draws.
         report: is told the step, and the share of the draws that have converged.
+        share: what a coordinate of a row counts, because markers err together (`ModelError.share`).
     """
     count = len(next(iter(body.values())))
     centre_key, noise_key, choice_key = jax.random.split(key, 3)
@@ -78,7 +81,7 @@ def fit_day(
         return given | {p.name: physical_of_normal(p, x, given) for p, x in zip(own, point.T, strict=True)}
 
     def white(point: np.ndarray, draw: np.ndarray) -> np.ndarray:
-        return problem.residual_batch(values_at(point, draw), horizon)
+        return np.sqrt(share) * problem.residual_batch(values_at(point, draw), horizon)
 
     seen = np.flatnonzero(problem.model.markers.valid)
     noise = np.asarray(jax.random.normal(noise_key, (count, len(seen))))
@@ -86,10 +89,11 @@ def fit_day(
     def residuals(point: np.ndarray, draw: np.ndarray, excess: float = 1.0) -> np.ndarray:
         return white(point, draw)[:, seen] / excess + noise[draw]
 
-    fit = fit_own(residuals, centre, start=np.zeros_like(centre), report=lambda step, share: report(step, 0.5 * share))
+    fit = fit_own(residuals, centre, start=np.zeros_like(centre), report=lambda step, done: report(step, 0.5 * done))
     misfit, excess = 2.0 * float(np.median(_least_cost(fit, noise))), 1.0
-    if misfit > chi2.ppf(SURE, len(seen)):
-        excess = float(np.sqrt(misfit / len(seen)))
+    independent = share * len(seen)
+    if misfit > chi2.ppf(SURE, independent):
+        excess = float(np.sqrt(misfit / independent))
         fit = fit_own(partial(residuals, excess=excess), centre, start=fit.point, report=report)
     evidence = _log_evidence(fit, noise)
     power, _ = next_step(partial(np.multiply, evidence), 1.0, LEAST_SHARE)

@@ -215,7 +215,12 @@ def _fitted(asked: Day, draws: int, key: jax.Array, show: bool | None) -> Adapte
     with Progress("adapt", show=show) as progress:
         words = {"draws": len(next(iter(body.values()))), "parameters": len(own)}
         found = fit_day(
-            problem, body, own, fit_key, lambda step, share: progress.stage(max(share, step / MOST_STEPS), **words)
+            problem,
+            body,
+            own,
+            fit_key,
+            lambda step, done: progress.stage(max(done, step / MOST_STEPS), **words),
+            share=left.share,
         )
     noise = replace(noise, scale=found.excess * noise.scale)
     problem = CalibrationProblem(replace(program, channels=(replace(channel, known=noise),)), chunk=simulator.lanes)
