@@ -108,7 +108,7 @@ def test_only_the_states_of_implicit_euler_tell_the_velocities_of_a_mesh(trunk):
 
 @pytest.mark.slow
 def test_an_arm_that_hangs_still_is_carried_by_its_base_under_sdirk2():
-    """And one that is pulled gets its energy from the cables: another integrator tells nearly the same."""
+    """And one that is pulled gets its energy from the cables: 1 % is lost to the steps, of implicit Euler 25 %."""
     robot = Robot.load("smooth_arm").with_changes(initial_state="equilibrium")
     arm = build_robot_simulator(ModelSpec(robot))
     assert arm.engine.integrator == "sdirk2"
@@ -122,6 +122,6 @@ def test_an_arm_that_hangs_still_is_carried_by_its_base_under_sdirk2():
     np.testing.assert_allclose(found.base_force[:10], np.tile(-weight, (10, 1)), atol=1e-3 * np.linalg.norm(weight))
     euler = replace(arm, engine=replace(arm.engine, integrator="euler"))
     other = jax.jit(euler.balance)({}, commands)
-    worked = float(found.cable_work[-1])
-    assert worked == pytest.approx(float(other.cable_work[-1]), rel=0.1)
-    assert abs(float(found.other_loss[-1])) < 0.3 * abs(float(other.other_loss[-1]))
+    shares = [abs(float(each.other_loss[-1] / each.cable_work[-1])) for each in (found, other)]
+    assert shares[0] < 0.03
+    assert shares[1] > 0.1
