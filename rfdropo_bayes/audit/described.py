@@ -118,13 +118,18 @@ def _beside(problem: AuditProblem, model: NamedModel, report: Callable[[str], No
     target, fit = model.last
     options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report)
     found = law_search(target.measured, *options).find(target, as_measured(target, fit))
-    last = found.last
-    if last is None:
+    if not found.terms:
         return Described(found)
     stages = stages_of(model.judge, model.base, model.steps)
-    stages.append(JudgedModel(last.target, last.fit, stages[-1].finer))
+    named = len(stages) - 1
+    stages += [JudgedModel(refit.target, refit.fit, stages[-1].finer) for refit in found.terms]
     held_out = predicted(problem, model.judge.measured, stages)
-    gain, overall = held_out.gain(len(stages) - 2, len(stages) - 1), held_out.gain(0, len(stages) - 1)
+    # As with what the library names, a law is cut to what unseen recordings support.
+    kept = held_out.supported_from(named) - named or len(found.terms)
+    if kept < len(found.terms):
+        report(f"unseen recordings do not support more than {kept} of {len(found.terms)} terms")
+    found, held_out = found.cut(kept), held_out.after(named + kept)
+    gain, overall = held_out.gain(named, named + kept), held_out.gain(0, named + kept)
     return Described(found, (), (), gain, overall, held_out, holds_on(problem.rules, gain))
 
 

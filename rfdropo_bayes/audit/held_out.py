@@ -76,8 +76,12 @@ class HeldOut:
 
     def supported(self) -> int:
         """Number of steps that the unseen recordings clearly support, each beside the last one that they do."""
-        last = 0
-        for after in range(1, len(self.predictions)):
+        return self.supported_from(0)
+
+    def supported_from(self, first: int) -> int:
+        """The same of the steps after the first so many, which are taken as they are."""
+        last = first
+        for after in range(first + 1, len(self.predictions)):
             if self.gain(last, after).clear:
                 last = after
         return last

@@ -92,7 +92,7 @@ class FoundLaw:
         left_out: ports that the body cannot carry, with the reason.
         terms: refits of the law's terms, the last one with all of them; empty where none is worth it.
         ties: refits of other terms in place of the first one that leave as little, within `TIED`; the best first.
-        after: largest log evidence of any port once the law is in the model; None without a law.
+        afterwards: largest log evidence of any port with each term and those before it in the model.
         centre: times of the ports' signals [s].
         gate: gain [nat] that a first term had to bring to left-out recordings; None where no port is significant.
     """
@@ -101,7 +101,7 @@ class FoundLaw:
     left_out: dict[str, str]
     terms: list[Refit]
     ties: list[Refit]
-    after: PortEvidence | None
+    afterwards: list[PortEvidence]
     centre: Float[np.ndarray, " spline"]
     gate: float | None
 
@@ -109,6 +109,15 @@ class FoundLaw:
     def last(self) -> Refit | None:
         """The model with all terms."""
         return self.terms[-1] if self.terms else None
+
+    @property
+    def after(self) -> PortEvidence | None:
+        """Largest log evidence of any port once the law is in the model; None without a law."""
+        return self.afterwards[-1] if self.terms else None
+
+    def cut(self, terms: int) -> FoundLaw:
+        """The law of the first so many terms."""
+        return replace(self, terms=self.terms[:terms], afterwards=self.afterwards[:terms])
 
     @property
     def rivals(self) -> list[Refit]:
@@ -235,6 +244,7 @@ class LawSearch:
         null = self._null(known, fit, found)
         where = evidences(found, null)
         first, terms, ties, gates = where, list[Refit](), list[Refit](), list[float]()
+        afterwards: list[PortEvidence] = []
         try:
             while len(terms) < self.most and where[0].adjusted_p <= self.family:
                 found = found if terms else self._sharpened(known, fit, found, values, where)
@@ -252,11 +262,13 @@ class LawSearch:
                 found = _relinearised(known, found, fit)
                 null = self._null(known, fit, found)
                 where = evidences(found, null)
+                afterwards.append(where[0])
                 self._say(best, where[0])
         except OutOfTime:
             self.report("the time was up before the law was found")
-        last, gate = where[0] if terms else None, next(iter(gates), None)
-        return FoundLaw(first, dict(self.ports.left_out), terms, ties, last, found.basis.centre, gate)
+        # The time may be up between a term and what is left beside it.
+        terms, gate = terms[: len(afterwards)], next(iter(gates), None)
+        return FoundLaw(first, dict(self.ports.left_out), terms, ties, afterwards, found.basis.centre, gate)
 
     def _sharpened(
         self, known: FitTarget, fit: Fit, found: Responses, values: np.ndarray, where: Sequence[PortEvidence]
