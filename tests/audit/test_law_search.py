@@ -8,7 +8,9 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
+from rfdropo_bayes.audit import described as described_module
 from rfdropo_bayes.audit.audit_record import next_experiment, record
+from rfdropo_bayes.audit.described import NamedModel, describe
 from rfdropo_bayes.audit.experiment_design import Hypothesis, outlooks
 from rfdropo_bayes.audit.inadequacy import as_measured
 from rfdropo_bayes.audit.law_search import law_search
@@ -67,6 +69,27 @@ def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
     assert float((left.residual_last**2).mean()) < float((left.residual_base**2).mean())
     assert left.signal.sel(port="marker m3 x").shape == (2, left.sizes["signal_time"])
     assert "What acts, and where" in render_audit(shown(answer), content, "toy", "")
+
+
+def test_a_term_that_unseen_recordings_do_not_support_is_cut(monkeypatch):
+    """A search whose second term brings nothing: it is the first one again."""
+    question = asked(5, Pushed())
+    target, base = base_model(question, question.seed)
+    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
+    search = replace(law_search(target.measured, *options), most=1)
+    once = search.find(target, as_measured(target, base))
+
+    class Twice:
+        def find(self, *_):
+            return replace(once, terms=[*once.terms] * 2, afterwards=[*once.afterwards] * 2)
+
+    monkeypatch.setattr(described_module, "law_search", lambda *_: Twice())
+    said = []
+    found = describe(question, NamedModel(target, base), None, said.append)
+    assert found.holds
+    assert [refit.term.port.name for refit in found.found.terms] == ["marker m3 x"]
+    assert len(found.held_out.predictions) == 2
+    assert said == ["unseen recordings do not support more than 1 of 2 terms"]
 
 
 def test_nothing_is_described_where_nothing_is_hidden():
