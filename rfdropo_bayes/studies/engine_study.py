@@ -1,7 +1,7 @@
 """``rfdropo benchmark audit --truth mujoco``: effects in an arm that MuJoCo moves, audited with our layered body.
 
 The two engines differ where nothing is hidden, too. That difference is audited once, on recordings of its own, and what
-the audit finds is adopted: the model that it extends is the base of all audits that follow. Three repeats of one random
+the audit names is adopted: the model with it is the base of all audits that follow. Three repeats of one random
 command and three recordings of others are fitted, four more are untouched.
 """
 
@@ -28,6 +28,7 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, read_lines, write_text
 from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import AuditTable, Experiment
 from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.model import Model
@@ -90,11 +91,19 @@ def _adopted(out: Path, seed: int) -> dict[str, Any]:
         place = _recorded(own, None, 0.0, [seed, 0], out / BASE / "data")
         assert place is not None
         found = audit(Model.read(place / "audit.toml"), out=out / BASE / "audit", workshop=_WORKSHOP, overwrite=True)
-        tables = dict(found.tables) if found.findings.size or found.content.get("law") else own
-        kept = {key: tables[key] for key in ("robot", "model", "simulator") if key in tables}
-        stored.write_text(json.dumps({**own, **kept}), encoding="utf-8")
+        stored.write_text(json.dumps(_with_findings(own, found.content["findings"])), encoding="utf-8")
         (out / BASE / "sentence.txt").write_text(found.sentence + "\n", encoding="utf-8")
     return dict(json.loads(stored.read_text(encoding="utf-8")))
+
+
+def _with_findings(tables: Mapping[str, Any], findings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """An experiment whose model has every mechanism that was named: the engines are known to differ, and so unseen
+    recordings need not support it."""
+    named = [row for row in findings if row["mechanism"] in REGISTRY]
+    model = dict(tables["model"])
+    model["mechanisms"] = [row["mechanism"] for row in named]
+    model["priors"] = {**model["priors"], **{name: {} for row in named for name in row["parameters"]}}
+    return {**tables, "model": model}
 
 
 def _one(job: Job, base: Mapping[str, Any], folder: Path) -> dict[str, Any]:
