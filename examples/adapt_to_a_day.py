@@ -27,7 +27,7 @@ zeros = [name for name in model.parameters.index if name.startswith("initial_dis
 tightened = dict(zip(zeros, (2e-3, -1e-3, 1.5e-3, -2e-3), strict=True))
 today = rb.simulate(model, {**walk, "recordings": ["today_1", "today_2"]}, parameters=tightened, noise=noise, seed=2)
 
-fit = rb.calibrate(model, monday, rb.Laplace(), seed=0, show=False)
+fit = rb.calibrate(model, monday, rb.Laplace(starts=1), seed=0, show=False)
 adapted = rb.adapt(fit, today[0], seed=0, show=False)
 
 figure, axes = plt.subplots(figsize=(8, 3.2), layout="constrained")

@@ -46,7 +46,7 @@ with TemporaryDirectory() as folder:
     }
     read = rb.read("monday.csv", folder=folder, format="csv", columns=columns)
 
-fit = rb.calibrate(model, read, rb.Laplace(), seed=0, show=False)
+fit = rb.calibrate(model, read, rb.Laplace(starts=1), seed=0, show=False)
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.2), layout="constrained")
 fit.plot_fit(ax=axes[0])
 fit.plot_prior_posterior("young_modulus", ax=axes[1])

@@ -40,7 +40,7 @@ axes[0].step(time, 1e3 * sent, where="post", label=channels)
 axes[0].set(xlabel="time [s]", ylabel="pull [mm]", title="proposed")
 spread = {}
 for words, second in (("another like it", again), ("the proposed one", designed)):
-    fit = rb.calibrate(model, [*first, *second], rb.Laplace(), seed=0, show=False)
+    fit = rb.calibrate(model, [*first, *second], rb.Laplace(starts=1), seed=0, show=False)
     draws = fit.posterior.posterior["rayleigh_stiffness"].values.ravel()
     axes[1].hist(1e3 * draws, bins=30, density=True, alpha=0.5, label=words)
     spread[words] = float(np.std(np.log(draws)))

@@ -36,7 +36,7 @@ with TemporaryDirectory() as folder:
     walk = {"duration": 3.0, "interval": 0.3, "step": 0.3, "low": -0.6, "high": 0.6, "sample_time": 0.03}
     noise = {"standard_deviation": 5e-4}
     runs = rb.simulate(model, {**walk, "recordings": ["one", "two"]}, parameters=TRUTH, noise=noise, seed=2)
-    fit = rb.calibrate(model, runs, rb.Laplace(), seed=0, show=False)
+    fit = rb.calibrate(model, runs, rb.Laplace(starts=1), seed=0, show=False)
 
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.2), layout="constrained")
 fit.plot_fit(marker="tip", axis="x", ax=axes[0])

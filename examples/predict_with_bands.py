@@ -18,7 +18,7 @@ priors = {
     "rayleigh_stiffness": {"distribution": "LogNormal", "median": 0.05, "sigma": 0.7},
 }
 model = rb.Model("smooth_arm", priors=priors, simulator={"refine": 1, "time_step": 0.02, "precision": "float32"})
-fit = rb.calibrate(model, runs, rb.Laplace(), seed=0, show=False)
+fit = rb.calibrate(model, runs, rb.Laplace(starts=1), seed=0, show=False)
 
 # Of the recording only the commands and the first row are looked at.
 ahead = rb.predict(fit, unseen, seed=0)

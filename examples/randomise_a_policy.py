@@ -15,7 +15,7 @@ priors = {
 }
 fast = {"precision": "float32"}
 model = rb.Model("virtual_trunk", priors=priors, mechanisms=["actuator_lag"], noise="ar1", simulator=fast)
-fit = rb.calibrate(model, rb.read("reach_1.nc", folder=VIRTUAL), rb.Laplace(), seed=0, show=False)
+fit = rb.calibrate(model, rb.read("reach_1.nc", folder=VIRTUAL), rb.Laplace(starts=1), seed=0, show=False)
 
 venv = rb.make_vec("TrunkReach-v0", model, posterior=fit, n=64)
 venv.seed(0)

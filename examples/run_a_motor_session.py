@@ -27,7 +27,7 @@ if __name__ == "__main__":  # the simulated drives are a process of their own
     axes[0].set_ylabel("tip and goal [mm]")
     axes[0].legend()
     axes[1].step(run.command_time, run.command, where="post")
-    axes[1].set(xlabel="time [s]", ylabel="motor angles sent [rad]")
+    axes[1].set(xlabel="time [s]", ylabel=f"sent [{run.command_unit}]")
     figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "run_a_motor_session.png")
     end = 1e3 * float(np.linalg.norm(run.position[-10:, -1].mean(axis=0) - GOAL))
     print(f"{len(run.time)} rows; the tip ends {end:.1f} mm from the goal")

@@ -249,7 +249,7 @@ class LawSearch:
             while len(terms) < self.most and where[0].adjusted_p <= self.family:
                 found = found if terms else self._sharpened(known, fit, found, values, where)
                 gates.append(self._gate(found, values, null))
-                ranked = self._ranked(found, values, gates[-1])
+                ranked = self._ranked(found, values, gates[-1], terms=terms)
                 refits = self._refits(known, terms, fit, where, ranked)
                 if not refits or refits[0].score <= 0.0:
                     break
@@ -302,15 +302,21 @@ class LawSearch:
         return float(np.quantile(most, 1.0 - self.family, method="higher"))
 
     def _ranked(
-        self, found: Responses, values: np.ndarray, gate: float, precision: Float[np.ndarray, "d d"] | None = None
-    ) -> list[TermGain]:
-        """All features at all ports that pass the gate, the largest gain first; see `left_out_gains`."""
+        self, found: Responses, values: np.ndarray, gate: float, precision: Float[np.ndarray, "d d"] | None = None,
+        terms: Sequence[Refit] = (),
+    ) -> list[TermGain]:  # fmt: skip
+        """All features at all ports that pass the gate, the largest gain first; see `left_out_gains`.
+
+        Terms that the law has are none of them: where a port is far from linear, they would bring something again.
+        """
         sizes, rows = signal_sizes(values), []
+        had = {(refit.term.port, refit.term.feature) for refit in terms}
         for port in found.whitened:
             columns = feature_columns(found, port, values / np.maximum(sizes, 1e-300)[:, None])
             gains, share, size, sd = left_out_gains(_sums(found, columns), precision)
             gain = gains[:, 0]
-            for k in np.flatnonzero((gain > gate) & (share >= LEAST)):
+            passed = np.flatnonzero((gain > gate) & (share >= LEAST))
+            for k in (k for k in passed if (port, self.table.features[k]) not in had):
                 parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
                 rows.append(TermGain(port, self.table.features[k], float(gain[k]), float(share[k]), *parts))
         return sorted(rows, key=lambda row: -row.gain)
@@ -335,7 +341,7 @@ class LawSearch:
             bare = replace(fit, x=without[:-1], free=fit.free[:-1], residual=residual, jacobian=fit.jacobian[:, :-1],
                            covariance=fit.covariance[:-1, :-1])  # fmt: skip
             linear = _relinearised(known, found, bare)
-            ranked = self._ranked(linear, values, gate, _precision(known, bare))
+            ranked = self._ranked(linear, values, gate, _precision(known, bare), terms)
             fresh = [row for row in ranked if (row.port, row.feature) not in tried][:FRESH]
             tried |= {(row.port, row.feature) for row in fresh}
             others = [self._refit(known, terms, bare, row) for row in fresh]

@@ -23,6 +23,7 @@ def found(truth: dict, seed: int, tension: bool):
     return json.loads(json.dumps(record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))))
 
 
+@pytest.mark.slow
 def test_a_friction_that_only_tensions_show_is_named_with_them_and_said_to_be_invisible_without():
     with_tension, without = (found({"drag": 0.5}, 31, tension) for tension in (True, False))
     assert with_tension["channels"] == ["markers", "tension"]
@@ -41,12 +42,14 @@ def test_a_friction_that_only_tensions_show_is_named_with_them_and_said_to_be_in
     assert "drag" in without["sentence"]
 
 
+@pytest.mark.slow
 def test_where_nothing_is_wrong_tensions_raise_no_alarm_and_positions_are_still_read():
     assert found({}, 32, True)["verdict"] == "no_discrepancy"
     content = found({"play": 1.0}, 33, True)
     assert [finding["mechanism"] for finding in content["findings"]] == ["play"]
 
 
+@pytest.mark.slow
 def test_a_weighed_part_holds_its_parameter_where_it_was_weighed():
     """A gain weighed 10 of its deviations off pulls the base fit there, and is one more residual of every data set."""
     free, held = (base_model(problem_of_cables({}, 34, True, weighed), 0) for weighed in ((), WEIGHED))

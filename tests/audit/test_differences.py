@@ -59,6 +59,7 @@ def found(asked: AuditProblem) -> dict:
     return json.loads(json.dumps(record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))))
 
 
+@pytest.mark.slow
 def test_a_mechanism_of_one_day_and_a_parameter_that_changed_are_named_with_their_sizes():
     content = found(compared({}, {"play": 0.5, "bend": -0.1}, 1))
     differences = {row["mechanism"]: row for row in content["between"]["differences"]}

@@ -263,7 +263,13 @@ class Hurried(Deadline):
 
 
 @pytest.mark.parametrize(
-    "share", [0.1, pytest.param(0.4, marks=pytest.mark.slow), pytest.param(0.7, marks=pytest.mark.slow), 0.95]
+    "share",
+    [
+        0.1,
+        pytest.param(0.4, marks=pytest.mark.slow),
+        pytest.param(0.7, marks=pytest.mark.slow),
+        pytest.param(0.95, marks=pytest.mark.slow),
+    ],
 )
 def test_an_audit_whose_time_is_up_finishes_with_what_it_knows(monkeypatch, share):
     """Play of ten times the size that is sure, and the time is up between the base fit and the end."""

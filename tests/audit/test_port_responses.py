@@ -101,6 +101,18 @@ def test_terms_of_null_data_pass_the_gate_as_seldom_as_is_said():
     assert 0 < small < 14
 
 
+def test_a_term_that_the_law_has_is_not_asked_for_again():
+    """At a port that is far from linear, such as a delay, it would bring something again."""
+    found, time = responses(3, signal=3.0), STEP * np.arange(ROWS)
+    values = np.stack([np.sin(k * time) for k in (8.0, 3.0, 5.0)])[None].repeat(GROUPS, axis=0)
+    features = [Feature("command", (k,)) for k in range(3)]
+    search = LawSearch(found.ports, SimpleNamespace(features=features), ((), "m"), 0, 0.1)
+    best, *others = [(row.port, row.feature) for row in search._ranked(found, values, 0.0)]
+    assert best == (PORTS[0], features[0])
+    law = [SimpleNamespace(term=SimpleNamespace(port=best[0], feature=best[1]))]
+    assert [(row.port, row.feature) for row in search._ranked(found, values, 0.0, terms=law)] == others
+
+
 def brute(found: Responses, column: np.ndarray) -> float:
     """Gain on pieces left out, each predicted from a fit to the others."""
     j, y, x = _pieces(found.jacobian), _pieces(found.residual), _pieces(column)

@@ -92,6 +92,7 @@ def problem(*recordings: Trajectory, known: Autoregression | None = None) -> Cal
     return CalibrationProblem(TrajectoryModel(simulator, space, {}, gathered, tuple(channels)))
 
 
+@pytest.mark.slow
 def test_the_log_likelihood_is_the_sum_of_the_channels_written_down_anew():
     reach, read = 0.1, recording(1)
     sent = np.concatenate([read.command[:1], read.command[:-1]])[:, 0]

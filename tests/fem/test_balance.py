@@ -66,6 +66,7 @@ def test_the_base_carries_the_weight(trunk, settle, balance, prepare):
     np.testing.assert_array_equal(found.kinetic_energy, 0.0)
 
 
+@pytest.mark.slow
 def test_momentum_changes_by_what_acts(trunk, trace, balance, prepare):
     """Base, cables, weight and drag make up the change of momentum in every step of a moving body."""
     material = fem.material(trunk, **SILICONE, rayleigh_mass=2.0, rayleigh_stiffness=0.01, gravity=GRAVITY)

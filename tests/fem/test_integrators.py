@@ -250,6 +250,7 @@ def slid(
     return found.pose
 
 
+@pytest.mark.slow
 def test_cubes_fall_without_a_rebound_and_rest():
     """Dropped, and thrown: it comes up again by less than 0.2 mm, and lies within 3 um of the plate a second later."""
     pose = slid(0.0, 1.0, {"height": 0.02}, {"height": 0.005, "velocity": (0.0, -1.0, 0.0)})
@@ -271,6 +272,7 @@ def test_cubes_stick_and_slide_on_a_slope():
     np.testing.assert_allclose(np.diff(above[0, :, 0], 2)[-5:] / TIME_STEP**2, expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_sliding_cube_stops_where_it_should():
     """v^2 / (2 mu g) on, at any step: within 10 um, where Euler is 2.5 mm short."""
     for step in (TIME_STEP, TIME_STEP / 2):

@@ -70,6 +70,7 @@ def test_stepwise_and_from_states_implicit_euler_is_the_same(trunk):
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-8 * scale, err_msg=name)
 
 
+@pytest.mark.slow
 def test_little_is_lost_in_steps_of_second_order(trunk):
     """Halving the step changes what is lost by 0.2 % of the work, where it changes what implicit Euler loses by ten
     times as much. The 0.6 % that stay are of the corotational forces, which have no exact potential."""
