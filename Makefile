@@ -60,7 +60,7 @@ validate: $(CORE) ## references and other simulators with ours beside them, in r
 	$(BIN)/python benchmarks/validate.py
 
 notebooks: $(DEV) ## run every notebook from top to bottom
-	$(PYTEST) -m notebook
+	$(PYTEST) -n $(WORKERS) -m notebook
 
 site: $(SITE) ## the documentation as pages, in site/; needs no network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
