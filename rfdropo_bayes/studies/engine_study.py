@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,7 @@ import jax
 import numpy as np
 from scipy.stats import binomtest
 
-from rfdropo_bayes.audit.audit_problem import measurements_of, simulated
-from rfdropo_bayes.audit.fit import FitTarget
-from rfdropo_bayes.audit.score import project_out, span
 from rfdropo_bayes.audit.verdict import DESCRIBED, EQUIVALENT, EXPLAINED, NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT
-from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
-from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder, read_lines, write_text
 from rfdropo_bayes.inference.progress import Progress
@@ -35,7 +29,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.studies.fits import Job, run_fits
-from rfdropo_bayes.studies.hidden_effects import NOISE, Setting, blank_recordings, experiment_tables, noisy
+from rfdropo_bayes.studies.hidden_effects import Setting, absorbing, blank_recordings, experiment_tables, noisy
 from rfdropo_bayes.studies.mujoco_truth import ENGINE_EFFECTS, EngineEffect, MuJoCoArm
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.audit import Workshop, audit, build_problem
@@ -165,22 +159,14 @@ def _size(
     fitted = list(blank[:FITTED])
     spec = spec_of(parse_table(Experiment, base, where=BASE), out)
     problem = build_problem(spec, AuditTable(), fitted, list(blank[FITTED:]), 0, workshop=_WORKSHOP)
-    measured = measurements_of(problem, range(FITTED), fitted)
-    forward = simulated(problem, False, measured, [group[0] for group in measured.members])
-    widths = [channel.valid.shape[-1] for channel in measured.channels]
-    white = Stacked(tuple(Autoregression(np.full(n, NOISE), np.ones(1), STATED, np.inf) for n in widths))
-    target = FitTarget(forward, replace(measured, count=measured.valid.astype(float)), white)
-    count = problem.coordinates.base
-    absorbed = span(target.jacobian(problem.coordinates.null, np.arange(count)))
-    first = [fitted[group[0]] for group in measured.members]
-    still = arm.positions(first, 0.0)
+    model = absorbing(problem, problem.coordinates.null, fitted)
+    still = arm.positions(model.recordings, 0.0)
     size = effect.usual
     for _ in range(STEPS):
         try:
-            moved = (arm.positions(first, size) - still).reshape(-1) / NOISE
+            found = model.rho(arm.positions(model.recordings, size) - still)
         except InputError:
             return None
-        found = float(np.sqrt(np.mean(project_out(absorbed, moved[:, None]) ** 2)))
         if found == 0.0:
             return None
         size *= rho / found

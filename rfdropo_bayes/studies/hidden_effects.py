@@ -8,10 +8,10 @@ discretisation's rho is computed as well.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -276,6 +276,35 @@ def _discretisation(target: FitTarget, truth: np.ndarray, made: Observation, mem
     fitted = replace(target.measurements, channels=tuple(replace(c, readings=part) for c, part in channels))
     refit = climb(replace(target, measurements=fitted), truth, np.arange(target.forward.coordinates.base))
     return float(np.sqrt(np.mean(refit.residual**2)))
+
+
+class Absorbing(NamedTuple):
+    """What a refit of the base model cannot absorb of a change of the markers.
+
+    Attributes:
+        recordings: the fitted ones, without repeats; ``commands``: theirs.
+        rho: of changes of their positions [m], (recording, time, marker, 3).
+    """
+
+    recordings: list[Trajectory]
+    commands: Any
+    rho: Callable[[np.ndarray], float]
+
+
+def absorbing(problem: Any, truth: np.ndarray, fitted: Sequence[Trajectory]) -> Absorbing:
+    """See `Absorbing`; the base model is linearised at ``truth``."""
+    measurements = measurements_of(problem, range(len(fitted)), fitted)
+    firsts = [group[0] for group in measurements.members]
+    forward = simulated(problem, False, measurements, firsts)
+    widths = [channel.valid.shape[-1] for channel in measurements.channels]
+    white = Stacked(tuple(Autoregression(np.full(n, NOISE), np.ones(1), STATED, np.inf) for n in widths))
+    target = FitTarget(forward, replace(measurements, count=measurements.valid.astype(float)), white)
+    base = span(target.jacobian(truth, np.arange(problem.coordinates.base)))
+
+    def rho(change: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(project_out(base, change.reshape(-1, 1) / NOISE) ** 2)))
+
+    return Absorbing([fitted[k] for k in firsts], forward.commands, rho)
 
 
 def noisy(

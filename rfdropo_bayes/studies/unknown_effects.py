@@ -18,11 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.audit.audit_problem import measurements_of, simulated
-from rfdropo_bayes.audit.fit import FitTarget
-from rfdropo_bayes.audit.score import project_out, span
-from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
-from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.files import output_folder
@@ -32,7 +27,7 @@ from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
 from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals
-from rfdropo_bayes.studies.hidden_effects import NOISE, Setting, blank_recordings, experiment_tables, noisy
+from rfdropo_bayes.studies.hidden_effects import Setting, absorbing, blank_recordings, experiment_tables, noisy
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
 
 REPEATS, OTHERS, UNTOUCHED = 3, 3, 4
@@ -275,17 +270,11 @@ def _sized(
     own: EffectSimulator, problem: Any, truth: np.ndarray, rho: float, fitted: Sequence[Trajectory]
 ) -> tuple[float, float] | None:
     """Size at which a refit of the base model cannot absorb ``rho`` noise deviations, and the rho that was reached."""
-    measurements = measurements_of(problem, range(len(fitted)), fitted)
-    forward = simulated(problem, False, measurements, [group[0] for group in measurements.members])
-    widths = [channel.valid.shape[-1] for channel in measurements.channels]
-    white = Stacked(tuple(Autoregression(np.full(n, NOISE), np.ones(1), STATED, np.inf) for n in widths))
-    target = FitTarget(forward, replace(measurements, count=measurements.valid.astype(float)), white)
-    base = span(target.jacobian(truth, np.arange(problem.coordinates.base)))
-    still = own.positions(forward.commands, 0.0)
+    base = absorbing(problem, truth, fitted)
+    still = own.positions(base.commands, 0.0)
 
     def reached(size: float) -> float:
-        effect = (own.positions(forward.commands, size) - still).reshape(-1) / NOISE
-        return float(np.sqrt(np.mean(project_out(base, effect[:, None]) ** 2)))
+        return base.rho(own.positions(base.commands, size) - still)
 
     found = [reached(size) for size in AMPLITUDES]
     above = [k for k, value in enumerate(found) if value >= rho]
