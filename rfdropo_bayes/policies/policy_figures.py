@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from rfdropo_bayes.policies.evaluation import Episode
-from rfdropo_bayes.report.style import CYCLE, WIDTH, styled
+from rfdropo_bayes.report.style import CYCLE, WIDTH, empty, styled
 
 MILLIMETRES = 1e3
 
@@ -64,7 +64,7 @@ def draws_figure(parameters: Mapping[str, np.ndarray], distances: np.ndarray) ->
         axes.plot(values, MILLIMETRES * distances, ".", markersize=4)
         axes.set(xlabel=name, ylabel="final distance [mm]", yscale="log")
     for axes in panels[len(parameters) :]:
-        axes.set_visible(False)
+        empty(axes)
     return figure
 
 

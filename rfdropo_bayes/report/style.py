@@ -172,7 +172,7 @@ def _cells(figure: Figure) -> list[tuple[Axes, Bbox]]:
         return []
     boxes = {axes: _inches(figure, box) for axes in shown if (box := axes.get_tightbbox()) is not None}
     rows: dict[int, list[Axes]] = {}
-    for axes in sorted(shown, key=lambda own: boxes[own].x0):
+    for axes in sorted(boxes, key=lambda own: boxes[own].x0):  # an invisible cell has no box
         rows.setdefault(specs[axes].rowspan.start, []).append(axes)  # type: ignore[union-attr]
     width = figure.get_figwidth()
     if width / max(len(row) for row in rows.values()) < LEAST_CELL:

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.policies.evaluation import Case, Episode
+from rfdropo_bayes.policies.policy_figures import draws_figure
 from rfdropo_bayes.policies.policy_page import Played, next_steps, render_policy
+from rfdropo_bayes.report.style import embed
 
 BROWSER = next(
     (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
@@ -73,6 +75,15 @@ def test_the_page_says_how_often_the_policy_succeeds():
     assert "97 %" in page
     assert "data:image/gif;base64,R0lGODlh" in page
     assert page.count('<td class="n">failed</td>') == 3
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 7])
+def test_every_parameter_has_its_panel_however_the_grid_fills(count: int):
+    values = {f"p{k}": np.linspace(1.0, 2.0, 20) for k in range(count)}
+    figure = draws_figure(values, np.full(20, 0.01))
+    shown = [axes for axes in figure.axes if axes.axison]
+    assert [axes.get_xlabel() for axes in shown] == list(values)
+    assert len(embed(figure, "draws").panels) in (1, count)
 
 
 @pytest.mark.slow

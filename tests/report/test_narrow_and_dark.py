@@ -58,6 +58,12 @@ def test_a_figure_of_one_piece_stays_one():
     assert [panel.kind for panel in embed(grid(2, 2), "Together", whole=True).panels] == ["whole"]
 
 
+def test_a_cell_that_is_not_shown_leaves_the_others():
+    figure = grid(2, 2)
+    figure.axes[3].set_visible(False)
+    assert len(embed(figure, "Three of four").panels) == 3
+
+
 def test_drawing_a_picture_hides_nothing_for_good():
     figure = grid(1, 2, legend=True)
     embed(figure, "Lines")
