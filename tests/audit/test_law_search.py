@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from rfdropo_bayes.audit import described as described_module
 from rfdropo_bayes.audit.audit_record import next_experiment, record
@@ -47,6 +48,7 @@ def asked(seed, toy=None, alike=False):
     )
 
 
+@pytest.mark.slow
 def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
     answer = audit(asked(5, Pushed()))
     content = record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))

@@ -167,7 +167,7 @@ def test_impossible_sample_times_are_rejected(recording, sample_time):
         recording.resample(sample_time)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=10)
 @given(seed=st.integers(0, 2**32 - 1), rows=st.integers(2, 30), optional=st.booleans())
 def test_saving_and_loading_changes_nothing(build, tmp_path_factory, seed, rows, optional):
     rng = np.random.default_rng(seed)

@@ -86,7 +86,9 @@ def errors(integrator: str, case: str, steps=(96, 192, 384)) -> np.ndarray:
     return np.array([np.sqrt(np.mean(np.sum((path(n, integrator) - converged) ** 2, axis=1))) for n in steps])
 
 
-@pytest.mark.parametrize("case", SMOOTH)
+@pytest.mark.parametrize(
+    "case", [case if case == "remembering" else pytest.param(case, marks=pytest.mark.slow) for case in SMOOTH]
+)
 def test_order_of_convergence(case):
     """Smooth motion: halving the step divides the error by two for Euler, by four for SDIRK2."""
     euler, sdirk2 = errors("euler", case), errors("sdirk2", case)

@@ -126,7 +126,7 @@ def test_episodes_without_a_seed_differ() -> None:
     assert not np.array_equal(goals[0].goal, goals[1].goal)
 
 
-@pytest.mark.parametrize("task", [REACH, "TrunkPush-v0"])
+@pytest.mark.parametrize("task", [REACH, pytest.param("TrunkPush-v0", marks=pytest.mark.slow)])
 def test_what_a_marker_has_moved_is_the_difference_of_two_sightings(task) -> None:
     """Else a policy could take the noise of motion capture off again. A fresh episode has not moved."""
     noisy = make_episodes(task, 2, actions="continuous", observed="full", noise=0.002)

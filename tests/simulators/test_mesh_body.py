@@ -74,6 +74,7 @@ def test_markers_start_at_the_mean_of_the_guides_and_the_first_stays(sofa):
     assert float(observation.tension.max()) > 0.1
 
 
+@pytest.mark.slow
 def test_both_engines_give_the_same_numbers(mesh, sofa):
     reference = trunk(mesh, engine="jax", **SOFA)
     commands = pulls(sofa, 3)

@@ -148,8 +148,9 @@ def test_another_recording_by_override_in_single_precision(sofa, tmp_path, monke
     overrides = f"data.fit=[{str(other)!r}]", "simulator.precision=float32"
     report = simulate(EXPERIMENTS / "sofa_reach.toml", tmp_path / "out", monkeypatch, capsys, *overrides)
     assert list(report["recordings"]) == ["other"]
-    assert report["error_mm"]["max"] < 0.1
-    assert report["error_mm"]["mean"] < 0.01
+    # Rounding decides when a slack cable tightens: some tenths of a millimetre in single rows (double: 0.0002 mm).
+    assert report["error_mm"]["max"] < 0.5
+    assert report["error_mm"]["mean"] < 0.05
 
 
 def test_values_set_on_the_command_line_count(sofa, tmp_path, monkeypatch, capsys):
