@@ -338,10 +338,15 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def target_digest(path: Path) -> str:
+    """SHA-256 of what a target's file means: another comment is no other target."""
+    return hashlib.sha256(describe(read_tables(path)).encode("utf-8")).hexdigest()
+
+
 def _judged_on(study: Study, row: str) -> dict[str, Any]:
     """What an evaluation is of, beside its policy."""
     exact = {"exact_oracle": study.size.exact_oracle} if ROWS[row].on_target else {}
-    return {"target_sha256": _digest(study.target), **exact}
+    return {"target_sha256": target_digest(study.target), **exact}
 
 
 def _learning(policy: Path) -> dict[str, float]:

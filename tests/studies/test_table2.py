@@ -19,6 +19,7 @@ from rfdropo_bayes.studies.table2 import ROWS, WITHOUT_CUBE, Study, Table2Size, 
 
 VIRTUAL = Path(__file__).resolve().parents[2] / "experiments" / "virtual"
 PUSH, REACH, TRUTH, AUDIT = (VIRTUAL / f"{name}.toml" for name in ("push", "reach", "truth", "audit"))
+COMMITTED = VIRTUAL.parents[1] / "reports" / "table2"
 SMALL = Table2Size(seeds=2, steps=1000, episodes=20, budget=100, minutes=1.0)
 
 
@@ -27,7 +28,7 @@ def keep(out: Path, row: str, seed: int, distances: np.ndarray) -> None:
     place = out / "push" / "evaluations" / f"{row.replace(' ', '_')}_{seed}"
     place.mkdir(parents=True)
     pd.DataFrame({"distance": distances, "diverged": ~np.isfinite(distances)}).to_csv(place / "episodes.csv")
-    made = {"sha256": "", "steps": 1000, "seconds": 1.0, "diverged": 0, "target_sha256": table2._digest(TRUTH)}
+    made = {"sha256": "", "steps": 1000, "seconds": 1.0, "diverged": 0, "target_sha256": table2.target_digest(TRUTH)}
     (place / "policy.json").write_text(json.dumps({**made, "exact_oracle": False}))
 
 
@@ -60,6 +61,22 @@ def test_what_is_done_makes_a_table(tmp_path) -> None:
     assert found["not_done"] == 2 * len(ROWS) - 4
     assert "75 %" in (tmp_path / "table2.md").read_text()
     assert (tmp_path / "table2.png").stat().st_size > 5000
+
+
+def test_the_committed_evaluations_are_of_the_committed_target() -> None:
+    """Else nobody could go on with the study, or make its tables again."""
+    study = Study({"push": PUSH, "reach": REACH}, TRUTH, AUDIT, COMMITTED, replace(Table2Size(), exact_oracle=True))
+    kept = [path.parent for path in COMMITTED.glob("*/evaluations/*/policy.json")]
+    jobs = [(task, row, seed) for task in study.experiments for row in ROWS for seed in range(3)]
+    assert len(kept) == sum(table2._cell(study, *job) is not None for job in jobs) > 0
+
+
+def test_another_comment_is_no_other_target(tmp_path) -> None:
+    other = tmp_path / "truth.toml"
+    other.write_text("# said anew\n" + TRUTH.read_text())
+    assert table2.target_digest(other) == table2.target_digest(TRUTH)
+    other.write_text(TRUTH.read_text().replace("command_delay = 0.03", "command_delay = 0.04"))
+    assert table2.target_digest(other) != table2.target_digest(TRUTH)
 
 
 def test_claims_follow_their_definitions() -> None:
