@@ -2,9 +2,9 @@
 
     python benchmarks/mujoco_audit.py [--out reports/audit_mujoco] [--seeds 0,1] [--effects friction,late_camera]
 
-The arm of `mujoco_sysid.py`: three joints with gravity, motors, markers at elbow and tip. What is hidden is written with
-MuJoCo alone, see `EFFECTS`; the audit reads the file as it is and infers the damping of each joint and the mass of the
-last link. Three repeats and two other recordings are fitted, three are untouched; noise of 0.3 mm a coordinate. One
+The arm of `mujoco_sysid.py`: three joints with gravity, motors, markers at elbow and tip. What is hidden is written
+with MuJoCo alone, see `EFFECTS`; the audit reads the file as it is and infers the damping of each joint and the mass of
+the last link. Three repeats and two other recordings are fitted, three are untouched; noise of 0.3 mm a coordinate. One
 line of the ledger for each data set; a data set in the ledger is not run again.
 """
 
@@ -178,10 +178,9 @@ def table(lines: list[dict[str, Any]]) -> str:
         law = ", ".join(f"{term['port']}: {term['feature']}" for term in line["law"].get("terms", []))
         told = ", ".join([*line["named"], *([law] if law else [])]) or "-"
         right = "yes" if line["right"] else "no"
-        rows.append(
-            f"| {line['effect'].replace('_', ' ')} | {line['seed']} | `{line['verdict']}` | {told.replace('_', ' ')} | {right} "
-            f"| {line['cpu_seconds']:.0f} |"
-        )
+        effect, told = (words.replace("_", " ") for words in (line["effect"], told))
+        cells = [effect, str(line["seed"]), f"`{line['verdict']}`", told, right, f"{line['cpu_seconds']:.0f}"]
+        rows.append(f"| {' | '.join(cells)} |")
     return "\n".join([*rows, ""])
 
 
