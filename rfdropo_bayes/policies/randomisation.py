@@ -17,6 +17,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
 
 POSTERIOR, PHI = "posterior.nc", "summary.json"
@@ -205,7 +206,7 @@ def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Ran
     return randomisation
 
 
-def read_posterior(path: Path, specs: Sequence[ParameterSpec], robot: Robot | None = None) -> Draws:
+def read_posterior(path: Path, specs: Sequence[ParameterSpec], robot: Robot | BlackBox | None = None) -> Draws:
     """Draws of a saved posterior, of the parameters that the simulator has: noise is none, nor what belongs to one
     recording.
 
@@ -227,7 +228,11 @@ def read_posterior(path: Path, specs: Sequence[ParameterSpec], robot: Robot | No
 
 
 def drawn_rows(
-    record: PosteriorRecord, specs: Sequence[ParameterSpec], *, where: str = "posterior", robot: Robot | None = None
+    record: PosteriorRecord,
+    specs: Sequence[ParameterSpec],
+    *,
+    where: str = "posterior",
+    robot: Robot | BlackBox | None = None,
 ) -> Draws:
     """Rows of a posterior, of the parameters that the simulator has.
 
@@ -245,7 +250,7 @@ def drawn_rows(
     return Draws(names, rows, hashlib.sha256(np.ascontiguousarray(rows).tobytes()).hexdigest())
 
 
-def read_phi(path: Path, specs: Sequence[ParameterSpec], robot: Robot | None = None) -> Phi:
+def read_phi(path: Path, specs: Sequence[ParameterSpec], robot: Robot | BlackBox | None = None) -> Phi:
     """RF-DROPO's distribution from a run folder.
 
     Raises:
@@ -271,7 +276,7 @@ def read_phi(path: Path, specs: Sequence[ParameterSpec], robot: Robot | None = N
     return Phi(shared)
 
 
-def _require_mechanisms(missing: Sequence[str], robot: Robot | None, where: str) -> None:
+def _require_mechanisms(missing: Sequence[str], robot: Robot | BlackBox | None, where: str) -> None:
     """Raise an InputError where a parameter that the simulator lacks is one of a mechanism of the library."""
     for name in REGISTRY:
         (mechanism,) = mechanisms_named([name], robot)

@@ -26,6 +26,8 @@ FOREGROUND = {
 PAPER, PLATE, GRID, INK = (250, 250, 250), (232, 232, 228), (205, 205, 200), (40, 40, 40)
 LIGHT = np.array([0.35, -0.45, 0.82]) / np.linalg.norm([0.35, -0.45, 0.82])
 GOAL_RADIUS = 0.004
+THICKNESS = 0.03
+"""Of a black box, radius of the line that is drawn through its markers, over its length."""
 
 
 class View(NamedTuple):
@@ -79,7 +81,8 @@ def picture(episodes: Episodes, lane: int) -> UInt8[np.ndarray, "height width 3"
         faces += [(corners[index], FOREGROUND["cube"]) for index in CUBE_FACES]
     faces += _goal_faces(goal)
     _draw_faces(draw, view, faces)
-    _draw_cables(draw, view, episodes, line, turn)
+    if robot.body is not None:
+        _draw_cables(draw, view, episodes, line, turn)
     _draw_goal_line(draw, view, goal, floor)
     _caption(draw, episodes, lane)
     return np.asarray(image.resize((WIDTH, HEIGHT), Image.Resampling.LANCZOS))
@@ -109,6 +112,9 @@ def frames_of(
 def _body(episodes: Episodes, lane: int) -> tuple[Float[np.ndarray, "point 3"], Float[np.ndarray, " point"]]:
     """Centre line from the clamp to the tip, and the radius along it."""
     robot = episodes.robot
+    if robot.body is None:
+        line = _straight(episodes, lane)
+        return line, np.full(len(line), THICKNESS * _reach(line))
     rest = robot.marker_points()[:, 2]
     order = np.argsort(rest)
     marker, heights = episodes.marker[lane][order], rest[order]
@@ -123,11 +129,28 @@ def _body(episodes: Episodes, lane: int) -> tuple[Float[np.ndarray, "point 3"], 
 def _stage(episodes: Episodes, turn: Float[np.ndarray, "3 3"]) -> tuple[np.ndarray, np.ndarray]:
     """Corners of the box that is shown: where the trunk can be, goals, cube and plate."""
     task, robot = episodes.task, episodes.robot
+    goals = [list(task.goal_low), list(task.goal_high)]
+    if robot.body is None:
+        reach = _reach(_straight(episodes, 0))
+        corners = np.array([[-reach, -reach, -reach], [reach, reach, reach], *goals]) @ turn.T
+        return corners.min(axis=0), corners.max(axis=0)
     length = float(robot.body.station_m[-1])
     reach = 0.55 * length
-    points = [[-reach, -reach, 0.0], [reach, 0.4 * reach, 1.02 * length], list(task.goal_low), list(task.goal_high)]
-    corners = np.array(points) @ turn.T
+    corners = np.array([[-reach, -reach, 0.0], [reach, 0.4 * reach, 1.02 * length], *goals]) @ turn.T
     return corners.min(axis=0), corners.max(axis=0)
+
+
+def _straight(episodes: Episodes, lane: int) -> Float[np.ndarray, "point 3"]:
+    """From the base through the markers, which are all that is known of a black box."""
+    corners = np.concatenate([np.zeros((1, 3)), episodes.marker[lane]])
+    at = np.linspace(0.0, len(corners) - 1.0, 20 * (len(corners) - 1) + 1)
+    return np.stack([np.interp(at, np.arange(len(corners)), corners[:, axis]) for axis in range(3)], axis=1)
+
+
+def _reach(line: Float[np.ndarray, "point 3"]) -> float:
+    """Length of a line [m], rounded up to steps of a tenth so that pictures of one robot have one scale."""
+    length = max(1e-3, float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()))
+    return float(1.1 ** np.ceil(np.log(length) / np.log(1.1)))
 
 
 def _tube_faces(line: np.ndarray, width: np.ndarray) -> list[tuple[np.ndarray, tuple[int, int, int]]]:

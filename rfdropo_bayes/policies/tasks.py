@@ -7,16 +7,16 @@ reward of staying there; and the cube starts at rest on its plate, where SOFA's 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.policy_layout import ObservationPart, PolicyLayout
+from rfdropo_bayes.robots.policy_layout import CommandUnit, ObservationPart, PolicyLayout
 
 Actions = Literal["discrete", "continuous"]
 Observed = Literal["full", "paper", "markers"]
@@ -26,9 +26,40 @@ EPISODE = 100
 PERIOD = 0.05
 """Control period [s]: five steps of SOFA's 10 ms. The authors' robot was driven at 10 Hz, a period of 0.1 s."""
 STEP = 0.005
-"""Most that an action moves a cable [m]."""
+"""Most that an action moves a cable [m], unless said otherwise."""
 TRACKED_HEIGHTS = (0.0363, 0.0792, 0.1292, 0.179)
 """Where motion capture sees the physical trunk [m along the axis]."""
+
+
+class Commanded(Protocol):
+    """What a task asks of a robot, or of what stands in its place."""
+
+    name: str
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Markers, the tip last."""
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Command channels."""
+
+    @property
+    def command_unit(self) -> CommandUnit:
+        """Unit of the commands."""
+
+    @property
+    def push(self) -> Any:
+        """A cube to push, and its plate; None without."""
+
+    def command_limits(self) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
+        """Least and greatest command of each channel."""
+
+    def command_of(self, pull: float) -> float:
+        """Size of a command that pulls a cable by so much [m], or is as large where commands are no lengths."""
+
+    def markers_near(self, heights: Sequence[float]) -> tuple[int, ...]:
+        """Indices of the markers nearest to these heights [m] of the undeformed body."""
 
 
 @dataclass(frozen=True)
@@ -113,15 +144,13 @@ def resting_height(robot: Robot, side: Float[np.ndarray, " lane"]) -> Float[np.n
     return robot.push.plate_height_m + robot.push.contact_distance_m + 0.5 * np.asarray(side)
 
 
-def tracked_markers(robot: Robot) -> tuple[int, ...]:
-    """Indices of the markers nearest to where motion capture sees the physical trunk."""
-    height = robot.marker_points()[:, 2]
-    chosen = [int(np.argmin(np.abs(height - wanted))) for wanted in TRACKED_HEIGHTS]
-    return tuple(dict.fromkeys(chosen))
-
-
 def layout_of(
-    task: Task, robot: Robot, actions: Actions, observed: Observed, period: float = PERIOD, step: float = STEP
+    task: Task,
+    robot: Commanded,
+    actions: Actions,
+    observed: Observed,
+    period: float = PERIOD,
+    step: float | None = None,
 ) -> PolicyLayout:
     """Observation and action of a task on a robot.
 
@@ -131,10 +160,15 @@ def layout_of(
         observed: "paper", markers and goal, and the cube's pose; "full", also the commands in force and how far each
             marker has moved since the last action; "markers", the same with the markers that motion capture sees.
         period: from one action to the next [s].
-        step: most that an action moves a channel [m or rad].
+        step: most that an action moves a channel, in the unit of its commands; `Commanded.command_of` 5 mm by default.
+
+    Raises:
+        InputError: a cube for a robot that has none, or commands that nothing limits.
     """
+    if task.push and robot.push is None:
+        raise InputError(f"robot {robot.name!r} has no cube to push", where="task", remedy="use a reaching task")
     channels = robot.channel_names
-    shown = len(tracked_markers(robot)) if observed == "markers" else len(robot.marker_names)
+    shown = len(robot.markers_near(TRACKED_HEIGHTS)) if observed == "markers" else len(robot.marker_names)
     parts = [ObservationPart("markers", 3 * shown, "m"), ObservationPart("goal", 3, "m")]
     parts += [ObservationPart("object", 7, "m, quaternion")] if task.push else []
     if observed != "paper":
@@ -142,15 +176,16 @@ def layout_of(
             ObservationPart("commands", len(channels), robot.command_unit),
             ObservationPart("moved", 3 * shown, "m"),
         ]
+    low, high = robot.command_limits()
+    step = step or robot.command_of(STEP)
     one = step * np.eye(len(channels))
     moves = np.full((1, len(channels)), step) if actions == "continuous" else np.concatenate([one, -one])
-    low, high = command_limits(robot)
     return PolicyLayout(
         task=task.name,
         period_s=period,
         observation=tuple(parts),
         channels=channels,
-        unit=robot.command.unit,
+        unit=robot.command_unit,
         kind=actions,
         moves=tuple(tuple(map(float, row)) for row in moves),
         low=tuple(map(float, low)),
@@ -166,25 +201,9 @@ def observed_of(layout: PolicyLayout) -> Observed:
     return "markers" if sizes["markers"] == 3 * len(TRACKED_HEIGHTS) else "full"
 
 
-def command_limits(robot: Robot) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
-    """Least and greatest command of each channel [m or rad] at nominal parameters.
-
-    A cable may be released as far as it may be pulled, or to its own limit where that is nearer: a policy could
-    otherwise pay out slack that takes hundreds of actions to wind up again.
-    """
-    limits = robot.displacement_limits()
-    pull, release = limits[:, 1], np.maximum(limits[:, 0], -limits[:, 1])
-    matrix = np.asarray(robot.channel_matrix(robot.nominal()), dtype=float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.stack([release[:, None] / matrix, pull[:, None] / matrix])
-    ends = np.where(matrix == 0.0, np.stack([np.full_like(matrix, -np.inf), np.full_like(matrix, np.inf)]), ends)
-    low, high = np.min(ends, axis=0), np.max(ends, axis=0)
-    return low.max(axis=0), high.min(axis=0)
-
-
 def parts_seen(
     layout: PolicyLayout,
-    robot: Robot,
+    robot: Commanded,
     marker: Float[np.ndarray, "lane marker 3"],
     before: Float[np.ndarray, "lane marker 3"],
     goal: Float[np.ndarray, "lane 3"],
@@ -193,7 +212,7 @@ def parts_seen(
 ) -> Mapping[str, np.ndarray]:
     """All pieces of an observation that a layout may ask for, from what is measured now and one action ago."""
     markers = next(part for part in layout.observation if part.name == "markers")
-    chosen = list(tracked_markers(robot)) if markers.size != 3 * len(robot.marker_names) else slice(None)
+    chosen = list(robot.markers_near(TRACKED_HEIGHTS)) if markers.size != 3 * len(robot.marker_names) else slice(None)
     seen, moved = marker[:, chosen], (marker - before)[:, chosen]
     lanes = len(goal)
     found = {

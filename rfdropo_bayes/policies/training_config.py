@@ -24,6 +24,12 @@ class TrainingTable(BaseModel):
         "changes; markers: what motion capture sees of the robot, with cable levels and changes",
     )
     period: float = Field(default=0.05, gt=0.0, description="time from one action to the next [s]")
+    step: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="most that an action moves a command, in its unit; 5 mm of cable by default, or a twentieth of the "
+        "range of commands that are no lengths",
+    )
     noise: float = Field(default=0.0, ge=0.0, description="white noise on what is seen of the markers [m]")
     algorithm: str = Field(default="PPO", description="an algorithm of Stable-Baselines3 by its name")
     options: dict[str, Any] = Field(

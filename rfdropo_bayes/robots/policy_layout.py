@@ -17,6 +17,8 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.errors import InputError
 
+CommandUnit = Literal["m", "rad", "N", "N m", "-"]
+
 
 @dataclass(frozen=True)
 class ObservationPart:
@@ -42,7 +44,7 @@ class PolicyLayout:
         period_s: time from one action to the next [s].
         observation: parts of the observation, in order.
         channels: command channels that it moves, in order.
-        unit: of the commands: "m" of cable or "rad" of a motor.
+        unit: of the commands: "m" of cable, "rad" of a motor; of a black box also "N", "N m" or "-".
         kind: "discrete" actions are rows of ``moves``; a "continuous" one is a number from -1 to 1 for every channel.
         moves: what an action adds to the commands [unit]: (action, channel) if discrete; if continuous, one row, the
             change at 1.
@@ -53,7 +55,7 @@ class PolicyLayout:
     period_s: float
     observation: tuple[ObservationPart, ...]
     channels: tuple[str, ...]
-    unit: Literal["m", "rad"]
+    unit: CommandUnit
     kind: Literal["discrete", "continuous"]
     moves: tuple[tuple[float, ...], ...]
     low: tuple[float, ...]

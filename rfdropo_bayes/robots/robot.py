@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -256,6 +256,32 @@ class Robot(RobotTable):
     def displacement_limits(self) -> Float[np.ndarray, "cable 2"]:
         """Least and greatest displacement of each cable [m], pull > 0."""
         return np.array([cable.displacement_limit_m for cable in self.cables])
+
+    def command_limits(self) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
+        """Least and greatest command of each channel [m or rad] at nominal parameters.
+
+        A cable may be released as far as it may be pulled, or to its own limit where that is nearer: a policy could
+        otherwise pay out slack that takes hundreds of actions to wind up again.
+        """
+        limits = self.displacement_limits()
+        pull, release = limits[:, 1], np.maximum(limits[:, 0], -limits[:, 1])
+        matrix = np.asarray(self.channel_matrix(self.nominal()), dtype=float)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = np.stack([release[:, None] / matrix, pull[:, None] / matrix])
+        none = np.stack([np.full_like(matrix, -np.inf), np.full_like(matrix, np.inf)])
+        ends = np.where(matrix == 0.0, none, ends)
+        low, high = np.min(ends, axis=0), np.max(ends, axis=0)
+        return low.max(axis=0), high.min(axis=0)
+
+    def command_of(self, pull: float) -> float:
+        """Size of a command that pulls a cable by so much [m]: the pull itself, or an angle at nominal parameters."""
+        turned = 1.0 if self.command_unit == "m" else np.abs(self.channel_matrix(self.nominal())).max()
+        return pull / float(turned)
+
+    def markers_near(self, heights: Sequence[float]) -> tuple[int, ...]:
+        """Indices of the markers nearest to these heights [m] along the axis of the undeformed body."""
+        own = self.marker_points()[:, 2]
+        return tuple(dict.fromkeys(int(np.argmin(np.abs(own - wanted))) for wanted in heights))
 
     def channel_matrix(self, parameters: Mapping[str, Any]) -> Any:
         """Matrix (cable, channel) from commands to cable displacements [m], for these parameter values.

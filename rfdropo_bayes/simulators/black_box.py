@@ -18,9 +18,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots.parameter import Parameter
+from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneStart
 from rfdropo_bayes.simulators.callbacks import one_callback
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
-from rfdropo_bayes.simulators.extended import ExtendedSimulator
+from rfdropo_bayes.simulators.control_session import Session
+from rfdropo_bayes.simulators.extended import ExtendedSimulator, Wound
 from rfdropo_bayes.simulators.finite_differences import LENGTH, with_differences
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, Mechanism, Values, check_mechanisms, code_of, obstacle
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
@@ -31,6 +33,9 @@ STROKES = {"m": LENGTH, "rad": 0.1, "N": 1.0, "N m": 1.0, "-": 1.0}
 """Units of commands, and the size that perturbations of a command are relative to."""
 SMALLEST_SHARE = 1e-3  # of its range: least size that perturbations of a parameter are relative to
 PROBED_ROWS = 3
+ACTION = 0.05
+"""Of the range of commands, what one action of a policy moves them by unless it is said. Twenty actions go from end to
+end; for a cable of the paper's trunk it is eight."""
 
 Batch = Mapping[str, Float[np.ndarray, " n"]]
 
@@ -60,6 +65,7 @@ class BlackBox:
         lanes: parameter sets that it is given at once.
         difference: relative step of derivatives; larger where the motion is rough on small scales.
         stroke: size of usual commands, in their unit; those of cables and motors are known.
+        limits: least and greatest command of each channel, which a policy keeps; none by default.
         families: parameters that are not inferred unless they have a prior, and the quantity of which each is the value
             at one place: an audit asks whether these differ from their nominal values.
 
@@ -80,6 +86,7 @@ class BlackBox:
     difference: float | None = None
     stroke: float | None = None
     families: Mapping[str, str] = field(default_factory=dict)
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.markers or not self.channels or not self.time_step > 0.0:
@@ -87,6 +94,12 @@ class BlackBox:
         if self.command_unit not in STROKES:
             remedy = nearest(self.command_unit, STROKES)
             raise InputError(f"commands in {self.command_unit!r}", where=self.name, remedy=remedy)
+        for name, ends in self.limits.items():
+            if name not in self.channels:
+                raise InputError(f"limits of {name!r}", where=self.name, remedy=nearest(name, self.channels))
+            if len(ends) != 2 or not -np.inf < ends[0] < ends[1] < np.inf:
+                remedy = "give two finite numbers, the lower first"
+                raise InputError(f"limits {ends!r} of {name!r}", where=self.name, remedy=remedy)
         tables = {name: _parameter(name, table) for name, table in self.parameters.items()}
         object.__setattr__(self, "parameters", tables)
 
@@ -109,6 +122,40 @@ class BlackBox:
     def gravity(self) -> Float[np.ndarray, "3"]:
         """Along z, for mechanisms of the body, which ask any robot for it; none of them acts on a black box."""
         return np.array([0.0, 0.0, -9.81])
+
+    @property
+    def push(self) -> None:
+        """No cube stands before it."""
+
+    @property
+    def body(self) -> None:
+        """Nobody knows it."""
+
+    def command_of(self, pull: float) -> float:
+        """That pull [m] where commands are lengths, else `ACTION` of the smallest range.
+
+        Raises:
+            InputError: a channel without limits.
+        """
+        low, high = self.command_limits()
+        return pull if self.command_unit == "m" else ACTION * float(np.min(high - low))
+
+    def markers_near(self, heights: Sequence[float]) -> tuple[int, ...]:
+        """All markers: nobody knows its undeformed body."""
+        return tuple(range(len(self.markers)))
+
+    def command_limits(self) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
+        """Least and greatest command of each channel, in their unit.
+
+        Raises:
+            InputError: a channel without limits.
+        """
+        for name in self.channels:
+            if name not in self.limits:
+                remedy = "give BlackBox limits, or the model's actuators a ctrlrange"
+                raise InputError(f"nothing limits the command {name!r}", where=self.name, remedy=remedy)
+        low, high = zip(*(self.limits[name] for name in self.channels), strict=True)
+        return np.array(low, float), np.array(high, float)
 
     @property
     def specs(self) -> tuple[ParameterSpec, ...]:
@@ -308,17 +355,25 @@ class BlackBoxSimulator(ExtendedSimulator):
         angle = self.driven(values, commands, self.time_step)
         return Observation(position, sample(moved.tension, commands), None, status, angle)
 
-    def session(self, lanes: int, period: float) -> Any:
-        """Lanes that go on from one control period [s] to the next, where the function has a method ``session``.
+    def lane_start(self, values: Values, drives: Wound) -> LaneStart:
+        """See `ExtendedSimulator.lane_start`."""
+        return LaneStart({spec.name: values[spec.name] for spec in self.box.specs}, drives.level, None)
+
+    def begin_lanes(self, count: int) -> BodyLanes:
+        """See `ExtendedSimulator.begin_lanes`; the function's own method of this name makes them.
 
         Raises:
-            InputError: it has none, or there are mechanisms around it.
+            InputError: it has none.
         """
-        begin = getattr(self.box.function, "session", None)
-        if begin is None or self.mechanisms:
-            why = "has no session" if begin is None else "has no session with mechanisms around it"
-            raise InputError(why, where=self.box.name, remedy="simulate whole rollouts")
-        return begin(lanes, period)
+        begin = getattr(self.box.function, "begin_lanes", None)
+        if begin is None:
+            remedy = "give the function a method begin_lanes, see docs/your_simulator.md"
+            raise InputError("simulates whole rollouts only", where=self.box.name, remedy=remedy)
+        return begin(count)
+
+    def session(self, lanes: int, period: float) -> Session:
+        """So many lanes that are commanded one control period [s] at a time; see `Session`."""
+        return Session(self, lanes, period)
 
     @cached_property
     def _differentiable(self) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem import Material, point_positions
+from rfdropo_bayes.fem import point_positions
 from rfdropo_bayes.fem.dynamics import Prepared, State, remembering, step
 from rfdropo_bayes.fem.layered import PointMap, joined
 from rfdropo_bayes.fem.native.layered_session import LayeredSession
@@ -29,7 +29,7 @@ TOUCHING = 0.001
 class LaneStart(NamedTuple):
     """What lanes start from."""
 
-    material: Material
+    material: Any  # fem.Material; of a black box its parameters by name
     start: Float[Any, "*row cable"]  # displacements that the initial state belongs to [m]
     cube: CubeInputs | None
 

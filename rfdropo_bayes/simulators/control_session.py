@@ -20,8 +20,9 @@ from jaxtyping import Array, Bool, Float, Int
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Travel
-from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneStart, body_lanes, flat_lanes, lanes_like
+from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneStart, flat_lanes, lanes_like
 from rfdropo_bayes.simulators.commands import carried_out
+from rfdropo_bayes.simulators.extended import Wound
 from rfdropo_bayes.simulators.mechanisms import (
     ActuationMechanism,
     CommandedSensingMechanism,
@@ -36,7 +37,7 @@ from rfdropo_bayes.simulators.mechanisms import (
 )
 from rfdropo_bayes.simulators.parameters import check_names, check_value
 from rfdropo_bayes.simulators.protocol import Observation
-from rfdropo_bayes.simulators.robot_simulator import Wound, status_of
+from rfdropo_bayes.simulators.robot_simulator import status_of
 
 WHOLE = 1e-6
 """How far a control period may be from a whole number of time steps, in time steps."""
@@ -82,15 +83,14 @@ class Session:
                 remedy=f"give a multiple of {simulator.time_step:g} s",
             )
         self._check_mechanisms(simulator.mechanisms)
-        self.bodies: BodyLanes = body_lanes(simulator.engine, lanes)
+        self.bodies: BodyLanes = simulator.begin_lanes(lanes)
         self._specs = {spec.name: spec for spec in simulator.parameters}
         self._table = np.tile([spec.nominal for spec in self._specs.values()], (lanes, 1))
         self._values = jnp.asarray(self._table)
-        command = self.robot.command
-        kept = math.ceil((command.ramp_s + command.dead_time_s) / self.period + WHOLE) + 2
+        kept = math.ceil(sum(simulator.command_timing) / self.period + WHOLE) + 2
         channels = len(self.robot.channel_names)
         self._past = _Past(np.full((lanes, kept), -np.inf), np.zeros((lanes, kept, channels)), np.zeros(lanes, int))
-        self._travel = self.robot.travel(recording, np.zeros(channels))
+        self._travel = simulator.travel(recording, np.zeros(channels))
         if self._travel is not None:
             self._travel = Travel(*(np.tile(part, (lanes, 1)) for part in astuple(self._travel)))
         self._forgotten = np.zeros((lanes, channels))
@@ -231,7 +231,7 @@ class Session:
         if self._travel is None:
             return
         for row, command in zip(rows, first, strict=True):
-            travel = self.robot.travel(self.recording, command)
+            travel = self.simulator.travel(self.recording, command)
             self._travel.low[row], self._travel.high[row] = travel.low, travel.high
 
     def _check_mechanisms(self, mechanisms: tuple[Mechanism, ...]) -> None:
@@ -277,15 +277,14 @@ class Session:
 
     def _sent(self, commands: Float[np.ndarray, "lane channel"]) -> Float[np.ndarray, "lane step channel"]:
         """What the drives carry out in every step of the period, ramps and dead time included."""
-        past, timing, time_step = self._past, self.robot.command, self.simulator.time_step
+        past, time_step, (ramp, dead_time) = self._past, self.simulator.time_step, self.simulator.command_timing
         if self._travel is not None:
             self._forgotten, commands = self._travel.advance(self._forgotten, past.value[:, -1], commands)
         past.given[:, :-1], past.value[:, :-1] = past.given[:, 1:].copy(), past.value[:, 1:].copy()
         past.given[:, -1], past.value[:, -1] = self.time, commands
         step = self.steps * past.periods[:, None] + np.arange(1, self.steps + 1)
         past.periods[:] += 1
-        end = time_step * step - timing.dead_time_s
-        return carried_out(past.given[:, None], past.value[:, None], end, timing.ramp_s)
+        return carried_out(past.given[:, None], past.value[:, None], time_step * step - dead_time, ramp)
 
     @property
     def _drive_chains(self) -> tuple[list[Any], list[Any]]:
@@ -341,8 +340,7 @@ class Session:
         """What the bodies of all lanes start from."""
 
         def of(values: Values, wound: Wound) -> LaneStart:
-            material, cube = self.simulator.body_inputs(values)
-            return LaneStart(material, wound.level + self.simulator.pretension(values), cube)
+            return self.simulator.lane_start(values, wound)
 
         return self._by_lane(of)
 
@@ -365,8 +363,7 @@ class Session:
                 else:
                     position = mechanism.sense(values, position[None])[0]
                 after.append(memory)
-            offset = jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])
-            return tuple(after), position + offset
+            return tuple(after), self.simulator.in_measuring_frame(values, position)
 
         return self._by_lane(look)
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from rfdropo_bayes.robots import Travel
 from rfdropo_bayes.simulators.commands import Commands, observed_at, sample
 from rfdropo_bayes.simulators.mechanisms import (
     ActuationMechanism,
@@ -24,6 +25,14 @@ from rfdropo_bayes.simulators.mechanisms import (
 )
 from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
 from rfdropo_bayes.simulators.port_signals import reached
+from rfdropo_bayes.simulators.protocol import Result
+
+
+class Wound(NamedTuple):
+    """Drives between two steps."""
+
+    level: Float[Array, " cable"]  # displacement of the cables at their drives, without pretension [m]
+    sent: Float[Array, " channel"]  # last command that reached them [m or rad]
 
 
 class ExtendedSimulator:
@@ -68,6 +77,45 @@ class ExtendedSimulator:
     ) -> Float[np.ndarray, "command channel"]:
         """The commands of a recording as the drives take them, given those that were sent [m or rad]."""
         return value
+
+    @property
+    def integrator(self) -> str | None:
+        """How time steps are taken, where that is ours to choose."""
+        return None
+
+    @property
+    def command_timing(self) -> tuple[float, float]:
+        """For how long a change of a command is carried out, and how late [s]."""
+        return 0.0, 0.0
+
+    def travel(self, recording: str, command: Float[np.ndarray, " channel"]) -> Travel | None:
+        """Within which limits the drives follow commands that begin with this one, in a recording; None: any."""
+        return None
+
+    def unwound(self, values: Values, initial: Float[Array, " channel"]) -> Wound:
+        """The drives before the first step, where this command has reached them."""
+        return Wound(initial, initial)
+
+    def wind(self, values: Values, drives: Wound, sent: Float[Array, " channel"]) -> tuple[Wound, Float[Array, " in"]]:
+        """The drives at the end of a step, and what moves the body then, given the command that reached them."""
+        return Wound(sent, sent), sent
+
+    def lane_start(self, values: Values, drives: Wound) -> Any:
+        """What a lane of a session starts from; see `body_lanes.LaneStart`."""
+        raise NotImplementedError
+
+    def begin_lanes(self, count: int) -> Any:
+        """So many bodies that go on from where they were left; see `body_lanes.BodyLanes`."""
+        raise NotImplementedError
+
+    @property
+    def unsolved(self) -> Result:
+        """How a rollout ended whose constraints were not all solved."""
+        return Result.DIVERGED
+
+    def in_measuring_frame(self, values: Values, position: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+        """Positions as they are measured [m], given those in the frame of the base."""
+        return position
 
     def complete(self, parameters: Values) -> dict[str, Array]:
         """All values by name; those left out are nominal.

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +18,12 @@ from rfdropo_bayes.fem import LayeredBody, Material
 from rfdropo_bayes.fem.balance import Balance
 from rfdropo_bayes.fem.layered import PointMap
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots import Robot, Travel
 from rfdropo_bayes.simulators.body_engine import Backend, CubeInputs, Engine
+from rfdropo_bayes.simulators.body_lanes import BodyLanes, LaneStart, body_lanes
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
 from rfdropo_bayes.simulators.cube import cube_at_measured, cube_inputs, push_table, scene_of
-from rfdropo_bayes.simulators.extended import ExtendedSimulator
+from rfdropo_bayes.simulators.extended import ExtendedSimulator, Wound
 from rfdropo_bayes.simulators.mechanisms import (
     BodyMechanism,
     Meanwhile,
@@ -51,13 +52,6 @@ def status_of(motion: Motion, unsolved: Result, arrays: Any = jnp) -> Int[Any, "
     cases = motion.diverged, motion.imbalance > EQUILIBRIUM_TOLERANCE, ~motion.converged
     codes = Result.DIVERGED, Result.NOT_IN_EQUILIBRIUM, unsolved
     return arrays.select(cases, [int(code) for code in codes], int(Result.OK))
-
-
-class Wound(NamedTuple):
-    """Drives between two steps."""
-
-    level: Float[Array, " cable"]  # displacement of the cables at their drives, without pretension [m]
-    sent: Float[Array, " channel"]  # last command that reached them [m or rad]
 
 
 class RobotSimulator(ExtendedSimulator):
@@ -331,6 +325,33 @@ class RobotSimulator(ExtendedSimulator):
         level = jnp.clip(drives.level + move, limits[:, 0], limits[:, 1])
         return Wound(level, sent), level + self.pretension(values)
 
+    @property
+    def integrator(self) -> str | None:
+        """See `ExtendedSimulator.integrator`."""
+        return self.engine.integrator
+
+    @property
+    def command_timing(self) -> tuple[float, float]:
+        """See `ExtendedSimulator.command_timing`."""
+        return self.robot.command.ramp_s, self.robot.command.dead_time_s
+
+    def travel(self, recording: str, command: Float[np.ndarray, " channel"]) -> Travel | None:
+        """See `ExtendedSimulator.travel`; stated by the robot."""
+        return self.robot.travel(recording, command)
+
+    def lane_start(self, values: Values, drives: Wound) -> LaneStart:
+        """See `ExtendedSimulator.lane_start`."""
+        material, cube = self.body_inputs(values)
+        return LaneStart(material, drives.level + self.pretension(values), cube)
+
+    def begin_lanes(self, count: int) -> BodyLanes:
+        """See `ExtendedSimulator.begin_lanes`.
+
+        Raises:
+            InputError: a body that is not made of layers.
+        """
+        return body_lanes(self.engine, count)
+
     def marker_points(self) -> Float[np.ndarray, "marker 3"]:
         """Markers of the undeformed robot [m]."""
         return self.robot.marker_points()
@@ -343,5 +364,8 @@ class RobotSimulator(ExtendedSimulator):
         meanwhile: Meanwhile | None = None,
     ) -> Float[Array, "time marker 3"]:
         """See `ExtendedSimulator.measured`; the offset of the measuring frame is added last."""
-        position = super().measured(values, position, time, meanwhile)
+        return self.in_measuring_frame(values, super().measured(values, position, time, meanwhile))
+
+    def in_measuring_frame(self, values: Values, position: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+        """See `ExtendedSimulator.in_measuring_frame`."""
         return position + jnp.stack([values["offset_x"], values["offset_y"], values["offset_z"]])

@@ -10,6 +10,7 @@ import numpy as np
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_json, write_text
+from rfdropo_bayes.model.assembly import AnySimulator
 from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import run_folder
@@ -37,8 +38,7 @@ from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
-from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of, with_training
+from rfdropo_bayes.verbs.make_vec import randomisation_of, steps_of, training_of, with_training
 from rfdropo_bayes.verbs.train import POLICY
 
 EVALUATION, TABLE, CSV, FIGURE = "evaluation.json", "evaluation.md", "episodes.csv", "success.png"
@@ -103,7 +103,7 @@ def evaluate(
             if film:
                 _film(batch, found[name], cases, out / f"{name}.gif")
         content = _judged(found, cases, seed)
-        content["otherwise_trained"] = _otherwise_trained(loaded, simulator.engine.integrator)
+        content["otherwise_trained"] = _otherwise_trained(loaded, steps_of(simulator))
         with whole(out / CSV) as partial:
             episode_table(found, cases).to_csv(partial, index=False)
         success_figure(found, THRESHOLDS).savefig(out / FIGURE, dpi=150)
@@ -114,7 +114,7 @@ def evaluate(
 
 def _episodes_for(
     layout: PolicyLayout,
-    simulator: RobotSimulator,
+    simulator: AnySimulator,
     task: Task,
     lanes: int,
     randomisation: Randomisation,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.model.assembly import build_robot_simulator, physical_values
+from rfdropo_bayes.model.assembly import AnySimulator, build_robot_simulator, build_simulator, physical_values
 from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
@@ -29,7 +29,7 @@ from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import OBJECT
-from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.tables import changed, parse_table
 
 
@@ -64,7 +64,12 @@ def with_training(model: Model, options: Mapping[str, Any]) -> Model:
     return Model.of(model.spec, replace(model.settings, training=table))
 
 
-def training_of(model: Model) -> tuple[TrainingTable, Task, RobotSimulator]:
+def training_of(model: Model) -> tuple[TrainingTable, Task, AnySimulator]:
+    """What [training] says, the task, and the simulator that it is played on.
+
+    Raises:
+        InputError: no such table, or a black box without a box of goals of its own, or for a task with a cube.
+    """
     table = model.settings.training
     if table is None:
         raise InputError(
@@ -73,18 +78,28 @@ def training_of(model: Model) -> tuple[TrainingTable, Task, RobotSimulator]:
     task = task_named(table.task)
     if table.goals is not None:
         task = replace(task, goal_low=table.goals[0], goal_high=table.goals[1])
+    if isinstance(model.robot, BlackBox):
+        if table.goals is None:
+            remedy = "give goals = [[x, y, z], [x, y, z]] [m]: the task's own are of the paper's trunk"
+            raise InputError("nobody knows where its goals are", where="[training]", remedy=remedy)
+        return table, task, build_simulator(model.spec)
     pushing = changed(model.spec.simulator, where="[simulator]", push=task.push)
     return table, task, build_robot_simulator(replace(model.spec, simulator=pushing))
 
 
 def episode_settings(table: TrainingTable) -> Settings:
-    return Settings(actions=table.actions, observed=table.observation, period=table.period, noise=table.noise)
+    return Settings(table.actions, table.observation, table.period, table.step, table.noise)
+
+
+def steps_of(simulator: AnySimulator) -> str:
+    """How time steps are taken: the integrator, or the engine of a black box."""
+    return simulator.integrator or str(simulator.description["engine"])
 
 
 def randomisation_of(
     table: TrainingTable,
     spec: ModelSpec,
-    simulator: RobotSimulator,
+    simulator: AnySimulator,
     posterior: Calibration | Path | None = None,
 ) -> Randomisation:
     """Where parameters come from: values that are held, what is randomised, and what differs between episodes.
@@ -107,7 +122,7 @@ def randomisation_of(
     parts: list[Randomisation] = [Point(physical_values(held, simulator))]
     if isinstance(posterior, Calibration):
         fitted = fitted_integrator(posterior.record.attrs, posterior.folder)
-        check_fitted_integrator(fitted, simulator.engine.integrator, where="posterior")
+        check_fitted_integrator(fitted, simulator.integrator, where="posterior")
         parts.append(drawn_rows(posterior.record, simulator.parameters, robot=simulator.robot))
     elif posterior is not None:
         parts.append(_of_run(Path(posterior), simulator))
@@ -118,7 +133,7 @@ def randomisation_of(
     return Layers((*parts, Uniform(start)), kind) if start or len(parts) > 1 else parts[0]
 
 
-def _randomised(table: TrainingTable, simulator: RobotSimulator, folder: Path) -> Randomisation:
+def _randomised(table: TrainingTable, simulator: AnySimulator, folder: Path) -> Randomisation:
     """What [training] randomises over."""
     if table.randomisation == "uniform":
         if not table.ranges:
@@ -137,7 +152,7 @@ def _randomised(table: TrainingTable, simulator: RobotSimulator, folder: Path) -
     return _of_run(source, simulator, phi=table.randomisation == "phi")
 
 
-def _of_run(source: Path, simulator: RobotSimulator, *, phi: bool = False) -> Randomisation:
+def _of_run(source: Path, simulator: AnySimulator, *, phi: bool = False) -> Randomisation:
     """The posterior, or phi, of a run's folder or file, of which parameters are drawn.
 
     Raises:
@@ -147,5 +162,5 @@ def _of_run(source: Path, simulator: RobotSimulator, *, phi: bool = False) -> Ra
     folder = source if source.is_dir() else source.parent
     attributes = {} if phi else PosteriorRecord.load(source / POSTERIOR if source.is_dir() else source).attrs
     fitted = fitted_integrator(attributes, folder)
-    check_fitted_integrator(fitted, simulator.engine.integrator, where=str(source))
+    check_fitted_integrator(fitted, simulator.integrator, where=str(source))
     return found

@@ -27,7 +27,7 @@ from rfdropo_bayes.report.facts import LEARNING
 from rfdropo_bayes.report.run_files import CONFIG
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
-from rfdropo_bayes.verbs.make_vec import episode_settings, randomisation_of, training_of, with_training
+from rfdropo_bayes.verbs.make_vec import episode_settings, randomisation_of, steps_of, training_of, with_training
 
 POLICY, CARD, SUMMARY, CURVE, PAGE = "policy.onnx", "card.md", "summary.json", "curve.png", "report.html"
 SCHEMA_VERSION = 1
@@ -85,7 +85,7 @@ def train(
             "randomisation": randomisation.kind,
             "posterior_sha256": randomisation.sha256,
             "simulator_sha256": str(known["simulator"]),
-            INTEGRATOR: simulator.engine.integrator,
+            INTEGRATOR: steps_of(simulator),
             "time_step_s": f"{simulator.time_step:g}",
             "seed": str(seed),
         }

@@ -17,7 +17,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.policies.building import make_episodes
 from rfdropo_bayes.policies.gym_env import TrunkEnv, TrunkVectorEnv
 from rfdropo_bayes.policies.randomisation import Draws, Phi, Point, Uniform, fitting, read_phi, read_posterior
-from rfdropo_bayes.policies.tasks import FLOOR, TASKS, command_limits, layout_of, potential, reward, tracked_markers
+from rfdropo_bayes.policies.tasks import FLOOR, TASKS, TRACKED_HEIGHTS, layout_of, potential, reward
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.robots import Robot
@@ -63,8 +63,8 @@ def test_observations_have_the_papers_size_and_goals_its_boxes() -> None:
     assert layout_of(TASKS[REACH], robot, "discrete", "paper").size == 66
     assert layout_of(TASKS["TrunkPush-v0"], robot, "discrete", "paper").size == 73
     assert len(layout_of(TASKS[REACH], robot, "discrete", "paper").moves) == 16
-    assert len(tracked_markers(robot)) == 4
-    low, high = command_limits(robot)
+    assert len(robot.markers_near(TRACKED_HEIGHTS)) == 4
+    low, high = robot.command_limits()
     assert high == pytest.approx([0.07] * 4 + [0.04] * 4)
     assert low == pytest.approx(-high)
 

@@ -269,5 +269,17 @@ def test_a_session_goes_on_as_the_rollout_does(spring):
     np.testing.assert_allclose(session.time, [1.0, 0.0])
     with pytest.raises(InputError, match="no whole number"):
         simulator.session(2, 0.0105)
-    with pytest.raises(InputError, match="mechanisms around it"):
-        BlackBoxSimulator(spring, mechanisms_named(["command_delay"], spring)).session(1, 0.1)
+
+
+def test_mechanisms_act_in_a_session_as_in_the_rollout(spring):
+    named = ["command_delay", "actuator_lag", "camera_offset"]
+    simulator = BlackBoxSimulator(spring, mechanisms_named(named, spring))
+    commands = sent(simulator, seconds=1.0, size=2.0)
+    values = {"k": 40.0, "command_delay": 0.034, "actuator_lag": 0.05, "camera_offset_x": 0.002}
+    whole = simulator.rollout({name: jnp.asarray(value) for name, value in values.items()}, commands).position
+    session = simulator.session(1, 0.1)
+    start = session.reset(np.arange(1), values)
+    np.testing.assert_allclose(start.position[0], whole[0], atol=1e-13)
+    for period in range(10):
+        seen = session.act(np.asarray(commands.step)[None, 100 * period])
+        np.testing.assert_allclose(seen.position[0], whole[100 * (period + 1)], atol=1e-9)

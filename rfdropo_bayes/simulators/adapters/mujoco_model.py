@@ -33,7 +33,7 @@ from rfdropo_bayes.simulators.adapters.mujoco_elements import (
     searched,
 )
 from rfdropo_bayes.simulators.adapters.mujoco_file import model_text
-from rfdropo_bayes.simulators.adapters.mujoco_session import MuJoCoSession
+from rfdropo_bayes.simulators.adapters.mujoco_lanes import MuJoCoLanes
 from rfdropo_bayes.simulators.adapters.mujoco_start import adapter_tables
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.tables import nearest
@@ -124,6 +124,7 @@ def MuJoCo(
         difference=difference,
         stroke=rollouts.stroke,
         families=families,
+        limits=rollouts.limits,
     )
 
 
@@ -293,6 +294,13 @@ class MuJoCoRollouts:
         ranges = [np.ptp(self.model.actuator_ctrlrange[k]) for k in self.actuators.values()]
         return 0.5 * float(np.mean([r if r > 0.0 else 2.0 for r in ranges]))
 
+    @property
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """Range of each channel's command, where its actuator has one."""
+        ranges = {name: self.model.actuator_ctrlrange[k] for name, k in self.actuators.items()}
+        limited = {name for name, k in self.actuators.items() if self.model.actuator_ctrllimited[k]}
+        return {name: (float(low), float(high)) for name, (low, high) in ranges.items() if name in limited}
+
     @cached_property
     def digest(self) -> str:
         """Digest of the compiled model and of what is measured of it."""
@@ -394,9 +402,9 @@ class MuJoCoRollouts:
         """Positions of the markers [m] and pulls of the cables [N] in what sensors told."""
         return sensed[:, :, self._places], -sensed[:, :, self._pulls]
 
-    def session(self, lanes: int, period: float) -> MuJoCoSession:
-        """Lanes that are commanded one control period [s] at a time; see `MuJoCoSession`."""
-        return MuJoCoSession(self, lanes, period)
+    def begin_lanes(self, count: int) -> MuJoCoLanes:
+        """So many models that go on from where they were left, for sessions; see `MuJoCoLanes`."""
+        return MuJoCoLanes(self, count)
 
     def _arrived(self, state: Float[np.ndarray, "n state"], steps: int) -> Bool[np.ndarray, " n"]:
         """Which rollouts went on to the end: MuJoCo stops the clock of one with a warning."""
