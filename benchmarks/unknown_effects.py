@@ -1,7 +1,7 @@
 """How often an audit says where an effect enters that the library lacks, and by what law; resumable.
 
     python benchmarks/unknown_effects.py [--out reports/unknown_effects] [--effects crosstalk,bouc_wen] [--seeds 0,1]
-                                         [--rho 1.0] [--null 0] [--alone]
+                                         [--rho 1.0] [--null 0] [--alone | --force]
 
 Effects are those of `rfdropo_bayes/studies/unknown_effects.py`, hidden in recordings of the layered arm; ``--null`` is
 the number of data sets with nothing hidden. A line of the ledger for each data set: verdict, port, law, unseen errors,
@@ -10,6 +10,9 @@ two cores.
 
 ``--alone`` leaves all candidates of the library out: laws at ports are all that may be named. That takes a third of the
 time, and does not say whether a candidate of the library would have stood in.
+
+``--force`` looks for laws in data sets with nothing hidden, whatever the joint test and the ports say. Lines have the
+largest gain of any feature at any port, the gate, and whether a term joined.
 """
 
 from __future__ import annotations
@@ -25,13 +28,16 @@ import numpy as np
 from scipy.stats import binomtest
 
 import rfdropo_bayes as rb
+from rfdropo_bayes.audit.inadequacy import as_measured
+from rfdropo_bayes.audit.law_search import law_search
+from rfdropo_bayes.audit.pipeline import base_model
 from rfdropo_bayes.audit.verdict import DESCRIBED
 from rfdropo_bayes.files import append_line
 from rfdropo_bayes.model.experiment import AuditTable
 from rfdropo_bayes.studies.unknown_effects import EFFECTS, conceal
 from rfdropo_bayes.verbs.audit import Workshop, build_problem
 
-ALL, NONE = "all", "none"
+ALL, NONE, FORCED = "all", "none", "forced"
 WITHIN = 1.15  # of the noise, an unseen error counts as explained
 
 
@@ -42,6 +48,8 @@ def one(name: str, rho: float, seed: int, library: str, folder: Path, workshop: 
     if hidden is None:
         return {**line, "verdict": "no size reaches this rho"}
     model = rb.Model.read(hidden.experiment)
+    if library == FORCED:
+        return line | forced_search(model, seed, workshop)
     unseen = rb.read(str(hidden.experiment.parent / "test_*.nc"), format="netcdf")
     left_out = []
     if library == NONE:
@@ -55,6 +63,22 @@ def one(name: str, rho: float, seed: int, library: str, folder: Path, workshop: 
     line |= {"profile": found.content["profile"], "ports": leading_ports(found.content["ports"])}
     line |= {"gate_nats": (found.content["ports"] or {}).get("gate_nats")}
     return line | judged(line, name, noise_of(unseen, hidden.clean))
+
+
+def forced_search(model: rb.Model, seed: int, workshop: Workshop) -> dict[str, Any]:
+    """What a search for laws finds where nobody would have asked for one."""
+    began = time.process_time()
+    problem = build_problem(model.spec, AuditTable(), model.runs(None, ())[0], [], seed, workshop=workshop)
+    assert problem.ports is not None
+    target, base = base_model(problem, seed)
+    simulator: Any = problem.lanes.simulator
+    channels, unit = simulator.channel_names, simulator.command_unit
+    search = law_search(target.measured, problem.ports, channels, unit, seed, problem.rules.family, lambda line: None)
+    found = search.find(target, as_measured(target, base), forced=True)
+    terms = [[refit.term.port.name, refit.term.feature.formula(channels), refit.score] for refit in found.terms]
+    numbers = {"port_p": found.ports[0].adjusted_p, "gate_nats": found.gate, "offered_nats": found.offered}
+    seconds = round(time.process_time() - began, 1)
+    return {"verdict": "a law" if terms else "no law", **numbers, "terms": terms, "cpu_seconds": seconds}
 
 
 def noise_of(unseen: Sequence[rb.Trajectory], clean: np.ndarray) -> float:
@@ -93,14 +117,16 @@ def main() -> None:
     parser.add_argument("--seeds", default="0,1")
     parser.add_argument("--rho", type=float, default=1.0)
     parser.add_argument("--null", type=int, default=0)
-    parser.add_argument("--alone", action="store_const", const=NONE, default=ALL, dest="library")
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument("--alone", action="store_const", const=NONE, default=ALL, dest="library")
+    kinds.add_argument("--force", action="store_const", const=FORCED, dest="library")
     given = parser.parse_args()
     cases = [("", 0.0, seed, given.library) for seed in range(given.null)]
     cases += [
         (name, given.rho, int(seed), given.library)
         for seed in given.seeds.split(",")
         for name in given.effects.split(",")
-        if name
+        if name and given.library != FORCED
     ]
     given.out.mkdir(parents=True, exist_ok=True)
     ledger = given.out / "ledger.jsonl"
@@ -114,6 +140,7 @@ def main() -> None:
             print(f"{case[0] or 'nothing'} {case[2]}: {lines[-1]['verdict']}", flush=True)
     for library in (ALL, NONE):
         show(library, [line for line in lines if line["library"] == library])
+    show_forced([line for line in lines if line["library"] == FORCED])
 
 
 def show(library: str, lines: Sequence[dict[str, Any]]) -> None:
@@ -130,6 +157,18 @@ def show(library: str, lines: Sequence[dict[str, Any]]) -> None:
     rate("law right", [line.get("law_right", False) for line in hidden])
     rate("unseen error within 15 % of the noise", [line.get("unseen_over_noise", np.inf) <= WITHIN for line in hidden])
     rate("described where nothing is hidden", [line["verdict"] == DESCRIBED for line in nothing])
+
+
+def show_forced(lines: Sequence[dict[str, Any]]) -> None:
+    """What forced searches found where nothing is hidden."""
+    print("\n| seed | smallest p of a port | largest gain [nat] | gate [nat] | terms | CPU s |")
+    print("|---|---|---|---|---|---|")
+    for line in lines:
+        terms = "; ".join(f"{formula} at {port}" for port, formula, _ in line["terms"]) or "none"
+        gains = f"{line['offered_nats']:.1f} | {line['gate_nats']:.1f}"
+        print(f"| {line['seed']} | {line['port_p']:.2g} | {gains} | {terms} | {line['cpu_seconds']} |")
+    rate("largest gain over the gate", [line["offered_nats"] > line["gate_nats"] for line in lines])
+    rate("a term joined", [bool(line["terms"]) for line in lines])
 
 
 def rate(words: str, marks: Sequence[bool]) -> None:

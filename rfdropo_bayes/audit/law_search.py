@@ -20,7 +20,7 @@ from rfdropo_bayes.audit.port_evidence import PortEvidence, evidences
 from rfdropo_bayes.audit.port_responses import Responses, feature_columns, responses, signal_sizes, with_exact_columns
 from rfdropo_bayes.audit.port_rollouts import FeatureTable, PlacedTerm, PortedForward, placed
 from rfdropo_bayes.audit.screen import null_residuals
-from rfdropo_bayes.mechanisms.features import Feature, dictionary
+from rfdropo_bayes.mechanisms.features import Feature, dictionary, own_dictionary
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
 
 LEAST = 0.01
@@ -88,22 +88,24 @@ class FoundLaw:
     """What the search for laws found around one model.
 
     Attributes:
+        map: all ports.
         ports: evidence of every port before the first term.
-        left_out: ports that the body cannot carry, with the reason.
         terms: refits of the law's terms, the last one with all of them; empty where none is worth it.
         ties: refits of other terms in place of the first one that leave as little, within `TIED`; the best first.
         afterwards: largest log evidence of any port with each term and those before it in the model.
         centre: times of the ports' signals [s].
         gate: gain [nat] that a first term had to bring to left-out recordings; None where no port is significant.
+        offered: largest gain [nat] of any feature at any port before the first term; 0 where none brings anything.
     """
 
+    map: PortMap
     ports: list[PortEvidence]
-    left_out: dict[str, str]
     terms: list[Refit]
     ties: list[Refit]
     afterwards: list[PortEvidence]
     centre: Float[np.ndarray, " spline"]
     gate: float | None
+    offered: float
 
     @property
     def last(self) -> Refit | None:
@@ -216,6 +218,7 @@ class LawSearch:
     Attributes:
         ports: of the simulator.
         table: features of the commands.
+        own: features of a cable's own command, for ports of several cables.
         units: names of the commands, and their unit.
         seed: of simulated data sets.
         family: probability that a port is named where nothing is hidden.
@@ -225,18 +228,20 @@ class LawSearch:
 
     ports: PortMap
     table: FeatureTable
+    own: Sequence[Feature]
     units: tuple[tuple[str, ...], str]
     seed: int
     family: float
     report: Callable[[str], None] = lambda line: None
     most: int = TERMS
 
-    def find(self, target: FitTarget, fit: Fit) -> FoundLaw:
+    def find(self, target: FitTarget, fit: Fit, forced: bool = False) -> FoundLaw:
         """Where something acts that the model lacks, and by what law.
 
         Args:
             target: under which the model was fitted.
             fit: the model, with residuals and slopes in deviations of the measurement's noise.
+            forced: whether a first term is looked for though no port is significant.
         """
         known = target.measured
         found = responses(known, fit, self.ports, self.table, self.report)
@@ -245,9 +250,12 @@ class LawSearch:
         where = evidences(found, null)
         first, terms, ties, gates = where, list[Refit](), list[Refit](), list[float]()
         afterwards: list[PortEvidence] = []
+        offered = 0.0
         try:
-            while len(terms) < self.most and where[0].adjusted_p <= self.family:
-                found = found if terms else self._sharpened(known, fit, found, values, where)
+            while len(terms) < self.most and (where[0].adjusted_p <= self.family or (forced and not terms)):
+                if not terms:
+                    found = self._sharpened(known, fit, found, values, where)
+                    offered = next((row.gain for row in self._ranked(found, values, 0.0)), 0.0)
                 gates.append(self._gate(found, values, null))
                 ranked = self._ranked(found, values, gates[-1], terms=terms)
                 refits = self._refits(known, terms, fit, where, ranked)
@@ -268,7 +276,7 @@ class LawSearch:
             self.report("the time was up before the law was found")
         # The time may be up between a term and what is left beside it.
         terms, gate = terms[: len(afterwards)], next(iter(gates), None)
-        return FoundLaw(first, dict(self.ports.left_out), terms, ties, afterwards, found.basis.centre, gate)
+        return FoundLaw(self.ports, first, terms, ties, afterwards, found.basis.centre, gate, offered)
 
     def _sharpened(
         self, known: FitTarget, fit: Fit, found: Responses, values: np.ndarray, where: Sequence[PortEvidence]
@@ -276,9 +284,20 @@ class LawSearch:
         """Responses with exact columns at the ports that lead by evidence or gain, and at all that need no rollouts."""
         by_gain = dict.fromkeys(row.port for row in self._ranked(found, values, 0.0))
         leading = [row.port for row in where[:BY_EVIDENCE]] + list(by_gain)[:BY_GAIN]
-        chosen = [p for p in found.whitened if p.stage == "sensing" or p in leading]
-        sizes = np.maximum(signal_sizes(values), 1e-300)[:, None]
-        return with_exact_columns(known, fit, found, chosen, values / sizes)
+        chosen = [p for p in self.ports.ports if p.stage == "sensing" or p in leading]
+        return with_exact_columns(known, fit, found, {port: self._offered(port, values)[1] for port in chosen})
+
+    def _features(self, port: Port) -> Sequence[Feature]:
+        """What a law at a port may be made of."""
+        return self.table.features if self.ports.members(port) == (port,) else self.own
+
+    def _offered(self, port: Port, values: Float[np.ndarray, "group feature row"]) -> tuple[np.ndarray, np.ndarray]:
+        """Sizes of a port's features, and the features over their sizes (group, feature, member, row)."""
+        place = {feature: k for k, feature in enumerate(self.table.features)}
+        own = [[place[f.of(m.number)] for m in self.ports.members(port)] for f in self._features(port)]
+        signals = values[:, np.array(own)]
+        sizes = signal_sizes(signals)
+        return sizes, signals / np.maximum(sizes, 1e-300)[:, None, None]
 
     def _say(self, best: Refit, where: PortEvidence) -> None:
         names = self.units[0]
@@ -296,8 +315,8 @@ class LawSearch:
         nothing."""
         series = np.moveaxis(null.reshape(-1, *found.residual.shape), 0, 2)
         most = np.full(len(null), -np.inf)
-        for port in found.whitened:
-            columns = feature_columns(found, port, values / np.maximum(signal_sizes(values), 1e-300)[:, None])
+        for port in self.ports.ports:
+            columns = feature_columns(found, port, self._offered(port, values)[1])
             most = np.maximum(most, left_out_gains(_sums(found, columns, series))[0][:, 1:].max(axis=0))
         return float(np.quantile(most, 1.0 - self.family, method="higher"))
 
@@ -309,16 +328,17 @@ class LawSearch:
 
         Terms that the law has are none of them: where a port is far from linear, they would bring something again.
         """
-        sizes, rows = signal_sizes(values), []
+        rows = []
         had = {(refit.term.port, refit.term.feature) for refit in terms}
-        for port in found.whitened:
-            columns = feature_columns(found, port, values / np.maximum(sizes, 1e-300)[:, None])
+        for port in self.ports.ports:
+            features, (sizes, signals) = self._features(port), self._offered(port, values)
+            columns = feature_columns(found, port, signals)
             gains, share, size, sd = left_out_gains(_sums(found, columns), precision)
             gain = gains[:, 0]
-            passed = np.flatnonzero((gain > gate) & (share >= LEAST))
-            for k in (k for k in passed if (port, self.table.features[k]) not in had):
+            passed = np.flatnonzero((gain > gate) & (share >= LEAST)).tolist()
+            for k in (k for k in passed if (port, features[k]) not in had):
                 parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
-                rows.append(TermGain(port, self.table.features[k], float(gain[k]), float(share[k]), *parts))
+                rows.append(TermGain(port, features[k], float(gain[k]), float(share[k]), *parts))
         return sorted(rows, key=lambda row: -row.gain)
 
     def _exchanged(
@@ -358,7 +378,7 @@ class LawSearch:
     def _cost(self, known: FitTarget) -> float:
         """Nats that a term costs: its parameter, and the choice among all features at all ports."""
         count = max(float(np.sum(known.measurements.valid)), 2.0)
-        return float(0.5 * np.log(count) + np.log(len(self.ports.ports) * len(self.table.features)))
+        return float(0.5 * np.log(count) + np.log(sum(len(self._features(port)) for port in self.ports.ports)))
 
     def _refits(
         self, known: FitTarget, terms: Sequence[Refit], fit: Fit, where: Sequence[PortEvidence], ranked: list[TermGain]
@@ -438,6 +458,7 @@ def law_search(
     """The search on a simulator with these ports and commands."""
     commands = target.forward.commands
     stroke = float(np.ptp(np.concatenate([np.asarray(commands.step), np.asarray(commands.initial)[:, None]], axis=1)))
-    features = dictionary(len(channels), max(stroke, 1e-12))
+    stroke = max(stroke, 1e-12)
+    features = dictionary(len(channels), stroke)
     table = FeatureTable(target.forward.lanes, features)
-    return LawSearch(ports, table, (tuple(channels), unit), seed, family, report)
+    return LawSearch(ports, table, own_dictionary(stroke), (tuple(channels), unit), seed, family, report)

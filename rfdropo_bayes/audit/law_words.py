@@ -58,7 +58,7 @@ def ports_record(answer: Answer) -> dict[str, Any] | None:
         return None
     return {
         "ports": [_port(row) for row in described.found.ports],
-        "left_out": dict(described.found.left_out),
+        "left_out": dict(described.found.map.left_out),
         "time_s": described.found.centre.tolist(),
         "gate_nats": described.found.gate,
     }
@@ -115,10 +115,10 @@ def _one(refit: Refit, row: dict[str, Any], names: Sequence[str]) -> str:
 
 
 def _when(described: Described) -> str:
-    """When the signal at the law's port is largest."""
-    port = described.found.terms[0].term.port
-    row = next(row for row in described.found.ports if row.port == port)
-    size = np.sqrt(np.mean(row.mean**2, axis=0))
+    """When the signals at the members of the law's port are largest."""
+    term = described.found.terms[0].term
+    members = described.found.map.members(term.port)
+    size = np.sqrt(np.mean([row.mean**2 for row in described.found.ports if row.port in members], axis=(0, 1)))
     large = described.found.centre[size > 0.7 * size.max()]
     return f", most from {large.min():.2g} to {large.max():.2g} s"
 
@@ -175,7 +175,7 @@ def law_tables(answer: Answer) -> list[dict[str, Any]]:
         size = abs(float(fit.x[coordinates.names.index(spec.name)]))
         entry: dict[str, Any] = {"coefficient": spec.name, "feature": feature.kind}
         if feature.channels:
-            entry["commands"] = [names[k] for k in feature.channels]
+            entry["commands"] = feature.commands(names)
         if feature.shape is not None:
             entry["shape"] = float(f"{feature.shape:.6g}")
         entry["scale"] = float(f"{spec.prior['scale'] * max(size, 1.0):.3g}")

@@ -8,7 +8,7 @@ with half the layers and twice the step the same laws come out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -65,7 +65,8 @@ class Responses:
     Attributes:
         ports: of the simulator.
         basis: the splines.
-        whitened: by port: what each spline in a group of recordings does to its whitened data.
+        whitened: by port, but for those of several members: what each spline in a group of recordings does to its
+            whitened data.
         residual: whitened, by group.
         jacobian: of the fit's free coordinates, by group; columns in deviations of their priors.
         levels: commands that reach the ports, by group.
@@ -108,14 +109,15 @@ def responses(
     basis = splines(rows, table.time_step)
     theta = forward.coordinates.physical_values(fit.x[None], forward.slots)[0]
     levels = table.levels(theta, forward.commands)
-    simulated = [port for port in ports.ports if port.stage != "sensing"]
+    single = [port for port in ports.ports if ports.members(port) == (port,)]
+    simulated = [port for port in single if port.stage != "sensing"]
     rollouts = len(simulated) * basis.value.shape[1] * groups
-    report(f"signals at {len(ports.ports)} ports: {rollouts} rollouts, {about(rollouts * forward.pace)}")
+    report(f"signals at {len(single)} ports: {rollouts} rollouts, {about(rollouts * forward.pace)}")
     found = {}
     shown = forward.observe_one(fit.x)
     signals = np.repeat(basis.value.T[:, None], groups, axis=1)
-    for port in ports.ports:
-        found[port] = _response(target, fit, ports, port, signals, shown)
+    for port in single:
+        found[port] = _response(target, fit, ports, port, signals[:, :, None], shown)
     white = target.measurements.series(fit.residual).reshape(groups, -1)
     slopes = target.measurements.series(fit.jacobian.T) * forward.coordinates.prior_sd[fit.free][:, None, None, None]
     jacobian = np.moveaxis(slopes.reshape(len(fit.free), groups, -1), 0, 2)
@@ -128,25 +130,26 @@ def _response(
     fit: Fit,
     ports: PortMap,
     port: Port,
-    signals: Float[np.ndarray, "signal group row"],
+    signals: Float[np.ndarray, "signal group member row"],
     shown: Fields,
 ) -> Float[np.ndarray, "group value signal"]:
-    """Whitened responses to signals of the port's unit; kept in the journal."""
+    """Whitened responses to signals of the port's unit at all its members at once; kept in the journal."""
 
     def compute() -> dict[str, np.ndarray]:
         forward, count = target.forward, len(signals)
         usual = forward.lanes.difference
         step = port.size * (SHARE if usual is None or usual <= FINE else SHARE * COARSE / STEP)
         lane = np.tile(np.arange(forward.count), count)
-        w = step * signals.reshape(-1, signals.shape[2])
+        w = np.moveaxis(step * signals.reshape(-1, *signals.shape[2:]), 1, 0)
+        acting = list(zip(ports.members(port), w, strict=True))
         commands = forward.commands.of(lane)
         if port.stage == "sensing":
             shift = shown["offset"][lane][:, None, None]
             still = shown["position"][lane] - shift
-            parts = {"position": as_sensed([(port, w)], still, commands, _time_step(forward)) + shift}
+            parts = {"position": as_sensed(acting, still, commands, _time_step(forward)) + shift}
         else:
             theta = forward.coordinates.physical_values(fit.x[None], forward.slots)[0]
-            commands = commands._replace(signals=signals_of(ports, [(port, w)]))
+            commands = commands._replace(signals=signals_of(ports, acting))
             parts, _ = forward.lanes.roll(theta[lane], forward.start[lane], commands, forward.deadline.check)
             forward.rollouts += len(lane)
         named = {name: part.reshape(count, forward.count, *part.shape[1:]) for name, part in parts.items()}
@@ -163,18 +166,19 @@ def with_exact_columns(
     target: FitTarget,
     fit: Fit,
     found: Responses,
-    ports: Sequence[Port],
-    features: Float[np.ndarray, "group feature row"],
+    features: Mapping[Port, Float[np.ndarray, "group feature member row"]],
 ) -> Responses:
-    """The same with what features do at some ports found as such, and not by the splines that come nearest to them.
+    """The same with what features do at their ports found as such, and not by the splines that come nearest to them.
 
     What is faster than the knots counts: of a crosstalk of two cables under noise with a memory of .6 a row, whose
     whitening brings the fast parts out, splines show half.
     """
     shown = target.forward.observe_one(fit.x)
-    signals = np.moveaxis(features, 1, 0)
-    new = [port for port in ports if port not in found.exact]
-    exact = {port: _response(target, fit, found.ports, port, signals, shown) for port in new}
+    exact = {
+        port: _response(target, fit, found.ports, port, np.moveaxis(own, 1, 0), shown)
+        for port, own in features.items()
+        if port not in found.exact
+    }
     return replace(found, exact={**found.exact, **exact})
 
 
@@ -188,14 +192,15 @@ def on_splines(basis: Splines, values: Float[np.ndarray, "*batch row"]) -> Float
 
 
 def feature_columns(
-    found: Responses, port: Port, features: Float[np.ndarray, "group feature row"]
+    found: Responses, port: Port, features: Float[np.ndarray, "group feature member row"]
 ) -> Float[np.ndarray, "group value feature"]:
-    """What features do to the whitened data at a port, each as a signal of its own size."""
+    """What features do to the whitened data at all members of a port, each as a signal of its own size."""
     if port in found.exact:
         return found.exact[port]
-    return found.whitened[port] @ np.moveaxis(on_splines(found.basis, features), 1, 2)
+    near = np.moveaxis(on_splines(found.basis, features), 1, 3)  # group, member, spline, feature
+    return sum(found.whitened[member] @ near[:, k] for k, member in enumerate(found.ports.members(port)))
 
 
-def signal_sizes(features: Float[np.ndarray, "group feature row"]) -> Float[np.ndarray, " feature"]:
+def signal_sizes(features: Float[np.ndarray, "group feature member row"]) -> Float[np.ndarray, " feature"]:
     """Root mean square of features over all recordings."""
-    return np.sqrt(np.mean(features**2, axis=(0, 2)))
+    return np.sqrt(np.mean(features**2, axis=(0, 2, 3)))

@@ -179,12 +179,13 @@ class PortedForward(Forward):
     def _acting(self, theta: np.ndarray, commands: Commands, points: Points) -> list[tuple[Port, Signals]]:
         """Signals of every lane at each port that has a law."""
         flat = theta.reshape(-1, theta.shape[-1])
-        values = self.table.over(self.table.levels(flat, commands), [term.feature for term in self.terms])
         sizes = np.repeat(self._beside(points), self.count, axis=0)
+        parts = [(k, member) for k, term in enumerate(self.terms) for member in self.ports.members(term.port)]
+        features = [self.terms[k].feature.of(member.number) for k, member in parts]
+        values = self.table.over(self.table.levels(flat, commands), features)
         found: dict[Port, Signals] = {}
-        for k, term in enumerate(self.terms):
-            w = sizes[:, k, None] * values[:, k]
-            found[term.port] = found.get(term.port, 0.0) + w
+        for place, (k, member) in enumerate(parts):
+            found[member] = found.get(member, 0.0) + sizes[:, k, None] * values[:, place]
         return list(found.items())
 
     def _per_lane(self, theta: np.ndarray, points: Points) -> tuple[np.ndarray, np.ndarray, Commands]:
@@ -218,7 +219,7 @@ def with_terms(coordinates: Coordinates, terms: Sequence[PlacedTerm]) -> Coordin
 def placed(port: Port, feature: Feature, size: float, channels: Sequence[str], unit: str) -> PlacedTerm:
     """A term whose coefficient has a prior of so many sizes of its port over the feature's own size."""
     scale = float(f"{SPREAD * port.size / max(size, 1e-300):.3g}")
-    at = f"{port.name} {feature.kind} {' '.join(channels[k] for k in feature.channels)}".strip()
+    at = f"{port.name} {feature.kind} {' '.join(feature.commands(channels))}".strip()
     shape = "" if feature.shape is None else f"_{feature.shape:.3g}"
     name = f"law_{at.replace(' ', '_')}{shape}"
     words = f"of the law at {port.name}: it changes {feature.words(channels)}"

@@ -6,6 +6,7 @@ A feature is written as a step with a memory, so that a whole rollout, which sca
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +17,9 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.tables import nearest
 
 REST = 1e-9  # m or rad per step: less is the rounding of a command that is held
+OWN = -1
+"""In the place of a command: that of the cable on which a law acts, at a port of several cables."""
+OWN_NAME = "own"
 
 
 class Kind(NamedTuple):
@@ -59,13 +63,21 @@ class Feature(NamedTuple):
 
     Attributes:
         kind: a key of `KINDS`.
-        channels: indices of its commands.
+        channels: indices of its commands; `OWN` is to be replaced before values are asked for, see `of`.
         shape: its time constant [s] or width [m or rad]; None without.
     """
 
     kind: str
     channels: tuple[int, ...] = ()
     shape: float | None = None
+
+    def of(self, channel: int) -> Feature:
+        """The same with a command in the place of `OWN`."""
+        return self._replace(channels=tuple(channel if k == OWN else k for k in self.channels))
+
+    def commands(self, names: Sequence[str]) -> list[str]:
+        """Names of its commands."""
+        return [OWN_NAME if k == OWN else names[k] for k in self.channels]
 
     def begin(self, first: Float[Array, " channel"]) -> Any:
         """Memory before the first step, given the command that was held before it."""
@@ -140,31 +152,44 @@ class Feature(NamedTuple):
 
     def words(self, names: Sequence[str]) -> str:
         """In a sentence."""
-        return KINDS[self.kind].words.format(*(names[k] for k in self.channels), shape=self.shape or 0.0)
+        own = ["its own command" if k == OWN else names[k] for k in self.channels]
+        return KINDS[self.kind].words.format(*own, shape=self.shape or 0.0)
 
     def formula(self, names: Sequence[str]) -> str:
         """As a symbol."""
-        return KINDS[self.kind].formula.format(*(names[k] for k in self.channels), shape=self.shape or 0.0)
+        return KINDS[self.kind].formula.format(*self.commands(names), shape=self.shape or 0.0)
 
 
 def dictionary(channels: int, stroke: float) -> list[Feature]:
     """All features of so many commands, whose largest change is ``stroke`` [m or rad]."""
+    return _of_channels(range(channels), stroke)
+
+
+def own_dictionary(stroke: float) -> list[Feature]:
+    """All features of a cable's own command, see `OWN`."""
+    return _of_channels([OWN], stroke)
+
+
+def _of_channels(channels: Sequence[int], stroke: float) -> list[Feature]:
     found = []
     for name, kind in KINDS.items():
         shapes: list[float | None] = [*kind.shapes] or [None]
         if name == "play":
             shapes = [share * stroke for share in kind.shapes]
-        places: list[tuple[int, ...]] = [()]
-        if kind.channels == 1:
-            places = [(k,) for k in range(channels)]
-        elif kind.channels == 2:
-            places = [(i, k) for i in range(channels) for k in range(i, channels)]
+        places = combinations_with_replacement(channels, kind.channels)
         found += [Feature(name, place, shape) for place in places for shape in shapes]
     return found
 
 
 def feature_named(kind: str, commands: Sequence[str], shape: float | None, names: Sequence[str], where: str) -> Feature:
     """A feature as a file has it.
+
+    Args:
+        kind: a key of `KINDS`.
+        commands: names of its commands, among them `OWN_NAME` where ``names`` has that.
+        shape: its time constant or width; None without.
+        names: of the commands, in their order; `OWN_NAME`, if it may be used, comes last.
+        where: the place in the file.
 
     Raises:
         InputError: an unknown kind or command, or a shape that is missing or has no meaning.
@@ -184,4 +209,4 @@ def feature_named(kind: str, commands: Sequence[str], shape: float | None, names
     if bool(wanted.shapes) != (shape is not None) or (shape is not None and not shape > 0.0):
         needs = "a positive shape" if wanted.shapes else "no shape"
         raise InputError(f"the feature {kind!r} takes {needs}", where=where, remedy="see docs/mechanisms.md")
-    return Feature(kind, tuple(names.index(command) for command in commands), shape)
+    return Feature(kind, tuple(OWN if command == OWN_NAME else names.index(command) for command in commands), shape)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms.default_priors import normal
-from rfdropo_bayes.mechanisms.features import KINDS, Feature, feature_named
+from rfdropo_bayes.mechanisms.features import KINDS, OWN_NAME, Feature, feature_named
 from rfdropo_bayes.mechanisms.ports import Port, PortMap, sensed
 from rfdropo_bayes.simulators.commands import sample
 from rfdropo_bayes.simulators.mechanisms import Meanwhile, Mechanism, Values
@@ -78,51 +78,69 @@ class Law:
 
     def signal(self, values: Values, levels: Float[Array, "row channel"], time_step: float) -> Float[Array, " row"]:
         """w(t), given the commands that reach the port; row 0 is before the first step."""
-        return sum(
-            (values[term.spec.name] * term.feature.over(levels, time_step) for term in self.terms),
-            jnp.zeros(len(levels)),
-        )
+        return _summed(self.terms, values, levels, time_step)
 
-    def _begin(self, first: Array) -> tuple[Any, ...]:
-        return tuple(term.feature.begin(first) for term in self.terms)
 
-    def _advance(self, values: Values, memory: tuple[Any, ...], given: Array, interval: Any) -> tuple[tuple, Array]:
-        after, w = [], jnp.zeros(())
-        for term, kept in zip(self.terms, memory, strict=True):
-            kept, value = term.feature.advance(kept, given, interval)
-            after.append(kept)
-            w = w + values[term.spec.name] * value
-        return tuple(after), w
+def _summed(terms: Sequence[Term], values: Values, levels: Float[Array, "row channel"], time_step: float) -> Array:
+    parts = (values[term.spec.name] * term.feature.over(levels, time_step) for term in terms)
+    return sum(parts, jnp.zeros(len(levels)))
 
 
 class CableLaw(Law):
-    """Adds its signal to what reaches one cable."""
+    """Adds its signal to what reaches one cable, or to each cable that by its own command."""
 
     stage = "actuation"
     inside_drive = False
 
+    @property
+    def _cables(self) -> list[tuple[int, list[Term]]]:
+        """Number and terms of each cable."""
+        numbers = [member.number for member in self._ports.members(self.port)]
+        return [(k, [term._replace(feature=term.feature.of(k)) for term in self.terms]) for k in numbers]
+
     def settle(self, values: Values, held: Float[Array, " channel"]) -> Float[Array, " channel"]:
         """See `ActuationMechanism`."""
-        w = sum((values[term.spec.name] * term.feature.at_rest(held) for term in self.terms), jnp.zeros(()))
-        return held.at[self.port.number].add(w)
+        reached = held
+        for k, terms in self._cables:
+            parts = (values[term.spec.name] * term.feature.at_rest(held) for term in terms)
+            reached = reached.at[k].add(sum(parts, jnp.zeros(())))
+        return reached
 
     def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Any, ...]:
         """See `SteppedMechanism`."""
-        return self._begin(first)
+        return tuple(tuple(term.feature.begin(first) for term in terms) for _, terms in self._cables)
 
     def advance(
         self, values: Values, memory: tuple[Any, ...], given: Float[Array, " channel"], now: float
     ) -> tuple[tuple[Any, ...], Float[Array, " channel"]]:
         """Add the signal of a step."""
-        memory, w = self._advance(values, memory, given, now)
-        return memory, given.at[self.port.number].add(w)
+        after, reached = [], given
+        for (k, terms), kept in zip(self._cables, memory, strict=True):
+            own, w = _advanced(terms, values, kept, given, now)
+            after.append(own)
+            reached = reached.at[k].add(w)
+        return tuple(after), reached
 
     def actuate(
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
     ) -> Float[Array, "step channel"]:
         """See `ActuationMechanism`."""
         levels = jnp.concatenate([jnp.asarray(initial, command.dtype)[None], command])
-        return command.at[:, self.port.number].add(self.signal(values, levels, time_step)[1:])
+        for k, terms in self._cables:
+            command = command.at[:, k].add(_summed(terms, values, levels, time_step)[1:])
+        return command
+
+
+def _advanced(
+    terms: Sequence[Term], values: Values, memory: tuple[Any, ...], given: Array, interval: Any
+) -> tuple[tuple[Any, ...], Array]:
+    """Memories and signal at the end of a step."""
+    after, w = [], jnp.zeros(())
+    for term, kept in zip(terms, memory, strict=True):
+        kept, value = term.feature.advance(kept, given, interval)
+        after.append(kept)
+        w = w + values[term.spec.name] * value
+    return tuple(after), w
 
 
 class DelayLaw(Law):
@@ -196,7 +214,7 @@ class ClockedSensingLaw(Law):
 
 def law_at(port: Port, terms: Sequence[Term], ports: PortMap, formula: str = "") -> Mechanism:
     """The law of these terms at a port, in the form that its stage has."""
-    if port.kind == "cable":
+    if port.kind in ("cable", "cables"):
         return CableLaw(port, terms, ports, formula)
     if port.kind == "delay":
         return DelayLaw(port, terms, ports, formula)
@@ -219,16 +237,16 @@ def make_law(choice: LawChoice, ports: PortMap, channels: Sequence[str], command
         remedy = nearest(choice.port, [each.name for each in ports.ports])
         raise InputError(f"no port {choice.port!r}", where=WHERE, remedy=f"{remedy}. {why}" if why else remedy)
     where = f"{WHERE} port = {choice.port!r}"
+    names = (*channels, OWN_NAME) if port.kind == "cables" else tuple(channels)
     terms = []
     for table in choice.terms:
-        feature = feature_named(table["feature"], table.get("commands", ()), table.get("shape"), channels, where)
+        feature = feature_named(table["feature"], table.get("commands", ()), table.get("shape"), names, where)
         scale = float(table["scale"])
         unit = unit_of(port.unit, feature, command_unit)
         words = f"of the law at {port.name}: it changes {feature.words(channels)}"
         name = str(table["coefficient"])
         terms.append(Term(feature, ParameterSpec(name, unit, -FAR * scale, FAR * scale, 0.0, normal(scale), words)))
-    names = [term.spec.name for term in terms]
-    if len(set(names)) < len(names):
+    if len({term.spec.name for term in terms}) < len(terms):
         raise InputError("two terms share a coefficient", where=where, remedy="name each after what it does")
     formula = " + ".join(f"{term.spec.name} {term.feature.formula(channels)}" for term in terms)
     return law_at(port, terms, ports, formula)

@@ -16,6 +16,7 @@ from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BODIES
 from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals
 
 AXES = "xyz"
+EVERY_CABLE = "every cable"
 PLACES = ("base", "middle", "tip")
 """Names of the places that forces may act on, as many as the engine has; see `simulators.engine.LOAD_PLACES`."""
 
@@ -27,7 +28,7 @@ class Port(NamedTuple):
         name: as in a file, such as "cable left" or "marker m3 along".
         stage: "actuation", "body" or "sensing".
         kind: what it is a port of.
-        number: which one of its kind: a channel, a place or a marker.
+        number: which one of its kind: a channel, a place or a marker; of "cables" the number of them.
         axis: 0 to 2, and 3 along the body; -1 where there is none.
         unit: of the signal.
         size: of an effect that a laboratory might see: the scale of priors and of differences.
@@ -64,6 +65,12 @@ class PortMap(NamedTuple):
         """A port by its name; None where there is none."""
         return next((port for port in self.ports if port.name == name), None)
 
+    def members(self, port: Port) -> tuple[Port, ...]:
+        """The ports at which a law acts that is placed at this one: at every cable by the cable's own command."""
+        if port.kind == "cables":
+            return tuple(each for each in self.ports if each.kind == "cable")
+        return (port,)
+
     def silent(self, rows: int) -> PortSignals:
         """Signals of zeros."""
         return PortSignals(jnp.zeros((rows, self.channels)), jnp.zeros(rows), self.no_push(rows))
@@ -75,7 +82,7 @@ class PortMap(NamedTuple):
         return BodySignals(jnp.zeros((rows, self.places, 3)), *(jnp.zeros(rows),) * 2, jnp.zeros((rows, 3)))
 
     def signals(self, port: Port, w: Float[Array, " row"]) -> PortSignals:
-        """A signal at a port of actuation or of the body, as a rollout takes it."""
+        """A signal at a port of actuation or of the body, as a rollout takes it; at one with several members none."""
         none = self.silent(len(w))
         if port.kind == "cable":
             return none._replace(command=none.command.at[:, port.number].set(w))
@@ -147,6 +154,9 @@ def _of_actuation(channels: Sequence[str], unit: str) -> list[Port]:
         Port(f"cable {name}", "actuation", "cable", k, -1, unit, size, look.format(name))
         for k, name in enumerate(channels)
     ]
+    if len(found) > 1:
+        look_at = "what all drives and cables share: gears, spools, guides, and the material of the cables"
+        found.append(Port(EVERY_CABLE, "actuation", "cables", len(found), -1, unit, size, look_at))
     look = "the way of commands to the drives: queues, buses, and clocks"
     return [*found, Port("command delay", "actuation", "delay", 0, -1, "s", 0.02, look)]
 

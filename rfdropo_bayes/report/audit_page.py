@@ -121,13 +121,14 @@ def shown(answer: Answer) -> figures.Shown:
 
 
 def _signal(answer: Answer) -> figures.Signal | None:
-    """The signal at the port of the law, or at the one of most evidence where there is none."""
+    """The signal at the port of the law, of its members the one of most evidence; without a law at the port of most."""
     described = answer.causes.described
     if described is None or not described.found.significant(answer.problem.rules.family):
         return None
     row, terms = described.found.ports[0], described.found.terms
     if terms:
-        row = next(each for each in described.found.ports if each.port == terms[0].term.port)
+        members = described.found.map.members(terms[0].term.port)
+        row = next(each for each in described.found.ports if each.port in members)
     names = answer.target.measurements.names
     return figures.Signal(row.port.name, row.port.unit, names, described.found.centre, row.mean, row.sd)
 

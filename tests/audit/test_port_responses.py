@@ -13,7 +13,7 @@ from rfdropo_bayes.audit.law_search import PIECES, LawSearch, _pieces, _sums, le
 from rfdropo_bayes.audit.port_evidence import MEMORIES, SIZES, evidences
 from rfdropo_bayes.audit.port_responses import Responses, feature_columns, on_splines, splines
 from rfdropo_bayes.audit.verdict import SMALL, negligible
-from rfdropo_bayes.mechanisms.features import Feature
+from rfdropo_bayes.mechanisms.features import OWN, Feature
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
 
 GROUPS, VALUES, ROWS, STEP = 3, 50, 61, 0.01
@@ -91,8 +91,8 @@ def test_terms_of_null_data_pass_the_gate_as_seldom_as_is_said():
     """At a family of .1 of 60 data sets about 6 have a term that passes; 14 by chance in one of a thousand series."""
     found, time, rng = responses(3), STEP * np.arange(ROWS), np.random.default_rng(4)
     values = np.stack([np.sin(k * time) for k in range(1, 30)])[None].repeat(GROUPS, axis=0)
-    table = SimpleNamespace(features=[Feature("time")] * 29)
-    search = LawSearch(found.ports, table, ((), "m"), 0, 0.1)
+    table = SimpleNamespace(features=[Feature("command", (k,)) for k in range(29)])
+    search = LawSearch(found.ports, table, [], ((), "m"), 0, 0.1)
     gate = search._gate(found, values, rng.normal(size=(199, GROUPS * VALUES)))
     small = 0
     for _ in range(60):
@@ -106,7 +106,7 @@ def test_a_term_that_the_law_has_is_not_asked_for_again():
     found, time = responses(3, signal=3.0), STEP * np.arange(ROWS)
     values = np.stack([np.sin(k * time) for k in (8.0, 3.0, 5.0)])[None].repeat(GROUPS, axis=0)
     features = [Feature("command", (k,)) for k in range(3)]
-    search = LawSearch(found.ports, SimpleNamespace(features=features), ((), "m"), 0, 0.1)
+    search = LawSearch(found.ports, SimpleNamespace(features=features), [], ((), "m"), 0, 0.1)
     best, *others = [(row.port, row.feature) for row in search._ranked(found, values, 0.0)]
     assert best == (PORTS[0], features[0])
     law = [SimpleNamespace(term=SimpleNamespace(port=best[0], feature=best[1]))]
@@ -146,7 +146,7 @@ def test_gains_on_what_is_left_out_are_those_of_refits(groups):
         found.duration[:groups],
     )
     time = STEP * np.arange(ROWS)
-    features = np.stack([np.sin(8.0 * time), np.ones(ROWS)])[None].repeat(groups, axis=0)
+    features = np.stack([np.sin(8.0 * time), np.ones(ROWS)])[None, :, None].repeat(groups, axis=0)
     columns = feature_columns(found, PORTS[0], features)
     gain, _, size, sd = left_out_gains(_sums(found, columns))
     assert len(_pieces(found.residual)) == (PIECES if groups == 1 else groups)
@@ -159,6 +159,34 @@ def test_gains_on_what_is_left_out_are_those_of_refits(groups):
     for draw in range(2):
         alone = replace(found, residual=null[:, :, draw])
         assert np.allclose(drawn[:, 1 + draw], left_out_gains(_sums(alone, columns))[0][:, 0])
+
+
+def cables(seed: int) -> tuple[Responses, Port]:
+    """Responses at two cables, and the port of both."""
+    given = responses(seed)
+    each = [Port(f"cable {k}", "actuation", "cable", k, -1, "m", 1.0, "") for k in range(2)]
+    every = Port("every cable", "actuation", "cables", 2, -1, "m", 1.0, "")
+    whitened = dict(zip(each, given.whitened.values(), strict=True))
+    ports = PortMap((*each, every), {}, 2, 0, (0.0, 0.0, 0.0))
+    return replace(given, ports=ports, whitened=whitened), every
+
+
+def test_a_law_of_every_cable_is_found_where_both_cables_follow_it():
+    """Both cables move by the same share of their own command; the law of both is one term, that of either is half."""
+    found, every = cables(7)
+    rng = np.random.default_rng(8)
+    values = rng.normal(size=(GROUPS, 2, len(found.basis.centre))) @ found.basis.value.T
+    near = on_splines(found.basis, values)
+    moved = sum(found.whitened[port] @ near[:, k, :, None] for k, port in enumerate(found.whitened))[..., 0]
+    found = replace(found, residual=found.residual + 0.5 * moved)
+    features = [Feature("command", (k,)) for k in range(2)]
+    search = LawSearch(found.ports, SimpleNamespace(features=features), [Feature("command", (OWN,))], ((), "m"), 0, 0.1)
+    best, *others = search._ranked(found, values, 0.0)
+    assert (best.port, best.feature) == (every, Feature("command", (OWN,)))
+    assert abs(best.size - 0.5) < 4.0 * best.sd
+    assert all(row.gain < 0.8 * best.gain for row in others)
+    single = sum(feature_columns(found, port, values[:, [k], None]) for k, port in enumerate(found.whitened))
+    assert np.allclose(feature_columns(found, every, values[:, None]), single)
 
 
 def test_splines_sum_to_one_and_follow_smooth_series():

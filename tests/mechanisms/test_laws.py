@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.mechanisms.features import KINDS, Feature, dictionary
+from rfdropo_bayes.mechanisms.features import KINDS, Feature, dictionary, own_dictionary
 from rfdropo_bayes.model.assembly import build_robot_simulator
 from rfdropo_bayes.model.experiment import Experiment
 from rfdropo_bayes.model.model_spec import spec_of
@@ -60,10 +60,14 @@ def test_features_are_what_their_formulas_say():
         feature = Feature(name, (0, 1)[: kind.channels], shapes.get(name))
         assert np.allclose(feature.over(jnp.asarray(LEVELS), STEP), truth[name]), name
     assert len(dictionary(4, 0.01)) == 2 + 4 * 7 + 10 + 4 * 2 + 4 * 3 - 4
+    own = own_dictionary(0.01)
+    assert [feature.of(3) for feature in own] == [f for f in dictionary(4, 0.01) if set(f.channels) <= {3}]
+    assert own[-1].formula(["up", "left"]) == "travel(u_own)"
 
 
-PORTS = ["cable left", "command delay", "force x at the tip", "stiffness", "damping", "base tilt z", "marker m3 x",
-         "marker m3 along the body", "camera y", "camera turn z", "camera scale", "observation delay"]  # fmt: skip
+PORTS = ["cable left", "every cable", "command delay", "force x at the tip", "stiffness", "damping", "base tilt z",
+         "marker m3 x", "marker m3 along the body", "camera y", "camera turn z", "camera scale",
+         "observation delay"]  # fmt: skip
 
 
 @pytest.mark.parametrize("port", PORTS)
@@ -98,12 +102,41 @@ def test_a_law_at_a_cable_is_a_change_of_its_command_in_rollouts_and_in_sessions
     assert np.abs(np.stack(seen) - whole.position[1:]).max() < 1e-12
 
 
+HALF = 1.5e-3  # of a play [m]
+
+
+def test_a_play_of_every_cable_is_the_mechanism_of_the_library():
+    """One law at every cable, by each cable's own command, moves the arm as play in all drives does."""
+    by_law = build_robot_simulator(spec(law("every cable", "play", commands=["own"], shape=HALF)))
+    named = spec()
+    named = build_robot_simulator(named.with_mechanisms("backlash"))
+    given = commands(named)
+    seen = by_law.rollout({"c": jnp.asarray(-HALF)}, given).position
+    truth = named.rollout({"backlash": jnp.asarray(HALF)}, given).position
+    still = named.rollout({"backlash": jnp.asarray(0.0)}, given).position
+    assert np.abs(truth - still).max() > 1e-4
+    assert np.abs(seen - truth).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_a_session_holds_the_play_of_every_cable():
+    acting = build_robot_simulator(spec(law("every cable", "play", commands=["own"], shape=HALF)))
+    value = np.random.default_rng(1).uniform(0.0, 0.008, (3, 4))
+    lanes = acting.session(1, 0.1)
+    lanes.reset(np.array([0]), {"c": np.array([-HALF])})
+    seen = [np.asarray(lanes.act(row[None]).position)[0] for row in value]
+    given = acting.commands(0.1 * np.arange(3), value, np.zeros(4), 0.1 * np.arange(4))
+    whole = acting.rollout({"c": jnp.asarray(-HALF)}, given)
+    assert np.abs(np.stack(seen) - whole.position[1:]).max() < 1e-12
+
+
 def test_what_a_law_cannot_be_is_said():
     for wrong, match in (
         (law("cable top"), "no port 'cable top'"),
         (law("cable left", "speed"), "unknown feature"),
         (law("cable left", "product", commands=["up"]), "made of 2 commands"),
         (law("cable left", "command", commands=["top"]), "unknown command"),
+        (law("cable left", "command", commands=["own"]), "unknown command"),
         (law("cable left", "low_pass", commands=["up"]), "takes a positive shape"),
     ):
         with pytest.raises(InputError, match=match):
