@@ -6,10 +6,11 @@ The settings name experiments, patterns of recordings that are left out together
 seconds of the first of them that each fit is then adapted to. Recordings are predicted whole, also where the experiment
 fits some rows of them; after an adaptation the first one as far as it was not shown. Climbs start from the prior, or
 where a study has `start`, the folder of a calibration, from its optimum: a day that is left out has chosen the basin
-then, and nothing else.
+then, and nothing else. `set` changes entries of the experiment, as ``--set`` does.
 
-Every figure is a line of DIR/ledger.jsonl: how far the last marker is off [mm], and which share of the measured
-coordinates lies in the 90 % bands: of all markers, of the last, and of rows whose last marker is inside in all three.
+Every line of DIR/ledger.jsonl has the figures of a day: how far the last marker is off [mm], before an adaptation (from
+the first row, in the same rows) and after it, and which share of the measured coordinates lies in the 90 % bands: of
+all markers, of the last, and of rows whose last marker is inside in all three.
 Lines that are there are not computed again, fits that are done are read again, and so an interrupted run goes on. A fit
 of the paper's trunk takes 2 to 10 minutes of two shared cores, one of the ASL trunk 7 minutes or more, an adaptation 1.
 """
@@ -44,6 +45,7 @@ HEAD = (
     "shown [s]",
     "recording",
     "start held [mm]",
+    "from the first row [mm]",
     "error [mm]",
     "coordinates in",
     "of the tip",
@@ -99,7 +101,7 @@ def figures(prediction: RecordingPrediction) -> dict[str, float]:
 def cases(study: dict[str, Any], out: Path, known: set[tuple[str, str, float]]) -> Iterator[dict[str, Any]]:
     """Lines of the ledger that are not known, each as soon as it is there; 0 seconds shown are the first row alone."""
     experiment = Path(study["experiment"])
-    model, start = rb.Model.read(experiment), Path(study["start"]) if "start" in study else None
+    model, start = rb.Model.read(experiment, study.get("set")), Path(study["start"]) if "start" in study else None
     for pattern in study["left_out"]:
         waiting = [seconds for seconds in (0.0, *study["adapt"]) if (experiment.stem, pattern, seconds) not in known]
         if not waiting:
@@ -111,6 +113,8 @@ def cases(study: dict[str, Any], out: Path, known: set[tuple[str, str, float]]) 
             if seconds:
                 fit = rb.adapt(found, first, seconds=seconds, test=others, group="the day left out")
             rows = {prediction.name: figures(prediction) for prediction in tested(fit)}
+            for name, check in fit.content["details"].get("checks", {}).items():
+                rows[name]["before_mm"] = check["from_first_row"]["error_mm"]
             yield {"experiment": experiment.stem, "left_out": pattern, "seconds": seconds, "recordings": rows}
 
 
@@ -131,7 +135,8 @@ def main() -> None:
     for line in lines:
         for name, row in line["recordings"].items():
             percent = " | ".join(f"{100 * row[key]:.0f} %" for key in FIGURES[2:])
-            errors = f"{row['held_mm']:.1f} | {row['error_mm']:.1f}"
+            before = f"{row['before_mm']:.1f}" if "before_mm" in row else ""
+            errors = f"{row['held_mm']:.1f} | {before} | {row['error_mm']:.1f}"
             print(f"| {line['left_out']} | {line['seconds']:g} | {name} | {errors} | {percent} |")
 
 

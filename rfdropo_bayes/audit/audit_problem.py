@@ -35,7 +35,7 @@ class AuditProblem:
         start: values of base parameters to start from, of an earlier calibration; None for a search.
         rules, seed: see `Rules`.
         left_out: mechanisms that do not run on this body or engine, with the reason.
-        groups: of recordings that are compared; None for an audit of all.
+        groups: of recordings, in which candidates may be by themselves; None without.
         ports: of the simulator, at which unknown causes are looked for; None where nobody asks for them.
     """
 
@@ -52,6 +52,11 @@ class AuditProblem:
     left_out: Mapping[str, str] = field(default_factory=dict)
     groups: Groups | None = None
     ports: PortMap | None = None
+
+    @property
+    def compared(self) -> Groups | None:
+        """The two groups whose differences are asked for; None for an audit of all recordings."""
+        return self.groups if self.groups is not None and self.groups.compared else None
 
     def candidate(self, name: str) -> Candidate | None:
         """A candidate by its name; None for the mesh and time step, which are none of the library's."""

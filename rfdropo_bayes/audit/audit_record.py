@@ -156,7 +156,7 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
 def _doubt(answer: Answer) -> str:
     """What shows whether a mechanism that is not adopted is there."""
     gain = answer.validation.gain
-    if gain is None or not gain.opposed or gain.worse or answer.problem.groups:
+    if gain is None or not gain.opposed or gain.worse or answer.problem.compared:
         return f"record {MORE_TESTS} more test recordings: they show whether the model needs it"
     return f"see whether it was otherwise in {' and '.join(gain.against)}: compare groups of recordings with --between"
 
@@ -235,7 +235,7 @@ def _finding(answer: Answer, step: Added, share: float | None) -> dict[str, Any]
 
 def _between(answer: Answer, findings: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """What differs between two groups of recordings, and what both lack; None where none are compared."""
-    groups = answer.problem.groups
+    groups = answer.problem.compared
     if groups is None:
         return None
     keys = ("mechanism", "group", "parameters", "relative", "log_bayes_factor")

@@ -92,7 +92,7 @@ def describe(
         held_out: predictions of unseen recordings by the base model and after each step; None without steps.
         report: called with a line of words now and then.
     """
-    if problem.ports is None or problem.groups is not None:
+    if problem.ports is None or problem.compared is not None:
         return None
     answer: Described | None = None
     clock = model.judge.forward.deadline

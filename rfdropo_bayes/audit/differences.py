@@ -1,7 +1,8 @@
-"""What may differ between two groups of recordings, such as two days: the candidates of an audit that compares them.
+"""What may differ between groups of recordings, such as days: candidates of an audit that compares two of them, and of
+every audit of recordings that belong to groups.
 
-A difference is added to a value that both groups share: a base parameter is higher in one group than in the other, a
-mechanism is there, or is larger, in one group only. A mechanism that both groups lack is a candidate as well, under its
+A difference is added to a value that all groups share: a base parameter is higher in one group than elsewhere, a
+mechanism is there, or is larger, in one group only. A mechanism that all groups lack is a candidate as well, under its
 plain name: without it, an error of the base model would pass for a difference wherever it pays more in one group.
 """
 
@@ -26,21 +27,29 @@ WHERE = "--between"
 
 @dataclass(frozen=True)
 class Groups:
-    """Two groups of recordings.
+    """Groups of recordings.
 
     Attributes:
         members: fitted and unseen recordings of each, by the group's name.
-        left_out: recordings that belong to neither, and are not looked at.
+        left_out: recordings that belong to none; where two groups are compared, these are not looked at.
+        compared: whether an audit asks for the differences between two groups, and for no others.
     """
 
     members: Mapping[str, tuple[str, ...]]
     left_out: tuple[str, ...] = ()
+    compared: bool = True
 
     @property
-    def names(self) -> tuple[str, str]:
-        """Of the two."""
-        first, second = self.members
-        return first, second
+    def names(self) -> tuple[str, ...]:
+        """Of the groups."""
+        return tuple(self.members)
+
+    @property
+    def shifted(self) -> tuple[str, ...]:
+        """Groups in which a value that all share may be another: of two groups without other recordings the second
+        alone, as the difference is the same, seen from either."""
+        two = len(self.members) == 2 and (self.compared or not self.left_out)
+        return self.names[1:] if two else self.names
 
 
 @dataclass
@@ -64,28 +73,27 @@ def with_differences(
     spreads: Mapping[str, float],
     held: Sequence[str] = (),
 ) -> tuple[ParameterSpace, list[Candidate]]:
-    """Parameters and candidates of a comparison.
+    """Parameters and candidates, those that may differ between groups among them.
 
     Args:
         space: base parameters, then those of the library.
         base: how many belong to the base model.
         simulated: every parameter of the base simulator.
-        library: candidates that both groups may lack.
-        groups: the two.
+        library: candidates that all groups may lack.
+        groups: of the recordings.
         spreads: standard deviations between groups that the model states, by parameter [its unit].
         held: parameters whose values are known, and which therefore do not differ.
     """
     found = _Space(list(space.parameters))
     candidates = list(library)
     shared = {p.spec.name: p for p in space.parameters[:base] if not p.recording}
-    free = {p.spec.name for p in space.parameters[:base] if p.recording}  # differ from one recording to the next
+    free = {p.physical for p in space.parameters[:base] if p.recording}  # differ between recordings or groups already
     places: dict[str, dict[str, int]] = {}  # by group, by parameter
     known = {*held, *free}
     specs = [spec for spec in simulated if spec.name not in known and (spec.name in shared or spec.prior)]
     for spec in specs:
         spread = np.sqrt(2.0) * spreads[spec.name] if spec.name in spreads else _deviation_of(spec, shared)
-        # A value that both share moves with it: the difference is the same, seen from either group.
-        for group in groups.names[1:] if spec.name in shared else groups.names:
+        for group in groups.shifted if spec.name in shared else groups.names:
             places.setdefault(group, {})[spec.name] = found.add(_difference(spec, spread, group, groups))
     for group in groups.names:
         own = places.get(group, {})
@@ -104,7 +112,7 @@ def _deviation_of(spec: ParameterSpec, shared: Mapping[str, InferredParameter]) 
 
 
 def _difference(spec: ParameterSpec, spread: float, group: str, groups: Groups) -> InferredParameter:
-    """What one group's value is off that of the other, Normal(0, ``spread``)."""
+    """What one group's value is off that of the others, Normal(0, ``spread``)."""
     width = spec.high - spec.low
     own = deviation_spec(spec, spread)._replace(low=-width, high=width)
     prior = prior_from_table(own, dict(own.prior), where=f"{WHERE} {spec.name}")
@@ -114,8 +122,9 @@ def _difference(spec: ParameterSpec, spread: float, group: str, groups: Groups) 
 def _changed(specs: Sequence[ParameterSpec], places: Sequence[int], group: str, groups: Groups) -> Candidate:
     name = specs[0].name if len(specs) == 1 else stem(specs)
     described = specs[0].description if len(specs) == 1 else f"{name.replace('_', ' ')} ({len(specs)} of them)"
-    cause = f"{described}: not the same in {' and '.join(groups.names)}"
-    remedy = f"measure it in {' and in '.join(groups.names)}, and undo what changed"
+    elsewhere = next(name for name in groups.names if name != group) if groups.compared else "other groups"
+    cause = f"{described}: not the same in {group} as in {elsewhere}"
+    remedy = f"measure it in {group} and in {elsewhere}, and undo what changed"
     change = OwnParameter(name, tuple(specs), cause, remedy)
     return Candidate(f"{name}{SEPARATOR}{group}", tuple(places), change, name, group)
 
@@ -137,7 +146,7 @@ def _in_one_group(candidate: Candidate, group: str, groups: Groups, found: _Spac
 
 
 def _of_one_group(parameter: InferredParameter, group: str, groups: Groups) -> InferredParameter:
-    """The size of a mechanism in one group, measured from its null value and added to what both share."""
+    """The size of a mechanism in one group, measured from its null value and added to what all share."""
     spec, table = parameter.spec, dict(parameter.table or parameter.spec.prior)
     for key in ("loc", "low", "high"):
         if key in table:

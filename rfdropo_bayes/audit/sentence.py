@@ -39,7 +39,7 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
 
 def _compared(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     """What two groups of recordings have in common, where they are compared."""
-    groups = answer.problem.groups
+    groups = answer.problem.compared
     if groups is None or answer.verdict == NO_VERDICT:
         return ""
     names = " and ".join(groups.names)

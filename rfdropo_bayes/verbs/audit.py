@@ -64,7 +64,7 @@ from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechan
 from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
 from rfdropo_bayes.tables import changed, parse_table
-from rfdropo_bayes.verbs.between import Between, extend_groups, find_groups
+from rfdropo_bayes.verbs.between import Between, extend_groups, find_groups, groups_at_hand
 
 Workshop = dict[str, Lanes]
 
@@ -117,8 +117,9 @@ def audit(
     runs, test = model.runs(runs, test)
     chosen, spec, table = model.settings.seed if seed is None else seed, model.spec, model.settings.audit
     deadline = Deadline(table.minutes)
-    groups = None
-    if between is not None:
+    if between is None:
+        groups = groups_at_hand(spec.groups, runs, test)
+    else:
         groups, runs, test = find_groups(between, spec.groups, runs, test)
     start = start_values(base)
     problem = build_problem(spec, table, runs, test, chosen, start=start, workshop=workshop, groups=groups)
@@ -134,7 +135,8 @@ def audit(
         return found(None)
     settings: dict[str, Any] = {"tables": tables, "folder": model.folder, "data": hashes([*runs, *test])}
     given: dict[str, Any] = {"base": base.folder if isinstance(base, Calibration) else base, "seed": chosen}
-    given |= {} if groups is None else {"between": {name: list(own) for name, own in groups.members.items()}}
+    if groups is not None and groups.compared:
+        given |= {"between": {name: list(own) for name, own in groups.members.items()}}
     settings |= {"options": given, "texts": model.texts()}
     with run_folder(Path(out), "audit", **settings, resume=resume, overwrite=overwrite) as place:
         answered = found(place)
@@ -184,10 +186,10 @@ def build_problem(
     """The base model with every candidate of the library in it, at its null value.
 
     ``table`` is [audit]; ``workshop`` keeps compiled simulators for further data sets of the same experiment; ``names``
-    are the candidates, where it is not all; ``groups`` of recordings are compared.
+    are the candidates, where it is not all; ``groups`` of recordings are compared, or have candidates of their own.
     """
     spreads, robot = spec.per_group, spec.robot
-    if groups is not None:  # what the groups do not share is to be found
+    if groups is not None and groups.compared:  # what the groups do not share is to be found
         spec = replace(spec, per_group={})
     trajectories = [*fitted, *tested]
     left_out: dict[str, str] = {}

@@ -1,4 +1,4 @@
-"""Two groups of recordings that an audit compares: which recordings they are, and how a model says what differs."""
+"""Groups of recordings of an audit: which recordings they are, and how a model says what differs between them."""
 
 from __future__ import annotations
 
@@ -59,6 +59,22 @@ def find_groups(
     return groups, [t for t in fitted if t.name in known], [t for t in tested if t.name in known]
 
 
+def groups_at_hand(patterns: Patterns, fitted: Sequence[Trajectory], tested: Sequence[Trajectory]) -> Groups | None:
+    """The groups of [model.groups], in each of which a candidate may be by itself; None where these recordings do not
+    tell one group from others.
+
+    Args:
+        patterns: [model.groups].
+        fitted: recordings that are fitted; tested: unseen ones.
+    """
+    names, own = [t.name for t in [*fitted, *tested]], {t.name for t in fitted}
+    found = gather_groups(names, patterns)
+    members = {group: each for group, each in found.items() if group in patterns and own & set(each)}
+    others = tuple(name for name in names if not any(name in each for each in members.values()))
+    apart = len(members) > 1 or bool(members and own & set(others))
+    return Groups(members, others, compared=False) if apart else None
+
+
 def _named(between: Sequence[str], patterns: Patterns, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Recordings of groups that the experiment names; a recording that it puts into none is a group of its own."""
     groups = gather_groups(names, patterns)
@@ -92,9 +108,9 @@ def _matching(
 
 
 def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -> None:
-    """Say in the table [model] of an experiment file what differs between the groups.
+    """Say in the table [model] of an experiment file what differs between groups.
 
-    A mechanism that one group only has is free in its recordings, and absent in all others. What both have is pooled.
+    A mechanism of one group alone is free in its recordings, and absent in all others. What several have is pooled.
     """
     coordinates, groups = answer.problem.coordinates, answer.problem.groups
     assert groups is not None
@@ -111,7 +127,8 @@ def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -
             own = [member for member in groups.members[candidate.group] if member in fitted]
             model.setdefault("per_recording", {})[name] = own
             continue
-        model.setdefault("groups", {}).update({group: list(own) for group, own in groups.members.items()})
+        if groups.compared:
+            model.setdefault("groups", {}).update({group: list(own) for group, own in groups.members.items()})
         model.get("per_recording", {}).pop(name, None)
         table = parameter.table or {}
         spread = float(table["scale"]) * float(factor[index]) / np.sqrt(2.0)

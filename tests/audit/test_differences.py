@@ -1,5 +1,8 @@
-"""Audits that compare two groups of recordings, on a simulator that is a formula. Seeds are fixed; a null data set is
-called discrepant in 1 % of cases, and a size is missed by four deviations in one of 10^4."""
+"""Audits that compare two groups of recordings, or have candidates of single groups, on a simulator that is a formula.
+
+Seeds are fixed; a null data set is called discrepant in 1 % of cases, and a size is missed by four deviations in one of
+10^4.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +18,14 @@ from rfdropo_bayes.audit.coordinates import Coordinates
 from rfdropo_bayes.audit.differences import Groups, with_differences
 from rfdropo_bayes.audit.fixed_quantities import families
 from rfdropo_bayes.audit.journal import Journal
-from rfdropo_bayes.audit.pipeline import audit, first_target
+from rfdropo_bayes.audit.pipeline import Answer, audit, first_target
 from rfdropo_bayes.bayes.channels import Markers
 from rfdropo_bayes.bayes.recordings import gather_recordings
+from rfdropo_bayes.bayes.space import ParameterSpace
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
-from rfdropo_bayes.verbs.between import find_groups
+from rfdropo_bayes.verbs.between import extend_groups, find_groups, groups_at_hand
 
 from .toys import BASE, Toy, problem, recordings
 
@@ -29,7 +33,7 @@ TRUTH = {"gain": 1.3, "bend": -0.4}
 MONTHS = {"january": ("r0", "r1", "r3", "r5", "r7"), "april": ("r2", "r4", "r6", "r8")}
 FITTED = 7  # r0 to r6: three repeats, one of them on another day, and four more sequences
 GROUPS = Groups(MONTHS, ("r9",))
-COORDINATES: list[Coordinates] = []  # whose priors are sampled once
+COORDINATES: dict[bool, Coordinates] = {}  # whose priors are sampled once
 
 
 def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> AuditProblem:
@@ -42,11 +46,11 @@ def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> 
         asked.coordinates.space, len(BASE), BASE, asked.candidates, groups, spreads={"bend": 0.5}
     )
     nominal = {spec.name: spec.nominal for spec in toy.parameters}
-    if not COORDINATES:
-        COORDINATES.append(Coordinates(space, len(BASE), tuple(nominal), nominal, {}))
+    if groups.compared not in COORDINATES:
+        COORDINATES[groups.compared] = Coordinates(space, len(BASE), tuple(nominal), nominal, {})
     return replace(
         asked,
-        coordinates=COORDINATES[0],
+        coordinates=COORDINATES[groups.compared],
         model=TrajectoryModel(toy, space, {}, gathered, (Markers.gather(gathered, "repeats"),)),
         trajectories=chosen[:FITTED],
         candidates=candidates,
@@ -55,7 +59,10 @@ def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> 
 
 
 def found(asked: AuditProblem) -> dict:
-    answer = audit(asked)
+    return content_of(audit(asked))
+
+
+def content_of(answer: Answer) -> dict:
     return json.loads(json.dumps(record(answer, versions={}, data_sha256="", next_experiment=next_experiment(answer))))
 
 
@@ -72,6 +79,21 @@ def test_a_mechanism_of_one_day_and_a_parameter_that_changed_are_named_with_thei
         assert abs(size["mean"] - truth) < 4.0 * size["sd"]
     assert "play in april" in content["sentence"]
     assert "shared by january and april" in content["sentence"]
+
+
+def test_a_mechanism_of_one_day_is_named_for_it_in_an_audit_that_compares_nothing():
+    answer = audit(compared({}, {"play": 0.5}, 1, replace(GROUPS, compared=False)))
+    content = content_of(answer)
+    (finding,) = content["findings"]
+    assert (finding["mechanism"], finding["group"]) == ("play", "april")
+    assert abs(finding["parameters"]["play@april"]["mean"] - 0.5) < 4.0 * finding["parameters"]["play@april"]["sd"]
+    assert content["verdict"] == "explained"
+    assert content["between"] is None
+    assert content["sentence"].startswith("Play in april (play 0.")
+    assert "shared by" not in content["sentence"]
+    table: dict = {}
+    extend_groups(table, answer, answer.problem.candidate("play@april"))
+    assert table == {"per_recording": {"play": ["r2", "r4", "r6"]}}  # r8 is not fitted
 
 
 def test_what_both_days_lack_is_no_difference():
@@ -116,6 +138,20 @@ def test_a_difference_is_added_to_what_both_share_and_shapes_are_shared():
     assert [bool(np.any(part)) for part in slopes] == days
 
 
+def test_groups_of_any_number_have_candidates_of_their_own_and_what_differs_already_has_none():
+    asked = problem(TRUTH, 1)
+    space = asked.coordinates.space
+    three = Groups({"january": ("r0",), "april": ("r1",), "june": ("r2",)}, compared=False)
+    options = (len(BASE), BASE, asked.candidates, three)
+    names = {candidate.name for candidate in with_differences(space, *options, spreads={})[1]}
+    assert {f"{name}@{day}" for name in ("play", "bend") for day in three.names} <= names
+    pooled = replace(space.parameters[len(BASE) - 1], recording="april", added_to="bend")
+    own = ParameterSpace((*space.parameters[: len(BASE)], pooled, *space.parameters[len(BASE) :]))
+    shifted = [replace(candidate, indices=tuple(i + 1 for i in candidate.indices)) for candidate in asked.candidates]
+    found = with_differences(own, len(BASE) + 1, BASE, shifted, three, spreads={})[1]
+    assert {each.name for each in found if each.title == "bend"} == set()
+
+
 def test_parameters_of_one_quantity_at_several_places_are_asked_for_together():
     zero = ParameterSpec("zero_up", "m", -1.0, 1.0, 0.0, {"distribution": "Normal", "loc": 0.0, "scale": 0.1}, "zero")
     specs = [zero, zero._replace(name="zero_down"), zero._replace(name="mass", unit="kg")]
@@ -140,6 +176,18 @@ def test_groups_that_cannot_be_compared_are_refused_by_name(between, words):
     patterns = {"january": "r[01]", "april": ["r2", "r3"], "june": "r9", "august": "nothing*"}
     with pytest.raises(InputError, match=words):
         find_groups(between, patterns, runs[:8], runs[8:])
+
+
+def test_groups_at_hand_are_those_that_tell_some_recordings_from_others():
+    runs = recordings(TRUTH, 1)
+    days = {"january": "r[01]", "april": ["r2", "r9"], "june": "r8"}
+    groups = groups_at_hand(days, runs[:4], runs[8:])
+    assert groups == Groups({"january": ("r0", "r1"), "april": ("r2", "r9")}, ("r3", "r8"), compared=False)
+    assert groups.shifted == ("january", "april")  # r3 is of neither
+    assert groups_at_hand({"january": "r*"}, runs[:4], runs[8:]) is None
+    assert groups_at_hand({"january": "r[01]"}, runs[:4], []).members == {"january": ("r0", "r1")}
+    assert groups_at_hand({"january": "r[01]"}, runs[:2], runs[8:]) is None
+    assert groups_at_hand({}, runs[:4], runs[8:]) is None
 
 
 def test_groups_are_found_by_wildcard_by_name_and_by_recording():
