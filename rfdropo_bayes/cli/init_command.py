@@ -115,6 +115,7 @@ def init(
 ) -> None:
     """Write a commented robot file and experiment file from a few answers, options, and the columns of a recording."""
     from rfdropo_bayes.verbs.init import (
+        assumed_of_columns,
         guess_units,
         matching_commands,
         matching_recordings,
@@ -146,6 +147,8 @@ def init(
         typer.echo(f"wrote {path}")
     if ask.assumed:
         typer.echo(f"assumed, and marked ASSUMED in the robot file: {', '.join(sorted(ask.assumed))}")
+    for line in assumed_of_columns(guess) if guess else []:
+        typer.echo(f"look over in the experiment file: {line}")
     typer.echo(f"next: rfdropo check {folder / 'experiment.toml'}")
 
 

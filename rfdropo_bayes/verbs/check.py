@@ -103,6 +103,7 @@ def run_check(path: Path, out: Path, overrides: Sequence[str] = (), *, ahead: bo
             _say_recording(found, trajectory, role, robot)
     named = [trajectory.name for trajectories in recordings.values() for trajectory in trajectories]
     if isinstance(robot, Robot):
+        _say_placement(found, experiment, robot, [*recordings["fit"], *recordings["test"]])
         found.notes += [caution.sentence for caution in _try(found, partial(robot.unstated, named)) or []]
     _say_repeats(found, [*recordings["fit"], *recordings["test"]])
     _say_model(found, experiment, folder, recordings["fit"])
@@ -218,7 +219,16 @@ def _markers(found: Check, trajectory: Trajectory, robot: Workpiece) -> Iterator
         return
     distances = ", ".join(f"{name} {MILLIMETRES * value:.3g}" for name, value in place.items())
     yield f"first row, distance from the undeformed robot in mm: {distances}"
-    found.notes += [f"{trajectory.name}: {hint}" for hint in placement_hints(robot, trajectory)]
+
+
+def _say_placement(found: Check, experiment: Experiment, robot: Robot, trajectories: Sequence[Trajectory]) -> None:
+    """First rows far from the undeformed robot, with a cause; recordings alike share one note."""
+    columns = None if experiment.data is None else experiment.data.columns
+    shared: dict[str, list[str]] = {}
+    for trajectory in trajectories:
+        for hint in placement_hints(robot, trajectory, *([columns.axes] if columns else [])):
+            shared.setdefault(hint, []).append(trajectory.name)
+    found.notes += [f"{_names(names)}: {hint}" for hint, names in shared.items()]
 
 
 def _masks(trajectory: Trajectory) -> str:

@@ -142,6 +142,18 @@ def guess_columns(path: Path, sent: Path | None = None) -> Guess:
     )
 
 
+def lost_positions(recordings: list[Path], guess: Guess) -> dict[str, int]:
+    """Recordings, by name, in which cells of positions are empty, and how many; of plain CSV alone."""
+    if guess.format != named_columns.FORMAT:
+        return {}
+    counts = {}
+    for path in recordings:
+        frame = CsvTable(path, (), machine_written=False).frame
+        known = [name for name in names_of(guess.positions) if name in frame]
+        counts[path.name] = int(frame[known].isna().to_numpy().sum())
+    return {name: count for name, count in counts.items() if count}
+
+
 def _measured(format: str, path: Path) -> tuple[CsvTable, str | None]:
     """The table of a recording, and the unit of lengths where the file tells it."""
     if format == rosbag.FORMAT:
@@ -156,8 +168,10 @@ def _measured(format: str, path: Path) -> tuple[CsvTable, str | None]:
 
 
 def _clock_of(table: CsvTable) -> str | None:
-    """The first column that is called a time and holds times."""
-    return next((name for name in table.frame.columns if TIME.search(name) and _holds_times(table, name)), None)
+    """The first column that is called a time and holds times; else the first in a unit of time that always rises."""
+    names = [str(name) for name in table.frame.columns]
+    called = next((name for name in names if TIME.search(name) and _holds_times(table, name)), None)
+    return called or next((name for name in names if _told_time_units(name) and _rises(table, name)), None)
 
 
 def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
@@ -222,12 +236,23 @@ def _holds_times(table: CsvTable, name: str) -> bool:
     return bool(len(ticks) == 1 or ticks[-1] != ticks[0])  # a date of the day alone is none
 
 
+def _rises(table: CsvTable, name: str) -> bool:
+    """Whether a column grows from every row to the next."""
+    numbers = table.numeric()
+    return len(numbers) > 1 and name in numbers and bool((numbers[name].diff().iloc[1:] > 0.0).all())
+
+
+def _told_time_units(name: str) -> set[str]:
+    """Units of time that words in a column's name tell."""
+    return {TIME_UNITS[word] for word in re.findall(r"[^\W_]+", name.lower()) if word in TIME_UNITS}
+
+
 def _time_unit(table: CsvTable, time: str | None) -> str:
     """The unit that the name of a column tells, or else the time from row to row."""
     if time is None or len(table) < 2:
         return "s"
     stamps = table.stamps(time, "s")
-    told = {TIME_UNITS[word] for word in re.findall(r"[^\W_]+", time.lower()) if word in TIME_UNITS}
+    told = _told_time_units(time)
     if stamps.dated or len(told) == 1:
         return "s" if stamps.dated else told.pop()
     interval = pace(stamps.since(stamps, str(table.path)))

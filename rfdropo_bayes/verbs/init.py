@@ -14,7 +14,7 @@ from rfdropo_bayes.files import matching_files, output_folder
 from rfdropo_bayes.model.experiment import load_experiment
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.outline import RobotOutline, robot_text
-from rfdropo_bayes.verbs.column_names import Guess, guess_columns
+from rfdropo_bayes.verbs.column_names import Guess, guess_columns, lost_positions
 
 PRIORS = (
     ("young_modulus", "how stiff"),
@@ -28,6 +28,11 @@ CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)
 """Formats that come from motion capture, which loses markers now and then."""
 AXES = {"+z": ["x", "z", "-y"], "-z": ["x", "-z", "y"]}
 """The base's axes in terms of Motive's, whose y axis points up: of a robot that hangs, and of one that stands."""
+
+
+def quoted(value: object) -> str:
+    """Text, numbers or lists of them as TOML; letters of every alphabet stay as they are."""
+    return json.dumps(value, ensure_ascii=False)
 
 
 def matching_recordings(patterns: list[str]) -> list[Path]:
@@ -120,15 +125,27 @@ def _head(name: str) -> list[str]:
 
 def _entries(folder: Path, recordings: list[Path], commands: list[Path], guess: Guess) -> list[str]:
     """The recordings as entries of fit and test."""
-    names = [json.dumps(os.path.relpath(path, folder)) for path in recordings]
+    names = [quoted(os.path.relpath(path, folder)) for path in recordings]
     if commands:
-        sent = [json.dumps(os.path.relpath(path, folder)) for path in commands]
+        sent = [quoted(os.path.relpath(path, folder)) for path in commands]
         return [f"{{observations = {name}, commands = {file}}}" for name, file in zip(names, sent, strict=True)]
     if guess.format == lerobot.FORMAT and len(names) == 1:
         episodes = lerobot.episode_numbers(recordings[0])
         parts = [episodes] if len(episodes) == 1 else [episodes[:-1], episodes[-1:]]
         return [f"{{observations = {names[0]}, episodes = {part}}}" for part in parts]
     return names
+
+
+def assumed_of_columns(guess: Guess) -> list[str]:
+    """What the tables of `data_tables` assume or leave out, and a recording does not tell; a sentence each."""
+    said = []
+    if guess.time is None:
+        said.append("sample_time = 0.05: no column was recognised as times")
+    if guess.command_time is not None:
+        said.append("command_offset = 0.0: the clocks of commands and observations begin together")
+    if guess.left:
+        said.append(f"columns that are not used: {', '.join(guess.left)}")
+    return said
 
 
 def data_tables(
@@ -142,12 +159,15 @@ def data_tables(
     """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it."""
     entries = _entries(folder, recordings, commands, guess)
     fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
-    masked = ['missing = "mask"  # positions that motion capture lost are left out'] if guess.format in CAPTURED else []
+    lost = lost_positions(recordings, guess)
+    counted = f" ({', '.join(f'{name}: {count} empty cells' for name, count in lost.items())})" if lost else ""
+    masked = [f'missing = "mask"  # positions that motion capture lost are left out{counted}']
+    masked = masked if lost or guess.format in CAPTURED else []
     axes, assumed = ["x", "y", "z"], ""
     if guess.format == motive_csv.FORMAT:
         axes, assumed = AXES.get(gravity, axes), "  # ASSUMED: Motive's y axis points up"
     optional = [
-        f"{key} = {json.dumps(values)}"
+        f"{key} = {quoted(values)}"
         for key, values in (("tensions", guess.tensions), ("motor_angles", guess.motor_angles))
         if values
     ]
@@ -162,16 +182,16 @@ def data_tables(
         "# Guessed from the names and sizes of the columns: look them over.",
         "[data.columns]",
         *_clock(guess),
-        f"commands = {json.dumps(guess.commands)}  # one for each of the robot's channels, in their order",
+        f"commands = {quoted(guess.commands)}  # one for each of the robot's channels, in their order",
         f'command_unit = "{guess.command_unit}"',
         *_command_clock(guess),
         "positions = [",
-        *(f"    {json.dumps(triple)}," for triple in guess.positions),
+        *(f"    {quoted(triple)}," for triple in guess.positions),
         "]",
         f'position_unit = "{guess.position_unit}"',
-        f"markers = {json.dumps(list(markers))}  # the robot's names, in the order of positions",
+        f"markers = {quoted(list(markers))}  # the robot's names, in the order of positions",
         "# x, y, z of the robot's base in terms of the file's axes: z runs away from the clamp.",
-        f"axes = {json.dumps(axes)}{assumed}",
+        f"axes = {quoted(axes)}{assumed}",
         *optional,
         *left,
         "",
@@ -184,7 +204,7 @@ def _clock(guess: Guess) -> list[str]:
         return ["sample_time = 0.05  # ASSUMED: seconds from row to row"]
     if guess.format == rosbag.FORMAT:
         return ['time = "header"  # stamps where messages have them; "log": the times at which they were received']
-    return [f"time = {json.dumps(guess.time)}", f'time_unit = "{guess.time_unit}"']
+    return [f"time = {quoted(guess.time)}", f'time_unit = "{guess.time_unit}"']
 
 
 def _command_clock(guess: Guess) -> list[str]:
@@ -192,7 +212,7 @@ def _command_clock(guess: Guess) -> list[str]:
     if guess.command_time is None:
         return []
     return [
-        f"command_time = {json.dumps(guess.command_time)}",
+        f"command_time = {quoted(guess.command_time)}",
         f'command_time_unit = "{guess.command_time_unit}"',
         "# ASSUMED: both clocks begin together. Else: what the observations' clock shows [s] when this one shows zero.",
         "command_offset = 0.0",

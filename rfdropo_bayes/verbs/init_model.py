@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from rfdropo_bayes.model.model_spec import find_robot
 from rfdropo_bayes.simulators.adapters import first_tables
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess
-from rfdropo_bayes.verbs.init import data_tables
+from rfdropo_bayes.verbs.init import data_tables, quoted
 
 OF_CABLE = {"m": ("m", "cm", "mm"), "rad": ("rad", "deg")}
 """Units that a recording may have of what a simulator takes in each of these."""
@@ -57,8 +56,8 @@ def write_model_experiment(
         guess = guess._replace(command_unit=box.command_unit)
     text = [
         "# Written by rfdropo init; docs/reference/experiment.md has every key. Look it over, then: rfdropo check.",
-        f"title = {json.dumps(model.stem)}",
-        f"robot = {json.dumps(name)}",
+        f"title = {quoted(model.stem)}",
+        f"robot = {quoted(name)}",
         "seed = 0",
         "",
         *_adapter(tables, assumed),
@@ -103,7 +102,7 @@ def _adapter(tables: dict[str, Any], assumed: list[str]) -> list[str]:
     }
     for key, words in said.items():
         lines += [words, f"[adapter.{key}]"]
-        lines += [f"{json.dumps(name)} = {json.dumps(value)}" for name, value in tables[key].items()]
+        lines += [f"{quoted(name)} = {quoted(value)}" for name, value in tables[key].items()]
         lines.append("")
     return [*(f"# ASSUMED: {line}" for line in assumed), *lines]
 
@@ -130,7 +129,7 @@ def _inferred(tables: dict[str, Any]) -> list[str]:
         "mechanisms = []         # effects of drives and cameras on top: rfdropo mechanisms lists them",
         "",
         "[model.priors]          # what to infer; {} asks for the default prior of its kind",
-        *(f"{json.dumps(name)} = {{}}" for name in tables["parameters"]),
+        *(f"{quoted(name)} = {{}}" for name in tables["parameters"]),
         "",
         "[inference]",
         'method = "smc"          # rfdropo methods lists them',

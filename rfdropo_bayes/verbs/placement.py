@@ -11,6 +11,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import pdist, squareform
 
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.named_columns import axes_matrix
 from rfdropo_bayes.robots import Robot
 
 FAR = 0.4
@@ -50,11 +51,16 @@ def far_from_rest(robot: Robot, trajectory: Trajectory) -> dict[str, float] | No
     return dict(zip(start.names, distance.tolist(), strict=True))
 
 
-def placement_hints(robot: Robot, trajectory: Trajectory) -> list[str]:
+def placement_hints(robot: Robot, trajectory: Trajectory, axes: tuple[str, str, str] = ("x", "y", "z")) -> list[str]:
     """What may be wrong with axes, origin, units or the order of markers, in words; nothing where all looks well.
 
     A soft robot hangs or rests bent, so only a first row far from the undeformed robot is looked at, and a cause is
     named only if it brings the markers near.
+
+    Args:
+        robot: with the undeformed markers.
+        trajectory: the recording, in the frame that ``axes`` made of its file's.
+        axes: under which it was read, as [data.columns] has them. A hint says what to write in their place.
     """
     start = start_of(robot, trajectory)
     length = robot.body.station_m[-1] - robot.body.station_m[0]
@@ -63,12 +69,12 @@ def placement_hints(robot: Robot, trajectory: Trajectory) -> list[str]:
     hints = _stretched(start)
     if _rms(start.first - start.rest) <= FAR * length:
         return hints
-    found = _cause(start, length)
-    head = f"the first row is {1e3 * _rms(start.first - start.rest):.0f} mm off the undeformed robot"
+    found = _cause(start, length, axes_matrix(axes))
+    head = f"the first row is {float(f'{1e3 * _rms(start.first - start.rest):.2g}'):g} mm off the undeformed robot"
     return [*hints, f"{head}; {found or 'look at axes, units, the order of markers and their point_m'}"]
 
 
-def _cause(start: Start, length: float) -> str | None:
+def _cause(start: Start, length: float, read: Float[np.ndarray, "3 3"]) -> str | None:
     """The simplest of a shift, an order of markers, axes, or axes and a shift, that brings the first row near."""
     names, rest, first = start
     shift = np.mean(rest - first, axis=0)
@@ -80,14 +86,18 @@ def _cause(start: Start, length: float) -> str | None:
     if _rms(first - rest[order]) <= NEAR * length:
         meant = ", ".join(names[index] for index in order)
         return f"another order of the markers would bring it there: {', '.join(names)} look like {meant}"
-    for words, turn in _turns():
+    straight = bool(np.all(2.0 * np.linalg.norm(rest[:, :2], axis=1) <= NEAR * length))  # half a turn moves them little
+    twist = ". Markers along the body do not show its turn about z: compare a motion with its command"
+    twist = twist if straight else ""
+    for turn in _turns():
         if _rms(first @ turn.T - rest) <= NEAR * length:
-            return f"axes = {words} would bring it there, on top of the axes that it was read with"
-    for words, turn in _turns():
+            return f"axes = {_words(turn @ read)} in [data.columns] would bring it there{twist}"
+    for turn in _turns():
         shift = np.mean(rest - first @ turn.T, axis=0)
         if len(names) > 1 and _rms(first @ turn.T + shift - rest) <= NEAR * length:
             return (
-                f"axes = {words} on top of those that it was read with, and a shift by {_millimetres(shift)} mm, would"
+                f"axes = {_words(turn @ read)} in [data.columns], and a shift by {_millimetres(shift)} mm, would bring "
+                f"it there{twist}"
             )
     return None
 
@@ -107,16 +117,21 @@ def _stretched(start: Start) -> list[str]:
     ]
 
 
-def _turns() -> list[tuple[str, Float[np.ndarray, "3 3"]]]:
-    """The 23 ways to name x, y and z anew that keep a frame right-handed, as ``axes`` has them."""
+def _turns() -> list[Float[np.ndarray, "3 3"]]:
+    """The 23 ways to name x, y and z anew that keep a frame right-handed."""
     turns = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         matrix = np.zeros((3, 3))
         matrix[range(3), order] = signs
         if np.linalg.det(matrix) > 0 and not np.allclose(matrix, np.eye(3)):
-            words = [f'"{"-" if sign < 0 else ""}{"xyz"[axis]}"' for axis, sign in zip(order, signs, strict=True)]
-            turns.append((f"[{', '.join(words)}]", matrix))
+            turns.append(matrix)
     return turns
+
+
+def _words(turn: Float[np.ndarray, "3 3"]) -> str:
+    """A turn as ``axes`` of [data.columns] has it."""
+    names = [f'"{"-" if row.min() < 0.0 else ""}{"xyz"[np.argmax(np.abs(row))]}"' for row in turn]
+    return f"[{', '.join(names)}]"
 
 
 def _rms(vectors: Float[np.ndarray, "marker 3"]) -> float:

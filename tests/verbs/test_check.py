@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.named_columns import axes_matrix
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
@@ -131,6 +132,31 @@ def test_turned_axes_are_named(axes):
     (hint,), _ = moved(lambda position: position[..., list(axes)])
     named = hint.split("axes = ")[1].split("]")[0]
     assert named.split(", ")[2].strip('"') == "xyz"[axes.index(2)]
+
+
+def test_axes_are_named_as_the_file_needs_them():
+    """Of a recording that was read with wrong axes, the hint's axes take their place and leave none to correct."""
+    demo, robot, axes = Trajectory.load(DEMO), Robot.load("smooth_arm"), ("y", "z", "x")
+    dataset = demo.dataset.copy(deep=True)
+    file = demo.position @ axes_matrix(("x", "z", "-y"))  # what reads right with these axes
+    dataset["position"] = dataset["position"].copy(data=file @ axes_matrix(axes).T)
+    (hint,) = placement_hints(robot, Trajectory(dataset), axes)
+    named = tuple(word.strip(' "') for word in hint.split("axes = [")[1].split("]")[0].split(","))
+    assert named[2] == "-y"
+    assert "do not show its turn about z" in hint
+    dataset["position"] = dataset["position"].copy(data=file @ axes_matrix(named).T)
+    assert placement_hints(robot, Trajectory(dataset), named) == []
+
+
+def test_recordings_alike_share_a_note(tmp_path):
+    checked(tmp_path)
+    path = tmp_path / "own.toml"
+    (tmp_path / "again.csv").write_bytes((tmp_path / "run.csv").read_bytes())
+    text = path.read_text().replace('fit = ["run.csv"]', 'fit = ["run.csv", "again.csv"]')
+    path.write_text(text.replace('position_unit = "mm"', 'position_unit = "mm"\naxes = ["x", "z", "-y"]'))
+    found = run_check(path, tmp_path / "pictures")
+    assert sum("off the undeformed robot" in note for note in found.notes) == 1
+    assert any(note.startswith("run, again: the first row is ") for note in found.notes)
 
 
 def test_markers_in_another_order_are_named():

@@ -38,6 +38,7 @@ def table(time: str, position: str, command: str, scale: float = 1.0, factor: fl
         ("time [s]", "{marker} {axis} [mm]", "motor{0} [rad]", 1.0, ("s", "rad", "mm"), ["low", "tip"]),
         ("timestamp", "{marker}_{axis}", "cmd_{0}", 1e-3, ("s", "m", "m"), ["low", "tip"]),
         ("Time_s", "{marker}.{axis}", "theta_{0}_deg", 1.0, ("s", "deg", "mm"), ["low", "tip"]),
+        ("Zeit [s]", "{marker} {axis} [mm]", "Motor {0} [deg]", 1.0, ("s", "deg", "mm"), ["low", "tip"]),
     ],
 )
 def test_columns_are_recognised_by_their_names(tmp_path, time, position, command, scale, units, markers):
@@ -72,6 +73,35 @@ def test_milliseconds_forces_and_measured_angles_are_told_apart(tmp_path):
     assert guess.tensions == [f"tension{k}" for k in range(1, 5)]
     assert guess.motor_angles == [f"motor{k}_meas" for k in range(1, 5)]
     assert guess.left == ["battery"]
+
+
+def test_a_column_of_times_in_another_language_is_known_by_its_unit_if_it_rises(tmp_path):
+    run = table("Zeit [ms]", "{marker}_{axis}", "motor{0}", factor=1e3)
+    run.insert(0, "latency [ms]", 3.0)
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.time, guess.time_unit) == ("Zeit [ms]", "ms")
+    run["Zeit [ms]"] = 5.0
+    run.to_csv(tmp_path / "run.csv", index=False)
+    assert guess_columns(tmp_path / "run.csv").time is None
+
+
+def test_lost_markers_and_letters_of_any_alphabet_are_written_down(tmp_path, monkeypatch, capsys):
+    for number in (1, 2):
+        run = table("nummer", "{marker}_{axis}", "motor{0}")
+        run.loc[3 * number : 8, ["low_x", "low_y", "low_z"]] = np.nan
+        run.to_csv(tmp_path / f"Prüfung {number}.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    status, told = init(monkeypatch, capsys, "arm", "--recording", "Prüfung *.csv")
+    assert status == 0
+    assert "look over in the experiment file: sample_time = 0.05: no column was recognised as times" in told
+    assert "columns that are not used: nummer" in told
+    text = (tmp_path / "arm" / "experiment.toml").read_text(encoding="utf-8")
+    assert '"../Prüfung 1.csv"' in text
+    assert "Prüfung 1.csv: 18 empty cells, Prüfung 2.csv: 9 empty cells" in text
+    experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
+    (fitted,) = load_recordings(experiment.data, tmp_path / "arm")
+    assert int((~fitted.position_mask).sum()) == 6
 
 
 def test_a_file_without_positions_is_refused(tmp_path):
