@@ -44,6 +44,7 @@ KINDS: Mapping[str, Kind] = {
     "constant": Kind(0, (0, 0), "always", "1"),
     "time": Kind(0, (0, 1), "with time", "t"),
     "command": Kind(1, (1, 0), "in proportion to {0}", "u_{0}"),
+    "drift": Kind(1, (1, 1), "with time times {0}", "t u_{0}"),
     "product": Kind(2, (2, 0), "with {0} times {1}", "u_{0} u_{1}"),
     "magnitude": Kind(1, (1, 0), "with the size of {0}, whatever its sign", "|u_{0}|"),
     "rate": Kind(1, (1, -1), "with the speed of {0}", "du_{0}/dt"),
@@ -85,6 +86,7 @@ class Feature(NamedTuple):
         zero = jnp.zeros((), first.dtype)
         memories: dict[str, Any] = {
             "time": zero,
+            "drift": zero,
             "rate": own,
             "direction": [*own, zero],
             "low_pass": own,
@@ -107,13 +109,15 @@ class Feature(NamedTuple):
     def advance(self, memory: Any, given: Float[Array, " channel"], interval: float) -> tuple[Any, Float[Array, ""]]:
         """Memory and value at the end of a step of so many seconds, given the command that has been reached."""
         own = [given[k] for k in self.channels]
-        if self.kind not in ("time", "rate", "direction", "low_pass", "play", "largest", "travelled"):
+        if self.kind not in ("time", "drift", "rate", "direction", "low_pass", "play", "largest", "travelled"):
             return memory, self.at_rest(given)
         return self._remembering(memory, own, interval)
 
     def _remembering(self, memory: Any, own: list[Array], interval: float) -> tuple[Any, Array]:
         if self.kind == "time":
             return memory + interval, memory + interval
+        if self.kind == "drift":
+            return memory + interval, (memory + interval) * own[0]
         u, before = own[0], memory[0]
         if self.kind == "rate":
             return own, (u - before) / interval

@@ -45,6 +45,7 @@ def test_features_are_what_their_formulas_say():
         "constant": np.ones(len(u)),
         "time": STEP * np.arange(len(u)),
         "command": u,
+        "drift": STEP * np.arange(len(u)) * u,
         "product": u * v,
         "magnitude": np.abs(u),
         "rate": np.append(0.0, move / STEP),
@@ -59,7 +60,7 @@ def test_features_are_what_their_formulas_say():
     for name, kind in KINDS.items():
         feature = Feature(name, (0, 1)[: kind.channels], shapes.get(name))
         assert np.allclose(feature.over(jnp.asarray(LEVELS), STEP), truth[name]), name
-    assert len(dictionary(4, 0.01)) == 2 + 4 * 7 + 10 + 4 * 2 + 4 * 3 - 4
+    assert len(dictionary(4, 0.01)) == 2 + 4 * 8 + 10 + 4 * 2 + 4 * 3 - 4
     own = own_dictionary(0.01)
     assert [feature.of(3) for feature in own] == [f for f in dictionary(4, 0.01) if set(f.channels) <= {3}]
     assert own[-1].formula(["up", "left"]) == "travel(u_own)"
