@@ -149,13 +149,16 @@ def port_map(simulator: Any, markers: Sequence[str]) -> PortMap:
 
 def _of_actuation(channels: Sequence[str], unit: str) -> list[Port]:
     size = 1e-3 if unit == "m" else 0.05
+    wound = unit in ("m", "rad")  # else of a simulator of one's own, whose commands may be forces or torques
     look = "guide, spool and tension of cable {0}, and what it shares with other cables"
+    look = look if wound else "the drive of {0}, what it moves, and what it shares with other drives"
     found = [
         Port(f"cable {name}", "actuation", "cable", k, -1, unit, size, look.format(name))
         for k, name in enumerate(channels)
     ]
     if len(found) > 1:
         look_at = "what all drives and cables share: gears, spools, guides, and the material of the cables"
+        look_at = look_at if wound else "what all drives share"
         found.append(Port(EVERY_CABLE, "actuation", "cables", len(found), -1, unit, size, look_at))
     look = "the way of commands to the drives: queues, buses, and clocks"
     return [*found, Port("command delay", "actuation", "delay", 0, -1, "s", 0.02, look)]
