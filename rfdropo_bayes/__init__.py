@@ -50,6 +50,7 @@ _HOMES = {
     "design_day": "verbs.design_day",
     "evaluate": "verbs.evaluate",
     "load": "results.load",
+    "load_deployment": "deployment.settings",
     "make_vec": "verbs.make_vec",
     "predict": "verbs.predict",
     "read": "verbs.read",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
@@ -57,6 +58,36 @@ def changed(table: Parsed, *, where: str, **values: Any) -> Parsed:
     """
     given = {name: value for name, value in table if name in table.model_fields_set}
     return parse_table(type(table), {**given, **values}, where=where)
+
+
+def parse_assignment(assignment: str) -> tuple[list[str], Any]:
+    """Keys and value of ``table.key=value``; a bare word is a string, so that names need no quotes on a command line.
+
+    Raises:
+        InputError: it has another form.
+    """
+    name, equals, text = assignment.partition("=")
+    keys = [key.strip() for key in name.split(".")]
+    if not equals or not all(keys):
+        raise InputError(f"{assignment!r} is not of the form name=value", where="--set", remedy="e.g. --set seed=1")
+    try:
+        return keys, tomllib.loads(f"value = {text.strip()}")["value"]
+    except tomllib.TOMLDecodeError:
+        return keys, text.strip()
+
+
+def set_entry(tables: dict[str, Any], keys: Sequence[str], value: Any) -> None:
+    """Set an entry of nested tables in place; tables on the way to it are made.
+
+    Raises:
+        InputError: a key on the way holds something else than a table.
+    """
+    table: Any = tables
+    for key in keys[:-1]:
+        table = table.setdefault(key, {})
+        if not isinstance(table, dict):
+            raise InputError(f"{key!r} in {'.'.join(keys)!r} is not a table", where="--set", remedy="check the key")
+    table[keys[-1]] = value
 
 
 def _follow(schema: type[BaseModel], location: Sequence[str | int]) -> tuple[list[str], list[type[BaseModel]]]:

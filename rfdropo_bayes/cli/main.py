@@ -117,8 +117,15 @@ def simulate(
 
 
 @app.command()
-def report(folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a calibration has written")]) -> None:
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="what a calibration or a deployment has written")],
+) -> None:
     """Write report.html again from the files of a run."""
+    if (folder / "cycles.bin").is_file():  # a motor session's journal
+        from rfdropo_bayes.verbs.session_report import write_session_page
+
+        typer.echo(f"report: {write_session_page(folder)}")
+        return
     see_calibration(folder, "DIR")
     from rfdropo_bayes.report import rebuild_report
 

@@ -34,16 +34,23 @@ def deploy(
     simulated: Annotated[bool, typer.Option(help="use simulated drives, whatever the mode")] = False,
     recording: Annotated[Path | None, typer.Option(help="what to replay: a session's folder, or a trajectory")] = None,
     quiet: Annotated[bool, typer.Option(help="no live view")] = False,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", help="key=value or table.key=value of the deployment file")
+    ] = None,
 ) -> None:
-    """Run a policy on drives, or try it: writes session.nc, the CAN frames, log.jsonl and summary.json."""
+    """Run a policy on drives, or try it: writes report.html, session.nc, the CAN frames, log.jsonl and summary.json."""
     from rfdropo_bayes.deployment.session import Mode
     from rfdropo_bayes.deployment.session import deploy as run_session
+    from rfdropo_bayes.deployment.settings import load_deployment
 
     if mode not in set(Mode):
         raise InputError(f"unknown mode {mode!r}", where="--mode", remedy=f"choose one of {', '.join(Mode)}")
     folder = out or Path("reports") / f"{deployment.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     show = not quiet and sys.stdout.isatty() and mode != "check"
-    outcome = run_session(deployment, mode, folder, simulated=simulated, commands=recording, show=show, keyboard=True)
+    settings = load_deployment(deployment, overrides or [])
+    if not quiet and (simulated or mode == Mode.DRY_RUN):
+        typer.echo("starting the simulated drives; the first start of a trunk compiles, for minutes", err=True)
+    outcome = run_session(settings, mode, folder, simulated=simulated, commands=recording, show=show, keyboard=True)
     for channel, found in outcome.drives.items() if mode == "check" else ():
         typer.echo(f"{channel}: " + ", ".join(f"{name} {value:#x}" for name, value in found.items()))
     for channel, lacking in outcome.without.items() if mode == "check" else ():
@@ -53,6 +60,9 @@ def deploy(
     for line in _figures(outcome.figures):
         typer.echo(line)
     typer.echo(f"session: {folder}")
+    from rfdropo_bayes.verbs.session_report import write_session_page  # with the drives at rest: it loads the figures
+
+    typer.echo(f"report: {write_session_page(folder)}")
     if not outcome.finished:
         raise typer.Exit(FAILED)
 

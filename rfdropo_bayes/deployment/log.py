@@ -219,6 +219,7 @@ def session_trajectory(folder: Path, phases: tuple[int, ...] | None = None) -> T
             name=Path(folder).name,
             robot=robot.name,
             format=FORMAT,
+            synthetic=bool(header["facts"].get("simulated")),
             provenance=f"session of {time.strftime('%Y-%m-%d %H:%M:%S', time.gmtime(header['wall_time']))} UTC",
             settings=header["facts"] | ({} if seen.any() else {"unseen": True}),
         ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +16,7 @@ from rfdropo_bayes.deployment.sensors import SensorTable
 from rfdropo_bayes.deployment.vendors import WITHOUT, AccelerationUnit, SpeedUnit, TorqueUnit, Units
 from rfdropo_bayes.deployment.watch import Patience
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.tables import parse_assignment, parse_table, set_entry
 
 
 class _Table(BaseModel):
@@ -205,8 +206,12 @@ class Deployment(_Table):
         return self
 
 
-def load_deployment(path: Path) -> Deployment:
+def load_deployment(path: Path | str, overrides: Sequence[str] = ()) -> Deployment:
     """Read a deployment file; paths in it are relative to it.
+
+    Args:
+        path: the file.
+        overrides: assignments such as ``"goal.x=0.02"`` that replace entries of the file.
 
     Raises:
         InputError: if it cannot be read, or a value does not hold.
@@ -216,6 +221,8 @@ def load_deployment(path: Path) -> Deployment:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"cannot be read ({error})", where=str(path), remedy="give a readable TOML file") from None
+    for assignment in overrides:
+        set_entry(table, *parse_assignment(assignment))
     settings = parse_table(Deployment, table, where=str(path))
     return settings.model_copy(update=_resolved(settings, path.resolve().parent))
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import find_files, unwritten
+from rfdropo_bayes.tables import parse_assignment, set_entry
 
 ROBOT_COPY = "robot.toml"
 MODEL_FILES = (".toml", ".xml", ".urdf")
@@ -51,27 +52,11 @@ def read_tables(path: Path) -> dict[str, Any]:
 
 def override(tables: dict[str, Any], assignment: str, fields: Container[str]) -> None:
     """Apply one assignment to nested tables in place; a bare name that is none of ``fields`` is a parameter."""
-    name, equals, text = assignment.partition("=")
-    keys = [key.strip() for key in name.split(".")]
-    if not equals or not all(keys):
-        raise InputError(f"{assignment!r} is not of the form name=value", where="--set", remedy="e.g. --set seed=1")
+    keys, value = parse_assignment(assignment)
     if len(keys) == 1 and keys[0] not in fields:
         tables.get("model", {}).get("priors", {}).pop(keys[0], None)
         keys = ["model", "fixed", keys[0]]
-    table: Any = tables
-    for key in keys[:-1]:
-        table = table.setdefault(key, {})
-        if not isinstance(table, dict):
-            raise InputError(f"{key!r} in {name!r} is not a table", where="--set", remedy="check the key")
-    table[keys[-1]] = _toml_value(text.strip())
-
-
-def _toml_value(text: str) -> Any:
-    """A value in TOML syntax; a bare word is taken as a string, so that names need no quotes on a command line."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
+    set_entry(tables, keys, value)
 
 
 def describe(tables: Mapping[str, Any]) -> str:

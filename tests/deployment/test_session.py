@@ -240,6 +240,20 @@ def test_bad_deployment_files_say_what_is_wrong(tmp_path: Path, text: str, messa
         load_deployment(path)
 
 
+def test_entries_of_a_deployment_file_are_replaced_and_checked(tmp_path: Path) -> None:
+    path = tmp_path / "d.toml"
+    path.write_text("robot = 'motor_arm'\n[goal]\nx = 0.0\n")
+    found = load_deployment(path, ["goal.x=0.02", "duration_s=2", "drives.eds=other.eds"])
+    assert (found.goal, found.duration_s) == ({"x": 0.02}, 2.0)
+    assert found.drives.eds == str(tmp_path / "other.eds")
+    with pytest.raises(InputError, match=r"unknown key 'safety.mises'.*did you mean 'misses'"):
+        load_deployment(path, ["safety.mises=3"])
+    with pytest.raises(InputError, match="not of the form name=value"):
+        load_deployment(path, ["duration_s"])
+    with pytest.raises(InputError, match=r"'robot' in 'robot\.name' is not a table"):
+        load_deployment(path, ["robot.name=x"])
+
+
 def test_the_command_line_runs_a_dry_run(robot: Robot, tmp_path: Path) -> None:
     turning(tmp_path / "policy.onnx", robot)
     text = """
@@ -263,8 +277,20 @@ def test_the_command_line_runs_a_dry_run(robot: Robot, tmp_path: Path) -> None:
         str(tmp_path / "arm.toml"),
         "--out",
         str(tmp_path / "s"),
+        "--set",
+        "duration_s=0.4",
     ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("finished")
-    assert (tmp_path / "s" / "session.nc").is_file()
+    assert "starting the simulated drives" in done.stderr
+    recording = Trajectory.load(tmp_path / "s" / "session.nc")
+    assert recording.synthetic
+    assert len(recording.command) == 5  # 0.4 s at the policy's 10 Hz, and the ramp to rest
+    page = (tmp_path / "s" / "report.html").read_text()
+    assert "ended <strong>as planned</strong>" in page
+    assert 'href="#goal"' not in page  # this policy has none
+    (tmp_path / "s" / "report.html").unlink()
+    again = subprocess.run([*command[:3], "report", str(tmp_path / "s")], capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "s" / "report.html").read_text() == page

@@ -1,0 +1,154 @@
+"""report.html of a motor session: how it ended, how the drives followed, how punctual it was, what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.report.page import render
+from rfdropo_bayes.report.session_figures import commands_figure, drives_figure, goal_figure, punctuality_figure
+from rfdropo_bayes.report.style import embed
+
+SECTIONS = (
+    ("result", "Result"),
+    ("drives", "Set-points and reached lengths"),
+    ("goal", "Distance to the goal"),
+    ("commands", "What the policy commanded"),
+    ("timing", "Punctuality"),
+    ("events", "Events"),
+    ("reproduce", "To reproduce"),
+)
+PLANNED = "finished"
+ROUTINE = "checked"
+"""The kind of event that every drive has, whatever happens."""
+CLIPPED = 1e-9
+"""A command nearer to what was asked for, in its own unit, differs by rounding alone."""
+REMEDIES = {
+    "deadlines_missed": "Keep other work off this machine, and give the loop real-time scheduling: rfdropo doctor "
+    "measures both.",
+    "markers_lost": "See whether the cameras see every marker at the place where the session ended.",
+    "tension": "Compare the limit in [safety] with the tensions in the table below.",
+    "following_error": "Lower rate_limit_m_s, or see what holds the cable back.",
+    "action_outside": "The policy met a scene that its training did not have: see the commands below.",
+    "action_not_finite": "See the last rows of session.nc: a marker or the policy gave a number that is not finite.",
+    "heartbeat_lost": "See the wiring, the supply and the terminating resistors of the bus.",
+    "stale_status": "See the wiring, the supply and the terminating resistors of the bus.",
+    "homing_failed": "Let the cables hang loose, turn each drum by hand, and home again.",
+}
+"""What to do first about the causes that end a session, by their word in summary.json."""
+
+
+class MotorSession(NamedTuple):
+    """What a session left.
+
+    Attributes:
+        name: of its folder.
+        summary: content of summary.json.
+        events: lines of log.jsonl.
+        config: config.toml as text, and ``goal`` its goal [m] by axis.
+        recording: session.nc; None where a session recorded nothing, as a check does.
+    """
+
+    name: str
+    summary: Mapping[str, Any]
+    events: Sequence[Mapping[str, Any]]
+    config: str
+    goal: Mapping[str, float]
+    recording: Trajectory | None
+
+
+def render_session(session: MotorSession) -> str:
+    """HTML of the page."""
+    recording, figures = session.recording, session.summary["figures"]
+    pictures = {}
+    if recording is not None:
+        pictures["drives"] = embed(drives_figure(recording), "Set-point and reached length of every cable")
+        pictures["commands"] = embed(commands_figure(recording), "Commands asked for and in force, by channel")
+        pictures["timing"] = embed(punctuality_figure(recording, figures["period_s"]), "How late the cycles began")
+        time, distance = distance_to_goal(recording, session.goal)
+        if len(distance):
+            pictures["goal"] = embed(goal_figure(time, distance), "Distance of the last marker from the goal")
+    shown = [(anchor, words) for anchor, words in SECTIONS if anchor in (*pictures, "result", "events", "reproduce")]
+    began = session.events[0]["monotonic"] if session.events else 0.0
+    return render(
+        "session.html.j2",
+        session=session,
+        sections=shown,
+        pictures=pictures,
+        drives=[] if recording is None else drive_rows(recording),
+        ended_at=None if recording is None else _final_distance(recording, session.goal),
+        goal_marker=None if recording is None else recording.marker_names[-1],
+        seconds=0.0 if recording is None else float(recording.time[-1]),
+        events=[(each["monotonic"] - began, each) for each in session.events if each["event"] != ROUTINE],
+        checked=sum(each["event"] == ROUTINE for each in session.events),
+        advice=session_steps(session),
+    )
+
+
+def drive_rows(recording: Trajectory) -> list[dict[str, Any]]:
+    """How each drive followed: range and differences [mm], greatest tension [N], cycles without an answer [%]."""
+    set_point, length = (1e3 * recording.dataset[name].to_numpy() for name in ("set_point", "length"))
+    tension, answered = recording.dataset["tension"].to_numpy(), recording.tension_mask
+    assert answered is not None
+    apart = length - set_point
+    return [
+        {
+            "name": name,
+            "low": float(length[:, k].min()),
+            "high": float(length[:, k].max()),
+            "rms": float(np.sqrt(np.mean(apart[:, k] ** 2))),
+            "most": float(np.abs(apart[:, k]).max()),
+            "tension": float(tension[answered[:, k], k].max()) if answered[:, k].any() else None,
+            "silent": 100.0 * float(1.0 - answered[:, k].mean()),
+        }
+        for k, name in enumerate(recording.cable_names)
+    ]
+
+
+def distance_to_goal(
+    recording: Trajectory, goal: Mapping[str, float]
+) -> tuple[Float[np.ndarray, " row"], Float[np.ndarray, " row"]]:
+    """Times [s] at which the last marker was seen, and its distance from a goal [m]; empty without a goal."""
+    seen = recording.position_mask[:, -1]
+    if set(goal) != set("xyz") or not seen.any():
+        return np.empty(0), np.empty(0)
+    place = np.array([goal[axis] for axis in "xyz"])
+    return recording.time[seen], np.linalg.norm(recording.position[seen, -1] - place, axis=1)
+
+
+def _final_distance(recording: Trajectory, goal: Mapping[str, float]) -> float | None:
+    """Distance [mm] from the goal where the policy's time ended; the phases in which drives come to rest follow it."""
+    phase = recording.dataset["phase"].to_numpy()
+    last = recording.time[phase == phase[0]][-1]
+    time, distance = distance_to_goal(recording, goal)
+    return 1e3 * float(distance[time <= last][-1]) if (time <= last).any() else None
+
+
+def session_steps(session: MotorSession) -> list[str]:
+    """What to do next, each a sentence with its ground."""
+    summary, recording, found = session.summary, session.recording, []
+    cause, figures = summary["cause"], summary["figures"]
+    if cause != PLANNED:
+        found.append(REMEDIES.get(cause, "Correct the cause that is named above, and run --mode check again."))
+    if figures and figures["missed"]:
+        found.append(f"{figures['missed']} cycles missed their time: rfdropo doctor says what this machine lacks.")
+    lacking = [channel for channel, guards in summary["without"].items() if guards]
+    if lacking:
+        found.append(f"{', '.join(lacking)} lack guards: --mode check says which, and what that costs.")
+    if recording is None:
+        return found or ["Nothing was recorded: go on with --mode home, shadow or run."]
+    asked = recording.dataset["asked_command"].to_numpy()
+    clipped = float(np.mean(np.any(np.abs(asked - recording.command) > CLIPPED, axis=1)))
+    if clipped:
+        found.append(f"A limit on length held back {100 * clipped:.0f} % of the actions: see the commands below.")
+    if cause == PLANNED and summary["facts"].get("simulated"):
+        found.append("The drives were simulated. On a robot, begin with --mode check, home and shadow.")
+    found.append(
+        'The recording is data: put session.nc under fit in [data] with format = "netcdf", then rfdropo calibrate and '
+        "rfdropo audit say how this robot differs from its model."
+    )
+    return found
