@@ -76,6 +76,12 @@ def test_init_finds_the_elements_and_says_what_it_assumed(place):
         rfdropo("init", "reacher.xml")
 
 
+def test_without_a_recording_or_a_site_all_bodies_that_move_are_markers(place):
+    shutil.copyfile(REACHER.parent / "inverted_pendulum.xml", place / "pendulum.xml")
+    assert "markers are all bodies that move, cart, pole" in rfdropo("init", "pendulum.xml")
+    assert rb.Model.read(place / "pendulum" / "experiment.toml").robot.marker_names == ("cart", "pole")
+
+
 @pytest.mark.slow
 def test_a_model_of_others_is_calibrated_drawn_predicted_and_written_back(place):
     recorded(place, 0.0)

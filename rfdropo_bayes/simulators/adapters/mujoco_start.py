@@ -62,6 +62,8 @@ def _markers(model: Any, markers: Mapping[str, np.ndarray | None]) -> tuple[dict
     mujoco.mj_forward(model, data)
     places = {"site": data.site_xpos, "body": data.xpos, "geom": data.geom_xpos}
     named = {(kind, name): k for kind in places for k, name in enumerate(element_names(model, kind))}
+    if not markers:
+        return _all_markers(model, named)
     found: dict[str, str] = {}
     for marker in markers:
         for kind, name in named:
@@ -90,6 +92,24 @@ def _markers(model: Any, markers: Mapping[str, np.ndarray | None]) -> tuple[dict
                 f"marker {left[row]} is the {kind} {name}, {1e3 * far[row, column]:.3g} mm from its first row"
             )
     return {marker: found[marker] for marker in markers}, assumed
+
+
+def _all_markers(model: Any, named: Mapping[tuple[str, str], int]) -> tuple[dict[str, str], list[str]]:
+    """All sites, or else all bodies that move, where no recording says what is measured."""
+    sites = [name for kind, name in named if kind == "site" and not name.isdigit()]
+    if sites:
+        return {name: f"site/{name}" for name in sites}, []
+    bodies = [
+        name
+        for (kind, name), k in named.items()
+        if kind == "body" and not name.isdigit() and int(model.body_weldid[k]) != 0
+    ]
+    if not bodies:
+        raise InputError(
+            "no site and no moving body has a name", where="markers", remedy="name sites in the model's file"
+        )
+    told = f"markers are all bodies that move, {', '.join(bodies)}: keep those that are measured"
+    return {name: f"body/{name}" for name in bodies}, [told]
 
 
 def _channels(model: Any, channels: Sequence[str]) -> tuple[dict[str, str | int], list[str]]:
