@@ -2,14 +2,15 @@
 every audit of recordings that belong to groups.
 
 A difference is added to a value that all groups share: a base parameter is higher in one group than elsewhere, a
-mechanism is there, or is larger, in one group only. A mechanism that all groups lack is a candidate as well, under its
-plain name: without it, an error of the base model would pass for a difference wherever it pays more in one group.
+mechanism is there, or is larger, in one group only, or is absent there. A mechanism that all groups lack is a candidate
+as well, under its plain name: without it, an error of the base model would pass for a difference wherever it pays more
+in one group.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import jax
 import numpy as np
@@ -33,11 +34,13 @@ class Groups:
         members: fitted and unseen recordings of each, by the group's name.
         left_out: recordings that belong to none; where two groups are compared, these are not looked at.
         compared: whether an audit asks for the differences between two groups, and for no others.
+        complements: recordings outside a group, by "all but NAME", where the fitted ones of them are no group.
     """
 
     members: Mapping[str, tuple[str, ...]]
     left_out: tuple[str, ...] = ()
     compared: bool = True
+    complements: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -48,8 +51,11 @@ class Groups:
     def shifted(self) -> tuple[str, ...]:
         """Groups in which a value that all share may be another: of two groups without other recordings the second
         alone, as the difference is the same, seen from either."""
-        two = len(self.members) == 2 and (self.compared or not self.left_out)
-        return self.names[1:] if two else self.names
+        return self.names[1:] if len(self.members) == 2 and not self.complements else self.names
+
+    def recordings(self, scope: str) -> tuple[str, ...]:
+        """Of a group, or of all groups but one."""
+        return self.members[scope] if scope in self.members else self.complements[scope]
 
 
 @dataclass
@@ -101,6 +107,8 @@ def with_differences(
         for family in families([spec for spec in specs if spec.name in own]):
             candidates.append(_changed(family, [own[spec.name] for spec in family], group, groups))
         candidates += [_in_one_group(candidate, group, groups, found) for candidate in library]
+    for scope in groups.complements:  # an effect of either sign is added to what all share, and so may be absent in one
+        candidates += [_in_one_group(each, scope, groups, found) for each in library if _one_sided(each, found)]
     return ParameterSpace(tuple(found.parameters)), candidates
 
 
@@ -116,7 +124,7 @@ def _difference(spec: ParameterSpec, spread: float, group: str, groups: Groups) 
     width = spec.high - spec.low
     own = deviation_spec(spec, spread)._replace(low=-width, high=width)
     prior = prior_from_table(own, dict(own.prior), where=f"{WHERE} {spec.name}")
-    return InferredParameter(own, prior, group, dict(own.prior), tuple(groups.members[group]), spec.name)
+    return InferredParameter(own, prior, group, dict(own.prior), groups.recordings(group), spec.name)
 
 
 def _changed(specs: Sequence[ParameterSpec], places: Sequence[int], group: str, groups: Groups) -> Candidate:
@@ -145,6 +153,12 @@ def _in_one_group(candidate: Candidate, group: str, groups: Groups, found: _Spac
     return replace(candidate, name=f"{candidate.name}{SEPARATOR}{group}", indices=tuple(indices), group=group)
 
 
+def _one_sided(candidate: Candidate, found: _Space) -> bool:
+    """Whether a size of a mechanism has one sign only, so that nothing added to it takes it away."""
+    specs = [found.parameters[i].spec for i in candidate.indices]
+    return any(spec.low >= spec.nominal or spec.high <= spec.nominal for spec in specs)
+
+
 def _of_one_group(parameter: InferredParameter, group: str, groups: Groups) -> InferredParameter:
     """The size of a mechanism in one group, measured from its null value and added to what all share."""
     spec, table = parameter.spec, dict(parameter.table or parameter.spec.prior)
@@ -154,4 +168,4 @@ def _of_one_group(parameter: InferredParameter, group: str, groups: Groups) -> I
     low, high, grid = spec.low - spec.nominal, spec.high - spec.nominal, tuple(g - spec.nominal for g in spec.grid)
     own = spec._replace(low=low, high=high, nominal=0.0, prior=table, grid=grid)
     prior = prior_from_table(own, table, where=f"{WHERE} {spec.name}")
-    return InferredParameter(own, prior, group, table, tuple(groups.members[group]), spec.name)
+    return InferredParameter(own, prior, group, table, groups.recordings(group), spec.name)

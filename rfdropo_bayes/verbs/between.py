@@ -71,8 +71,12 @@ def groups_at_hand(patterns: Patterns, fitted: Sequence[Trajectory], tested: Seq
     found = gather_groups(names, patterns)
     members = {group: each for group, each in found.items() if group in patterns and own & set(each)}
     others = tuple(name for name in names if not any(name in each for each in members.values()))
-    apart = len(members) > 1 or bool(members and own & set(others))
-    return Groups(members, others, compared=False) if apart else None
+    if len(members) < 2 and not (members and own & set(others)):
+        return None
+    outside = {group: tuple(name for name in names if name not in each) for group, each in members.items()}
+    alone = [own & set(each) for each in members.values()]
+    apart = {f"all but {group}": each for group, each in outside.items() if own & set(each) not in alone}
+    return Groups(members, others, compared=False, complements=apart)
 
 
 def _named(between: Sequence[str], patterns: Patterns, names: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -124,7 +128,7 @@ def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -
             continue
         name = parameter.added_to
         if alone:
-            own = [member for member in groups.members[candidate.group] if member in fitted]
+            own = [member for member in groups.recordings(candidate.group) if member in fitted]
             model.setdefault("per_recording", {})[name] = own
             continue
         if groups.compared:

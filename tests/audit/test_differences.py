@@ -33,7 +33,7 @@ TRUTH = {"gain": 1.3, "bend": -0.4}
 MONTHS = {"january": ("r0", "r1", "r3", "r5", "r7"), "april": ("r2", "r4", "r6", "r8")}
 FITTED = 7  # r0 to r6: three repeats, one of them on another day, and four more sequences
 GROUPS = Groups(MONTHS, ("r9",))
-COORDINATES: dict[bool, Coordinates] = {}  # whose priors are sampled once
+COORDINATES: dict[str, Coordinates] = {}  # whose priors are sampled once
 
 
 def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> AuditProblem:
@@ -46,11 +46,11 @@ def compared(january: dict, april: dict, seed: int, groups: Groups = GROUPS) -> 
         asked.coordinates.space, len(BASE), BASE, asked.candidates, groups, spreads={"bend": 0.5}
     )
     nominal = {spec.name: spec.nominal for spec in toy.parameters}
-    if groups.compared not in COORDINATES:
-        COORDINATES[groups.compared] = Coordinates(space, len(BASE), tuple(nominal), nominal, {})
+    if repr(groups) not in COORDINATES:
+        COORDINATES[repr(groups)] = Coordinates(space, len(BASE), tuple(nominal), nominal, {})
     return replace(
         asked,
-        coordinates=COORDINATES[groups.compared],
+        coordinates=COORDINATES[repr(groups)],
         model=TrajectoryModel(toy, space, {}, gathered, (Markers.gather(gathered, "repeats"),)),
         trajectories=chosen[:FITTED],
         candidates=candidates,
@@ -94,6 +94,16 @@ def test_a_mechanism_of_one_day_is_named_for_it_in_an_audit_that_compares_nothin
     table: dict = {}
     extend_groups(table, answer, answer.problem.candidate("play@april"))
     assert table == {"per_recording": {"play": ["r2", "r4", "r6"]}}  # r8 is not fitted
+
+
+def test_a_mechanism_that_one_day_of_three_lacks_is_named_for_the_others():
+    months = {"january": ["r0", "r1", "r3"], "march": "r[57]", "april": MONTHS["april"]}
+    runs = recordings(TRUTH, 1)[:9]
+    content = found(compared({"play": 0.5}, {}, 1, groups_at_hand(months, runs[:FITTED], runs[FITTED:])))
+    (finding,) = content["findings"]
+    assert (finding["mechanism"], finding["group"]) == ("play", "all but april")
+    (size,) = finding["parameters"].values()
+    assert abs(size["mean"] - 0.5) < 4.0 * size["sd"]
 
 
 def test_what_both_days_lack_is_no_difference():
@@ -141,10 +151,13 @@ def test_a_difference_is_added_to_what_both_share_and_shapes_are_shared():
 def test_groups_of_any_number_have_candidates_of_their_own_and_what_differs_already_has_none():
     asked = problem(TRUTH, 1)
     space = asked.coordinates.space
-    three = Groups({"january": ("r0",), "april": ("r1",), "june": ("r2",)}, compared=False)
+    days = {"january": "r0", "april": "r1", "june": "r2"}
+    three = groups_at_hand(days, recordings(TRUTH, 1)[:3], [])
     options = (len(BASE), BASE, asked.candidates, three)
     names = {candidate.name for candidate in with_differences(space, *options, spreads={})[1]}
     assert {f"{name}@{day}" for name in ("play", "bend") for day in three.names} <= names
+    assert "play@all but june" in names
+    assert "delay@all but june" not in names  # it has either sign: less of it in June is delay@june
     pooled = replace(space.parameters[len(BASE) - 1], recording="april", added_to="bend")
     own = ParameterSpace((*space.parameters[: len(BASE)], pooled, *space.parameters[len(BASE) :]))
     shifted = [replace(candidate, indices=tuple(i + 1 for i in candidate.indices)) for candidate in asked.candidates]
@@ -182,10 +195,18 @@ def test_groups_at_hand_are_those_that_tell_some_recordings_from_others():
     runs = recordings(TRUTH, 1)
     days = {"january": "r[01]", "april": ["r2", "r9"], "june": "r8"}
     groups = groups_at_hand(days, runs[:4], runs[8:])
-    assert groups == Groups({"january": ("r0", "r1"), "april": ("r2", "r9")}, ("r3", "r8"), compared=False)
+    assert groups.members == {"january": ("r0", "r1"), "april": ("r2", "r9")}
+    assert groups.left_out == ("r3", "r8")
+    assert groups.complements == {
+        "all but january": ("r2", "r3", "r8", "r9"),
+        "all but april": ("r0", "r1", "r3", "r8"),
+    }
     assert groups.shifted == ("january", "april")  # r3 is of neither
-    assert groups_at_hand({"january": "r*"}, runs[:4], runs[8:]) is None
-    assert groups_at_hand({"january": "r[01]"}, runs[:4], []).members == {"january": ("r0", "r1")}
+    assert groups_at_hand({"january": "r*"}, runs[:4], runs[8:]) is None  # nothing to tell it from
+    assert groups_at_hand({"january": "r[01]"}, runs[:4], []).complements == {"all but january": ("r2", "r3")}
+    two = groups_at_hand({"january": "r[01]", "april": "r[23]"}, runs[:4], runs[8:])
+    assert two.shifted == ("april",)
+    assert two.complements == {}  # of the fitted recordings, all but january is april
     assert groups_at_hand({"january": "r[01]"}, runs[:2], runs[8:]) is None
     assert groups_at_hand({}, runs[:4], runs[8:]) is None
 
