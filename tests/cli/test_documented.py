@@ -14,7 +14,7 @@ from rfdropo_bayes.cli.main import app
 
 ROOT = Path(__file__).resolve().parents[2]
 # A line of its own, in a block or a comment; or a command in running words.
-LINE = re.compile(r"^(?:[#\s]*|.*: )(rfdropo [a-z][^`]*)$")
+LINE = re.compile(r"^(?:[#\s]*|.*: )(?:\.venv/bin/)?(rfdropo +[a-z][^`]*)$")
 INLINE = re.compile(r"`(rfdropo [a-z][^`]*)`")
 PLACEHOLDER = re.compile(r"\b[A-Z]\b")  # of a number
 

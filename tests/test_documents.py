@@ -1,0 +1,225 @@
+"""Code that documents and notebooks show: it parses, it uses names and arguments that exist, and short scripts run."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import subprocess
+import sys
+import typing
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import jax
+import nbformat
+import numpy as np
+import pytest
+
+import rfdropo_bayes as rb
+from rfdropo_bayes.inference import methods
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+DOCUMENTS = sorted({*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").rglob("*.md"), *REPOSITORY.glob("*/*/README.md")})
+NOTEBOOKS = sorted((REPOSITORY / "notebooks").glob("*.ipynb"))
+BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+PACKAGE = "rfdropo_bayes"
+DOOR = "rb"
+
+
+def blocks() -> list[tuple[str, str]]:
+    """Name and code of every Python block of a document, and of every notebook as a whole."""
+    found = []
+    for document in DOCUMENTS:
+        for number, code in enumerate(BLOCK.findall(document.read_text(encoding="utf-8"))):
+            found.append((f"{document.relative_to(REPOSITORY)}#{number}", code))
+    for path in NOTEBOOKS:
+        cells = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+        found.append((path.name, "\n".join(cells)))
+    return found
+
+
+BLOCKS = blocks()
+NAMED = pytest.mark.parametrize(("name", "code"), BLOCKS, ids=[name for name, _ in BLOCKS])
+
+
+def set_by_methods(holder: Any) -> set[str]:
+    """Attributes that the methods of a class, other than a built-in one, set on its objects."""
+    lineage = [each for each in getattr(holder, "__mro__", ()) if each.__module__ != "builtins"]
+    return {name for each in lineage for name in re.findall(r"\bself\.(\w+)\b[^=\n]*=[^=]", inspect.getsource(each))}
+
+
+class PublicNames(ast.NodeVisitor):
+    """Follows what comes out of the front door through a script, and lists what does not exist.
+
+    A variable has the type that the function or class which made it states; others are not looked at.
+    """
+
+    def __init__(self) -> None:
+        self.types: dict[str, Any] = {}
+        self.wrong: list[str] = []
+        self.looked_at = 0
+
+    def visit_Import(self, node: ast.Import) -> None:
+        for alias in node.names:
+            if alias.name.split(".")[0] == PACKAGE:
+                import_module(alias.name)
+                self.types.setdefault(alias.asname or alias.name, import_module(alias.name))
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
+        if (node.module or "").split(".")[0] == PACKAGE:
+            module = import_module(str(node.module))
+            for alias in node.names:
+                self.looked_at += 1
+                if not hasattr(module, alias.name):
+                    self.wrong.append(f"{node.module} has no {alias.name}")
+
+    def visit_Assign(self, node: ast.Assign) -> None:
+        self.generic_visit(node)
+        made = self.made_by(node.value)
+        for target in node.targets:
+            if isinstance(target, ast.Name):
+                self.types.pop(target.id, None)
+                if made is not None:
+                    self.types[target.id] = made
+
+    def visit_Attribute(self, node: ast.Attribute) -> None:
+        self.generic_visit(node)
+        self.meaning(node)
+
+    def visit_Call(self, node: ast.Call) -> None:
+        self.generic_visit(node)
+        called = self.meaning(node.func)
+        if not callable(called) or any(isinstance(a, ast.Starred) for a in node.args):
+            return
+        self.looked_at += 1
+        try:
+            signature = inspect.signature(called)
+        except ValueError:
+            return
+        keywords = {k.arg: None for k in node.keywords if k.arg is not None}
+        method = isinstance(node.func, ast.Attribute) and inspect.isfunction(called) and self.is_instance(node.func)
+        try:
+            signature.bind_partial(*[None] * (len(node.args) + method), **keywords)
+        except TypeError as error:
+            self.wrong.append(f"{ast.unparse(node.func)}(...): {error}")
+
+    def is_instance(self, node: ast.Attribute) -> bool:
+        """Whether a function is reached through an object, which is then its first argument."""
+        return isinstance(node.value, ast.Name) and inspect.isclass(self.types.get(node.value.id))
+
+    def made_by(self, node: ast.expr) -> Any:
+        """The class of what a call returns, where it is stated and one."""
+        if not isinstance(node, ast.Call):
+            return None
+        called = self.meaning(node.func)
+        if inspect.isclass(called):
+            return called
+        routine = inspect.isfunction(called) or inspect.ismethod(called)
+        stated = typing.get_type_hints(called).get("return") if routine else None
+        return stated if inspect.isclass(stated) and stated.__module__.startswith(PACKAGE) else None
+
+    def meaning(self, node: ast.expr) -> Any:
+        """The object that a dotted name stands for; None where it is not known."""
+        if isinstance(node, ast.Name):
+            return self.types.get(node.id)
+        if not isinstance(node, ast.Attribute):
+            return None
+        holder = self.meaning(node.value)
+        if holder is None:
+            return None
+        known = {*dir(holder), *getattr(holder, "__annotations__", {}), *set_by_methods(holder)}
+        self.looked_at += 1
+        if node.attr not in known and f"{ast.unparse(node)} does not exist" not in self.wrong:
+            self.wrong.append(f"{ast.unparse(node)} does not exist")
+        found = getattr(holder, node.attr, None)
+        called = inspect.isfunction(found) or inspect.ismethod(found) or inspect.isclass(found)
+        return found if called or inspect.ismodule(found) else None
+
+
+def looked_through(code: str) -> PublicNames:
+    found = PublicNames()
+    found.visit(ast.parse(code))
+    return found
+
+
+@NAMED
+def test_code_in_documents_and_notebooks_names_what_exists(name: str, code: str) -> None:
+    found = looked_through(code)
+    assert found.wrong == []
+    assert found.looked_at or PACKAGE not in packages(code)
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong"),
+    [
+        ("rb.calibrat(model, runs)", "rb.calibrat does not exist"),
+        ("rb.calibrate(model, runs, methd=1)", "rb.calibrate(...): got an unexpected keyword argument 'methd'"),
+        ("rb.SMC(rollout=3)", "rb.SMC(...): got an unexpected keyword argument 'rollout'"),
+        ("fit = rb.calibrate(model, runs)\nfit.plot_pairs()", "fit.plot_pairs does not exist"),
+        ("fit = rb.calibrate(model, runs)\nfit.plot_pair(axes=1)", "unexpected keyword argument 'axes'"),
+        ("rb.Robot.lode('x')", "rb.Robot.lode does not exist"),
+        ("from rfdropo_bayes.data import Trajectry", "rfdropo_bayes.data has no Trajectry"),
+    ],
+)
+def test_names_that_do_not_exist_are_found(line: str, wrong: str) -> None:
+    (found,) = looked_through(f"import rfdropo_bayes as rb\n{line}").wrong
+    assert wrong in found
+
+
+def test_names_that_exist_are_looked_at() -> None:
+    found = looked_through("import rfdropo_bayes as rb\nfit = rb.calibrate(m, r)\nfit.plot_pair(ax=a)\nfit.rmse")
+    assert found.wrong == []
+    assert found.looked_at >= 5
+
+
+def packages(code: str) -> Iterator[str]:
+    """Modules that a script imports."""
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield str(node.module)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_import_the_front_door_alone(path: Path) -> None:
+    code = dict(BLOCKS)[path.name]
+    assert {name for name in packages(code) if name.split(".")[0] == PACKAGE} == {PACKAGE}
+    assert f"import {PACKAGE} as {DOOR}" in code
+
+
+def block(document: str, opening: str) -> str:
+    """The Python block of a document that begins with some words."""
+    (code,) = [code for name, code in BLOCKS if name.startswith(document) and code.startswith(opening)]
+    return code
+
+
+def test_the_engine_of_a_document_moves(tmp_path: Path) -> None:
+    """The whole script of your_simulator.md: a tip that swings to where it is pulled."""
+    (tmp_path / "engine.py").write_text(block("docs/your_simulator.md", "# engine.py"), encoding="utf-8")
+    script = "import engine; box = engine.arm(stiffness=30.0); print(box.parameters['stiffness'].nominal)"
+    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True, capture_output=True)
+    scope: dict[str, Any] = {}
+    exec(compile((tmp_path / "engine.py").read_text(), "engine.py", "exec"), scope)
+    model = rb.Model(scope["arm"]())
+    pulled = {"duration": 1.0, "interval": 0.5, "step": 0.01, "low": 0.0, "high": 0.02, "sample_time": 0.05}
+    (run,) = rb.simulate(model, {**pulled, "recordings": ["try"]}, seed=1)
+    assert run.marker_names == ("tip",)
+    assert np.ptp(run.position[:, 0, 0]) > 1e-3
+    np.testing.assert_allclose(run.position[:, 0, 2], 0.3)
+
+
+def test_the_problem_of_a_document_is_inferred() -> None:
+    """The scripts of inference.md that follow each other: a line through five points."""
+    script = ast.parse(block("docs/inference.md", "import jax.numpy"))
+    last = script.body.pop()
+    assert isinstance(last, ast.Expr)
+    scope: dict[str, Any] = {"jax": jax, "methods": methods}
+    exec(compile(script, "inference.md", "exec"), scope)
+    draws = eval(compile(ast.Expression(last.value), "inference.md", "eval"), scope)
+    time, data = scope["Line"].time, scope["Line"].data
+    precision = 1.0 + time @ time / 0.1**2  # of a standard normal prior and noise of 0.1
+    assert float(draws.mean()) == pytest.approx(float(time @ data / 0.1**2 / precision), abs=5.0 * precision**-0.5)
