@@ -261,7 +261,7 @@ class LawSearch:
                 refits = self._refits(known, terms, fit, where, ranked)
                 if not refits or refits[0].score <= 0.0:
                     break
-                best, others = self._exchanged(known, terms, found, values, refits, gates[-1])
+                best, others = self._exchanged(known, terms, found, values, refits, gates[-1], where)
                 if best.score <= 0.0:
                     break
                 ties = ties if terms else _tied(best, others)
@@ -343,13 +343,14 @@ class LawSearch:
 
     def _exchanged(
         self, known: FitTarget, terms: Sequence[Refit], found: Responses, values: np.ndarray, refits: Sequence[Refit],
-        gate: float,
+        gate: float, where: Sequence[PortEvidence],
     ) -> tuple[Refit, list[Refit]]:  # fmt: skip
         """The best term climbed to its end, or another one in its place; and all others that were refitted.
 
         The base model has made up for a part of what it lacks, and the linear model does not see how far it goes back
         with a law. With a law in the model the base parameters are nearer to the truth. There the terms are ranked
-        anew, with base parameters held to what is then known of them.
+        anew, with base parameters held to what is then known of them. The term's feature is also tried at the ports
+        that lead by evidence, where the linear model may have preferred another one: a delay is far from linear.
         """
         chosen, every = refits[0], list(refits)
         best, tried = self._climbed(chosen), {(chosen.term.port, chosen.term.feature)}
@@ -362,7 +363,7 @@ class LawSearch:
                            covariance=fit.covariance[:-1, :-1])  # fmt: skip
             linear = _relinearised(known, found, bare)
             ranked = self._ranked(linear, values, gate, _precision(known, bare), terms)
-            fresh = [row for row in ranked if (row.port, row.feature) not in tried][:FRESH]
+            fresh = fresh_terms([row for row in ranked if (row.port, row.feature) not in tried], best.term, where)
             tried |= {(row.port, row.feature) for row in fresh}
             others = [self._refit(known, terms, bare, row) for row in fresh]
             every += others
@@ -416,6 +417,13 @@ class LawSearch:
         """The same, climbed to its end."""
         judge, fit = fit_with_noise(refit.target, refit.fit.x, refit.fit.free)
         return replace(refit, target=judge, fit=fit)
+
+
+def fresh_terms(ranked: Sequence[TermGain], best: PlacedTerm, where: Sequence[PortEvidence]) -> list[TermGain]:
+    """Terms that may take the place of the best one: those of most gain, and its feature at the leading ports."""
+    leading = [row.port for row in where[:BY_EVIDENCE]]
+    alike = [row for row in ranked if row.port in leading and row.feature == best.feature]
+    return list(dict.fromkeys([*ranked[:FRESH], *alike]))
 
 
 FARTHEST = 100.0  # prior deviations within which a refit starts

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.audit.extension import Rules
-from rfdropo_bayes.audit.law_search import PIECES, LawSearch, _pieces, _sums, left_out_gains
+from rfdropo_bayes.audit.law_search import PIECES, LawSearch, TermGain, _pieces, _sums, fresh_terms, left_out_gains
 from rfdropo_bayes.audit.port_evidence import MEMORIES, SIZES, evidences
 from rfdropo_bayes.audit.port_responses import Responses, feature_columns, on_splines, splines
 from rfdropo_bayes.audit.verdict import SMALL, negligible
@@ -111,6 +111,16 @@ def test_a_term_that_the_law_has_is_not_asked_for_again():
     assert best == (PORTS[0], features[0])
     law = [SimpleNamespace(term=SimpleNamespace(port=best[0], feature=best[1]))]
     assert [(row.port, row.feature) for row in search._ranked(found, values, 0.0, terms=law)] == others
+
+
+def test_a_term_is_tried_at_all_leading_ports():
+    """Of a port far from linear, which leads by evidence, the linear model may rank another feature first."""
+    time, other = Feature("time"), Feature("command", (0,))
+    places = [(0, other), (0, Feature("constant")), (1, other), (0, Feature("rate", (0,))), (1, time)]
+    ranked = [TermGain(PORTS[p], own, 9.0 - k, 0.5, 1.0, 0.1, 1.0) for k, (p, own) in enumerate(places)]
+    where = [SimpleNamespace(port=port) for port in reversed(PORTS)]
+    assert fresh_terms(ranked, SimpleNamespace(feature=time), where) == [*ranked[:3], ranked[4]]
+    assert fresh_terms(ranked, SimpleNamespace(feature=other), where) == ranked[:3]
 
 
 def brute(found: Responses, column: np.ndarray) -> float:
