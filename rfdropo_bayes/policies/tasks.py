@@ -131,9 +131,10 @@ def layout_of(
         observed: "paper", markers and goal, and the cube's pose; "full", also the commands in force and how far each
             marker has moved since the last action; "markers", the same with the markers that motion capture sees.
         period: from one action to the next [s].
-        step: most that an action moves a channel [m or rad].
+        step: most that an action moves a cable [m], at nominal parameters.
     """
     channels = robot.channel_names
+    most = [float(f"{step / pulled:.9g}") for pulled in cable_per_command(robot)]
     shown = len(tracked_markers(robot)) if observed == "markers" else len(robot.marker_names)
     parts = [ObservationPart("markers", 3 * shown, "m"), ObservationPart("goal", 3, "m")]
     parts += [ObservationPart("object", 7, "m, quaternion")] if task.push else []
@@ -142,8 +143,8 @@ def layout_of(
             ObservationPart("commands", len(channels), robot.command_unit),
             ObservationPart("moved", 3 * shown, "m"),
         ]
-    one = step * np.eye(len(channels))
-    moves = np.full((1, len(channels)), step) if actions == "continuous" else np.concatenate([one, -one])
+    one = np.diag(most)
+    moves = np.array([most]) if actions == "continuous" else np.concatenate([one, -one])
     low, high = command_limits(robot)
     return PolicyLayout(
         task=task.name,
@@ -156,6 +157,18 @@ def layout_of(
         low=tuple(map(float, low)),
         high=tuple(map(float, high)),
     )
+
+
+def cable_per_command(robot: Robot) -> Float[np.ndarray, " channel"]:
+    """Most cable [m] that a unit of each channel's command moves, at nominal parameters; 1 if commands are lengths."""
+    if robot.command_unit == "m":
+        return np.ones(len(robot.channel_names))
+    return np.abs(np.asarray(robot.channel_matrix(robot.nominal()), dtype=float)).max(axis=0)
+
+
+def step_of(layout: PolicyLayout, robot: Robot) -> float:
+    """The ``step`` [m] with which `layout_of` makes the actions of a layout."""
+    return float(np.max(np.asarray(layout.moves) * cable_per_command(robot)))
 
 
 def observed_of(layout: PolicyLayout) -> Observed:

@@ -17,7 +17,16 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.policies.building import make_episodes
 from rfdropo_bayes.policies.gym_env import TrunkEnv, TrunkVectorEnv
 from rfdropo_bayes.policies.randomisation import Draws, Phi, Point, Uniform, fitting, read_phi, read_posterior
-from rfdropo_bayes.policies.tasks import FLOOR, TASKS, command_limits, layout_of, potential, reward, tracked_markers
+from rfdropo_bayes.policies.tasks import (
+    FLOOR,
+    TASKS,
+    command_limits,
+    layout_of,
+    potential,
+    reward,
+    step_of,
+    tracked_markers,
+)
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.robots import Robot
@@ -156,6 +165,19 @@ def test_rewards_stay_finite_for_episodes_that_begin_at_the_goal() -> None:
     far = np.array([0.05])
     for first in (0.0, 0.0005, 0.001, 0.0010005):
         assert reward(far, np.array([first]))[0] == reward(far, np.array([0.005]))[0] < -1.0
+
+
+@pytest.mark.parametrize("kind", ["continuous", "discrete"])
+def test_an_action_moves_the_same_cable_whether_commands_are_lengths_or_angles(kind) -> None:
+    """5 mm of cable, by hand: 0.5 rad of a spool of 10 mm."""
+    answers = {"length": 0.2, "radius": 0.01, "markers": {"tip": 0.2}}
+    turned = Robot.outline(name="turned", command_unit="rad", spool_radius=0.01, **answers)
+    pulled = Robot.outline(name="pulled", **answers)
+    for robot, most in ((turned, 0.5), (pulled, 0.005)):
+        layout = layout_of(TASKS[REACH], robot, kind, "full")
+        assert np.max(layout.moves) == most
+        assert step_of(layout, robot) == pytest.approx(0.005)
+        assert layout_of(TASKS[REACH], robot, kind, "full", step=step_of(layout, robot)) == layout
 
 
 @pytest.mark.parametrize("action", [-1, 16, 3.0])
