@@ -109,6 +109,20 @@ def test_links_inside_the_repository_lead_somewhere(document: Path) -> None:
     assert not [target for target in targets if not (document.parent / target).exists()]
 
 
+REPORTS = sorted((REPOSITORY / "reports").glob("*/*.md"))
+
+
+@pytest.mark.parametrize("page", REPORTS, ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_links_of_reports_lead_to_files_and_headings(page: Path) -> None:
+    missing = []
+    for name, heading in re.findall(r"\]\((?!https?://)([^)#]*)(?:#([^)]+))?\)", page.read_text(encoding="utf-8")):
+        found = page.parent / name if name else page
+        headings = re.findall(r"^#+ (.+)$", found.read_text(encoding="utf-8"), re.MULTILINE) if heading else []
+        known = {re.sub(r"[^\w -]", "", words.lower()).replace(" ", "-") for words in headings}
+        missing += [] if found.exists() and (not heading or heading in known) else [f"{name}#{heading}"]
+    assert missing == []
+
+
 def test_what_contributing_points_to_is_there() -> None:
     """Modules in the second column of "Where things are", tests in the last; a bare name is beside the last."""
     lines = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8").split("## Where things are")[1].splitlines()

@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 """Pages of the site by their path in the repository; those of docs/ keep their names."""
-GROUPS = ("reports/**/README.md", "models/**/README.md", "notebooks/*.ipynb")
+GROUPS = ("reports/**/README.md", "reports/*/details.md", "models/**/README.md", "notebooks/*.ipynb")
 LINK = re.compile(r"(?<!\\)(!?\[(?:[^\[\]]|\[[^\]]*\])*\]\()([^)\s#]+)?(#[^)\s]*)?(\))")
 CODE = re.compile(r"(```.*?```)", re.DOTALL)
 
@@ -33,10 +33,10 @@ def site_path(path: str) -> str | None:
     if path.startswith("docs/"):
         return path.removeprefix("docs/")
     room, _, rest = path.partition("/")
-    readme = room in ("reports", "models") and rest.endswith("README.md")
+    report = room in ("reports", "models") and rest.endswith(("README.md", "/details.md"))
     if room == "notebooks" and rest.endswith(".ipynb"):
         return path.replace(".ipynb", ".md")
-    return path if readme else None
+    return path if report else None
 
 
 def repository_path(source: str) -> str:

@@ -66,7 +66,9 @@ def train(
         f"half of the episodes end within {1e3 * last['distance_median']:.2f} mm of the goal, 95 % within "
         f"{1e3 * last['distance_q95']:.2f} mm, after {found['steps']} steps in {found['seconds']:.0f} s"
     )
-    say(found, learnt, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", quiet=quiet, as_json=as_json)
+    ahead = shlex.join(["rfdropo", "evaluate", str(folder / "config.toml"), "--policy", str(folder)])
+    lines = (learnt, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", f"next: {ahead}")
+    say(found, *lines, quiet=quiet, as_json=as_json)
 
 
 def _task_and_goal(task: str | None, goal: str | None) -> list[str]:

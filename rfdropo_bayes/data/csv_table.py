@@ -105,14 +105,20 @@ class CsvTable:
     Args:
         path: the file, plain or gzipped.
         required: columns that must be there.
-        machine_written: the format's own writer ends every line with a newline, so a last line without one was cut.
+        machine_written: the format has a writer and columns of its own: it ends every line with a newline, so a last
+            line without one was cut. Else a table [data.columns] names the columns.
 
     Raises:
         InputError: empty file, header without rows, ragged or cut rows, a missing, renamed or repeated column.
     """
 
+    missing_remedy = "correct its name in [data.columns]"
+    """What to do about a column that is not there."""
+
     def __init__(self, path: Path, required: Sequence[str], *, machine_written: bool = True) -> None:
         self.path = path
+        if machine_written:
+            self.missing_remedy = "rename the column, or use format = 'csv' with a [data.columns] mapping"
         text = read_text(path)
         lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
         if lines[0].lower().startswith("sep="):  # spreadsheets write so which separator follows
@@ -199,7 +205,7 @@ class CsvTable:
                 raise InputError(
                     f"column {name!r} is missing; {closest(name, spare)}",
                     where=str(self.path),
-                    remedy="rename the column, or use format = 'csv' with a [data.columns] mapping",
+                    remedy=self.missing_remedy,
                 )
 
     def numbers(self, names: Sequence[str], *, allow_missing: bool = False) -> Float[np.ndarray, "rows columns"]:

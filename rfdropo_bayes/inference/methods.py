@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,7 +80,7 @@ def make_config(name: str, options: Mapping[str, Any]) -> Any:
     Raises:
         InputError: an option that this method does not have (the nearest is offered), or of a wrong type.
     """
-    return _build(method_named(name).config, options, "[inference]")
+    return _build(method_named(name).config, options, "[inference]", beside=("method",))
 
 
 def run(
@@ -114,13 +114,14 @@ def run(
     return method.run(problem, config, key, Logbook(checkpoint_dir, resume, progress))
 
 
-def _build(kind: type, options: Mapping[str, Any], where: str) -> Any:
+def _build(kind: type, options: Mapping[str, Any], where: str, beside: Sequence[str] = ()) -> Any:
+    """A configuration from a table, which may have been meant to hold the keys ``beside``, too."""
     hints = typing.get_type_hints(kind)
     names = [field.name for field in dataclasses.fields(kind)]
     values = {}
     for name, value in options.items():
         if name not in names:
-            raise InputError(f"unknown option {name!r}", where=where, remedy=nearest(name, names))
+            raise InputError(f"unknown option {name!r}", where=where, remedy=nearest(name, [*names, *beside]))
         values[name] = _convert(hints[name], value, f"{where} {name}")
     return kind(**values)
 

@@ -65,7 +65,7 @@ class Settings:
     actions: Actions = "discrete"
     observed: Observed = "paper"
     period: float = 0.05
-    step: float | None = None
+    step: float | Sequence[float] | None = None
     noise: float = 0.0
     near: float | None = None
 

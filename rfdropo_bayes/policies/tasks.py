@@ -55,8 +55,8 @@ class Commanded(Protocol):
     def command_limits(self) -> tuple[Float[np.ndarray, " channel"], Float[np.ndarray, " channel"]]:
         """Least and greatest command of each channel."""
 
-    def command_of(self, pull: float) -> float:
-        """Size of a command that pulls a cable by so much [m], or is as large where commands are no lengths."""
+    def command_of(self, pull: float) -> Float[np.ndarray, " channel"]:
+        """Size of each channel's command that pulls a cable by so much [m], or is as large where nothing is wound."""
 
     def markers_near(self, heights: Sequence[float]) -> tuple[int, ...]:
         """Indices of the markers nearest to these heights [m] of the undeformed body."""
@@ -150,7 +150,7 @@ def layout_of(
     actions: Actions,
     observed: Observed,
     period: float = PERIOD,
-    step: float | None = None,
+    step: float | Sequence[float] | None = None,
 ) -> PolicyLayout:
     """Observation and action of a task on a robot.
 
@@ -160,7 +160,8 @@ def layout_of(
         observed: "paper", markers and goal, and the cube's pose; "full", also the commands in force and how far each
             marker has moved since the last action; "markers", the same with the markers that motion capture sees.
         period: from one action to the next [s].
-        step: most that an action moves a channel, in the unit of its commands; `Commanded.command_of` 5 mm by default.
+        step: most that an action moves a channel, in the unit of its commands, or that of each; as much as pulls a cable
+            by 5 mm by default, see `Commanded.command_of`.
 
     Raises:
         InputError: a cube for a robot that has none, or commands that nothing limits.
@@ -177,9 +178,10 @@ def layout_of(
             ObservationPart("moved", 3 * shown, "m"),
         ]
     low, high = robot.command_limits()
-    step = step or robot.command_of(STEP)
-    one = step * np.eye(len(channels))
-    moves = np.full((1, len(channels)), step) if actions == "continuous" else np.concatenate([one, -one])
+    given = robot.command_of(STEP) if step is None else np.broadcast_to(step, len(channels))
+    most = [float(f"{one:.9g}") for one in given]
+    one = np.diag(most)
+    moves = np.array([most]) if actions == "continuous" else np.concatenate([one, -one])
     return PolicyLayout(
         task=task.name,
         period_s=period,

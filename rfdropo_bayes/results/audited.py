@@ -23,6 +23,7 @@ from rfdropo_bayes.report import audit_figures as figures
 from rfdropo_bayes.report.audit_figures import Shown
 from rfdropo_bayes.report.trajectory_figures import AXES
 from rfdropo_bayes.results.calibrated import axes_or_new
+from rfdropo_bayes.results.named_entries import entry_number
 from rfdropo_bayes.tables import nearest, parse_table
 
 if TYPE_CHECKING:
@@ -130,12 +131,12 @@ class Audit:
         """Draw the last marker of an unseen recording: measured, base model, extended model.
 
         Raises:
-            InputError: no recording was left unseen, or nothing was named.
+            InputError: no such axis, no recording was left unseen, or nothing was named.
         """
         if self._shown().unseen is None:
             raise InputError("no unseen recording was predicted", where="audit", remedy="give recordings as test=")
         axes = axes_or_new(ax)
-        figures.draw_unseen(axes, self._shown(), AXES.index(axis))
+        figures.draw_unseen(axes, self._shown(), entry_number(axis, AXES, "axis"))
         axes.legend()
         return axes
 

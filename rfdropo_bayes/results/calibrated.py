@@ -24,6 +24,7 @@ from rfdropo_bayes.report import render_page, write_run
 from rfdropo_bayes.report.posterior_figures import draw_before_and_after, draw_pairs, pair_figure, paired_names
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.report.trajectory_figures import AXES, draw_band
+from rfdropo_bayes.results.named_entries import entry_number
 from rfdropo_bayes.tables import nearest
 
 if TYPE_CHECKING:
@@ -149,14 +150,17 @@ class Calibration:
             marker: name or number of the marker; the last by default.
             axis: ``"x"``, ``"y"`` or ``"z"``; the one along which it moves most by default.
             ax: that it is drawn on.
+
+        Raises:
+            InputError: no such recording, marker or axis.
         """
         shown = self.prediction(recording)
-        index = shown.marker_names.index(marker) if isinstance(marker, str) else range(len(shown.marker_names))[marker]
+        index = entry_number(marker, shown.marker_names, "marker")
         moved = np.ptp(
             np.where(shown.mask[:, index, None], shown.observed[:, index], shown.observed[:1, index]), axis=0
         )
         axes = axes_or_new(ax)
-        draw_band(axes, shown, index, int(np.argmax(moved)) if axis is None else AXES.index(axis))
+        draw_band(axes, shown, index, int(np.argmax(moved)) if axis is None else entry_number(axis, AXES, "axis"))
         axes.set_xlabel("time [s]")
         axes.set_title(shown.name)
         axes.legend()
@@ -169,11 +173,7 @@ class Calibration:
             InputError: no such recording.
         """
         known = {shown.name: shown for shown in self.record.recordings}
-        if isinstance(recording, int):
-            recording = list(known)[recording]
-        if recording not in known:
-            raise InputError(f"no recording {recording!r}", where="calibration", remedy=nearest(recording, known))
-        return known[recording]
+        return known[list(known)[entry_number(recording, list(known), "recording")]]
 
     def _known(self, names: Sequence[str]) -> list[str]:
         for name in names:

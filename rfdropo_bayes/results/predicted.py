@@ -14,8 +14,9 @@ from jaxtyping import Float
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.files import whole
 from rfdropo_bayes.posteriors import RecordingPrediction
-from rfdropo_bayes.report.trajectory_figures import draw_band
+from rfdropo_bayes.report.trajectory_figures import AXES, draw_band
 from rfdropo_bayes.results.calibrated import axes_or_new
+from rfdropo_bayes.results.named_entries import entry_number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,11 +51,14 @@ class Prediction:
         return _columns(self.bands)
 
     def plot(self, marker: str | int = -1, axis: str = "x", ax: Axes | None = None) -> Axes:
-        """Draw one coordinate of one marker over time, with its 50 % and 90 % bands."""
-        names = self.drawn.marker_names
-        index = names.index(marker) if isinstance(marker, str) else range(len(names))[marker]
+        """Draw one coordinate of one marker over time, with its 50 % and 90 % bands.
+
+        Raises:
+            InputError: no such marker or axis.
+        """
+        index = entry_number(marker, self.drawn.marker_names, "marker")
         axes = axes_or_new(ax)
-        draw_band(axes, self.drawn, index, "xyz".index(axis))
+        draw_band(axes, self.drawn, index, entry_number(axis, AXES, "axis"))
         axes.set_xlabel("time [s]")
         axes.legend()
         return axes

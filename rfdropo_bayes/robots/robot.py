@@ -273,10 +273,12 @@ class Robot(RobotTable):
         low, high = np.min(ends, axis=0), np.max(ends, axis=0)
         return low.max(axis=0), high.min(axis=0)
 
-    def command_of(self, pull: float) -> float:
-        """Size of a command that pulls a cable by so much [m]: the pull itself, or an angle at nominal parameters."""
-        turned = 1.0 if self.command_unit == "m" else np.abs(self.channel_matrix(self.nominal())).max()
-        return pull / float(turned)
+    def command_of(self, pull: float) -> Float[np.ndarray, " channel"]:
+        """Size of each channel's command that pulls a cable by so much [m]: the pull itself, or at nominal parameters
+        the angle that moves the cable that moves most."""
+        if self.command_unit == "m":
+            return np.full(len(self.channel_names), pull)
+        return pull / np.abs(np.asarray(self.channel_matrix(self.nominal()), dtype=float)).max(axis=0)
 
     def markers_near(self, heights: Sequence[float]) -> tuple[int, ...]:
         """Indices of the markers nearest to these heights [m] along the axis of the undeformed body."""

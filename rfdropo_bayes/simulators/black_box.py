@@ -131,14 +131,14 @@ class BlackBox:
     def body(self) -> None:
         """Nobody knows it."""
 
-    def command_of(self, pull: float) -> float:
-        """That pull [m] where commands are lengths, else `ACTION` of the smallest range.
+    def command_of(self, pull: float) -> Float[np.ndarray, " channel"]:
+        """That pull [m] where commands are lengths, else `ACTION` of each range.
 
         Raises:
             InputError: a channel without limits.
         """
         low, high = self.command_limits()
-        return pull if self.command_unit == "m" else ACTION * float(np.min(high - low))
+        return np.full(len(low), pull) if self.command_unit == "m" else ACTION * (high - low)
 
     def markers_near(self, heights: Sequence[float]) -> tuple[int, ...]:
         """All markers: nobody knows its undeformed body."""

@@ -11,9 +11,10 @@ import numpy as np
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_json, write_text
 from rfdropo_bayes.model.assembly import AnySimulator
+from rfdropo_bayes.model.experiment_file import read_tables
 from rfdropo_bayes.model.fitted_integrator import INTEGRATOR
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.model.run_folder import run_folder
+from rfdropo_bayes.model.run_folder import CONFIG, run_folder
 from rfdropo_bayes.policies.episodes import Episodes, Settings
 from rfdropo_bayes.policies.evaluation import (
     EVALUATION_SEED,
@@ -43,6 +44,8 @@ from rfdropo_bayes.verbs.train import POLICY
 
 EVALUATION, TABLE, CSV, FIGURE = "evaluation.json", "evaluation.md", "episodes.csv", "success.png"
 SCHEMA_VERSION = 1
+OF_EPISODES = ("task", "goals", "start", "actions", "observation", "period", "noise")
+"""Keys of [training] that say what an episode is, whatever is simulated."""
 
 
 def evaluate(
@@ -72,7 +75,8 @@ def evaluate(
         seed: of the cases.
         film: whether to draw the animations.
         overwrite: start anew whatever ``out`` holds.
-        options: keys of an experiment file's [training], such as the task.
+        options: keys of an experiment file's [training], such as the task. Of an experiment without that table they
+            are those of the first policy's training.
 
     Returns:
         the content of evaluation.json.
@@ -80,10 +84,10 @@ def evaluate(
     Raises:
         InputError: bad input, a policy for another layout, or one that is given twice.
     """
-    model = with_training(model, options)
+    opened = [ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies]
+    model = with_training(model, {**(_task_of(policies) if model.settings.training is None else {}), **options})
     table, task, simulator = training_of(model)
     randomisation = randomisation_of(table, model.spec, simulator, posterior)
-    opened = [ExportedPolicy(p / POLICY if p.is_dir() else p) for p in policies]
     loaded = dict(zip(_names(policies), opened, strict=True))
     chosen = {"episodes": episodes, "seed": seed}
     record: dict[str, Any] = {
@@ -112,6 +116,14 @@ def evaluate(
     return content
 
 
+def _task_of(policies: Sequence[Path]) -> dict[str, Any]:
+    """What an episode is in the training of the first policy; nothing if its folder does not say."""
+    first = policies[0] if policies[0].is_dir() else policies[0].parent
+    if not (first / CONFIG).is_file():
+        return {}
+    return {key: value for key, value in read_tables(first / CONFIG).get("training", {}).items() if key in OF_EPISODES}
+
+
 def _episodes_for(
     layout: PolicyLayout,
     simulator: AnySimulator,
@@ -126,7 +138,7 @@ def _episodes_for(
         actions=layout.kind,
         observed=observed_of(layout),
         period=table.period,
-        step=float(np.max(layout.moves)),
+        step=np.max(layout.moves, axis=0).tolist(),
         noise=table.noise,
     )
     batch = Episodes(simulator, task, lanes, randomisation, settings)

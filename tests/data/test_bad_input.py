@@ -79,6 +79,10 @@ def test_missing_and_renamed_columns(optitrack_table, write, tmp_path):
         read_optitrack_csv(write(table.rename(columns={"timestamp": "time_stamp"}), tmp_path / "a.csv"))
     with fails("column 'z3' is missing"):
         read_optitrack_csv(write(table.drop(columns="z3"), tmp_path / "b.csv"))
+    (tmp_path / "own.csv").write_text("t,x,y,z,pull\n0,1,2,3,4\n1,1,2,3,4\n")
+    columns = CsvColumns.model_validate(COLUMNS | {"commands": ["pul"]})
+    with fails(r"column 'pul' is missing; did you mean 'pull'\?; correct its name in \[data.columns\]"):
+        read_plain_csv(tmp_path / "own.csv", columns)
     (tmp_path / "c.csv").write_text("a,a\n1,2\n")
     with fails("column 'a' appears twice"):
         CsvTable(tmp_path / "c.csv", ["a"])

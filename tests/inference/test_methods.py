@@ -21,6 +21,7 @@ OTHERS = ("bayessim", "npdr", "udr", "nuts", "nested")
         ("smd", {}, "did you mean 'smc'"),
         ("smc", {"particels": 100}, "did you mean 'particles'"),
         ("smc", {"variance_floor": 1e-5}, "unknown option 'variance_floor'"),
+        ("smc", {"metod": "laplace"}, "did you mean 'method'"),
         ("rfdropo", {"rolouts": 100}, "did you mean 'rollouts'"),
         ("bridge", {"climb": {"strats": 3}}, "did you mean 'starts'"),
         ("smc", {"particles": "many"}, "'many' is not of type int"),

@@ -158,6 +158,18 @@ def test_rewards_stay_finite_for_episodes_that_begin_at_the_goal() -> None:
         assert reward(far, np.array([first]))[0] == reward(far, np.array([0.005]))[0] < -1.0
 
 
+@pytest.mark.parametrize("kind", ["continuous", "discrete"])
+def test_an_action_moves_the_same_cable_whether_commands_are_lengths_or_angles(kind) -> None:
+    """5 mm of cable, by hand: 0.5 rad of a spool of 10 mm."""
+    answers = {"length": 0.2, "radius": 0.01, "markers": {"tip": 0.2}}
+    turned = Robot.outline(name="turned", command_unit="rad", spool_radius=0.01, **answers)
+    pulled = Robot.outline(name="pulled", **answers)
+    for robot, most in ((turned, 0.5), (pulled, 0.005)):
+        layout = layout_of(TASKS[REACH], robot, kind, "full")
+        assert np.max(layout.moves) == most
+        assert layout_of(TASKS[REACH], robot, kind, "full", step=np.max(layout.moves, axis=0).tolist()) == layout
+
+
 @pytest.mark.parametrize("action", [-1, 16, 3.0])
 def test_a_discrete_action_that_is_none_is_refused(action) -> None:
     layout = layout_of(TASKS[REACH], Robot.load("trunk_sofa"), "discrete", "paper")

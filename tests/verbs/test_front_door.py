@@ -149,6 +149,11 @@ def test_a_calibration_shows_itself_and_comes_back(fit, tmp_path):
     fit.plot_pair(ax=axes[0])
     fit.plot_prior_posterior("gain", ax=axes[1])
     fit.plot_fit("run_2", marker="tip", axis="x", ax=axes[2])
+    for wrong, said in (({"marker": "tpi"}, "no marker 'tpi'; did you mean 'tip'"), ({"axis": "w"}, "no axis 'w'")):
+        with pytest.raises(rb.InputError, match=said):
+            fit.plot_fit("run_2", **wrong)
+    with pytest.raises(rb.InputError, match="no recording 7"):
+        fit.plot_fit(7)
     assert axes[2].get_ylabel() == "tip x [mm]"
     plt.close(figure)
     shown = fit._repr_html_()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +116,19 @@ def test_settings_that_cannot_be_are_refused(tmp_path, overrides, words) -> None
 def test_an_experiment_without_training_is_refused(tmp_path) -> None:
     with pytest.raises(InputError, match=r"no table \[training\]"):
         rb.train(rb.Model.read(REPOSITORY / "experiments" / "sofa_reach_layered.toml"), tmp_path)
+
+
+def test_an_experiment_without_training_is_evaluated_as_the_policy_was_trained(tmp_path) -> None:
+    """The table of the policy's own run is read: its period, which is not the policy's here, is what is refused."""
+    trained = tmp_path / "trained"
+    trained.mkdir()
+    shutil.copy(COMMITTED / "policy.onnx", trained)
+    model = rb.Model.read(REPOSITORY / "experiments" / "sofa_reach_layered.toml")
+    with pytest.raises(InputError, match=r"no table \[training\]"):
+        rb.evaluate(model, [trained], tmp_path / "test", episodes=2)
+    (trained / "config.toml").write_text('[training]\ntask = "TrunkReach-v0"\nperiod = 0.1\nsource = "nowhere"\n')
+    with pytest.raises(InputError, match=r"period_s is 0\.05, here it is 0\.1"):
+        rb.evaluate(model, [trained], tmp_path / "test", episodes=2)
 
 
 @pytest.mark.parametrize(
