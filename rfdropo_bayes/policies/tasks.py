@@ -160,8 +160,8 @@ def layout_of(
         observed: "paper", markers and goal, and the cube's pose; "full", also the commands in force and how far each
             marker has moved since the last action; "markers", the same with the markers that motion capture sees.
         period: from one action to the next [s].
-        step: most that an action moves a channel, in the unit of its commands, or that of each; as much as pulls a cable
-            by 5 mm by default, see `Commanded.command_of`.
+        step: most that an action moves a channel, in the unit of its commands, or that of each; by default as much as
+            pulls a cable by 5 mm, see `Commanded.command_of`.
 
     Raises:
         InputError: a cube for a robot that has none, or commands that nothing limits.
