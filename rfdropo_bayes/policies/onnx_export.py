@@ -154,6 +154,10 @@ class ExportedPolicy:
     def __init__(self, path: Path) -> None:
         import onnxruntime
 
+        if not Path(path).is_file():
+            raise InputError(
+                "no such policy", where=str(path), remedy="name a policy.onnx, or the folder of a training"
+            )
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # two threads take longer over so small a network
         try:

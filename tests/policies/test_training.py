@@ -283,6 +283,8 @@ def test_the_time_of_a_decision_is_that_of_the_clock(trained, tmp_path, monkeypa
 @pytest.mark.parametrize("content", [b"", b"not a model"])
 def test_a_file_that_is_no_policy_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "policy.onnx"
+    with pytest.raises(InputError, match="no such policy; name a policy"):
+        ExportedPolicy(path)
     path.write_bytes(content)
     with pytest.raises(InputError, match="cannot read the policy"):
         ExportedPolicy(path)
